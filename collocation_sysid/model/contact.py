@@ -32,7 +32,7 @@ from .generated import Generated
 from .point_forces import Pointwise
 
 # κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample.
-STIFFNESS, WIDTH, SLIP = 100.0, 0.002, (0.1, 1e-4)
+STIFFNESS, WIDTH, SLIP = 100.0, 0.002, (0.01, 1e-4)
 # Evaluations are of so many points at a time, or a multiple: that few sizes are compiled.
 AT_A_TIME = 16
 
@@ -191,6 +191,13 @@ class Contact(Pointwise):
         near = np.flatnonzero((gap < self.contact.width_m).any(axis=0))
         beside = np.setdiff1d(np.arange(min(self.points.count, len(near) + AT_A_TIME)), near)
         return np.sort(np.append(near, beside[: -len(near) % AT_A_TIME]))
+
+    def deepest(self, x: Array) -> tuple[float, Array]:
+        """How far within δ the point is at x (3n,) that is deepest, and the normal (3,) there."""
+        y = self.points.vectors(x[None])
+        gap, slopes = self.contact.distance.slopes(y, np.zeros((0, *y.shape[1:])))
+        place = int(gap[0, 0].argmin())
+        return self.contact.width_m - float(gap[0, 0, place]), slopes[0, :3, 0, place]
 
     def _no_data(self, states: States) -> Array:
         return np.zeros((0, len(states.xi), self.points.count))

@@ -6,9 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
+from ..model.contact import Contact
 from ..model.forces import Forces
 from ..model.viscoelasticity import at_start
 from ..recording.experiment import Experiment
+from ..recording.obstacle import Obstacle
 from .factorisation import NONE
 from .lapack import one_blas_thread
 from .newton import NewtonFailure, Solver, followed, simulation_error
@@ -25,8 +27,9 @@ def rest_state(
     """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
 
     Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails, the
-    load is applied and the other grasps are moved in steps, from the shape carried. A body with
-    memory has relaxed, or has been loaded for as long as the experiment says.
+    load is applied and the other grasps are moved in steps, from the shape carried; obstacles come
+    from where they just do not touch it. A body with memory has relaxed, or has been loaded for as
+    long as the experiment says.
 
     Raises
     ------
@@ -49,6 +52,7 @@ def _at_rest(
 ) -> Array:
     still, shape = np.zeros((1, len(goals_m))), experiment.rigid_positions([at_s])[0]
     forces = at_start(forces, experiment.loaded_since_s)
+    away = _before_contact(forces, shape)
 
     def solve(x: Array, share: float) -> Array:
         loaded = forces.scaled(share)
@@ -62,20 +66,35 @@ def _at_rest(
             return at.force[0], -at.by_position[0], NONE
 
         # Grasps that are off are there at the end: the way there may be any.
-        goal = goals_m if share == 1 else _on_the_way(experiment, shape, at_s, share).ravel()
+        goal = goals_m if share == 1 else _on_the_way(experiment, away, at_s, share).ravel()
         return solver.newton(x, residual, linearise, keep_definite=True, goal=goal[solver.held])
 
+    guess = shape.ravel() if start is None and experiment.obstacles else start
     try:
-        return followed(solve, shape.ravel(), solver.options.halvings, start)
+        return followed(solve, away.ravel(), solver.options.halvings, guess)
     except NewtonFailure as failure:
         raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
+
+
+def _before_contact(forces: Forces, shape: Array) -> Array:
+    """A shape (n, 3) with each obstacle drawn back from the point that is deepest in it.
+
+    What a curved obstacle does to points far inside is not stable: it has to be come upon.
+    """
+    places = shape.copy()
+    for term in forces.further:
+        if isinstance(term, Contact):
+            frame, (depth_m, normal) = term.contact.obstacle.nodes, term.deepest(shape.ravel())
+            places[frame] -= max(depth_m, 0.0) * normal
+    return places
 
 
 def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: float) -> Array:
     """Held nodes (n, 3) when their grasps have come a share of their way from the carried body.
 
     Each grasp turns about the middle of its nodes, which goes straight: none is squeezed or
-    sheared on the way, however far it turns. Other nodes stay where they are carried.
+    sheared on the way, however far it turns. Obstacles are turned already. Other nodes stay where
+    they are carried.
     """
     positions = carried.copy()
     for grasp in experiment.grasps:
@@ -84,6 +103,9 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
         start, nodes = carried[grasp.nodes], grasp.nodes
         place = np.ix_(nodes, grasp.columns)
         goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
+        if isinstance(grasp, Obstacle):
+            positions[nodes] = start + share * (goal - start)
+            continue
         turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
         part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
         middle, way = start.mean(axis=0), (goal - start).mean(axis=0)

@@ -1,0 +1,441 @@
+"""The physics of contact: what pushes, what rubs, and what comes to rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems_small import EDGE_M, IDEAL, TRUTH, as_theta, box, nodes_where, pressed_cube
+from scipy.optimize import brentq, minimize
+
+from collocation_sysid.fem.body import Body
+from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.force_term import States
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import (
+    Capsule,
+    Cuboid,
+    Cylinder,
+    Experiment,
+    Grasp,
+    Obstacle,
+    Plane,
+    PoseSequence,
+    Sphere,
+    Wrench,
+)
+
+G_M_S2 = 9.81
+UP = np.array([0.0, 0.0, 1.0])
+ENDS = np.array([(0.05, 0.0, -0.1), (0.1, 0.1, 0.2)])
+CORNERS = np.array([(-0.3, -0.2, -0.1), (0.3, 0.2, 0.4)])
+SOLIDS = {
+    "plane": Plane(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3])),
+    "sphere": Sphere(0.2, np.array([0.1, 0.0, 0.0])),
+    "cylinder": Cylinder(0.15, ENDS),
+    "rounded cylinder": Cylinder(0.15, ENDS, 0.05),
+    "capsule": Capsule(0.15, ENDS),
+    "box": Cuboid(CORNERS),
+    "rounded box": Cuboid(CORNERS, 0.08),
+}
+
+
+def sensor(t_s) -> Wrench:
+    """Not read yet."""
+    return Wrench(t_s, np.zeros((len(t_s), 6)), 1.0, sigma_nm=1.0)
+
+
+def moved(t_s, way_m, **changes) -> PoseSequence:
+    """Along a way (T, 3), not turned."""
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    return PoseSequence(t_s, np.asarray(way_m, dtype=float), turns, "linear", **changes)
+
+
+# Solids --------------------------------------------------------------------------------------
+
+
+def gaps(solid, points_m) -> tuple[np.ndarray, np.ndarray]:
+    """Gaps (i,) of points (i, 3), and their slopes (3, i)."""
+    point = ca.SX.sym("point", 3)
+    gap = solid.gap(point)
+    both = ca.Function("both", [point], [gap, ca.gradient(gap, point)]).map(len(points_m))
+    value, slope = both(points_m.T)
+    return np.array(value)[0], np.array(slope)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_a_gap_is_a_distance_from_the_surface(name):
+    """Along its slope, which is of length one, lies the surface; and no nearer a point of it."""
+    solid, rng = SOLIDS[name], np.random.default_rng(0)
+    points = rng.uniform(-0.6, 0.6, (2000, 3))
+    gap, slope = gaps(solid, points)
+    np.testing.assert_allclose(np.linalg.norm(slope, axis=0), 1.0, atol=1e-9)
+    foot = points - (gap * slope).T
+    np.testing.assert_allclose(gaps(solid, foot)[0], 0.0, atol=1e-9)
+    for point, distance in zip(points[:50], gap[:50], strict=True):
+        assert np.linalg.norm(foot - point, axis=1).min() >= abs(distance) - 1e-9
+
+
+@pytest.mark.parametrize("name", ["cylinder", "box"])
+def test_rounding_takes_edges_away_and_leaves_sides(name):
+    sharp, rounded = SOLIDS[name], SOLIDS[f"rounded {name}"]
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (2000, 3))
+    more = gaps(rounded, points)[0] - gaps(sharp, points)[0]
+    assert more.min() > -1e-9
+    # At an edge of a box √2 − 1 roundings, at a corner √3 − 1.
+    farthest = {"cylinder": np.sqrt(2) - 1, "box": np.sqrt(3) - 1}[name]
+    assert more.max() <= farthest * rounded.rounding_m + 1e-9
+    assert np.mean(np.abs(more) < 1e-9) > 0.1
+
+
+# Force and energy ----------------------------------------------------------------------------
+
+
+def pushed(friction: float = 0.0) -> tuple[Experiment, States]:
+    """A cube into which a ball and a turned plate have come, and which moves against them."""
+    experiment = pressed_cube(friction=friction)
+    rng = np.random.default_rng(0)
+    x = experiment.rigid_positions(experiment.t_s[-1:])
+    own = len(experiment.body.nodes.points_m)
+    x[:, :own] += rng.uniform(-0.002, 0.002, (own, 3))
+    x[:, :own, 2] += 0.008
+    nu = rng.normal(scale=0.1, size=(1, x.size))
+    return experiment, States(x.reshape(1, -1), nu, as_theta(TRUTH))
+
+
+def energy_j(term, x) -> float:
+    """Ψ, by its formula and the solid's gap alone."""
+    law, body = term.contact, term.contact.body
+    places = term.points.vectors(x[None])[:3, 0].T
+    origin, *ends = x.reshape(-1, 3)[law.obstacle.nodes]
+    axes = (np.array(ends) - origin) / (body.frame_m[1, 0] - body.frame_m[0, 0])
+    gap, _ = gaps(law.obstacle.shape, (places - origin) @ axes.T + body.frame_m[0])
+    kappa = law.obstacle.stiffness_pa_m
+    if kappa is None:
+        young_pa = TRUTH["mu_pa"] * (3 * 200 + 2 * 300) / (200 + 300)
+        kappa = 100 * young_pa / law.surface.edge_m
+    near = np.maximum(law.width_m - gap, 0)
+    return float((law.surface.area_m2 * kappa / (3 * law.width_m) * near**3).sum())
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_contact_force_is_the_slope_of_its_energy(which):
+    experiment, states = pushed()
+    term = contacts(experiment, 1)[which]
+    force, x = term.force(states)[0], states.xi[0]
+    assert energy_j(term, x) > 0
+    ways = np.random.default_rng(1).normal(size=(6, len(x)))
+    step = 1e-7
+    slopes = [
+        (energy_j(term, x + step * w) - energy_j(term, x - step * w)) / (2 * step) for w in ways
+    ]
+    np.testing.assert_allclose(-ways @ force, slopes, rtol=1e-6)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_what_a_body_is_given_its_obstacle_loses(friction):
+    experiment, states = pushed(friction)
+    places = states.xi.reshape(-1, 3)
+    for term in contacts(experiment, 1):
+        force = term.force(states).reshape(-1, 3)
+        assert np.abs(force).max() > 1e-4
+        np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12)
+        np.testing.assert_allclose(np.cross(places, force).sum(axis=0), 0.0, atol=1e-12)
+
+
+def test_friction_dissipates_and_stays_within_its_cone():
+    experiment, states = pushed(0.4)
+    smooth, _ = pushed()
+    rubbing, pressing = contacts(experiment, 1)[0], contacts(smooth, 1)[0]
+    along = (rubbing.force(states) - pressing.force(states))[0]
+    assert along @ states.nu[0] < 0
+    own = slice(3 * len(experiment.body.nodes.points_m))
+    most = 0.4 * np.linalg.norm(pressing.force(states)[0, own].reshape(-1, 3), axis=1).sum()
+    assert np.linalg.norm(along[own].reshape(-1, 3).sum(axis=0)) <= most
+
+
+def test_a_sensor_of_an_obstacle_reads_the_sum_of_its_contact_forces():
+    experiment = pressed_cube(friction=0.4)
+    grasps = [replace(g, wrench=sensor(experiment.t_s)) for g in experiment.grasps]
+    experiment = replace(experiment, grasps=grasps)
+    seen = simulate(experiment, TRUTH, "backward-euler")
+    x = seen.positions_m.reshape(len(seen.t_s), -1)
+    nu = np.diff(x, axis=0, prepend=x[:1]) / experiment.timestep_s
+    terms = contacts(experiment, len(x))
+    own = slice(len(experiment.body.nodes.points_m))
+    for term, read in zip(terms, seen.wrenches[1:], strict=True):
+        force = term.force(States(x, nu, as_theta(TRUTH))).reshape(len(x), -1, 3)[:, own]
+        total = force.sum(axis=1)
+        torque = np.cross(seen.positions_m[:, own], force).sum(axis=1)
+        assert np.abs(total[1:]).max() > 1e-3
+        known: np.ndarray = np.all(np.isfinite(read), axis=1)
+        assert known[2:].all()
+        np.testing.assert_allclose(read[known], np.hstack([total, torque])[known], atol=1e-9)
+
+
+# Platens -------------------------------------------------------------------------------------
+
+PRESSED_M = np.array([0.0, 0.005, 0.01, 0.02])
+
+
+def platens(body: Body, friction: float = 0.0, **changes) -> Experiment:
+    """A quarter of a block between a plate at rest and one that comes down on it."""
+    t_s = np.arange(len(PRESSED_M), dtype=float)
+    settings = {"friction": friction, "wrench": sensor(t_s), "slip": 1e-7 if friction else None}
+    below = Obstacle(shape=Plane(), name="below", **settings)
+    down = moved(t_s, np.outer(PRESSED_M, [0.0, 0.0, -1.0]))
+    above = Obstacle(poses=down, shape=Plane(-UP, EDGE_M * UP), name="above", **settings)
+    return Experiment(
+        body,
+        t_s,
+        [*quarter(body), below, above],
+        kind="static",
+        gravity_m_s2=(0.0, 0.0, 0.0),
+        nuisance=IDEAL,
+        **changes,
+    )
+
+
+def quarter(body: Body) -> list[Grasp]:
+    """Two planes of symmetry."""
+    fixed = PoseSequence.fixed()
+    return [
+        Grasp(nodes_where(body, 0, 0.0), fixed, axes="x"),
+        Grasp(nodes_where(body, 1, 0.0), fixed, axes="y"),
+    ]
+
+
+def squeezed(gap_m: float) -> tuple[float, float, float]:
+    """Stretches along and across, and pressure, of a block whose platens are that much nearer."""
+    mu, lame, edge_m = TRUTH["mu_pa"], TRUTH["lambda_pa"], 0.1
+    young_pa = mu * (3 * lame + 2 * mu) / (lame + mu)
+    edges_m = np.array([1.0, 1.0, np.sqrt(2)]) * edge_m / 2
+    kappa, delta = 100 * young_pa / edges_m.mean(), 0.002 * edges_m.mean()
+
+    def across(along: float) -> float:
+        def stress(b: float) -> float:
+            return mu * (b - 1 / b) + lame * np.log(along * b * b) / b
+
+        return float(brentq(stress, 0.5, 2.0, xtol=1e-15))  # type: ignore[arg-type]
+
+    def pressure(along: float) -> float:
+        b = across(along)
+        return -(mu * (along - 1 / along) + lame * np.log(along * b * b) / along)
+
+    def unbalanced(along: float) -> float:
+        near = delta - (edge_m - gap_m - along * edge_m) / 2
+        return pressure(along) - kappa / delta * max(near, 0.0) ** 2
+
+    along = float(brentq(unbalanced, 0.5, 1.0, xtol=1e-15))  # type: ignore[arg-type]
+    return along, across(along), pressure(along)
+
+
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_a_block_between_smooth_platens_is_squeezed_evenly(element):
+    """As the law of the material and that of the contact say, both of them known in closed form."""
+    experiment = platens(box(element=element))
+    seen = simulate(experiment, TRUTH)
+    own = len(experiment.body.nodes.points_m)
+    for k, gap_m in enumerate(PRESSED_M):
+        along, across, pressure_pa = squeezed(gap_m)
+        expected = experiment.body.nodes_m[:own] * [across, across, along]
+        expected[:, 2] += (EDGE_M - gap_m - along * EDGE_M) / 2
+        np.testing.assert_allclose(seen.positions_m[k, :own], expected, atol=1e-10)
+        for read, sign in zip(seen.wrenches, (1, -1), strict=True):
+            assert read[k, 2] == pytest.approx(sign * pressure_pa * EDGE_M**2, rel=1e-6)
+
+
+def test_platens_that_rub_enough_stick():
+    experiment = platens(box(), friction=2.0)
+    ends = [nodes_where(experiment.body, 2, height) for height in (0.0, EDGE_M)]
+    sides = [replace(g, nodes=np.setdiff1d(g.nodes, np.concatenate(ends))) for g in quarter(box())]
+    poses = [PoseSequence.fixed(), experiment.obstacles[1].poses]
+    glued = [Grasp(n, p, wrench=sensor(experiment.t_s)) for n, p in zip(ends, poses, strict=True)]
+    held = Experiment(
+        box(),
+        experiment.t_s,
+        [*glued, *sides],
+        kind="static",
+        gravity_m_s2=(0, 0, 0),
+        nuisance=IDEAL,
+    )
+    (rubbed, stuck, smooth) = (
+        simulate(each, TRUTH).wrenches[1][-1, 2] for each in (experiment, held, platens(box()))
+    )
+    assert rubbed == pytest.approx(stuck, rel=0.01)
+    assert abs(smooth - stuck) > 0.02 * abs(stuck)
+
+
+# An independent answer -----------------------------------------------------------------------
+
+
+def test_stiffer_contact_tends_to_what_may_not_enter_at_all():
+    """The least elastic energy of all shapes of which no point of contact is in the ball."""
+    body, t_s = box(divisions=(2, 2, 1)), np.zeros(1)
+    held = Grasp(nodes_where(body, 2, 0.0), PoseSequence.fixed())
+    ball = Sphere(0.08, np.array([0.04, 0.05, EDGE_M + 0.07]))
+
+    def pressed(stiffness_pa_m: float, width_m: float) -> Experiment:
+        obstacle = Obstacle(
+            shape=ball, stiffness_pa_m=stiffness_pa_m, width_m=width_m, wrench=sensor(t_s)
+        )
+        still = {"kind": "static", "gravity_m_s2": (0.0, 0.0, 0.0), "nuisance": IDEAL}
+        return Experiment(body, t_s, [held, obstacle], **still)
+
+    points = contacts(pressed(1.0, 1e-4), 1)[0].points
+    own = len(body.nodes_m)
+    free = np.setdiff1d(np.arange(3 * own), held.dofs)
+    elastic = {name: TRUTH[name] for name in ("lambda_pa", "mu_pa")}
+    start = np.append(body.nodes_m, np.zeros((4, 3)), axis=0).ravel()
+
+    # In centimetres and 0.1 mJ, so that its numbers are near one.
+    def whole(q_cm):
+        x = start.copy()
+        x[free] = q_cm / 100
+        return x
+
+    def nodes(q_cm):
+        return whole(q_cm)[: 3 * own].reshape(-1, 3)
+
+    def pull_n(q_cm):
+        return -body.elastic_force(nodes(q_cm), **elastic)
+
+    def outside(q_cm):
+        return gaps(ball, points.vectors(whole(q_cm)[None])[:3, 0].T)
+
+    rows = points.vectors(np.eye(len(start)))[:3]
+    best = minimize(
+        lambda q_cm: 1e4 * body.energy(nodes(q_cm), **elastic),
+        100 * start[free],
+        jac=lambda q_cm: 100 * pull_n(q_cm).ravel()[free],
+        constraints={
+            "type": "ineq",
+            "fun": lambda q_cm: 100 * outside(q_cm)[0],
+            "jac": lambda q_cm: np.einsum("ai,axi->ix", outside(q_cm)[1], rows)[:, free],
+        },
+        method="SLSQP",
+        options={"ftol": 1e-12, "maxiter": 300},
+    )
+    assert best.success, best.message
+    hard_n = pull_n(best.x)[np.setdiff1d(np.arange(own), held.nodes)].sum(axis=0)
+    misses = []
+    for law in ((1e6, 1e-4), (1e7, 3e-5), (1e8, 1e-5)):
+        seen = simulate(pressed(*law), TRUTH)
+        apart_m = np.abs(seen.positions_m[0, :own] - nodes(best.x)).max()
+        misses.append((apart_m, np.linalg.norm(seen.wrenches[0][0, :3] - hard_n)))
+    assert (np.diff(misses, axis=0) < 0).all()
+    assert misses[-1][0] < 5e-5
+    assert misses[-1][1] < 2e-3 * np.linalg.norm(hard_n)
+
+
+# Bodies that are let go ----------------------------------------------------------------------
+
+RUBBER = {"lambda_pa": 2e4, "mu_pa": 3e4, "gamma_r_s": 0.005, "gamma_m_1_s": 1e-6}
+SPONGE = {"lambda_pa": 2e3, "mu_pa": 3e3, "gamma_r_s": 0.005, "gamma_m_1_s": 0.01}
+
+
+def laid(
+    body: Body, steps: int, above_m: float = 0.0, tilt_rad: float = 0.0, friction: float = 0.0
+):
+    """Let go above a table, which is tilted by tilting gravity instead."""
+    t_s = 0.005 * np.arange(steps + 1)
+    table = Obstacle(shape=Plane(UP, -above_m * UP), friction=friction, wrench=sensor(t_s))
+    gravity = G_M_S2 * np.array([np.sin(tilt_rad), 0.0, -np.cos(tilt_rad)])
+    return Experiment(body, t_s, [table], gravity_m_s2=gravity, start="undeformed", nuisance=IDEAL)
+
+
+def energies_j(experiment: Experiment, positions_m: np.ndarray, scheme: str) -> np.ndarray:
+    """All of it at each step: of motion, of height, of the body and of the contact."""
+    body, law = experiment.body, contacts(experiment, 1)[0]
+    own, mass, step_s = len(body.nodes.points_m), body.node_mass, experiment.timestep_s
+    elastic = {name: SPONGE[name] for name in ("lambda_pa", "mu_pa")}
+    young_pa = 3e3 * (3 * 2e3 + 2 * 3e3) / (2e3 + 3e3)
+    kappa, delta = 100 * young_pa / law.contact.surface.edge_m, law.contact.width_m
+    gap = law.points.vectors(positions_m.reshape(len(positions_m), -1))[2] + 0.005
+    near = np.maximum(delta - gap, 0)
+    still = (law.contact.surface.area_m2 * kappa / (3 * delta) * near**3).sum(axis=1)
+    still += G_M_S2 * (mass * positions_m[..., 2]).sum(axis=1)
+    still += [box().energy(x[:own], **elastic) for x in positions_m]
+    x = positions_m
+    if scheme == "bdf2":
+        v, still = (3 * x[2:] - 4 * x[1:-1] + x[:-2]) / (2 * step_s), still[2:]
+    else:
+        v = np.diff(x, axis=0) / step_s
+        still = (still[1:] + still[:-1]) / 2 if scheme == "midpoint" else still[1:]
+    return still + (mass[:, None] * v**2).sum(axis=(1, 2)) / 2
+
+
+@pytest.mark.parametrize("scheme", ["backward-euler", "bdf2"])
+def test_a_body_let_go_onto_a_table_comes_to_rest_under_its_weight(scheme):
+    experiment = laid(box(), 200, above_m=0.005)
+    seen = simulate(experiment, SPONGE, scheme)
+    weight_n = experiment.body.mass_kg * G_M_S2
+    force_n = seen.wrenches[0]
+    assert np.nanmax(force_n[:, 2]) > 3 * weight_n
+    known = force_n[np.isfinite(force_n[:, 2])]
+    np.testing.assert_allclose(known[-10:, 2], weight_n, rtol=1e-6)
+    np.testing.assert_allclose(known[-10:, :2], 0.0, atol=1e-6 * weight_n)
+    energy_j = energies_j(experiment, seen.positions_m, scheme)
+    fallen_j = weight_n * 0.005
+    assert np.diff(energy_j).max() < 1e-6 * fallen_j
+    assert energy_j[-1] < energy_j[0] - 0.9 * fallen_j
+
+
+def test_the_midpoint_rule_gains_energy_at_an_impact():
+    """What the pages say of it: its contact rings, unless steps are short."""
+    experiment = laid(box(), 30, above_m=0.005)
+    seen = simulate(experiment, SPONGE, "midpoint")
+    energy_j = energies_j(experiment, seen.positions_m, "midpoint")
+    assert energy_j.max() > energy_j[0] + 5 * experiment.body.mass_kg * G_M_S2 * 0.005
+
+
+@pytest.mark.parametrize("scheme", ["backward-euler", "bdf2"])
+@pytest.mark.parametrize("degrees", [20.0, 35.0])
+def test_a_block_on_a_tilted_plane_slides_beyond_its_angle_of_friction(degrees, scheme):
+    friction, tilt = 0.5, np.deg2rad(degrees)
+    experiment = laid(box(divisions=(2, 2, 1)), 80, tilt_rad=tilt, friction=friction)
+    seen = simulate(experiment, RUBBER, scheme)
+    mass = experiment.body.node_mass
+    speed = np.diff(mass @ seen.positions_m[..., 0].T / mass.sum()) / experiment.timestep_s
+    gained = (speed[-1] - speed[-41]) / (40 * experiment.timestep_s)
+    if np.tan(tilt) < friction:
+        share = np.tan(tilt) / friction
+        slip = contacts(experiment, 1)[0].contact.slip
+        assert gained == pytest.approx(0.0, abs=1e-6)
+        assert speed[-1] == pytest.approx(slip * share / np.sqrt(1 - share**2), rel=1e-4)
+    else:
+        pulled = G_M_S2 * (np.sin(tilt) - friction * np.cos(tilt))
+        assert gained == pytest.approx(pulled, rel=2e-3)
+    across, normal = np.linalg.norm(seen.wrenches[0][:, :2], axis=1), seen.wrenches[0][:, 2]
+    known = np.isfinite(normal)
+    assert (across[known] <= friction * normal[known] + 1e-9).all()
+
+
+def test_a_dragged_block_sticks_then_slips_and_the_other_way_again():
+    """Static: the plate's way is 6 mm and back, the force between ±μ N."""
+    body, friction = box(), 0.4
+    way_m = np.concatenate([np.linspace(0.0, 0.006, 13), np.linspace(0.0055, -0.006, 24)])
+    t_s = np.arange(len(way_m), dtype=float)
+    sides = np.concatenate([nodes_where(body, 0, x) for x in (0.0, EDGE_M)])
+    drag = Grasp(sides, moved(t_s, np.outer(way_m, [1.0, 0.0, 0.0])), axes="x")
+    line = Grasp(nodes_where(body, 1, 0.0), PoseSequence.fixed(), axes="y")
+    press = moved(t_s, np.tile([0.0, 0.0, -0.005], (len(t_s), 1)))
+    table = Obstacle(shape=Plane(), friction=friction, name="table", wrench=sensor(t_s))
+    plate = Obstacle(poses=press, shape=Plane(-UP, EDGE_M * UP), name="plate")
+    experiment = Experiment(
+        body,
+        t_s,
+        [drag, line, table, plate],
+        kind="static",
+        gravity_m_s2=(0.0, 0.0, 0.0),
+        nuisance=IDEAL,
+    )
+    force_n = simulate(experiment, TRUTH).wrenches[0]
+    share = force_n[:, 0] / (friction * force_n[:, 2])
+    assert np.abs(share).max() <= 1 + 1e-9
+    assert abs(share[1]) < 0.9
+    np.testing.assert_allclose(share[8:13], -1.0, atol=0.02)
+    assert -0.9 < share[13] < 0.9
+    np.testing.assert_allclose(share[-8:], 1.0, atol=0.02)
