@@ -9,6 +9,8 @@ v_t being the velocity along the obstacle's surface against it. Forces are −�
 those on the frame are what the obstacle is given, and balance. Ψ has continuous second derivatives
 and joins nothing but the nodes of a face. In a static experiment v is the way since the sample
 before, so that friction holds each point where it was then.
+
+An impact rings, and may gain energy, under the midpoint rule; BDF2 and backward Euler lose it.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ from .force_term import Slots, States
 from .generated import Generated
 from .point_forces import Pointwise
 
-# κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample.
+# κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample. With friction a body
+# that lies creeps by up to ε.
 STIFFNESS, WIDTH, SLIP = 100.0, 0.002, (0.01, 1e-4)
 # Evaluations are of so many points at a time, or a multiple: that few sizes are compiled.
 AT_A_TIME = 16

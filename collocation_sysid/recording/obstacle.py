@@ -44,7 +44,8 @@ class Obstacle(Grasp):
     """A rigid solid that pushes away the surface of a body, and may rub on it.
 
     It is a grasp that holds nothing but a frame of its own, so that poses, displacements and forces
-    are stated and read as those of grasps are. Its force is that on the body.
+    are stated and read as those of grasps are. Its force is that on the body. Where a body hits it,
+    take the scheme "bdf2": under the midpoint rule contact rings.
 
     Parameters
     ----------
