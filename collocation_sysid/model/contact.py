@@ -33,8 +33,8 @@ from .force_term import Slots, States
 from .generated import Generated
 from .point_forces import Pointwise
 
-# κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample. With friction a body
-# that lies creeps by up to ε.
+# κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample: by up to that much
+# a body creeps that lies where it is held by friction.
 STIFFNESS, WIDTH, SLIP = 100.0, 0.002, (0.01, 1e-4)
 # Evaluations are of so many points at a time, or a multiple: that few sizes are compiled.
 AT_A_TIME = 16
