@@ -57,7 +57,8 @@ class Hypothesis:
     def concern(self, grade: Grade = "check") -> Concern:
         """The same with its numbers, as what gives concern."""
         tried = {} if self.without is None else {"nearer": self.strength}
-        return Concern(f"description/{self.code}", grade, {"of": self.of, **self.data, **tried})
+        of = {"of": self.of} if self.of else {}
+        return Concern(f"description/{self.code}", grade, {**of, **self.data, **tried})
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON and tables."""

@@ -259,13 +259,7 @@ class Identified:
             "cells": body.cells,
             "node_mass_kg": self.node_mass_kg,
             "tied_mass_kg": self.tied_kg,
-            "regions": [
-                {
-                    **{k: v for k, v in vars(region).items() if k != "branches"},
-                    "branches": [vars(branch) for branch in region.branches],
-                }
-                for region in self.regions
-            ],
+            "regions": self.regions,
             "experiment": e.name,
             "kind": e.kind,
             "start": e.start,

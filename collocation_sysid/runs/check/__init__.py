@@ -6,7 +6,7 @@ Every warning is one sentence that ends with the remedy.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -299,7 +299,7 @@ def _concerns(
         *(cause.concern() for cause in findings.causes),
         *stillness_concerns(experiments, parameters),
         *scale_concerns(experiments, parameters),
-        *(each for body in bodies for each in _of_body(body, bodies)),
+        *(each for body in bodies for each in _of_body(body, len(bodies) == 1)),
         *(each for hold in findings.holds for each in hold_concerns(hold)),
         *(each for motion in findings.motions for each in motion_concerns(motion)),
         *stability_concerns(unstable),
@@ -317,11 +317,11 @@ def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
     return tuple(body_finding(body, body.theta(guesses), own) for body, own in pairs)
 
 
-def _of_body(body: BodyFinding, bodies: Sequence[BodyFinding]) -> Iterator[Concern]:
-    """Those of a body, with the names of its experiments where there are several bodies."""
-    of = f"in the body of {', '.join(map(repr, body.experiments))}" if len(bodies) > 1 else ""
-    for each in body.concerns:
-        yield replace(each, data={"of": of, **each.data})
+def _of_body(body: BodyFinding, alone: bool) -> tuple[Concern, ...]:
+    """Those of a body, with the names of its experiments where it is not alone."""
+    of = f"in the body of {', '.join(map(repr, body.experiments))}"
+    named = (replace(each, data={"of": of, **each.data}) for each in body.concerns)
+    return body.concerns if alone else tuple(named)
 
 
 def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:
