@@ -146,7 +146,7 @@ def given_keys(section: Section, *names: str) -> list[str]:
 
 def require_one(section: Section, *names: str) -> None:
     """Refuse a section that gives none or several of the keys."""
-    given = given_keys(section, *names)
-    if len(given) != 1:
-        found = " and ".join(given) or f"no {' or '.join(names)}"
-        raise ValueError(f"found {found}; expected exactly one of {', '.join(names)}")
+    there = given_keys(section, *names)
+    if len(there) != 1:
+        which = " and ".join(there) or f"no {' or '.join(names)}"
+        raise ValueError(f"found {which}; expected exactly one of {', '.join(names)}")

@@ -9,10 +9,10 @@ from ..fem.body import Body
 from ..fem.constants import DENSITY, MASS, bare, is_density
 from .schema import ObjectSection, ParameterSection, RegionSection
 
-Given = Mapping[str, ParameterSection | float]
+Sections = Mapping[str, ParameterSection | float]
 
 
-def completed(section: ObjectSection, parameters: Given) -> ObjectSection:
+def completed(section: ObjectSection, parameters: Sections) -> ObjectSection:
     """[object] with the guesses of densities that it leaves out.
 
     Raises
@@ -35,7 +35,7 @@ def completed(section: ObjectSection, parameters: Given) -> ObjectSection:
     return section.model_copy(update=changes)
 
 
-def guessed(parameters: Given, body: Body) -> dict[str, ParameterSection | float]:
+def guessed(parameters: Sections, body: Body) -> dict[str, ParameterSection | float]:
     """[parameters] with the densities that [object] states as guesses, where there are none."""
     return {
         name: section.model_copy(update={"guess": _stated(body, name)})
@@ -49,14 +49,14 @@ def guessed(parameters: Given, body: Body) -> dict[str, ParameterSection | float
     }
 
 
-def _weighed(region: RegionSection, parameters: Given) -> RegionSection:
+def _weighed(region: RegionSection, parameters: Sections) -> RegionSection:
     if region.density_kg_m3 is not None:
         return region
     guess = _guess(parameters, f"{region.name}.{DENSITY.name}")
     return region.model_copy(update={DENSITY.name: guess})
 
 
-def _guess(parameters: Given, name: str) -> float | None:
+def _guess(parameters: Sections, name: str) -> float | None:
     section = parameters.get(name)
     if not isinstance(section, ParameterSection):
         return section

@@ -62,7 +62,11 @@ def _message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> st
     expected = description[:1].lower() + description[1:].rstrip(".").split(";")[0]
     kind, model = fault["type"], _model_in(field.annotation) if field else None
     if kind == "extra_forbidden":
-        return _unknown_key(key, root)
+        table, _ = _field(key[:-1], root)
+        inside = _model_in(table.annotation) if table else None
+        known = list((inside or root).model_fields)
+        hint = hint_at(str(key[-1]), known)
+        return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"
     if kind == "value_error":
         error = fault["ctx"]["error"]
         return error.message if isinstance(error, InputError) else str(error)
@@ -79,12 +83,6 @@ def _message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> st
         hint = hint_at(str(fault["input"]), re.findall("'(.*?)'", choices))
         return f"{found}; expected {choices}{hint}"
     return f"{found}; expected {wanted(fault)}"
-
-
-def _unknown_key(key: Sequence[Part], root: type[BaseModel]) -> str:
-    known = list(_model_at(key[:-1], root).model_fields)
-    hint = hint_at(str(key[-1]), known)
-    return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"
 
 
 def _place(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
@@ -145,12 +143,6 @@ def _field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo | None
         field, depth, named = model.model_fields[part], count, False
         model = _model_in(field.annotation)
     return field, depth
-
-
-def _model_at(key: Sequence[Part], root: type[BaseModel]) -> type[BaseModel]:
-    field, _ = _field(key, root)
-    model = _model_in(field.annotation) if field is not None else None
-    return model or root
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

@@ -18,7 +18,6 @@ from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
 from ..recording.selected import selection
 from ..stated import keys_of, tables_of
-from ..statistics.assumptions import Assumptions
 from ..statistics.plausible import oddities
 from .code import Code, existing_file
 from .densities import completed, guessed
@@ -67,16 +66,11 @@ def contents_of(
         "method": file.solver.method,
         "methods": file.solver.methods,
         "rollout": RolloutOptions(**file.rollout.model_dump()),
-        "uncertainty": _uncertainty(file.uncertainty.model_dump()),
+        "uncertainty": UncertaintyOptions(**file.uncertainty.model_dump()),
         "title": file.title,
         "notes": notes,
         "origin": Origin(path, text, _named_files(file, folder)),
     }
-
-
-def _uncertainty(keys: dict[str, Any]) -> UncertaintyOptions:
-    keys["assumptions"] = Assumptions(**keys["assumptions"])
-    return UncertaintyOptions(**keys)
 
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:

@@ -248,10 +248,10 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
 
     @model_validator(mode="after")
     def _template(self) -> MarkersSection:
-        given = given_keys(self, "template_m", "template_window_s", "max_template_residual_m")
-        if given and not {"template_m", "template_window_s"} <= set(given):
+        there = given_keys(self, "template_m", "template_window_s", "max_template_residual_m")
+        if there and not {"template_m", "template_window_s"} <= set(there):
             raise ValueError(
-                f"found {', '.join(given)}; expected template_m and template_window_s, both or "
+                f"found {', '.join(there)}; expected template_m and template_window_s, both or "
                 "neither"
             )
         _at_least_three(self.template_m, "template_m")

@@ -56,7 +56,6 @@ class NodeForceSection(CodeSection):
         What it acts on: these nodes, or faces of the surface that have all of theirs among them.
     """
 
-    function: Text
     nodes: Nodes | None = None
     on: Literal["nodes", "faces"] = "nodes"
 
@@ -223,8 +222,8 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
 
     @model_validator(mode="after")
     def _one_kind(self) -> ParameterSection:
-        if len(given := given_keys(self, "guess", "fixed", "tied_to")) > 1:
-            raise ValueError(f"found {' and '.join(given)}; expected one of them, or none")
+        if len(there := given_keys(self, "guess", "fixed", "tied_to")) > 1:
+            raise ValueError(f"found {' and '.join(there)}; expected one of them, or none")
         of_kind = {
             "guess": ("lower", "upper", "prior", "scale", "typical"),
             "fixed": (),

@@ -46,12 +46,12 @@ class MethodSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _options_are_in_tables(cls, given: Any) -> Any:
-        outside = [name for name in given if _owners(name)] if isinstance(given, Mapping) else []
+    def _options_are_in_tables(cls, table: Any) -> Any:
+        outside = [name for name in table if _owners(name)] if isinstance(table, Mapping) else []
         if outside:
-            remedy = f"move {_moves(outside, given.get('method', DEFAULT))}"
+            remedy = f"move {_moves(outside, table.get('method', DEFAULT))}"
             raise ValueError(f"the options of a method have a table of their own: {remedy}")
-        return given
+        return table
 
     @property
     def methods(self) -> dict[str, Method]:
@@ -59,18 +59,18 @@ class MethodSection(Section):
         return {name: getattr(self, name) for name in METHODS}
 
 
-def _read(method: str, given: Any) -> Any:
+def _read(method: str, table: Any) -> Any:
     """The method with the options that its table gives."""
     where = f"solver.{method}"
-    if not isinstance(given, Mapping):
-        raise InputError(f"found {given!r}; expected a table of options", None, where)
-    for name in given:
+    if not isinstance(table, Mapping):
+        raise InputError(f"found {table!r}; expected a table of options", None, where)
+    for name in table:
         owners = _owners(name)
         if owners and method not in owners:
             owned = f"{name} is an option of {', '.join(owners)}"
             has = f"{method} has {', '.join(OPTIONS[method])}"
             raise InputError(f"{owned}; {has}", None, where)
-    return built(METHODS[method], given, where)
+    return built(METHODS[method], table, where)
 
 
 def _owners(option: str) -> list[str]:

@@ -124,9 +124,9 @@ class Gauge:
         where, samples = f"the reading '{self.name}'", len(self.times)
         if self.values is None:
             return read_only_floats(np.zeros((samples, count)), (None, None), where)
-        given = np.array(self.values, dtype=float)
-        given = given[:, None] if given.ndim == 1 else given
-        values = read_only_floats(given, (samples, None), f"values of {where}", finite=False)
+        columns = np.array(self.values, dtype=float)
+        columns = columns[:, None] if columns.ndim == 1 else columns
+        values = read_only_floats(columns, (samples, None), f"values of {where}", finite=False)
         if np.isinf(values).any():
             raise InputError(f"{where} holds an infinite value; expected numbers, NaN if missing")
         if not np.isfinite(values).any():
@@ -168,8 +168,8 @@ class Gauge:
         """
         names = OF_POINTS if self.grasp is None else OF_GRASP
         at = Look(t_s, **dict(zip(names, looked, strict=True)))
-        found = self.expression(at, **dict(zip(self.unknowns, unknowns, strict=True)))
-        return ca.vec(ca.SX(ca.vertcat(*found) if isinstance(found, (list, tuple)) else found))
+        read = self.expression(at, **dict(zip(self.unknowns, unknowns, strict=True)))
+        return ca.vec(ca.SX(ca.vertcat(*read) if isinstance(read, (list, tuple)) else read))
 
     def _checked_count(self) -> int:
         """How many numbers it reads; refused where these or their slopes are none at rest."""

@@ -115,50 +115,50 @@ def _other_columns(grid: Grid) -> InputError:
     )
 
 
-def _axes(grid: Grid, given: str | None) -> tuple[list[int], float]:
+def _axes(grid: Grid, length_unit: str | None) -> tuple[list[int], float]:
     """The columns of the position, and what their unit is in metres; of two, one is a slip."""
     parts = [name_and_unit(column) for column in grid.columns]
     axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
     stated = [parts[k][1] for k in axes]
-    metres = [si_factor(unit or given or "m", "length") for unit in stated]
+    metres = [si_factor(unit or length_unit or "m", "length") for unit in stated]
     if len(axes) != 3 or None in metres or len(set(metres)) > 1:
         raise _other_columns(grid)
     named = ", ".join(grid.columns[k] for k in axes)
-    if given is None and None in stated:
+    if length_unit is None and None in stated:
         raise grid.refusal(
             f"the columns {named} name no unit; expected length_unit, one of "
             f"{', '.join(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m"
         )
-    if given and any(
-        unit and si_factor(unit, "length") != METRES_PER_UNIT[given] for unit in stated
+    if length_unit and any(
+        unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit] for unit in stated
     ):
         raise grid.refusal(
-            f"length_unit is '{given}', but the columns are {named}; expected the same unit, or no "
-            "length_unit"
+            f"length_unit is '{length_unit}', but the columns are {named}; expected the same "
+            "unit, or no length_unit"
         )
     return axes, float(metres[0] or 1.0)
 
 
-def _components(grid: Grid, given: str | None, others: list[int]) -> list[int]:
+def _components(grid: Grid, order: str | None, others: list[int]) -> list[int]:
     """The columns of the quaternion in the order x, y, z, w."""
     place = {grid.columns[k]: k for k in others}
     if sorted(place) == ["qw", "qx", "qy", "qz"]:
-        order = "".join(name[1] for name in place)
-        if given not in (None, order):
+        named = "".join(name[1] for name in place)
+        if order not in (None, named):
             raise grid.refusal(
-                f"quaternion is '{given}', but the columns are {', '.join(place)}; expected the "
+                f"quaternion is '{order}', but the columns are {', '.join(place)}; expected the "
                 "same order, or no quaternion"
             )
         return [place[f"q{axis}"] for axis in "xyzw"]
     numbered = sorted(place)
     if len(others) != 4 or numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
         raise _other_columns(grid)
-    if given is None:
+    if order is None:
         raise grid.refusal(
             f"the columns {', '.join(numbered)} do not say which is the scalar; expected "
             "quaternion = 'xyzw' or 'wxyz', or columns qx, qy, qz, qw"
         )
-    return [place[numbered[given.index(axis)]] for axis in "xyzw"]
+    return [place[numbered[order.index(axis)]] for axis in "xyzw"]
 
 
 # Matrices -----------------------------------------------------------------------------------------

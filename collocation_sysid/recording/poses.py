@@ -97,11 +97,11 @@ class PoseSequence:
             If shapes disagree, or a matrix is no rigid motion; the first bad one is named.
         """
         times = read_only_floats(t_s, (None,), "t_s of the poses", finite=False)
-        given = read_only_floats(matrices, (len(times), 4, 4), "matrices of the poses", False)
-        if fault := first_matrix_fault(times, given):
+        motions = read_only_floats(matrices, (len(times), 4, 4), "matrices of the poses", False)
+        if fault := first_matrix_fault(times, motions):
             raise InputError(fault[1], where=f"matrix {fault[0] + 1}")
-        quaternions = Rotation.from_matrix(given[:, :3, :3]).as_quat()
-        return cls(times, given[:, :3, 3], quaternions, interpolation)
+        quaternions = Rotation.from_matrix(motions[:, :3, :3]).as_quat()
+        return cls(times, motions[:, :3, 3], quaternions, interpolation)
 
     def after(self, matrix: ArrayLike | PoseSequence) -> PoseSequence:
         """Return the poses that move by a 4×4 matrix [[R, p], [0, 1]] first, then as these do.

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 PLANE = 1e-9
 
 
-def _faces(given: Selection | ArrayLike) -> Selection | Index:
-    if isinstance(given, Selection):
-        return given
-    faces = np.array(given)
+def _faces(wanted: Selection | ArrayLike) -> Selection | Index:
+    if isinstance(wanted, Selection):
+        return wanted
+    faces = np.array(wanted)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise InputError(
             f"faces of a pressure are {faces.dtype} {faces.shape}; expected a selection or a "

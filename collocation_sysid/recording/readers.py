@@ -155,13 +155,13 @@ def _require_one_of(name: str, there: Sequence[str], what: str) -> None:
         raise InputError(f"no {what} '{name}'; the file has {', '.join(there)}{hint}")
 
 
-def _unit(raw: RawTracks, given: str | None) -> str:
-    if given and raw.unit and given != raw.unit:
+def _unit(raw: RawTracks, length_unit: str | None) -> str:
+    if length_unit and raw.unit and length_unit != raw.unit:
         raise InputError(
-            f"length_unit is '{given}', but {raw.unit_key} says '{raw.unit}'; expected the same, "
-            "or no length_unit"
+            f"length_unit is '{length_unit}', but {raw.unit_key} says '{raw.unit}'; expected the "
+            "same, or no length_unit"
         )
-    unit = given or raw.unit or raw.default_unit
+    unit = length_unit or raw.unit or raw.default_unit
     if unit is None:
         raise InputError(
             f"no unit of length is stated by {raw.unit_key}; expected length_unit, one of "
@@ -170,9 +170,9 @@ def _unit(raw: RawTracks, given: str | None) -> str:
     return unit
 
 
-def _times_s(raw: RawTracks, given_hz: float | None) -> Array:
+def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
     """Times of the frames: as in the file, else from the rate."""
-    t_s, rates = raw.t_s, {raw.rate_key: raw.rate_hz, "rate_hz": given_hz}
+    t_s, rates = raw.t_s, {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
     stated = {key: rate for key, rate in rates.items() if rate}
     if t_s is not None:
         for key, rate in stated.items():
@@ -186,7 +186,7 @@ def _times_s(raw: RawTracks, given_hz: float | None) -> Array:
     first, *others = stated.values()
     if not all(math.isclose(first, other, rel_tol=1e-6) for other in others):
         raise InputError(
-            f"rate_hz is {given_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "
+            f"rate_hz is {rate_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "
             "rate_hz"
         )
     return np.arange(len(raw.coordinates)) / first

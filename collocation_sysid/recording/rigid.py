@@ -96,15 +96,17 @@ def fit_poses(
     reference = read_only_floats(reference_m, (None, 3), "reference_m")
     count = len(reference)
     tracks = read_only_tracks(tracks_m, (None, count, 3), "tracks_m")
-    given = read_only_floats(np.ones(count) if weights is None else weights, (count,), "weights")
-    if (given < 0).any():
-        raise InputError(f"a weight is {given.min():g}; expected 0 or more")
-    if not _fixes_rotation(reference[None], given[None])[0]:
+    of_marker = read_only_floats(
+        np.ones(count) if weights is None else weights, (count,), "weights"
+    )
+    if (of_marker < 0).any():
+        raise InputError(f"a weight is {of_marker.min():g}; expected 0 or more")
+    if not _fixes_rotation(reference[None], of_marker[None])[0]:
         raise InputError(
-            f"the {np.count_nonzero(given)} markers of a rigid fit lie on one line or in one "
+            f"the {np.count_nonzero(of_marker)} markers of a rigid fit lie on one line or in one "
             "place; expected at least three that do not"
         )
-    weight = given * np.isfinite(tracks[:, :, 0])
+    weight = of_marker * np.isfinite(tracks[:, :, 0])
     repeated = np.broadcast_to(reference, tracks.shape)
     missing = ~_fixes_rotation(repeated, weight)
     rotations, translations = _best_motions(repeated, tracks, weight)

@@ -70,10 +70,10 @@ def some_nodes(what: str) -> Callable[[ArrayLike | Selection], Index]:
         If there are none, or see `read_only_nodes`.
     """
 
-    def chosen(given: Any) -> Any:
-        if isinstance(given, Selection):
-            return given
-        nodes = np.unique(read_only_nodes(given, (None,), f"nodes of {what}"))
+    def chosen(wanted: Any) -> Any:
+        if isinstance(wanted, Selection):
+            return wanted
+        nodes = np.unique(read_only_nodes(wanted, (None,), f"nodes of {what}"))
         if nodes.size == 0:
             raise InputError(f"{what} needs at least one node; its selection found none")
         nodes.setflags(write=False)
