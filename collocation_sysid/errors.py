@@ -75,6 +75,26 @@ class InputError(ValueError):
         return InputError(self.message, self.source or source, self.where or where)
 
 
+def require_among(
+    name: str,
+    known: Iterable[str],
+    source: str | Path | None = None,
+    where: str | None = None,
+    count: str = "one",
+) -> None:
+    """Refuse a name that is none of the known ones, of which `count` is expected.
+
+    Raises
+    ------
+    InputError
+        With the one that was probably meant.
+    """
+    names = list(known)
+    if name not in names:
+        expected = f"expected {count} of {', '.join(names)}{hint_at(name, names)}"
+        raise InputError(f"found {name!r}; {expected}", source, where)
+
+
 @contextmanager
 def located(source: str | Path | None = None, where: str | None = None) -> Iterator[None]:
     """Input errors of what is done within get file and key where they lack them."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from ..errors import InputError, hint_at
+from ..errors import InputError, require_among
 from ..stated import documented
 from .comparison.casadi_nlp import why_not
 from .continuation import STAGES, Continuation
@@ -18,8 +18,9 @@ METHODS: dict[str, type] = STAGES | {Continuation.name: Continuation}
 def require_method(name: str, option: str) -> None:
     """Refuse the name of a method that there is not, given as an option of the command line."""
     if name not in METHODS:
-        unknown = f"found {name!r}; expected one of {', '.join(METHODS)}{hint_at(name, METHODS)}"
-        raise InputError(why_not(name) or unknown, None, option)
+        if (reason := why_not(name)) is not None:
+            raise InputError(reason, None, option)
+        require_among(name, METHODS, None, option)
 
 
 def summary(method: str) -> str:

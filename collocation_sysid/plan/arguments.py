@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, hint_at
+from ..errors import InputError, require_among
 from ..files import require_regular
 from ..methods import METHODS, require_method
 from ..problem.explaining import short
@@ -65,9 +65,7 @@ def read_truth(
     for item in sources:
         source, table = _truth_table(item)
         for name, value in table.items():
-            if name not in known:
-                expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
-                raise InputError(f"found {name!r}; {expected}", source, "--truth")
+            require_among(name, known, source, "--truth")
             truth[name] = _positive(name, value, source)
     if missing := [name for name in needed if sources and name not in truth]:
         raise InputError(

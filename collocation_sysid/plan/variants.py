@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, hint_at
+from ..errors import InputError, hint_at, require_among
 from ..fem.constants import bare, usual_value
 from ..fem.materials import MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
@@ -58,9 +58,7 @@ def parse_materials(text: str) -> tuple[str, ...]:
     """
     names = each_once(text)
     for name in names or ("",):
-        if name not in MATERIALS:
-            known = f"expected some of {', '.join(MATERIALS)}{hint_at(name, MATERIALS)}"
-            raise InputError(f"found {name!r}; {known}", None, "--materials")
+        require_among(name, MATERIALS, None, "--materials", "some")
     return names
 
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import InputError
+from ..errors import InputError, require_among
 from ..files import safe_name, whole_file
 from .pictures.camera import Camera
 from .pictures.scene import (
@@ -133,9 +133,7 @@ def chosen(
         raise InputError("no experiment of this run has a trajectory", run)
     if experiment is None:
         return next(iter(seen.values()))
-    if experiment not in seen:
-        key = None if run is None else "--experiment"
-        raise InputError(f"found {experiment!r}; expected one of {', '.join(seen)}", run, key)
+    require_among(experiment, seen, run, None if run is None else "--experiment")
     return seen[experiment]
 
 

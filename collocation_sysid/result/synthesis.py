@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..checked import Count, NotNegative, Positive
-from ..errors import InputError
+from ..errors import InputError, require_among
 from ..files import whole_file
 from ..methods.options import Options
 from ..model.schemes import SCHEMES
@@ -66,10 +66,7 @@ class Recipe(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known = ("newmark", *SCHEMES)
-        if self.integrator not in known:
-            expected = f"expected one of {', '.join(known)}"
-            raise InputError(f"found {self.integrator!r}; {expected}", None, "integrator")
+        require_among(self.integrator, ("newmark", *SCHEMES), None, "integrator")
 
 
 def write_data(

@@ -6,7 +6,6 @@ The fields are those of the run's frames for ParaView.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from importlib import import_module
 from importlib.util import find_spec
@@ -17,7 +16,7 @@ import meshio
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError
+from ..errors import InputError, require_among
 from ..files import damage_refused, is_own
 from .animation import chosen
 from .page import Colouring, cells_of_faces, write_page
@@ -67,7 +66,7 @@ def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
         for _, file in frames:
             frame = meshio.read(file)
             points, in_cells = frame.point_data, frame.cell_data
-            require_field(field, [*in_cells, *points])
+            require_among(field, [*in_cells, *points], None, "--field")
             if field in in_cells:
                 values = in_cells[field][0][cells]
             else:
@@ -76,12 +75,6 @@ def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
         times = np.array([time for time, _ in frames])
         nearest = np.abs(replay.t_s[:, None] - times).argmin(axis=1)
         return np.array(shown)[nearest]
-
-
-def require_field(field: str, known: Sequence[str]) -> None:
-    """Refuse a field that the frames do not have."""
-    if field not in known:
-        raise InputError(f"found {field!r}; expected one of {', '.join(known)}", None, "--field")
 
 
 def view(
@@ -165,7 +158,7 @@ class _Scene:
         self.times = np.array([time for time, _ in frames])
         self.meshes: list[Any] = [pv.read(file) for _, file in frames]
         known = [*self.meshes[0].cell_data, *self.meshes[0].point_data]
-        require_field(field, known)
+        require_among(field, known, None, "--field")
         self.plotter = pv.Plotter(off_screen=off_screen, window_size=list(WINDOW))
         self.plotter.set_background("white")
         self.range = self._range()

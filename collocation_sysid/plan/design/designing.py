@@ -10,7 +10,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...checked import AboveOne, AtLeastOne, Count
-from ...errors import InputError, SimulationError
+from ...errors import InputError, SimulationError, require_among
 from ...methods.options import Options
 from ...model.parameters import ThetaMap
 from ...problem import Problem
@@ -385,11 +385,9 @@ def _chosen(problem: Problem, name: str | None) -> Experiment:
         raise InputError("every experiment is static; expected one that moves", problem.path)
     if name is None:
         return moving[0]
-    for each in moving:
-        if each.name == name:
-            return each
-    known = ", ".join(each.name for each in moving)
-    raise InputError(f"found {name!r}; expected one of {known}", problem.path, "--experiment")
+    named = {each.name: each for each in moving}
+    require_among(name, named, problem.path, "--experiment")
+    return named[name]
 
 
 def _require_guesses(problem: Problem) -> None:

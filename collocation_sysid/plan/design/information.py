@@ -28,7 +28,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from ...arrays import Array
-from ...errors import InputError, hint_at
+from ...errors import InputError, require_among
 from ...model.parameters import Parameters, ThetaMap
 from ...problem import Problem
 from ...program.collocation import Collocation
@@ -100,14 +100,8 @@ class Criterion:
         ------
         InputError
         """
-        known = list(errors.slopes)
         for name in self.names:
-            if name not in known:
-                raise InputError(
-                    f"found {name!r}; expected some of {', '.join(known)}{hint_at(name, known)}",
-                    None,
-                    "--for",
-                )
+            require_among(name, errors.slopes, None, "--for", "some")
         slopes = errors.slopes_of(self.names)
         if self.kind == "D" and np.linalg.matrix_rank(slopes) < len(slopes):
             raise InputError(
