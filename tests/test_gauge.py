@@ -147,6 +147,7 @@ def test_error_bars_and_verdict_know_them():
         ),
         ({"grasp": 0}, "has both points_m and grasp"),
         ({"points_m": ()}, "has neither points_m nor grasp"),
+        ({"sigma": "1e-3"}, "sigma of the reading 'accelerometer' is '1e-3'; expected a number"),
         (
             {"frame": "hand"},
             "frame of the reading 'accelerometer' is 'hand'; expected one of world",

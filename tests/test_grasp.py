@@ -165,6 +165,10 @@ def test_after_moves_by_the_matrix_first():
     np.testing.assert_allclose(
         body.carry(POINTS, gripper.t_s), gripper.carry(in_gripper, gripper.t_s), atol=1e-14
     )
+    quaternion = Rotation.from_matrix(of_body[:3, :3]).as_quat()
+    by_pose = gripper.after(PoseSequence([0.0], [of_body[:3, 3]], [quaternion]))
+    np.testing.assert_allclose(by_pose.positions_m, body.positions_m, atol=1e-15)
+    np.testing.assert_allclose(by_pose.quaternions_xyzw, body.quaternions_xyzw, atol=1e-15)
     held = replace(gripper, interpolation="hold").after(np.eye(4))
     assert held.interpolation == "hold"
     np.testing.assert_allclose(held.positions_m, gripper.positions_m)
@@ -173,6 +177,8 @@ def test_after_moves_by_the_matrix_first():
 def test_a_matrix_that_is_no_rigid_motion_is_refused():
     with pytest.raises(InputError, match="mirrors: its determinant"):
         recorded(20).after(np.diag([1.0, 1.0, -1.0, 1.0]))
+    with pytest.raises(InputError, match=r"^the quaternion has the norm 2; expected 1"):
+        PoseSequence([0.0], [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 2.0]])
 
 
 def test_hold_keeps_the_latest_sample():
