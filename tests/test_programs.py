@@ -104,6 +104,12 @@ def whirled(x, v, at, whirl_n_m3):
     return whirl_n_m3 * at.volume_m3 * ca.vertcat(at.rest_m[1] - x[1], x[0] - at.rest_m[0], 0)
 
 
+def magnus(x, v, at, spin_n_s_m4):
+    """Across where it goes, as on what spins; it does no work."""
+    spin = ca.vertcat(0.3, 1 + ca.sumsqr(x), -0.5)
+    return 10 * spin_n_s_m4 * at.volume_m3 * ca.cross(v, spin)
+
+
 def breathing(x, v, at, breath_pa):
     return -breath_pa * (1 + 10 * at.t_s + ca.dot(v, at.normal)) * at.area_m2 * at.normal
 
@@ -328,6 +334,12 @@ PROGRAMS: dict[str, Make] = {
     "a user's drag": lambda: in_field(smooth_drag),
     "a user's drag, bdf2": lambda: in_field(smooth_drag, "bdf2"),
     "a user's whirl": lambda: in_field(whirled),
+    "a user's spin": lambda: in_field(magnus),
+    "a user's spin, bdf2": lambda: in_field(magnus, "bdf2"),
+    "a user's spin, let go": lambda: in_field(magnus, moved=bar_let_go(6)),
+    "a user's spin, wrench": lambda: in_field(
+        magnus, moved=sensing(hung_cube(5, (1, 1, 2)), frame="grasp")
+    ),
     "a user's pressure": lambda: in_field(breathing, on="faces"),
     "a user's pressure, bdf2": lambda: in_field(breathing, "bdf2", on="faces"),
     "a user's drag, memory": lambda: in_field(

@@ -51,6 +51,7 @@ class Linearisation:
     by_velocity : (T, m) lower triangles of ∂f/∂v; for Rayleigh's −γ_r K − γ_m M [N·s/m]
     by_theta : (T, 3n, k) ∂f/∂θ
     by_position_skew : (T, m) lower triangles of the skew part of ∂f/∂x, or (T, 0)
+    by_velocity_skew : the same of ∂f/∂v: only forces of users have some, such as gyroscopic ones
     """
 
     force: Array
@@ -58,6 +59,7 @@ class Linearisation:
     by_velocity: Array
     by_theta: Array
     by_position_skew: Array
+    by_velocity_skew: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,7 +382,7 @@ class Body(Discretisation):
         for column, slope in self._drag_slopes(theta, tied_kg):
             by_theta[:, :, column] = -slope * v
         self._spread_stiffening(by_theta, carried)
-        return Linearisation(force, by_position, by_velocity, by_theta, skew)
+        return Linearisation(force, by_position, by_velocity, by_theta, skew, skew[:, :0])
 
     def _spread_stiffening(self, by_theta: Array, carried: Past | None) -> None:
         """Turn ∂f/∂s (…, k), in the column of a part's first branch, into those by its memory."""

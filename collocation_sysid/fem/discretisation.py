@@ -114,7 +114,7 @@ class Discretisation(Model):
     def unsymmetric(self) -> bool:
         """Whether the slopes of the force have a skew part."""
         laws = any(part.damping.stress is not None for part in self.parts)
-        return laws or self.rubs or any(force.turns for force in self.forces)
+        return laws or self.rubs or any(f.turns or f.spins for f in self.forces)
 
     @cached_property
     def pattern(self) -> SymmetricPattern:

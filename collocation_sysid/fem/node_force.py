@@ -73,8 +73,7 @@ class NodeForce:
         For messages.
     law : callable
         ``law(x, v, at, **constants) -> (3,)`` force [N] on a node at x [m] with velocity v [m/s],
-        ``at`` being an `AtNode`; or on a face, whose middle is at x. Its derivative by v must be
-        symmetric.
+        ``at`` being an `AtNode`; or on a face, whose middle is at x.
     constants : tuple of Constant
     nodes : Selection, (k,) int array or None
     on : {"nodes", "faces"}
@@ -119,7 +118,7 @@ class NodeForce:
         Raises
         ------
         InputError
-            If it cannot be evaluated, or its derivative by v is not symmetric.
+            If it cannot be evaluated.
         """
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
         told = {constant.name: constant for constant in constants}
@@ -181,6 +180,11 @@ class NodeForce:
         return self._skew[0] > SYMMETRIC
 
     @cached_property
+    def spins(self) -> bool:
+        """The same of its derivative by v, as of gyroscopic forces."""
+        return self._skew[1] > SYMMETRIC
+
+    @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """u, data, and the force."""
         u, data = ca.SX.sym("u", self.inputs(self._dofs)), ca.SX.sym("data", DATA)
@@ -231,11 +235,6 @@ class NodeForce:
             raise InputError(
                 f"force {self.name!r} or its slope is not finite where the node is at rest; "
                 "expected a smooth law, such as sqrt(v·v + 1e-12) in place of |v|"
-            )
-        if self._skew[1] > SYMMETRIC:
-            raise InputError(
-                f"the derivative of force {self.name!r} by the velocity is not symmetric; "
-                "expected a force that a potential of the velocity has, such as a drag along it"
             )
 
     def on_finer(self, nodes: Index | None) -> NodeForce:

@@ -320,12 +320,13 @@ class LiveSweep:
         found: list[Array] = []
         for k, (t, right, force) in enumerate(zip(here, *sides, strict=True)):
             row, before, whole = self._row(t), forward.last, np.zeros(forward.shape)
-            parts, skew = (at.by_position[k], at.by_velocity[k]), at.by_position_skew[k]
-            matrix = row.block(*parts, solver.pattern), row.skew_block(skew)
+            parts = at.by_position[k], at.by_velocity[k]
+            skew = at.by_position_skew[k], at.by_velocity_skew[k]
+            matrix = row.block(*parts, solver.pattern), row.skew_block(*skew)
             found.append(whole)
             try:
                 factor = solver.factoriser.factorise(*matrix, self.model.room)
-                step = Step(t, row, at.force[k], *parts, factor, skew)
+                step = Step(t, row, at.force[k], *parts, factor, *skew)
                 forward.advance(step, right, force, whole)
             except np.linalg.LinAlgError:
                 return found, np.nan

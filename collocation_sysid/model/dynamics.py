@@ -382,9 +382,14 @@ class StencilRow:
         values[pattern.diagonal] += self.s[0] * self.mass_kg
         return values
 
-    def skew_block(self, by_position_skew: Array) -> Array:
-        """Lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t from that of G."""
-        return -self.w[0] * self.p[0] * by_position_skew
+    def skew_block(self, by_position_skew: Array, by_velocity_skew: Array) -> Array:
+        """Lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t from those of G and C."""
+        return -self.w[0] * self.skew(0, by_position_skew, by_velocity_skew)
+
+    def skew(self, lag: int, by_position_skew: Array, by_velocity_skew: Array) -> Array:
+        """That of p G + q C of a lag."""
+        found = self.p[lag] * by_position_skew
+        return found + self.q[lag] * by_velocity_skew if by_velocity_skew.size else found
 
 
 def weighted(coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]) -> Array:

@@ -62,6 +62,8 @@ class ForceTerm(ABC):
         are none.
     by_velocity : bool
         Whether its slopes by velocities may change with these.
+    spins : bool
+        Whether these slopes are not symmetric, as of gyroscopic forces.
     carries : int
         How many numbers each of its instances carries; only one that is `Pointwise` carries any.
     """
@@ -71,6 +73,7 @@ class ForceTerm(ABC):
     slides: bool = False
     carries: int = 0
     by_velocity: bool = False
+    spins: bool = False
 
     @abstractmethod
     def at(self, u: Array) -> Self:

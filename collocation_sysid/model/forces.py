@@ -174,6 +174,7 @@ class Forces:
                 spread(at.by_velocity),
                 self._widened(at.by_theta),
                 spread(at.by_position_skew),
+                np.zeros((len(at.force), self.pattern.entries * self.spins)),
             )
         for term, places in self._placed:
             term.add_slopes(at, places, of(term))
@@ -219,6 +220,11 @@ class Forces:
             states = of(term)
             term.add_curvature(at, places, states, weights.reshape(states.xi.shape))
         return at
+
+    @cached_property
+    def spins(self) -> bool:
+        """Whether slopes by velocities have a skew part."""
+        return any(term.spins for term in self.further)
 
     @cached_property
     def _by_velocity(self) -> bool:

@@ -138,7 +138,11 @@ class Pointwise(ForceTerm):
             skew = points.entries(by_x - by_x.swapaxes(0, 1), here.chosen, skew=True) / 2
             at.by_position_skew[:, places.entries] += skew
         if self.by_velocity:
-            at.by_velocity[:, places.entries] += points.entries(by_v, here.chosen)
+            both = by_v + by_v.swapaxes(0, 1)
+            at.by_velocity[:, places.entries] += points.entries(both, here.chosen) / 2
+        if self.spins:
+            skew = points.entries(by_v - by_v.swapaxes(0, 1), here.chosen, skew=True) / 2
+            at.by_velocity_skew[:, places.entries] += skew
         for k, column in enumerate(self.columns(places)):
             at.by_theta[:, :, column] += points.summed(by_c[:, k], here.chosen)
 
@@ -275,6 +279,11 @@ class PointForces(Pointwise):
     brought: Brought | None = None
     weighed: Array | None = None
     size = 0
+
+    @property
+    def spins(self) -> bool:  # type: ignore[override]
+        """Whether the user's law does."""
+        return self.placed.force.spins
 
     @property
     def carries(self) -> int:  # type: ignore[override]

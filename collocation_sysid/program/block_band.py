@@ -318,15 +318,21 @@ def whole(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
 
 
 def adding_skew(
-    columns: int, row_starts: Index, blocks: Sequence[BandBlock], top: int = 0
+    columns: int,
+    row_starts: Index,
+    blocks: Sequence[BandBlock],
+    top: int = 0,
+    by_velocity: bool = False,
 ) -> BlockBand:
-    """What adds skew parts, as `skew_values` has them, where these blocks have symmetric ones."""
-    # The slope by the velocity has none.
+    """What adds skew parts, as `skew_values` has them, where these blocks have symmetric ones.
+
+    The slope by the velocity has none unless told.
+    """
     own = [
         replace(
             block,
             source=block.whole,
-            terms=[BlockTerm(term.shift, term.a, np.zeros(len(term.b))) for term in block.terms],
+            terms=[BlockTerm(t.shift, t.a, t.b if by_velocity else 0.0 * t.b) for t in block.terms],
         )
         for block in blocks
     ]

@@ -189,7 +189,7 @@ class RowEquations:
         """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
         at = self.forces.linearise(*self.states(x))
         matrix = self.row.block(at.by_position[0], at.by_velocity[0], self.forces.pattern)
-        skew = self.row.skew_block(at.by_position_skew[0])
+        skew = self.row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
         return self.balanced(at.force[0], x), matrix, skew
 
 

@@ -51,8 +51,9 @@ class MotionRows:
 
     @cached_property
     def _skew(self) -> BlockBand:
-        """The same, to add the skew part of ∂F/∂x to it."""
-        return adding_skew(self.pattern.size, self._starts, self._blocks())
+        """The same, to add the skew parts of ∂F/∂x and ∂F/∂v to it."""
+        spins = self.dynamics.forces.spins
+        return adding_skew(self.pattern.size, self._starts, self._blocks(), by_velocity=spins)
 
     @property
     def _starts(self) -> Index:
@@ -140,9 +141,11 @@ class MotionRows:
         positions, grasps = self._constants
         values[positions] += self._inertia(dynamics) if mass_moves else self._known_inertia
         skew = skew_values(self.pattern, forces.by_position_skew)
+        of_rates = skew_values(self.pattern, forces.by_velocity_skew)
         if skew.size:
-            self._skew.fill(values, skew, skew, threads)
-        self._passing.correct(values, forces.by_position, forces.by_velocity, skew)
+            self._skew.fill(values, skew, of_rates if of_rates.size else skew, threads)
+        skews = skew, of_rates
+        self._passing.correct(values, forces.by_position, forces.by_velocity, *skews)
         values[grasps] = 1.0
 
 
@@ -198,16 +201,21 @@ class ReleasedGrasps:
         dropped = tuple(_dropped(dynamics, band, pattern, place, scale))
         return cls(dropped, zeros, np.concatenate([nothing, *ones]))
 
-    def correct(self, values: Array, by_position: Array, by_velocity: Array, skew: Array) -> None:
+    def correct(
+        self, values: Array, by_position: Array, by_velocity: Array, skew: Array, of_rates: Array
+    ) -> None:
         """Correct the values in place.
 
-        G and C are (evaluations, m) lower triangles; `skew` has the entries of G's skew part.
+        G and C are (evaluations, m) lower triangles; the others are the entries of their skew
+        parts.
         """
         for gone in self.dropped:
             force = gone.a * by_position[gone.evaluation, gone.source]
             values[gone.positions] -= force + gone.b * by_velocity[gone.evaluation, gone.source]
             if skew.size:
                 values[gone.positions] -= gone.a * skew[gone.evaluation, gone.whole]
+            if of_rates.size:
+                values[gone.positions] -= gone.b * of_rates[gone.evaluation, gone.whole]
         values[self.zeros] = 0.0
         values[self.ones] = 1.0
 

@@ -162,7 +162,10 @@ class _Stepper:
             at = forces.linearise(x, v)
             matrix = -(at.by_position[0] + slope * at.by_velocity[0])
             matrix[forces.pattern.diagonal] += slope**2 * mass
-            return at.force[0] - mass * a, matrix, -at.by_position_skew[0]
+            skew = -at.by_position_skew[0]
+            if at.by_velocity_skew.size:
+                skew = skew - slope * at.by_velocity_skew[0]
+            return at.force[0] - mass * a, matrix, skew
 
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         guess[solver.held] = x_held

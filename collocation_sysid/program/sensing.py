@@ -173,7 +173,7 @@ class Sensing:
             if weight.any():
                 skew = at.by_position_skew[k]
                 state[first + k] = rows.of(at.by_position[k], skew).T @ weight
-                rate[first + k] = rows.of(at.by_velocity[k], skew[:0]).T @ weight
+                rate[first + k] = rows.of(at.by_velocity[k], at.by_velocity_skew[k]).T @ weight
         by_x = dynamics.combine_transposed(t.p, state)
         by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
         inertia = dynamics.combine_transposed(t.s, self._mass_kg * weights)

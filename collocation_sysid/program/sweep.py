@@ -33,7 +33,7 @@ from ..model.histories import AnyHistory
 from ..model.setting import Setting
 from ..model.viscoelasticity import Slopes
 from .block_band import Submatrix
-from .factorisation import NONE, Choice, Factor, Factoriser
+from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
 from .reaction import HeldForces
 from .segment import Segment
@@ -94,7 +94,7 @@ class LastRows:
 
 
 class Step(NamedTuple):
-    """One timestep's F, G, C (lower triangles), −∂c_t/∂x_t factorised, and G's skew part."""
+    """One timestep's F, G, C (lower triangles), −∂c_t/∂x_t factorised, and their skew parts."""
 
     t: int
     row: StencilRow
@@ -103,6 +103,7 @@ class Step(NamedTuple):
     by_velocity: Array
     factor: Factor
     skew: Array
+    rate_skew: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,8 @@ class GraspMotion:
         if not len(moved):
             return 0.0
         p, q, force = step.row.p[0], step.row.q[0], np.zeros((len(solver.free), self.count))
-        matrix = solver.beside.of(p * step.by_position + q * step.by_velocity, p * step.skew)
+        skew = step.row.skew(0, step.skew, step.rate_skew)
+        matrix = solver.beside.of(p * step.by_position + q * step.by_velocity, skew)
         force[:, moved] = matrix @ now[:, moved]
         return force
 
@@ -331,14 +333,15 @@ class Sweep:
                 if known.any():
                     by_position = self.matrix.of(step.by_position, -step.skew) @ known
                     pulled[t] -= p[0] * by_position
-                    pulled[t] -= q[0] * (self.matrix.of(step.by_velocity, NONE) @ known)
+                    pulled[t] -= q[0] * (self.matrix.of(step.by_velocity, -step.rate_skew) @ known)
                 # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left; the factor is of its negative.
                 right = self.without_taken(t, pulled[t])
                 y[t, free] = -step.factor.solve(right, transposed=True)
                 force_weight = known + row.w[0] * y[t]
                 by_position = self.matrix.of(step.by_position, -step.skew) @ force_weight
                 by_position += by_state
-                by_velocity = self.matrix.of(step.by_velocity, NONE) @ force_weight + by_rate
+                by_velocity = self.matrix.of(step.by_velocity, -step.rate_skew) @ force_weight
+                by_velocity += by_rate
                 for each in carried:
                     each.retreat(force_weight)
                 for i in range(1, min(reach, t) + 1):
@@ -399,7 +402,7 @@ class Sweep:
                 factors = self._factorise(dynamics, at, here, rows, rooms)
             numbers = range(start, here.stop)
             parts = numbers, rows, at.force, at.by_position, at.by_velocity, factors
-            steps = map(Step, *parts, at.by_position_skew)
+            steps = map(Step, *parts, at.by_position_skew, at.by_velocity_skew)
             yield Chunk(here, at, list(steps))
 
     def _factorise(
@@ -414,7 +417,7 @@ class Sweep:
 
         def matrix(k: int) -> tuple[Array, Array]:
             values = rows[k].block(at.by_position[k], at.by_velocity[k], pattern)
-            skew = rows[k].skew_block(at.by_position_skew[k])
+            skew = rows[k].skew_block(at.by_position_skew[k], at.by_velocity_skew[k])
             if taken[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
                 gone = taken[k][pattern.rows] | taken[k][pattern.columns]
@@ -549,7 +552,7 @@ class Forward:
         held.force[step.t] = step.force[dofs]
         state, rate = (self._evaluated(weights, found) for weights in (row.p, row.q))
         slopes = force[dofs] + matrix.of(step.by_position, step.skew) @ state
-        held.slopes[step.t] = slopes + matrix.of(step.by_velocity, NONE) @ rate
+        held.slopes[step.t] = slopes + matrix.of(step.by_velocity, step.rate_skew) @ rate
 
     def _evaluated(self, weights: Sequence[float], found: Array) -> Array:
         """Σ_i weights[i] Y_{t−i} (3n, c): how ξ, or ν, of row t changes."""
@@ -564,9 +567,9 @@ class Forward:
             (i,) = row.lags
             block = row.p[i] * step.by_position
             block += row.q[i] * step.by_velocity
-            return matrix.of(block, row.p[i] * step.skew) @ self.past[i - 1]
+            return matrix.of(block, row.skew(i, step.skew, step.rate_skew)) @ self.past[i - 1]
         past = weighted(row.q, self.past, self.shape)
-        total = matrix.of(step.by_velocity, NONE) @ past
+        total = matrix.of(step.by_velocity, step.rate_skew) @ past
         if any(row.p[1:]):
             past = weighted(row.p, self.past, self.shape)
             total += matrix.of(step.by_position, step.skew) @ past
