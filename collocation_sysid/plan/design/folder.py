@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import tomli_w
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from ...problem.schema import ProblemFile, completed
 from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
@@ -144,10 +145,11 @@ def _of_gripper(design: Design) -> PoseSequence:
         return design.poses
     sections = ProblemFile.model_validate(tomllib.loads(origin.text)).experiment
     (section,) = (section for section in sections if section.name == name)
-    transform = section.grasps[0].gripper_to_body
-    return (
-        design.poses if transform is None else design.poses.after(np.linalg.inv(transform.matrix))
-    )
+    if (moved := section.grasps[0].gripper_to_body) is None:
+        return design.poses
+    turn = Rotation.from_quat(moved.quaternion_xyzw)
+    body_in_gripper = RigidTransform.from_components(moved.position_m, turn)
+    return design.poses.after(body_in_gripper.inv().as_matrix())
 
 
 def _content(design: Design, folder: Path) -> dict[str, Any]:
