@@ -5,10 +5,15 @@ TOML tells text, numbers and truth values apart, so a "30" or true for a number 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from typing import Annotated, Any
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Annotated, Any, ClassVar, get_type_hints
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+
+from .errors import InputError, hint_at
 
 # Sizes that anything measured or meant has; the square of any of them is a number too.
 SMALLEST, LARGEST = 1e-100, 1e100
@@ -57,3 +62,38 @@ def expected(fault: Mapping[str, Any]) -> str:
     if fault["type"] in _EXPECTED:
         return _EXPECTED[fault["type"]].format(**fault.get("ctx", {}))
     return fault["msg"].removeprefix("Input should be ")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Base of methods and options: a value that is not of its field's type is an `InputError`."""
+
+    name: ClassVar[str]
+    # Whether a method can only start from parameters with which everything can be simulated.
+    needs_whole_start: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        for name, adapter in _adapters(type(self)).items():
+            found = getattr(self, name)
+            try:
+                object.__setattr__(self, name, adapter.validate_python(found))
+            except ValidationError as error:
+                raise _refusal(name, found, error.errors(include_url=False)[0]) from error
+
+
+@cache
+def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
+    types = get_type_hints(kind, include_extras=True)
+    return {field.name: TypeAdapter(types[field.name]) for field in fields(kind)}
+
+
+def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
+    """The error for a value, or for an entry of the table that it is."""
+    for part in fault["loc"]:
+        if isinstance(found, Mapping) and part in found:
+            name, found = f"{name}.{part}", found[part]
+    if fault["type"] == "value_error":
+        return InputError(str(fault["ctx"]["error"]), None, name)
+    choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
+    hint = hint_at(str(found), choices)
+    return InputError(f"found {found!r}; expected {expected(fault)}{hint}", None, name)

@@ -565,3 +565,8 @@ def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):
         found = file.getvalue().splitlines()
         assert len(found) == lines
         assert {word for line in found for word in line.split()} == {"misfit"}
+
+
+def test_what_reads_runs_needs_no_solver_to_show_its_help():
+    code = "import sys, collocation_sysid.cli.runs; sys.exit('casadi' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -30,8 +30,8 @@ from typing import (
 import typer
 from typer.models import OptionInfo, ParameterInfo
 
+from ..checked import Options
 from ..errors import InputError
-from ..methods.options import Options
 from ..stated import attributes
 
 if TYPE_CHECKING:

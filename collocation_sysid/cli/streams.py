@@ -11,12 +11,11 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from ..checked import NotNegative, Positive
+from ..checked import NotNegative, Options, Positive
 from ..errors import InputError
 from ..folders import require_possible
 from ..live import Estimator, LiveOptions
 from ..live.sources import problem_in
-from ..methods.options import Options
 from .common import EXIT_BAD_INPUT, errors, show
 from .options import AllowCode, Overrides, ProblemPath, Told, command
 

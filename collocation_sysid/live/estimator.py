@@ -22,9 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
-from ..checked import AtLeastOne, Positive
+from ..checked import AtLeastOne, Options, Positive
 from ..errors import InputError, SimulationError
-from ..methods.options import Options
 from ..pipeline import Run
 from ..problem import Problem
 from ..program.lapack import one_blas_thread

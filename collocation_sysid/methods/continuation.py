@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from ..arrays import Array
+from ..checked import Options
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
@@ -21,7 +22,7 @@ from .comparison.casadi_nlp import Sleqp, SqpMethod
 from .comparison.penalty import AugmentedLagrangian, Penalty
 from .comparison.shooting import Shooting
 from .interior_point import InteriorPoint
-from .options import SHARES, Options, Shares, built, part_of
+from .options import SHARES, Shares, built, part_of
 from .recorder import Recorder
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Method, Solution, Status, Watch

@@ -10,12 +10,11 @@ import numpy as np
 from pydantic import BeforeValidator
 
 from ..arrays import Array
-from ..checked import Count, Finite, NotNegative, Positive, Text, Whole
+from ..checked import Count, Finite, NotNegative, Options, Positive, Text, Whole
 from ..program.collocation import Collocation
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .condensed import condensed
-from .options import Options
 from .recorder import Recorder
 from .solution import Solution, Status, Watch
 

@@ -1,40 +1,21 @@
-"""A method is a dataclass of its options, checked against the types of its fields.
+"""A method is made of its options, by name.
 
 Many take growing first parts of every recording, solved one after another.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from functools import cache
+from dataclasses import fields
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, TypeAdapter, ValidationError
+from pydantic import AfterValidator
 
-from ..checked import Positive, expected
+from ..checked import Options, Positive
 from ..errors import InputError, hint_at
 
 T = TypeVar("T", bound="Options")
-
-
-@dataclass(frozen=True)
-class Options:
-    """Base of the methods: a value that is not of its field's type is an `InputError`."""
-
-    name: ClassVar[str]
-    # Whether it can only start from parameters with which everything can be simulated.
-    needs_whole_start: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        for name, adapter in _adapters(type(self)).items():
-            found = getattr(self, name)
-            try:
-                object.__setattr__(self, name, adapter.validate_python(found))
-            except ValidationError as error:
-                raise _refusal(name, found, error.errors(include_url=False)[0]) from error
 
 
 def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
@@ -61,24 +42,6 @@ def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
         return kind(**given)
     except InputError as error:
         raise InputError(error.message, None, f"{where}.{error.where}") from error
-
-
-@cache
-def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
-    types = get_type_hints(kind, include_extras=True)
-    return {field.name: TypeAdapter(types[field.name]) for field in fields(kind)}
-
-
-def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
-    """The error for a value, or for an entry of the table that it is."""
-    for part in fault["loc"]:
-        if isinstance(found, Mapping) and part in found:
-            name, found = f"{name}.{part}", found[part]
-    if fault["type"] == "value_error":
-        return InputError(str(fault["ctx"]["error"]), None, name)
-    choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")
-    hint = hint_at(str(found), choices)
-    return InputError(f"found {found!r}; expected {expected(fault)}{hint}", None, name)
 
 
 # Fewest samples, or rows of a grid, of a first part.

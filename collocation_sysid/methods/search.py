@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..arrays import Array
-from ..checked import Count, Positive
+from ..checked import Count, Options, Positive
 from ..errors import SimulationError
 from ..program.factorisation import Choice
 from .curvature import exact_curvature, updated, with_curvature
 from .horizon import Horizon, Iterate
-from .options import FEWEST, SHARES, Options, Shares, part_of
+from .options import FEWEST, SHARES, Shares, part_of
 from .recorder import Recorder
 from .solution import Iteration, Status
 from .trajectory import Seen

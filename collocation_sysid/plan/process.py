@@ -25,12 +25,11 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..apart import killed_by
-from ..checked import AtLeastOne, Positive
+from ..checked import AtLeastOne, Options, Positive
 from ..cluster import connected, distributed
 from ..errors import InputError
 from ..fem.kernels import available_threads
 from ..files import write_whole
-from ..methods.options import Options
 from ..tree import as_json
 from .study import PlannedRun
 

@@ -17,9 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checked import AtLeastOne, Count, OneOrMore
+from ..checked import AtLeastOne, Count, OneOrMore, Options
 from ..errors import InputError
-from ..methods.options import Options
 from ..problem import Problem
 from ..problem.reading import read_problem_file
 from ..problem.schema import ParameterSection, ProblemFile

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checked import Positive
-from ..methods.options import Options
+from ..checked import Options, Positive
 from ..runs.result import Result
 from ..tree import read
 from .process import TIMEOUT, Record

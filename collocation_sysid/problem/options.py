@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..checked import Positive, Text
-from ..methods.options import Options
+from ..checked import Options, Positive, Text
 from ..statistics.assumptions import Assumptions
 from ..statistics.uncertainty import ErrorsOption, NoiseOption
 

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checked import Count, NotNegative, Positive
+from ..checked import Count, NotNegative, Options, Positive
 from ..errors import InputError, require_among
 from ..files import whole_file
-from ..methods.options import Options
 from ..model.schemes import SCHEMES
 from ..problem import Problem
 from ..program.simulation import Trajectory, simulate

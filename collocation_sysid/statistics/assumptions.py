@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..checked import Positive
+from ..checked import Options, Positive
 from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
 from ..fem.moduli import engineering
 from ..fem.node_force import surface_of
-from ..methods.options import Options
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters
 from ..program.collocation import Part

@@ -25,11 +25,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from ...arrays import Array
-from ...checked import Count, Positive
+from ...checked import Count, Options, Positive
 from ...program.collocation import Collocation
 from .. import nlpsol
 from ..callbacks import HessianValues, NlpFunctions
-from ..options import Options
 from ..recorder import Recorder
 from ..solution import Solution, Status, Watch
 

@@ -25,10 +25,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ...arrays import Array
-from ...checked import AboveOne, AtLeastOne, Count, Positive
+from ...checked import AboveOne, AtLeastOne, Count, Options, Positive
 from ...errors import InputError
 from ...program.collocation import Collocation
-from ..options import Options
 from ..recorder import Ended, Recorder
 from ..solution import Solution, Status, Watch
 from .inner import FIRST_ORDER, Inner, minimise

@@ -23,12 +23,11 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from ...arrays import Array
-from ...checked import Count, Positive
+from ...checked import Count, Options, Positive
 from ...errors import SimulationError
 from ...program.collocation import Collocation
 from ...program.stopwatch import Stopwatch
 from ..horizon import Horizon
-from ..options import Options
 from ..recorder import Ended, Recorder
 from ..solution import Solution, Status, Watch, constraint_multipliers
 from ..start import completed, marched

@@ -9,9 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from ...arrays import Array
-from ...checked import AboveOne, AtLeastOne, Count
+from ...checked import AboveOne, AtLeastOne, Count, Options
 from ...errors import InputError, SimulationError, require_among
-from ...methods.options import Options
 from ...model.parameters import ThetaMap
 from ...problem import Problem
 from ...program.simulation import Trajectory, simulate, with_markers
