@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -11,6 +13,8 @@ from problems_small import EDGE_M, IDEAL, TRUTH, as_theta, box, nodes_where, pre
 from scipy.optimize import brentq, minimize
 
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.contact import contacts
 from collocation_sysid.model.force_term import States
 from collocation_sysid.program.simulation import simulate
@@ -26,6 +30,10 @@ from collocation_sysid.recording import (
     Sphere,
     Wrench,
 )
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from study_contact import cylinder, sphere
 
 G_M_S2 = 9.81
 UP = np.array([0.0, 0.0, 1.0])
@@ -439,3 +447,56 @@ def test_a_dragged_block_sticks_then_slips_and_the_other_way_again():
     np.testing.assert_allclose(share[8:13], -1.0, atol=0.02)
     assert -0.9 < share[13] < 0.9
     np.testing.assert_allclose(share[-8:], 1.0, atol=0.02)
+
+
+def ring(sides: int, outer_m: float, inner_m: float, width_m: float) -> TetMesh:
+    """A polygon with a hole that stands on a corner at z = -`outer_m`."""
+    flat = box_mesh((1.0,) * 3, (sides, 1, 1))
+    i, j, k = np.rint(flat.points_m * [sides, 1, 1]).astype(int).T
+    number = ((i % sides) * 2 + j) * 2 + k
+    angle, out, along = np.meshgrid(
+        2 * np.pi * np.arange(sides) / sides, (0, 1), (0, 1), indexing="ij"
+    )
+    radius = inner_m + (outer_m - inner_m) * out
+    places = np.stack([radius * np.sin(angle), width_m * along, -radius * np.cos(angle)], axis=-1)
+    return TetMesh(places.reshape(-1, 3), number[flat.tetrahedra])
+
+
+@pytest.mark.long
+def test_a_stiff_ring_rolls_down_a_plane_without_slipping():
+    radius_m, tilt = 0.05, np.deg2rad(15.0)
+    body = Body(ring(40, radius_m, 0.025, 0.03), density_kg_m3=200.0)
+    experiment = laid(body, 50, above_m=radius_m, tilt_rad=tilt, friction=0.8)
+    stiff = {"lambda_pa": 2e6, "mu_pa": 2e6, "gamma_r_s": 0.002, "gamma_m_1_s": 1e-6}
+    seen, mass = simulate(experiment, stiff, "bdf2"), body.node_mass
+    places = seen.positions_m[:, : len(mass)]
+    middle = np.einsum("n,tnk->tk", mass, places) / mass.sum()
+    spoke = places[:, 0] - middle
+    turned = -np.unwrap(np.arctan2(spoke[:, 0], -spoke[:, 2]))
+    rolled_m = middle[:, 0] - middle[0, 0]
+    assert rolled_m[-1] > 3 * 2 * np.pi * radius_m / 40
+    np.testing.assert_allclose(
+        radius_m * (turned - turned[0])[10:], rolled_m[10:], rtol=0.02, atol=1e-5
+    )
+    arms_m = body.nodes_m - mass @ body.nodes_m / mass.sum()
+    inertia = mass @ (arms_m[:, [0, 2]] ** 2).sum(axis=1)
+    expected = G_M_S2 * np.sin(tilt) / (1 + inertia / (mass.sum() * radius_m**2))
+    assert 2 * np.polyfit(experiment.t_s, rolled_m, 2)[0] == pytest.approx(expected, rel=0.05)
+
+
+# Hertz ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_a_long_cylinder_presses_as_hertz_found():
+    """Converging to the force for the half-width of the contact; see `study_contact`."""
+    misses = [abs(cylinder(cells)[0] - 1) for cells in (1.0, 2.0, 4.0)]
+    assert misses[-1] < 0.01
+    assert misses[-1] < misses[0] / 2
+
+
+@pytest.mark.long
+def test_a_sphere_presses_as_hertz_found():
+    misses = [abs(sphere(cells)[0] - 1) for cells in (1.5, 3.0)]
+    assert misses[-1] < 0.02
+    assert misses[-1] < misses[0] / 4
