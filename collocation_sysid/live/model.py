@@ -288,6 +288,8 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("a force that carries something from step to step", "none")
     if experiment.actuators:
         raise refused("tensions and pressures, which frames do not bring,", "none")
+    if experiment.obstacles:
+        raise refused("obstacles, which frames do not bring,", "none")
     if felt := [gauge.name for gauge in experiment.readings if gauge.grasp is not None]:
         names = ", ".join(map(repr, felt))
         raise refused(f"the readings {names} of grasps", "readings of points")

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import Constant, constant_named
+from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
@@ -151,9 +151,10 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
-    """Those of obstacles that are parameters."""
+    """Those of obstacles that are parameters; others than frictions are refused where they are."""
     stated = (each.friction for section in file.experiment for each in section.obstacle)
-    return tuple(dict.fromkeys(constant_named(one) for one in stated if isinstance(one, str)))
+    named = (one for one in stated if isinstance(one, str) and one.endswith(FRICTION.name))
+    return tuple(dict.fromkeys(map(constant_named, named)))
 
 
 def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | float:

@@ -134,7 +134,7 @@ class _Stepper:
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """The state with accelerations of some dofs from the forces on them."""
         acceleration = state.a.copy()
-        acceleration[dofs] = (self._force(state, load_s) / self._mass(load_s))[dofs]
+        acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:

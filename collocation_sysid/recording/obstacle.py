@@ -79,7 +79,7 @@ class Obstacle(Grasp):
     nodes: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     poses: PoseSequence = field(default_factory=PoseSequence.fixed)
     shape: Solid = key(SolidSection, read=solid_of, converter=_shape, kw_only=True)
-    name: str = key(Text, default="obstacle", kw_only=True)
+    name: str = key(Text | None, default="obstacle", kw_only=True)
     friction: float | str = key(NotNegative | Text, default=0.0, kw_only=True)
     faces: Selection | None = key(
         Nodes | None, converter=_faces, read=selection, default=None, kw_only=True

@@ -347,8 +347,10 @@ def _air_drag(at: Fitted, _: int) -> Effect | None:
     if at.part.segment.experiment.static:
         return None
     area_m2, shape = surface_of(at.body.nodes)[0], at.states[1].shape
-    v = at.states[1].reshape(shape[0], -1, 3)
-    drag = -0.125 * AIR_KG_M3 * area_m2[:, None] * np.linalg.norm(v, axis=2, keepdims=True) * v
+    v = at.states[1].reshape(shape[0], -1, 3)[:, : len(area_m2)]
+    drag = np.zeros((shape[0], shape[1] // 3, 3))
+    speed = np.linalg.norm(v, axis=2, keepdims=True)
+    drag[:, : len(area_m2)] = -0.125 * AIR_KG_M3 * area_m2[:, None] * speed * v
     return Effect(drag.reshape(shape))
 
 

@@ -340,8 +340,14 @@ def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> Iterator[Hy
     misfit, of = left((sensor.wrench, tare)), f"the wrench of '{part.segment.experiment.name}'"
     if misfit > MISFIT:
         yield from Trial(misfit, left, BETTER, least=1.0).of(
-            _wrench_mistakes(of, sensor.wrench, tare)
+            _wrench_mistakes(of, sensor.wrench, tare, _weighs(part))
         )
+
+
+def _weighs(part: Part) -> bool:
+    """Whether markers alone tell how large forces are: by densities, or loads, that are known."""
+    segment = part.segment
+    return not segment.body.mass_slopes or without_sensors(segment.experiment).knows_a_force
 
 
 def _wrench_misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: float) -> float:
@@ -359,14 +365,14 @@ def _wrench_misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: floa
     return float(np.sqrt(np.nanmean((apart - offsets) ** 2)))
 
 
-def _wrench_mistakes(of: str, wrench: Wrench, tare: float) -> Iterator[Hypothesis]:
+def _wrench_mistakes(of: str, wrench: Wrench, tare: float, weighs: bool) -> Iterator[Hypothesis]:
     """Each undone: the wrench, and how many sigmas its tare may have."""
     opposite = replace(wrench, values=-wrench.values)
     yield Hypothesis("wrench-sign", of, without=(opposite, tare))
     other: Frame = "grasp" if wrench.frame == "world" else "world"
     turned = replace(wrench, frame=other)
     yield Hypothesis("wrench-frame", of, {"other": other}, (turned, tare))
-    for what, units, columns in UNITS:
+    for what, units, columns in UNITS if weighs else ():
         for unit, factor in units.items():
             data = {"what": what, "unit": unit, "factor": factor}
             yield Hypothesis("wrench-unit", of, data, (_scaled(wrench, columns, factor), tare))

@@ -7,7 +7,7 @@ simulators hold the grasped nodes there, or move them on from there.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -74,6 +74,18 @@ class IdentifiedRegion:
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
 
+def _alone(experiment: Experiment, folder: Path) -> Experiment:
+    """The experiment without obstacles, which no export has."""
+    try:
+        return replace(experiment, grasps=experiment.gripping)
+    except InputError as error:
+        raise InputError(
+            "exports leave obstacles out, and nothing else carries this body; expected a recording "
+            "in which it is grasped",
+            folder,
+        ) from error
+
+
 @dataclass(frozen=True, eq=False)
 class Identified:
     """A body as a run identified it, in the grasp of one of its recordings.
@@ -90,6 +102,8 @@ class Identified:
     experiment : Experiment
         With gravity and grasps as they were found.
     rolled_out_m : (T, n, 3) our prediction at the samples, or None
+    obstacles : tuple of str
+        Names of what it may touch, which is left out.
     """
 
     title: str
@@ -100,6 +114,7 @@ class Identified:
     theta: Array
     experiment: Experiment
     rolled_out_m: Array | None
+    obstacles: tuple[str, ...] = ()
 
     @classmethod
     def read(
@@ -144,7 +159,12 @@ class Identified:
             body = segment.body
             if replay.undeformed_m.shape != body.nodes_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
-        corrected = segment.corrected(phi)
+        corrected, rolled_out_m = segment.corrected(phi), replay.rolled_out_positions_m
+        touched = tuple(obstacle.name for obstacle in corrected.obstacles)
+        if touched:
+            corrected = _alone(corrected, folder)
+            body = corrected.body
+            rolled_out_m = None if rolled_out_m is None else rolled_out_m[:, : len(body.nodes_m)]
         return cls(
             problem.title,
             result.trust.verdict,
@@ -153,7 +173,8 @@ class Identified:
             body,
             body.theta(values),
             corrected,
-            replay.rolled_out_positions_m,
+            rolled_out_m,
+            touched,
         )
 
     @property

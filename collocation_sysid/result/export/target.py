@@ -147,6 +147,8 @@ def _never_held(body: Identified) -> Iterator[str]:
         yield "tendons and pressures are not exported"
     if e.body.forces:
         yield f"{', '.join(f.name for f in e.body.forces)} of your own is not exported"
+    if body.obstacles:
+        yield f"what it may touch is not exported: {', '.join(body.obstacles)}"
     if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
         yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.holds(times).all() for grasp in e.grasps):

@@ -1,0 +1,132 @@
+"""Obstacles in problem files: what is read, what is refused, and where they are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problems_small import TRUTH, measured, pressed_cube
+
+import collocation_sysid as cs
+from collocation_sysid.errors import InputError
+from collocation_sysid.live.model import Model
+from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
+
+PROBLEM = """
+[object]
+mesh = "cube.vtu"
+density_kg_m3 = 30.0
+
+[parameters]
+lambda_pa = 400.0
+mu_pa = 150.0
+gamma_r_s = 0.02
+gamma_m_1_s = 0.5
+{parameter}
+
+[[experiment]]
+name = "pressed"
+
+[experiment.nuisance]
+obstacle = {{ prior_m = 0.0002, prior_rad = 0.01 }}
+marker_offsets = "none"
+
+[experiment.grasp]
+nodes = {{ box_m = [[-1, -1, -1], [1, 1, 0.001]] }}
+
+[[experiment.obstacle]]
+name = "ball"
+shape = {{ {ball} }}
+poses = "ball.csv"
+friction = {friction}
+force = {{ file = "force.csv", sigma_n = 0.3 }}
+
+[[experiment.obstacle]]
+shape = {{ plane = {{ normal = [1, 0, 0], point_m = [-0.002, 0, 0] }} }}
+stiffness_pa_m = 4e4
+
+[experiment.markers]
+file = "markers.csv"
+reference_m = {{ m1 = [0, 0, 0.1], m2 = [0.1, 0, 0.1] }}
+"""
+BALL = "sphere_m = { radius_m = 0.05, centre_m = [0.05, 0.05, 0.152] }"
+
+
+def written(folder: Path, ball: str = BALL, friction: str = '"ball_friction"') -> Path:
+    """The pressed cube as a problem file."""
+    cube = pressed_cube(5)
+    cube.body.mesh.write(folder / "cube.vtu")
+    write_poses_csv(folder / "ball.csv", cube.obstacles[0].poses)
+    write_markers_csv(folder / "markers.csv", cube.t_s, ["m1", "m2"], np.zeros((6, 2, 3)) + 0.1)
+    write_wrench_csv(folder / "force.csv", cube.t_s, np.full((6, 3), 0.05))
+    parameter = "ball_friction = { guess = 0.4 }" if "friction" in friction else ""
+    content = PROBLEM.format(ball=ball, friction=friction, parameter=parameter)
+    (folder / "problem.toml").write_text(content)
+    return folder / "problem.toml"
+
+
+def test_what_a_file_says_of_obstacles(tmp_path: Path):
+    problem = cs.Problem.read(written(tmp_path), simulation=True)
+    (experiment,) = problem.experiments
+    ball, wall = experiment.obstacles
+    assert (ball.name, wall.name) == ("ball", "obstacle 2")
+    assert isinstance(ball.shape, cs.Sphere)
+    assert ball.shape.radius_m == 0.05
+    np.testing.assert_allclose(wall.shape.normal, [1, 0, 0])
+    assert wall.stiffness_pa_m == 4e4
+    assert ball.wrench is not None
+    assert ball.wrench.sigma_n == 0.3
+    friction = problem.parameters.items[-1]
+    assert (friction.name, friction.lower, friction.upper) == ("ball_friction", 0.0, 2.0)
+    (segment,) = problem.collocation().segments
+    labels = [name.partition(": ")[2] for name in segment.nuisance.names]
+    assert [label for label in labels if "ball" in label or "obstacle" in label] == [
+        "place of ball [m]",
+        "place of obstacle 2 [m]",
+        "tilt of obstacle 2, first [rad]",
+        "tilt of obstacle 2, second [rad]",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("ball", "friction", "message"),
+    [
+        ("ball_m = [0, 0, 0, 1]", "0.3", "ball_m"),
+        (f"{BALL}, plane = {{}}", "0.3", "found plane and sphere_m; expected exactly one of"),
+        ("sphere_m = { radius_m = -0.05 }", "0.3", "radius_m"),
+        ("capsule_m = { radius_m = 0.01, ends_m = [[0, 0, 0]] }", "0.3", "ends_m"),
+        (BALL, "2.5", "friction of ball is 2.5; expected 0 to 2"),
+        (BALL, '"mu_pa"', "expected a number, or the name of a parameter that ends with friction"),
+        (BALL, '"table_friction"', "did you mean 'table_friction'"),
+    ],
+)
+def test_what_cannot_be_is_refused(tmp_path: Path, ball: str, friction: str, message: str):
+    with pytest.raises(InputError, match=message):
+        cs.Problem.read(written(tmp_path, ball, friction), simulation=True)
+
+
+def test_two_obstacles_have_two_names():
+    cube = pressed_cube(3)
+    held, ball, plate = cube.grasps
+    with pytest.raises(InputError, match="two obstacles are called 'ball'"):
+        replace(cube, grasps=[held, ball, replace(plate, name="ball")])
+
+
+def test_a_body_keeps_its_nodes_and_mass_and_its_obstacles_come_last():
+    cube = pressed_cube(3)
+    plain = replace(cube, grasps=cube.gripping)
+    assert plain.body.frames.size == 0
+    assert cube.body.mass_kg == plain.body.mass_kg
+    nodes = len(plain.body.nodes_m)
+    np.testing.assert_array_equal(cube.body.frames.ravel(), nodes + np.arange(8))
+    shuffled = replace(cube, grasps=[cube.grasps[k] for k in (2, 0, 1)])
+    assert [type(grasp).__name__ for grasp in shuffled.grasps] == ["Grasp", "Obstacle", "Obstacle"]
+    assert replace(cube, name="again").body is cube.body
+
+
+def test_live_refuses_obstacles():
+    problem = cs.Problem([measured(pressed_cube(4))], cs.Parameters.of(TRUTH))
+    with pytest.raises(InputError, match="obstacles, which frames do not bring"):
+        Model.of(problem)
