@@ -59,11 +59,11 @@ class ForcePoints:
     def vectors(self, x: Array, chosen: Index | None = None) -> Array:
         """Y (3L, T, i) of x (T, 3n), of all instances or of chosen ones."""
         found = self._of(chosen) @ x.T
-        return found.reshape(-1, self.dofs, len(x)).transpose(1, 2, 0)
+        return found.reshape(len(found) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
 
     def summed(self, forces: Array, chosen: Index | None = None) -> Array:
         """(T, 3n) from the forces (3L, T, i) on the vectors."""
-        flat = forces.transpose(2, 0, 1).reshape(-1, forces.shape[1])
+        flat = forces.transpose(2, 0, 1).reshape(len(forces) * forces.shape[2], forces.shape[1])
         return (self._of(chosen).T @ flat).T
 
     def entries(self, blocks: Array, chosen: Index | None = None, skew: bool = False) -> Array:
@@ -71,7 +71,7 @@ class ForcePoints:
         columns, rows = np.triu_indices(len(blocks))
         values = np.moveaxis(blocks[rows, columns], 0, 2)
         onto = self._some("skew" if skew else "couplings", chosen)
-        return (onto @ values.reshape(len(values), -1).T).T
+        return (onto @ values.reshape(len(values), onto.shape[1]).T).T
 
     def _of(self, chosen: Index | None) -> sp.csr_array:
         """Rows of the operator."""

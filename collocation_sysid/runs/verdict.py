@@ -11,6 +11,7 @@ from ..methods.solution import Solution, Status, pooled_wrench_rms
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.stability import instabilities
+from ..program.touches import touches
 from ..recording.nuisance import TIME
 from ..recording.turning import TOO_FAST
 from ..statistics.concern import Concern
@@ -19,6 +20,7 @@ from ..statistics.plausible import odd_material, oddities
 from ..statistics.scale import scale_concerns
 from ..statistics.trust import (
     clock_concerns,
+    contact_concerns,
     fit_concerns,
     marker_concerns,
     noise_rms_m,
@@ -69,6 +71,8 @@ def concerns(
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(instabilities(solution.collocation, solution.z))
+    for part in solution.collocation.parts(solution.z):
+        yield from contact_concerns(touches(part.segment.experiment, part.x))
     for name, rollout in rollouts.items():
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
     collocation = solution.collocation

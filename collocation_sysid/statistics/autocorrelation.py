@@ -371,10 +371,10 @@ def score_covariance(
     total = information.prior.copy()
     doubt = np.zeros(directions.shape[1])
     for slope, process in zip(information.slopes, processes, strict=True):
-        width = slope.shape[2]
+        shape = slope.shape[0] * slope.shape[1], slope.shape[2]
         smoothed = along_time(process.along_time, slope)
         mixed = np.einsum("cd,tdr->tcr", process.among_channels, smoothed)
-        part = slope.reshape(-1, width).T @ mixed.reshape(-1, width)
+        part = slope.reshape(shape).T @ mixed.reshape(shape)
         total += (part + part.T) / 2
         for k, direction in enumerate(directions.T):
             by_time = slope @ direction

@@ -229,6 +229,18 @@ TOPICS: Mapping[str, Topic] = {
             "{growth_1_s:.2g} 1/s",
         },
     ),
+    "contact": Topic(
+        "Contact",
+        "contact",
+        "Look at the place, the normal and the motion of the obstacle, and at the mesh where it "
+        "touches.",
+        {
+            "never": "'{experiment}' never touches {obstacle}, but comes as near as {mm:.3g} mm: "
+            "its force and friction say nothing",
+            "coarse": "in '{experiment}' only {faces:.2g} faces touch {obstacle} at a time: how "
+            "wide the contact is follows from the mesh",
+        },
+    ),
     "mesh": Topic(
         "The mesh",
         "mesh",

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..program.stability import Instability
+from ..program.touches import Touch
 from ..recording.experiment import Experiment
 from ..recording.turning import FAST, fastest_turn
 from .concern import Concern, concerned
@@ -53,6 +54,8 @@ DAMPING_SHARE, GROSS_DAMPING_SHARE, LITTLE_DAMPING = 0.2, 1.0, 0.005
 PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
 # Powers of e by which a disturbance may grow in a recording.
 E_FOLDINGS, GROSS_E_FOLDINGS = 1.0, 7.0
+# A contact of fewer faces is as wide as the mesh makes it.
+FEWEST_FACES = 4.0
 # Standard errors that step and mesh may move a parameter: the half width of its interval.
 MOVED = 2.0
 # What is said of the numerical error: estimated, and measured.
@@ -253,6 +256,18 @@ def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
     for each in found:
         grows, grossly = each.e_foldings > E_FOLDINGS, each.e_foldings > GROSS_E_FOLDINGS
         concerns += concerned(grows, grossly, "stability/grows", **vars(each))
+    return concerns
+
+
+def contact_concerns(found: Iterable[Touch]) -> list[Concern]:
+    """Obstacles that are never touched, or by too few faces to tell the shape of a contact."""
+    concerns: list[Concern] = []
+    for each in found:
+        data = {"experiment": each.experiment, "obstacle": each.obstacle}
+        if not each.points:
+            concerns.append(Concern("contact/never", "doubtful", {**data, "mm": 1e3 * each.gap_m}))
+        elif each.faces < FEWEST_FACES:
+            concerns.append(Concern("contact/coarse", data={**data, "faces": each.faces}))
     return concerns
 
 

@@ -1,0 +1,100 @@
+"""A block that a ball pokes: what its force tells, and what is said where it is stated wrongly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.program.touches import touches
+from collocation_sysid.recording import Experiment
+
+TRUTH = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+DEPTHS_M = np.linspace(-0.0005, 0.006, 14)
+SIGMA_N = 0.002
+
+
+@cache
+def block() -> cs.Body:
+    return cs.Body(cs.box_mesh((0.06, 0.06, 0.03), (4, 4, 2)), density_kg_m3=50.0)
+
+
+def poked(higher_m: float = 0.0, place_sigma_m: float | None = 5e-4, **changes) -> Experiment:
+    """A ball that comes down on the middle of a block, stated so much higher than it is."""
+    t_s = np.arange(len(DEPTHS_M), dtype=float)
+    down = np.outer(-DEPTHS_M + higher_m, [0.0, 0.0, 1.0])
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    ball = cs.Obstacle(
+        shape=cs.Sphere(0.02, (0.03, 0.03, 0.05)),
+        poses=cs.PoseSequence(t_s, down, upright),
+        name="ball",
+        wrench=cs.Wrench(t_s, np.zeros((len(t_s), 3)), SIGMA_N),
+    )
+    below = np.flatnonzero(block().nodes_m[:, 2] < 1e-6)
+    held = cs.Grasp(below, cs.PoseSequence.fixed())
+    known = {"kind": "static", "gravity_m_s2": (0.0, 0.0, 0.0), "name": "poke"}
+    known["nuisance"] = cs.Nuisance.none(obstacle_offset_m=place_sigma_m)
+    return Experiment(block(), t_s, [held, replace(ball, **changes)], None, **known)
+
+
+@cache
+def forces_n(seed: int) -> np.ndarray:
+    """What the ball measures where it is as stated, with noise."""
+    exact = cs.simulate(poked(), TRUTH).wrenches[0][:, :3]
+    return exact + SIGMA_N * np.random.default_rng(seed).normal(size=exact.shape)
+
+
+def answer(experiment: Experiment, seed: int = 0, **unknown) -> cs.Run:
+    """Of E and the place of the ball."""
+    held, ball = experiment.grasps
+    measured = replace(ball, wrench=replace(ball.wrench, values=forces_n(seed)))
+    seen = replace(experiment, grasps=[held, measured])
+    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4), **unknown})
+    return cs.run(cs.Problem([seen], known), seek_causes=False)
+
+
+def told(run: cs.Run) -> set[str]:
+    assert run.trust is not None
+    return {concern.code for concern in run.trust.concerns}
+
+
+@pytest.mark.parametrize("off_m", [0.0, 3e-4])
+def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(off_m: float):
+    finished = answer(poked(off_m))
+    low, high = finished.result.parameters["young_pa"].ci95
+    assert low < TRUTH["young_pa"] < high
+    assert high - low < 0.1 * TRUTH["young_pa"]
+    part = finished.solution.collocation.parts(finished.solution.z)[0]
+    place_m = float((part.phi * part.segment.nuisance.scales)[0])
+    assert place_m == pytest.approx(-off_m, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    held = 0
+    for seed in range(20):
+        run = answer(poked(), seed)
+        low, high = run.result.parameters["young_pa"].ci95
+        held += low < TRUTH["young_pa"] < high
+    assert held >= 17
+
+
+def test_an_obstacle_far_from_where_it_is_stated_is_told():
+    assert "nuisance/far" in told(answer(poked(2.5e-3)))
+
+
+def test_an_obstacle_that_is_never_touched_is_told():
+    assert "contact/never" in told(answer(poked(0.05, place_sigma_m=None)))
+
+
+def test_a_contact_of_few_faces_is_told():
+    fine = poked(shape=cs.Sphere(0.004, (0.03, 0.03, 0.034)))
+    x = cs.simulate(fine, TRUTH).positions_m.reshape(len(DEPTHS_M), -1)
+    (touch,) = touches(fine, x)
+    assert 0 < touch.faces < 4
+    (wide,) = touches(poked(), cs.simulate(poked(), TRUTH).positions_m.reshape(len(DEPTHS_M), -1))
+    assert wide.faces > touch.faces
+    assert wide.gap_m < 1e-4
