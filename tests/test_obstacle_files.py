@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from problems_small import TRUTH, measured, pressed_cube
@@ -13,6 +14,7 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.live.model import Model
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
+from collocation_sysid.result.replay import Replay
 
 PROBLEM = """
 [object]
@@ -130,3 +132,35 @@ def test_live_refuses_obstacles():
     problem = cs.Problem([measured(pressed_cube(4))], cs.Parameters.of(TRUTH))
     with pytest.raises(InputError, match="obstacles, which frames do not bring"):
         Model.of(problem)
+
+
+SOLIDS = {
+    "plane": cs.Plane((0.0, 0.6, 0.8), (0.01, 0.02, 0.03)),
+    "sphere": cs.Sphere(0.02, (0.01, 0.0, 0.05)),
+    "cylinder": cs.Cylinder(0.01, [[0, 0, 0], [0.05, 0, 0.02]]),
+    "capsule": cs.Capsule(0.01, [[0, 0, 0], [0.05, 0, 0.02]]),
+    "cuboid": cs.Cuboid([[0, 0, 0], [0.05, 0.03, 0.02]]),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_an_outline_is_on_the_surface(name: str):
+    solid, point = SOLIDS[name], ca.SX.sym("point", 3)
+    gap = ca.Function("gap", [point], [solid.gap(point)])
+    points_m = np.concatenate(solid.outline(np.array([0.05, 0.05, 0.05]), 0.1))
+    assert len(points_m) > 3
+    assert max(abs(float(gap(each))) for each in points_m) < 1e-9
+
+
+def test_pictures_have_outlines_where_obstacles_are_and_keep_them():
+    cube = pressed_cube(4)
+    seen = Replay.of(cube)
+    assert seen.obstacles_m is not None
+    ball = cube.obstacles[0]
+    circles = seen.obstacles_m[:, : 3 * 34]
+    centres = ball.poses.at(cube.t_s)[1] + ball.shape.centre_m
+    distance_m = np.linalg.norm(circles - centres[:, None], axis=2)
+    np.testing.assert_allclose(distance_m[np.isfinite(distance_m)], ball.shape.radius_m)
+    kept = Replay.from_arrays(cube.name, seen.arrays())
+    np.testing.assert_array_equal(kept.obstacles_m, seen.obstacles_m)
+    assert Replay.of(replace(cube, grasps=cube.gripping)).obstacles_m is None

@@ -20,7 +20,7 @@ from ..stated import key, stated
 from .grasp import Grasp
 from .poses import PoseSequence
 from .selected import Nodes, selection
-from .solids import KINDS, Solid, SolidSection, solid_of
+from .solids import KINDS, Solid, SolidSection, across, solid_of
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -124,7 +124,7 @@ class Obstacle(Grasp):
     @property
     def across(self) -> Array:
         """(2, 3) axes that it may be tilted about: they complete its normal to a basis."""
-        return np.linalg.svd(self.shape.normal[None])[2][1:]
+        return across(self.shape.normal)
 
     def off_by(self, offset_m: float, tilt_rad: Array, late_s: float) -> Obstacle:
         """The same elsewhere, by a shift along its direction, a tilt (2,), and later."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -26,6 +27,10 @@ class Solid(ABC):
     @abstractmethod
     def gap(self, point: ca.SX) -> ca.SX:
         """How far outside a point (3,) is [m]; negative inside."""
+
+    @abstractmethod
+    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+        """Polylines (k, 3) for pictures, of a plane about a point and so long."""
 
     @property
     def normal(self) -> Array:
@@ -79,6 +84,13 @@ class Plane(Solid):
         """Its point."""
         return self.point_m
 
+    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+        """A square."""
+        middle = about_m - (about_m - self.point_m) @ self.normal * self.normal
+        u, v = across(self.normal) * size_m / 2
+        corners = [middle + a * u + b * v for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
+        return [np.array(corners)]
+
     def gap(self, point: ca.SX) -> ca.SX:
         """Along the normal."""
         return ca.dot(ca.DM(self.normal), point - ca.DM(self.point_m))
@@ -97,6 +109,10 @@ class Sphere(Solid):
     radius_m: float = key(Positive)
     centre_m: Array = key(Vector, converter=floats((3,), "centre_m"), default=(0.0,) * 3)
 
+    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+        """Three circles."""
+        return [_circle(self.centre_m, axis, self.radius_m) for axis in np.eye(3)]
+
     def gap(self, point: ca.SX) -> ca.SX:
         """From its surface."""
         return _length(point - ca.DM(self.centre_m)) - self.radius_m
@@ -107,6 +123,13 @@ class _Round(Solid):
 
     radius_m: float
     ends_m: Array
+
+    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+        """A circle at each end, and four lines between them."""
+        axis = np.diff(self.ends_m, axis=0)[0]
+        first, last = (_circle(end, axis, self.radius_m) for end in self.ends_m)
+        quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
+        return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
     def _along(self, point: ca.SX) -> tuple[ca.SX, ca.SX, float]:
         """How far along the axis from the middle, how far from it, and half of its length."""
@@ -197,11 +220,28 @@ class Cuboid(Solid):
         """Half way between the corners."""
         return self.corners_m.mean(axis=0)
 
+    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+        """Its edges."""
+        corners = np.array(list(product(*self.corners_m.T)))
+        apart = (corners[:, None] != corners).sum(axis=2)
+        return [corners[[i, j]] for i, j in np.argwhere(apart == 1) if i < j]
+
     def gap(self, point: ca.SX) -> ca.SX:
         """From its surface."""
         low, high = self.corners_m
         beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM((high - low) / 2)
         return _of_corner(beyond + self.rounding_m) - self.rounding_m
+
+
+def across(normal: Array) -> Array:
+    """(2, 3) axes that complete a direction to a basis."""
+    return np.linalg.svd(normal[None])[2][1:]
+
+
+def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
+    angle = np.linspace(0, 2 * np.pi, 33)
+    round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across(axis)
+    return centre_m + radius_m * round_m
 
 
 def _length(vector: ca.SX) -> ca.SX:

@@ -208,7 +208,8 @@ class Film:
         replay = self.replay
         measured = replay.measured_m[t]
         for name, positions, markers, drawn, title in self.panels:
-            drawn.show(positions[t], replay.held[t], measured)
+            outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
+            drawn.show(positions[t], replay.held[t], measured, outlines_m=outlines_m)
             distances = np.linalg.norm(markers[t] - measured, axis=1)
             present = distances[np.isfinite(distances)]
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"

@@ -29,7 +29,8 @@ ARRAYS_FILE = "trajectory.npz"
 WRENCH, READING = "wrench_", "reading_"
 # Of the body, and so the same for all experiments of a run.
 OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
-# Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes.
+# Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes,
+# p and o points of lines.
 LAYOUT = {
     "undeformed_m": ("f", "n3"),
     "tetrahedra": ("iu", "E4"),
@@ -48,7 +49,10 @@ LAYOUT = {
     "rolled_out_m": ("f", "TM3"),
     "natural_hz": ("f", "k"),
     "tendons_m": ("f", "p3"),
+    "obstacles_m": ("f", "To3"),
 }
+# A plane is shown so many times as long as the body.
+LONGER = 1.4
 # Arrays that may hold NaN or infinity, and the largest length, time or frequency of any.
 GAPS = LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
 LARGEST = 1e100
@@ -85,6 +89,7 @@ class Replay:
     static : bool
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
+    obstacles_m : (T, o, 3) points of the obstacles' outlines, NaN after each line
     """
 
     name: str
@@ -110,6 +115,7 @@ class Replay:
     static: bool = False
     tendons_m: Array | None = None
     readings: Mapping[str, Array] = field(default_factory=dict)
+    obstacles_m: Array | None = None
 
     @classmethod
     def of(
@@ -151,6 +157,7 @@ class Replay:
             experiment.static,
             _apart([tendon.points_m for tendon in experiment.tendons]),
             readings or {},
+            _outlines(experiment),
         )
 
     @property
@@ -209,6 +216,19 @@ class Replay:
         if numbers.min() < 0 or numbers.max() >= len(stored["part_names"]):
             raise ValueError("surface_parts names parts that are not there")
         return cls(name=name, **stored)
+
+
+def _outlines(experiment: Experiment) -> Array | None:
+    """(T, o, 3) outlines of the obstacles where they are stated; None where there are none."""
+    body, found = experiment.body.nodes.points_m, []
+    for obstacle in experiment.obstacles:
+        low, high = body.min(axis=0), body.max(axis=0)
+        size_m = LONGER * float((high - low).max())
+        outline = _apart(obstacle.shape.outline((low + high) / 2, size_m))
+        assert outline is not None
+        turns, shifts = obstacle.poses.at(experiment.t_s)
+        found.append(np.einsum("tij,kj->tki", turns, outline) + shifts[:, None])
+    return np.concatenate(found, axis=1) if found else None
 
 
 def _apart(lines_m: Sequence[Array]) -> Array | None:

@@ -111,6 +111,7 @@ class Drawn:
         self.skin.set_joinstyle("round")
         axes.add_collection(self.skin, autolim=False)
         self.grasped = axes.add_line(Line2D([], [], zorder=3, **_SQUARE))
+        self.outlines = axes.add_line(Line2D([], [], zorder=0.5, lw=0.6, color=BLACK))
         self.rings = axes.add_line(Line2D([], [], mfc="none", zorder=4, **_DOT))
         self.dots = axes.add_line(Line2D([], [], mfc=VERMILION, zorder=5, **_DOT))
 
@@ -120,8 +121,9 @@ class Drawn:
         held: NDArray[np.bool_],
         markers_m: Array,
         skins: Array | None = None,
+        outlines_m: Array | None = None,
     ) -> None:
-        """Show nodes (n, 3), those of them that are grasped, and markers (M, 3).
+        """Show nodes (n, 3), those of them that are grasped, markers (M, 3), and outlines (o, 3).
 
         Markers that the body hides are rings; grasped nodes turned away are left out. Triangles
         have the colours `skins` (F, 3), by default those of their parts.
@@ -137,6 +139,8 @@ class Drawn:
             self.skin.set_edgecolor(colours)
         outer = np.unique(self.nodes[faces])
         self.grasped.set_data(*self.view.places(positions_m[outer[held[outer]]]).T)
+        if outlines_m is not None:
+            self.outlines.set_data(*self.view.places(outlines_m).T)
         hidden = camera.hidden(markers_m, positions_m, self.surface)
         self.rings.set_data(*self.view.places(markers_m[hidden]).T)
         self.dots.set_data(*self.view.places(markers_m[~hidden]).T)

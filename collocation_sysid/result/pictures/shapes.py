@@ -71,7 +71,8 @@ def shapes(seen: Replay, count: int = SHOWN, field: Field | None = None) -> Figu
     for t, first, last, skin in zip(shown, left, right, skins, strict=True):
         view = View(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
         body = Drawn(axes, view, seen.surface, seen.surface_parts, seen.surface_nodes)
-        body.show(positions_m[t], seen.held[t], measured_m[t], skin)
+        outlines_m = None if seen.obstacles_m is None else seen.obstacles_m[t]
+        body.show(positions_m[t], seen.held[t], measured_m[t], skin, outlines_m)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)
