@@ -95,7 +95,8 @@ def pressed(
     place = term.points.vectors(x)[:, 0]
     gap_m = term.contact.distance.value(place[:, None], np.zeros((0, 1, place.shape[1])))[0, 0]
     push = term.contact.surface.area_m2 * np.maximum(term.contact.width_m - gap_m, 0) ** 2
-    r2_m2 = place[0] ** 2 + (place[1] ** 2 if isinstance(shape, cs.Sphere) else 0.0)
+    x_m, y_m, _ = place[:3] + term.contact.body.frame_m[0][:, None]
+    r2_m2 = x_m**2 + (y_m**2 if isinstance(shape, cs.Sphere) else 0.0)
     return -float(seen.wrenches[0][0, 2]), float((push * r2_m2).sum() / push.sum())
 
 

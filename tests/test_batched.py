@@ -25,6 +25,7 @@ from collocation_sysid.fem.kernels import (
     jit,
     make_combiner,
     make_evaluator,
+    make_instances,
     simd,
 )
 from collocation_sysid.fem.kernels.combine import combine_natively, combine_with_numpy
@@ -116,6 +117,29 @@ def test_vectors_of_any_width_give_the_same(small_mesh, make_body, lanes, monkey
     assert relative_error(found, expected) < 1e-12
     found, expected = (each.stiffness(x, **ELASTIC).toarray() for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
+
+
+def distance_and_slopes() -> ca.Function:
+    point, share = ca.SX.sym("point", 3), ca.SX.sym("share")
+    distance = share * ca.sqrt(ca.sumsqr(point) + 1)
+    return ca.Function("distance", [point, share], [distance, ca.jacobian(distance, point)])
+
+
+@pytest.mark.parametrize("count", [1, 7, 32])
+def test_any_number_of_instances_gives_the_same_compiled(count):
+    rng = np.random.default_rng(0)
+    inputs = [rng.normal(size=(3, count)), rng.normal(size=(1, count))]
+    compiled = make_instances(distance_and_slopes(), compiled=True)(inputs)
+    expected = make_instances(distance_and_slopes(), compiled=False)(inputs)
+    assert [each.shape for each in compiled] == [(1, count), (3, count)]
+    for each, other in zip(compiled, expected, strict=True):
+        np.testing.assert_allclose(each, other, rtol=1e-14)
+
+
+def test_instances_are_evaluated_by_casadi_where_they_cannot_be_compiled(broken_compiler, cache):
+    inputs = [np.ones((3, 4)), np.ones((1, 4))]
+    distance, _ = make_instances(distance_and_slopes(), compiled=True)(inputs)
+    np.testing.assert_array_equal(distance, np.full((1, 4), 2.0))
 
 
 FUNCTIONS: dict[str, Callable] = {

@@ -116,10 +116,10 @@ def pushed(friction: float = 0.0) -> tuple[Experiment, States]:
 def energy_j(term, x) -> float:
     """Ψ, by its formula and the solid's gap alone."""
     law, body = term.contact, term.contact.body
-    places = term.points.vectors(x[None])[:3, 0].T
+    from_origin = term.points.vectors(x[None])[:3, 0].T
     origin, *ends = x.reshape(-1, 3)[law.obstacle.nodes]
     axes = (np.array(ends) - origin) / (body.frame_m[1, 0] - body.frame_m[0, 0])
-    gap, _ = gaps(law.obstacle.shape, (places - origin) @ axes.T + body.frame_m[0])
+    gap, _ = gaps(law.obstacle.shape, from_origin @ axes.T + body.frame_m[0])
     kappa = law.obstacle.stiffness_pa_m
     if kappa is None:
         young_pa = TRUTH["mu_pa"] * (3 * 200 + 2 * 300) / (200 + 300)
@@ -361,7 +361,8 @@ def energies_j(experiment: Experiment, positions_m: np.ndarray, scheme: str) -> 
     elastic = {name: SPONGE[name] for name in ("lambda_pa", "mu_pa")}
     young_pa = 3e3 * (3 * 2e3 + 2 * 3e3) / (2e3 + 3e3)
     kappa, delta = 100 * young_pa / law.contact.surface.edge_m, law.contact.width_m
-    gap = law.points.vectors(positions_m.reshape(len(positions_m), -1))[2] + 0.005
+    above_m = law.points.vectors(positions_m.reshape(len(positions_m), -1))[2]
+    gap = above_m + body.frame_m[0, 2] + 0.005
     near = np.maximum(delta - gap, 0)
     still = (law.contact.surface.area_m2 * kappa / (3 * delta) * near**3).sum(axis=1)
     still += G_M_S2 * (mass * positions_m[..., 2]).sum(axis=1)

@@ -66,12 +66,23 @@ class ForcePoints:
         flat = forces.transpose(2, 0, 1).reshape(len(forces) * forces.shape[2], forces.shape[1])
         return (self._of(chosen).T @ flat).T
 
-    def entries(self, blocks: Array, chosen: Index | None = None, skew: bool = False) -> Array:
-        """(T, m) lower triangles on the couplings from those of blocks (3L, 3L, T, i)."""
+    def add_entries(
+        self,
+        to: Array,
+        places: Index,
+        blocks: Array,
+        chosen: Index | None = None,
+        skew: bool = False,
+    ) -> None:
+        """Add to (T, any) at places (m,) lower triangles on the couplings, from (3L, 3L, T, i).
+
+        Half of the sum of each block with its transpose, or with `skew` of the difference.
+        """
         columns, rows = np.triu_indices(len(blocks))
-        values = np.moveaxis(blocks[rows, columns], 0, 2)
-        onto = self._some("skew" if skew else "couplings", chosen)
-        return (onto @ values.reshape(len(values), onto.shape[1]).T).T
+        values = blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
+        onto, touched = self._some("skew" if skew else "couplings", chosen)
+        values = np.moveaxis(values, 0, 2).reshape(values.shape[1], onto.shape[1])
+        to[:, places[touched]] += (onto @ values.T).T / 2
 
     def _of(self, chosen: Index | None) -> sp.csr_array:
         """Rows of the operator."""
@@ -79,25 +90,27 @@ class ForcePoints:
 
     def _some(self, what: str, chosen: Index | None) -> Any:
         """Of a matrix what belongs to chosen instances; that of the last few choices is kept."""
-        whole = {
-            "operator": lambda: self._operator,
-            "couplings": lambda: self._onto_couplings,
-            "skew": lambda: self._onto_skew,
-        }[what]()
-        if chosen is None:
-            return whole
-        key = what, chosen.tobytes()
+        key = what, None if chosen is None else chosen.tobytes()
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.pop(next(iter(self._kept)), None)
             if what == "operator":
-                self._kept[key] = whole[_each(chosen, self.dofs)]
+                rows = slice(None) if chosen is None else _each(chosen, self.dofs)
+                self._kept[key] = self._operator[rows]
             else:
-                self._kept[key] = whole[:, _each(chosen, self.dofs * (self.dofs + 1) // 2)]
+                whole: Any = self._onto_skew if what == "skew" else self._onto_couplings
+                if chosen is not None:
+                    whole = whole[:, _each(chosen, self.dofs * (self.dofs + 1) // 2)]
+                # Of few instances most rows are empty.
+                is_touched = np.bincount(whole.indices, minlength=whole.shape[0]) > 0
+                number, touched = np.cumsum(is_touched) - 1, np.flatnonzero(is_touched)
+                parts = whole.data, number[whole.indices], whole.indptr
+                shape = len(touched), whole.shape[1]
+                self._kept[key] = sp.csc_array(parts, shape=shape), touched
         return self._kept[key]
 
     @cached_property
-    def _kept(self) -> dict[tuple[str, bytes], Any]:
+    def _kept(self) -> dict[tuple[str, bytes | None], Any]:
         return {}
 
     @cached_property

@@ -11,8 +11,8 @@ from .body import Body
 from .force_points import ForcePoints
 from .selection import Selection
 
-# A point of the surface, and the four nodes of a frame.
-VECTORS = 5
+# From the origin of a frame to a point of the surface, and to the ends of the frame's axes.
+VECTORS = 4
 
 # Barycentric points and weights of a triangle, exact to order 2 and 4 (Dunavant 1985).
 _A, _B = (0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)
@@ -33,7 +33,7 @@ class Touching:
     Attributes
     ----------
     points : ForcePoints
-        Quadrature points of faces; of each the point, and the nodes of the frame.
+        Quadrature points of faces; of each the ways from the frame's origin to it and to the ends.
     area_m2 : (i,)
     edge_m : float
         Mean length of an edge of the faces.
@@ -62,7 +62,8 @@ class Touching:
         nodes = np.hstack([faces, np.broadcast_to(frame, (len(faces), 4))])
         mix = np.zeros((count, VECTORS, nodes.shape[1]))
         mix[:, 0, : faces.shape[1]] = shape
-        mix[:, 1:, faces.shape[1] :] = np.eye(4)
+        mix[:, 1:, faces.shape[1] + 1 :] = np.eye(3)
+        mix[:, :, faces.shape[1]] = -1
         points = ForcePoints(
             np.repeat(nodes, count, axis=0), np.tile(mix, (len(faces), 1, 1)), len(body.nodes_m)
         )

@@ -92,57 +92,55 @@ class ContactLaw:
         return constants[-1] if isinstance(stated, str) else ca.SX(stated)
 
     def seen(self, y: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """A point in the frame of its obstacle, and the axes of that."""
-        point, origin, *ends = ca.vertsplit(y, 3)
-        size_m = float(self.body.frame_m[1, 0] - self.body.frame_m[0, 0])
-        axes = ca.horzcat(*[(end - origin) / size_m for end in ends])
-        return axes.T @ (point - origin), axes
+        """A point in the frame of its obstacle, from the origin on, and the axes of that."""
+        point, *ends = ca.vertsplit(y, 3)
+        axes = ca.horzcat(*ends) / self._size_m
+        return axes.T @ point, axes
 
-    def gap(self, y: ca.SX) -> ca.SX:
-        """G of (y, X)."""
-        return self.obstacle.shape.gap(self.seen(y)[0] + ca.DM(self.body.frame_m[0]))
+    @property
+    def _size_m(self) -> float:
+        """Of the frame."""
+        return float(self.body.frame_m[1, 0] - self.body.frame_m[0, 0])
 
-    def pressure(self, y: ca.SX, constants: ca.SX) -> ca.SX:
-        """κ/δ ⟨δ − g⟩²."""
-        near = ca.fmax(self.width_m - self.gap(y), 0)
-        return self.stiffness(constants) / self.width_m * near**2
+    def gap(self, place: ca.SX) -> ca.SX:
+        """G at a place so seen."""
+        return self.obstacle.shape.gap(place + ca.DM(self.body.frame_m[0]))
 
     @cached_property
     def distance(self) -> Generated:
         """G alone."""
-        return Generated(lambda y, _: self.gap(y), 3 * VECTORS, 0)
+        return Generated(lambda y, _: self.gap(self.seen(y)[0]), 3 * VECTORS, 0, compiled=True)
 
     @cached_property
     def generated(self) -> Generated:
         """The forces, of (y, ẏ, c) or (y, c); data are A."""
         moving = 3 * VECTORS * self.obstacle.rubs
-        return Generated(self.force, 3 * VECTORS + moving + len(self.columns), 1)
+        return Generated(self.force, 3 * VECTORS + moving + len(self.columns), 1, compiled=True)
 
     def force(self, u: ca.SX, area: ca.SX) -> ca.SX:
-        """(15,) on the point and on the frame."""
+        """(12,) on the ways to the point and to the ends of the frame."""
         size = 3 * VECTORS
         y, constants = u[:size], u[u.numel() - len(self.columns) :]
-        near = ca.fmax(self.width_m - self.gap(y), 0)
-        energy = area * self.stiffness(constants) / (3 * self.width_m) * near**3
-        force = -ca.gradient(energy, y)
+        place, axes = self.seen(y)
+        here = ca.SX.sym("place", 3)
+        gap, slope = self.gap(here), ca.gradient(self.gap(here), here)
+        gap, slope = ca.substitute([gap, slope], [here], [place])
+        near = ca.fmax(self.width_m - gap, 0)
+        normal_n = area * self.stiffness(constants) / self.width_m * near**2
+        # What turns the frame is as the point is seen along its axes.
+        push = normal_n * slope
+        force = ca.vertcat(axes @ push, ca.vec(y[:3] @ push.T) / self._size_m)
         if not self.obstacle.rubs:
             return force
-        v = u[size : 2 * size]
-        normal_n = area * self.pressure(y, constants)
-        lost = self.friction(constants) * normal_n * self._speed(y, v)
-        return force - ca.gradient(lost, v)
-
-    def _speed(self, y: ca.SX, v: ca.SX) -> ca.SX:
-        """√(|v_t|² + ε²)."""
-        place, _ = self.seen(y)
-        size_m = float(self.body.frame_m[1, 0] - self.body.frame_m[0, 0])
-        own, origin, *ends = ca.vertsplit(v, 3)
-        carried = sum((place[k] / size_m * (end - origin) for k, end in enumerate(ends)), origin)
-        normal = ca.gradient(self.gap(y), y)[:3]
-        normal = normal / ca.norm_2(normal)
-        against = own - carried
+        against, *ends = ca.vertsplit(u[size : 2 * size], 3)
+        shares = place / self._size_m
+        against -= ca.horzcat(*ends) @ shares
+        normal = axes @ slope
+        normal /= ca.norm_2(normal)
         along = against - normal * ca.dot(normal, against)
-        return ca.sqrt(ca.sumsqr(along) + self.slip**2)
+        speed = ca.sqrt(ca.sumsqr(along) + self.slip**2)
+        rub = -self.friction(constants) * normal_n / speed * along
+        return force + ca.vertcat(rub, -ca.vec(rub @ shares.T))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,12 +186,14 @@ class Contact(Pointwise):
         """Obstacles move with their frames, as grasps do."""
         return self
 
-    def acting(self, states: States) -> Index:
-        """Points within δ at any of the times, and some more."""
-        gap = self.contact.distance.value(self.points.vectors(states.xi), self._no_data(states))[0]
-        near = np.flatnonzero((gap < self.contact.width_m).any(axis=0))
-        beside = np.setdiff1d(np.arange(min(self.points.count, len(near) + AT_A_TIME)), near)
-        return np.sort(np.append(near, beside[: -len(near) % AT_A_TIME]))
+    def acting(self, states: States) -> tuple[Index, Array]:
+        """Points within δ at any of the times, and some more, with their y."""
+        y = self.points.vectors(states.xi)
+        gap = self.contact.distance.value(y, np.zeros((0, *y.shape[1:])))[0]
+        near = (gap < self.contact.width_m).any(axis=0)
+        near[np.flatnonzero(~near)[: -near.sum() % AT_A_TIME]] = True
+        chosen = np.flatnonzero(near)
+        return chosen, y[..., chosen]
 
     def deepest(self, x: Array) -> tuple[float, Array]:
         """How far within δ the point is at x (3n,) that is deepest, and the normal (3,) there."""
@@ -201,9 +201,6 @@ class Contact(Pointwise):
         gap, slopes = self.contact.distance.slopes(y, np.zeros((0, *y.shape[1:])))
         place = int(gap[0, 0].argmin())
         return self.contact.width_m - float(gap[0, 0, place]), slopes[0, :3, 0, place]
-
-    def _no_data(self, states: States) -> Array:
-        return np.zeros((0, len(states.xi), self.points.count))
 
     def constants(self, states: States) -> Array:
         """What κ follows, and the friction."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..fem.kernels import COMPILING, Instances, make_instances
 
 Expression = Callable[[ca.SX, ca.SX], ca.SX]
 
@@ -30,11 +30,14 @@ class Generated:
         ``expression(u, data) -> y`` in CasADi operations, of columns.
     inputs, data : int
         Lengths k of u and d of the data.
+    compiled : bool
+        Whether it is evaluated at so many instances that compiling it pays.
     """
 
     expression: Expression
     inputs: int
     data: int
+    compiled: bool = False
 
     def value(self, u: Array, data: Array) -> Array:
         """(m, …)."""
@@ -121,27 +124,16 @@ class Generated:
         sizes = [function.size_out(k) for k in range(function.n_out())]
         if not count:
             return [np.zeros((*size, *shape)) for size in sizes]
-        key = function.name(), count
-        if key not in self._mappings:
-            self._mappings[key] = function.map(count)
-        # Through buffers, as CasADi's own matrices take ten times as long.
-        buffer, evaluate = self._mappings[key].buffer()
-        # CasADi declares no type for what it takes.
-        take: Any = buffer.set_arg
-        give: Any = buffer.set_res
-        given = [np.ascontiguousarray(x.reshape(len(x), count).T, float) for x in (u, *others)]
-        found = [np.empty((count, columns, rows)) for rows, columns in sizes]
-        for place, each in enumerate(given):
-            if each.size:
-                take(place, each.data)
-        for place, each in enumerate(found):
-            give(place, each.data)
-        evaluate()
-        axes = len(shape) + 1, len(shape), *range(len(shape))
-        return [each.reshape(*shape, *each.shape[1:]).transpose(axes) for each in found]
+        name = function.name()
+        with COMPILING:
+            if name not in self._evaluators:
+                self._evaluators[name] = make_instances(function, self.compiled)
+        found = self._evaluators[name]([x.reshape(len(x), count) for x in (u, *others)])
+        pairs = zip(found, sizes, strict=True)
+        return [each.reshape(*size[::-1], *shape).swapaxes(0, 1) for each, size in pairs]
 
     @cached_property
-    def _mappings(self) -> dict[tuple[str, int], ca.Function]:
+    def _evaluators(self) -> dict[str, Instances]:
         return {}
 
 

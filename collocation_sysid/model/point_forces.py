@@ -70,12 +70,12 @@ class Pointwise(ForceTerm):
         """Whether it depends on ẏ."""
         return True
 
-    def acting(self, states: States) -> Index | None:
-        """The instances at which it may be more than nothing; None for all.
+    def acting(self, states: States) -> tuple[Index | None, Array]:
+        """The instances at which it may be more than nothing, None for all, and y of these.
 
         Others leave nothing either.
         """
-        return None
+        return None, self.points.vectors(states.xi)
 
     @abstractmethod
     def constants(self, states: States) -> Array:
@@ -108,8 +108,7 @@ class Pointwise(ForceTerm):
         return since_s, (since_s == 0).astype(float)
 
     def _at(self, states: States) -> _At:
-        chosen = self.acting(states)
-        y, constants = self.points.vectors(states.xi, chosen), self.constants(states)
+        (chosen, y), constants = self.acting(states), self.constants(states)
         moving = (self.points.vectors(states.nu, chosen),) if self.by_velocity else ()
         steady = np.broadcast_to(constants[..., None], (len(constants), *y.shape[1:]))
         before = np.zeros((self.carries, *y.shape[1:]))
@@ -132,17 +131,15 @@ class Pointwise(ForceTerm):
         value, slopes = value[here.y], self.share * slopes[here.y]
         at.force[:] += self.share * points.summed(value, here.chosen)
         by_x, by_v, by_c = (slopes[:, part] for part in (here.y, here.v, here.c))
-        both = by_x + by_x.swapaxes(0, 1)
-        at.by_position[:, places.entries] += points.entries(both, here.chosen) / 2
+        at_x, add = (places.entries, by_x, here.chosen), points.add_entries
+        add(at.by_position, *at_x)
         if at.by_position_skew.size:
-            skew = points.entries(by_x - by_x.swapaxes(0, 1), here.chosen, skew=True) / 2
-            at.by_position_skew[:, places.entries] += skew
+            add(at.by_position_skew, *at_x, skew=True)
+        at_v = places.entries, by_v, here.chosen
         if self.by_velocity:
-            both = by_v + by_v.swapaxes(0, 1)
-            at.by_velocity[:, places.entries] += points.entries(both, here.chosen) / 2
+            add(at.by_velocity, *at_v)
         if self.spins:
-            skew = points.entries(by_v - by_v.swapaxes(0, 1), here.chosen, skew=True) / 2
-            at.by_velocity_skew[:, places.entries] += skew
+            add(at.by_velocity_skew, *at_v, skew=True)
         for k, column in enumerate(self.columns(places)):
             at.by_theta[:, :, column] += points.summed(by_c[:, k], here.chosen)
 
@@ -151,15 +148,13 @@ class Pointwise(ForceTerm):
         here, points, entries = self._at(states), self.points, places.entries
         w, x, v = self._weights(here, weights), here.y, here.v
         whole = self.law.curvature(here.u, here.data, w)
-        at.position_position[:, entries] += points.entries(whole[x, x], here.chosen)
+        add, chosen = points.add_entries, here.chosen
+        add(at.position_position, entries, whole[x, x], chosen)
         if self.by_velocity:
-            xv = whole[x, v]
-            both = points.entries(xv + xv.swapaxes(0, 1), here.chosen)
-            at.position_velocity[:, entries] += both / 2
+            add(at.position_velocity, entries, whole[x, v], chosen)
             if at.position_velocity_skew.size:
-                skew = points.entries(xv - xv.swapaxes(0, 1), here.chosen, skew=True) / 2
-                at.position_velocity_skew[:, entries] += skew
-            at.velocity_velocity[:, entries] += points.entries(whole[v, v], here.chosen)
+                add(at.position_velocity_skew, entries, whole[x, v], chosen, skew=True)
+            add(at.velocity_velocity, entries, whole[v, v], chosen)
         _, slopes = self.law.slopes(here.u, here.data)
         columns = list(enumerate(self.columns(places), here.c.start))
         for k, column in columns:

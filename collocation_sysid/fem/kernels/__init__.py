@@ -13,6 +13,7 @@ that solve, from an empty cache, took 3.3 and 3.1 s of processor time in place o
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ import casadi as ca
 from ...errors import InputError
 from .batch import Batch, CasadiEvaluator, Evaluator, VectorCodeError
 from .combine import Combiner, Plan, combine_natively, combine_with_numpy
+from .instances import Instances, instances_by_casadi, instances_natively
 from .threads import COMPILING, alone, at_once, available_threads, in_slices, side_by_side
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ __all__ = [
     "Batch",
     "Evaluator",
     "EvaluatorChoice",
+    "Instances",
     "VectorCodeError",
     "alone",
     "at_once",
@@ -41,6 +44,7 @@ __all__ = [
     "in_slices",
     "make_combiner",
     "make_evaluator",
+    "make_instances",
     "make_skyline",
     "side_by_side",
 ]
@@ -156,6 +160,15 @@ class EvaluatorChoice:
             f"The material is evaluated by CasADi's map, which is many times slower: "
             f"{error.message}.",
         )
+
+
+def make_instances(function: ca.Function, compiled: bool) -> Instances:
+    """A function at many instances, compiled where that is asked for and can be."""
+    if compiled and choose_evaluator() == "simd":
+        # What llvmlite raises where it cannot compile, and what there is no instruction for.
+        with suppress(RuntimeError, VectorCodeError):
+            return instances_natively(function)
+    return instances_by_casadi(function)
 
 
 def make_combiner(plan: Plan) -> Combiner:

@@ -1,0 +1,101 @@
+"""A function of a few numbers at many instances, natively or by CasADi's own machine.
+
+Numbers are (k, instances) arrays, and so are the entries of its dense outputs, column after column.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...arrays import Array
+
+Instances = Callable[[list[Array]], list[Array]]
+
+
+def instances_by_casadi(function: ca.Function) -> Instances:
+    """The reference: mapped over so many instances as there are."""
+    mapped: dict[int, ca.Function] = {}
+
+    def evaluate(inputs: list[Array]) -> list[Array]:
+        count = inputs[0].shape[1]
+        if count not in mapped:
+            mapped[count] = function.map(count)
+        # Through buffers, as CasADi's own matrices take ten times as long.
+        buffer, run = mapped[count].buffer()
+        # CasADi declares no type for what it takes.
+        take: Any = buffer.set_arg
+        give: Any = buffer.set_res
+        arguments = [np.ascontiguousarray(each.T, float) for each in inputs]
+        outputs = [np.empty((count, function.nnz_out(k))) for k in range(function.n_out())]
+        for place, each in enumerate(arguments):
+            if each.size:
+                take(place, each.data)
+        for place, each in enumerate(outputs):
+            give(place, each.data)
+        run()
+        return [each.T for each in outputs]
+
+    return evaluate
+
+
+def instances_natively(function: ca.Function) -> Instances:
+    """The same in vector code, whose lanes are instances."""
+    from .instructions import check_operations
+    from .jit import CompiledFunction, address, vector_lanes
+
+    check_operations(function)
+    lanes, arrays = vector_lanes(), function.n_in() + function.n_out()
+    key = f"instances {lanes} {hashlib.sha256(function.serialize().encode()).hexdigest()}"
+    signature = [ctypes.c_int64, *[ctypes.c_void_p] * arrays]
+    run = CompiledFunction(lambda: _emit(function, lanes), "instances", key, signature)
+
+    def evaluate(inputs: list[Array]) -> list[Array]:
+        count = inputs[0].shape[1]
+        whole = -(-count // lanes) * lanes
+        if whole > count:
+            # The last lanes repeat the last instance.
+            here = np.minimum(np.arange(whole), count - 1)
+            inputs = [each[:, here] for each in inputs]
+        arguments = [np.ascontiguousarray(each, float) for each in inputs]
+        outputs = [np.empty((function.nnz_out(k), whole)) for k in range(function.n_out())]
+        run(whole, *map(address, [*arguments, *outputs]))
+        return [each[:, :count] for each in outputs]
+
+    return evaluate
+
+
+def _emit(function: ca.Function, lanes: int) -> Any:
+    """Writes ``instances(count, input…, output…)``, for whole blocks of W instances."""
+    from llvmlite import ir
+
+    from .instructions import function_values
+    from .jit import DOUBLE, DOUBLES, I64, Builder, Value, counting
+
+    module, vector = ir.Module(), ir.VectorType(DOUBLE, lanes)
+    arrays = [DOUBLES] * (function.n_in() + function.n_out())
+    kind = ir.FunctionType(ir.VoidType(), [I64, *arrays])
+    run = ir.Function(module, kind, "instances")
+    count, *places = run.args
+    for place in places:
+        place.add_attribute("noalias")
+    b: Builder = ir.IRBuilder(run.append_basic_block("entry"))
+    with counting(b, I64(0), b.udiv(count, I64(lanes)), "block") as block:
+        first = b.mul(block, I64(lanes))
+
+        def pointer(array: int, entry: int) -> Value:
+            place = b.gep(places[array], [b.add(b.mul(I64(entry), count), first)])
+            return b.bitcast(place, vector.as_pointer())
+
+        def read(array: int, entry: int) -> Value:
+            return b.load(pointer(array, entry), align=8)
+
+        for output, entry, value in function_values(b, function, vector, read):
+            b.store(value, pointer(function.n_in() + output, entry), align=8)
+    b.ret_void()
+    return module
