@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from collocation_sysid.recording import Grasp
 from collocation_sysid.runs.check import description_causes
 from collocation_sysid.runs.check.body import hold_concerns, holds_of
 from collocation_sysid.statistics.causes import likely_causes
-from collocation_sysid.statistics.plausible import odd_material, oddities
+from collocation_sysid.statistics.plausible import odd_material, oddities, steps
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from twins import BODIES, SOFT, STIFF, twin
@@ -152,6 +153,15 @@ def test_the_search_for_causes_is_bounded_by_what_the_fit_took(monkeypatch, rng)
     assert len(sweeps) > 1
     assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done
     assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
+
+
+@pytest.mark.parametrize("count", [0, 4])
+def test_markers_that_are_hardly_ever_seen_are_nothing_sudden(count: int):
+    (experiment,) = soft("block").experiments
+    tracks = np.array(experiment.markers.positions_m)
+    tracks[: len(tracks) - count, 0] = np.nan
+    with warnings.catch_warnings(action="error"):
+        assert list(steps(with_markers(experiment, tracks))) == []
 
 
 # Sizes and densities ------------------------------------------------------------------------------

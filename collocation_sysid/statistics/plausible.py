@@ -185,8 +185,10 @@ def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
     others = np.delete(to_others, marker, axis=1)
     if not others.shape[1]:
         return True
-    change = np.nanmedian(others[sample:], axis=0) - np.nanmedian(others[:sample], axis=0)
-    return bool(np.nanmax(np.abs(change)) > 0.3 * step_m)
+    before, after = others[:sample], others[sample:]
+    both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
+    change = np.nanmedian(after[:, both], axis=0) - np.nanmedian(before[:, both], axis=0)
+    return bool(np.abs(change).max(initial=0.0) > 0.3 * step_m)
 
 
 def _lively(sizes: Array) -> float:
