@@ -35,12 +35,12 @@ NOTHING = {name: "none" for name in Assumptions().deviations}
 
 def problem(**stated) -> Problem:
     options = UncertaintyOptions(assumptions=Assumptions(**stated))
-    return Problem([measured(hung_cube(20))], GUESS, uncertainty=options)
+    return Problem([measured(hung_cube(20))], GUESS, substeps=1, uncertainty=options)
 
 
 @pytest.fixture(scope="module")
 def finished():
-    return run(problem(), seek_causes=False)
+    return run(replace(problem(), substeps="auto"), seek_causes=False)
 
 
 def test_the_shares_of_a_budget_sum_to_one_largest_first(finished):
@@ -153,7 +153,7 @@ def swings(*gamma_r_s: float) -> Problem:
         noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(markers.shape)
         recordings.append(with_markers(swing, markers + noise_m))
     options = UncertaintyOptions(assumptions=Assumptions(**NOTHING), numerical=False)
-    return Problem(recordings, GUESS, uncertainty=options)
+    return Problem(recordings, GUESS, substeps=1, uncertainty=options)
 
 
 def test_what_recordings_disagree_on_is_in_the_whole_interval():

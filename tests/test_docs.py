@@ -49,6 +49,10 @@ def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: P
     names: dict[str, object] = {"__name__": "docs"}
     if "import mujoco\n" in page.read_text():
         pytest.importorskip("mujoco")
+    # Half of the recording that pages read shows as well that they run.
+    markers = checkout / "problems" / "foam_cylinder" / "swing_markers.csv"
+    lines = markers.read_text().splitlines(keepends=True)
+    markers.write_text("".join(lines[: len(lines) // 2]))
     for code in blocks(page, "python"):
         exec(compile(code, name_of(page), "exec", dont_inherit=True), names)
 

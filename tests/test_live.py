@@ -135,7 +135,7 @@ def unknown(problem: cs.Problem) -> cs.Problem:
     known = seen.markers
     markers = Markers(known.t_s, known.positions_m, known.sigma_m, known.names)
     free = {name: cs.Unknown() for name in ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")}
-    return cs.Problem([replace(seen, markers=markers)], free)
+    return cs.Problem([replace(seen, markers=markers)], free, substeps=1)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_when_frames_end_the_estimate_settles_where_the_batch_ends(problem):
 
 
 def test_it_settles_at_the_batch_of_what_was_not_left_out():
-    problem = swing()
+    problem = replace(swing(), substeps=1)
     live = Estimator(problem, NO_TIME)
     (seen,) = problem.experiments
     tracks = seen.markers.positions_m.copy()
@@ -170,7 +170,8 @@ def test_it_settles_at_the_batch_of_what_was_not_left_out():
             frame = replace(frame, tracks_m=nowhere)
         live.take(frame)
     settled = live.settle()
-    batch = cs.run(cs.Problem([cs.with_markers(seen, tracks)], GUESS), seek_causes=False)
+    whole = replace(problem, experiments=[cs.with_markers(seen, tracks)])
+    batch = cs.run(whole, seek_causes=False)
     assert "8 % of the markers' samples lie far from where they can be" in settled.trust.reasons
     for name, estimate in settled.estimates.items():
         assert estimate.value == pytest.approx(batch.parameters[name], rel=1e-6)
@@ -586,7 +587,7 @@ def felt(bias_m_s2: float = 0.3) -> cs.Problem:
     accelerations = accelerations + [0, 0, bias_m_s2] + 0.05 * rng.normal(size=(len(inner), 3))
     accelerations[5, 1] = accelerations[7] = np.nan
     strains = strains + 1e-4 * rng.normal(size=strains.shape)
-    return cs.Problem([cs.with_readings(made, [accelerations, strains])], GUESS)
+    return cs.Problem([cs.with_readings(made, [accelerations, strains])], GUESS, substeps=1)
 
 
 def test_readings_of_ones_own_say_what_they_say_to_the_batch(monkeypatch):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import chain
 
 import casadi as ca
@@ -415,9 +416,15 @@ PROGRAMS: dict[str, Make] = {
 }
 
 
+@cache
+def made_of(name: str) -> Collocation:
+    """What collecting the tests asks is asked of the programs that they check."""
+    return PROGRAMS[name]()
+
+
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_matrices_are_those_of_differences_and_laid_out_in_order(name: str, rng):
-    made = PROGRAMS[name]().made_explicit()
+    made = made_of(name).made_explicit()
     z, y = some_point(made, rng), rng.normal(size=made.constraints)
 
     def slope(at: np.ndarray) -> np.ndarray:
@@ -443,7 +450,7 @@ def test_matrices_are_those_of_differences_and_laid_out_in_order(name: str, rng)
 
 @pytest.mark.parametrize("name", ["places unknown", "places unknown, huber", "wrench, huber"])
 def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(name: str, rng):
-    made = PROGRAMS[name]().made_explicit()
+    made = made_of(name).made_explicit()
     z = some_point(made, rng)
     convex = np.linalg.eigvalsh(made.hessian(z, 1.0, None).toarray())
     assert convex[0] > -1e-12 * convex[-1]
@@ -453,12 +460,12 @@ def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(name: str,
 
 
 # Where nothing but the last rows is left out: what moves the body moves it along its equations.
-ALONG = [name for name in PROGRAMS if not PROGRAMS[name]().remembers and "fixed" not in name]
+ALONG = [name for name in PROGRAMS if not made_of(name).remembers and "fixed" not in name]
 
 
 @pytest.mark.parametrize("name", ALONG)
 def test_sensitivities_keep_the_linearised_constraints(name: str, rng):
-    made = PROGRAMS[name]()
+    made = made_of(name)
     z = some_point(made, rng)
     jacobian, found = made.jacobian(z), []
     for part in made.parts(z):
@@ -477,13 +484,13 @@ def test_sensitivities_keep_the_linearised_constraints(name: str, rng):
 
 
 def can_be_simulated(name: str) -> bool:
-    made = PROGRAMS[name]()
+    made = made_of(name)
     return len(made.guess_p) > 0 and not made.explicit_grasps
 
 
 @pytest.mark.parametrize("name", [name for name in PROGRAMS if can_be_simulated(name)])
 def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(name: str, rng):
-    made = PROGRAMS[name]()
+    made = made_of(name)
     q, phi = made.parameters.guess_q, 0.1 + 0.3 * np.abs(rng.normal(size=made.nphi))
     p = np.clip(np.concatenate([q, phi]), *made.bounds_p)
     z = simulated(made, p)
