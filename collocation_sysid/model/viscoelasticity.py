@@ -70,7 +70,7 @@ def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
     return ca.vertcat(_stiffening(u, data), OVERSTRESS.coefficients(u, data)[:2])
 
 
-COEFFICIENTS = Generated(_coefficients, 2, 3)
+COEFFICIENTS, STIFFENING = Generated(_coefficients, 2, 3), Generated(_stiffening, 2, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +111,6 @@ class Fading:
         """Derivatives (q, B, N) of d and a by what θ changes with by theta_q (k, q)."""
         d_q, a_q = np.einsum("cjbn,jbq->cqbn", self.by[1:], theta_q[self.places])
         return d_q, a_q
-
-    def bent(self, weights: Array) -> Array:
-        """Second derivatives (2, 2, B, N) of the sum of c, d and a with weights (3, B, N)."""
-        return COEFFICIENTS.curvature(self.u, self.data, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +168,7 @@ class History:
         found.overstress[:] = self.memory.summed(self.brought[rows])
         for branch, c in zip(self.memory.branches, fades.c, strict=True):
             found.stiffening[:, branch.part] += c[rows]
-        bent = fades.bent(np.stack([np.ones_like(fades.c), 0 * fades.c, 0 * fades.c]))
+        bent = STIFFENING.curvature(fades.u, fades.data)
         found.slopes[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
         found.bends[:, fades.places[:, None], fades.places] = np.moveaxis(bent[..., rows], 3, 0)
         return found
@@ -216,10 +212,14 @@ class History:
         """σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k."""
         return self.memory.summed(self.memory.spread(self.fading.a) * mu)
 
-    def _sums(self, mu: Array) -> tuple[Array, Array]:
-        """Derivatives (B, N) by d and by a."""
-        totals, borne = self.memory.totals, self.memory.borne(self.stress)
-        return totals(mu * self.brought), totals(mu * borne)
+    def _summed(self, mu: Array) -> Array:
+        """U (5, B, N) of `OVERSTRESS` whose value is Σ μ_k m_k of each branch.
+
+        As that is linear in m and S, it goes on from Σ μ_k m_{k−1}, at Σ μ_k S_k.
+        """
+        borne = self.memory.borne(self.stress)
+        before, now = (self.memory.totals(mu * each) for each in (self.brought, borne))
+        return np.stack([before, now, 0 * now, *self.fading.u])
 
     def stress_by(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
         """∂S/∂θ θ_q (T, q, width), a few evaluations at a time."""
@@ -243,8 +243,9 @@ class History:
         mu = np.zeros_like(pushes)
         for k in range(len(mu) - 1, 0, -1):
             mu[k - 1] = d[k] * mu[k] + pushes[k]
-        parts = zip(self.fading.along(theta_q), self._sums(mu), strict=True)
-        by_q = np.sum([np.einsum("qbn,bn->q", *each) for each in parts], axis=0)
+        _, by = OVERSTRESS.step.slopes(self._summed(mu), self.fading.data)
+        by_own = by[0, OVERSTRESS.ends[2] :]
+        by_q = np.einsum("jbn,jbq->q", by_own, theta_q[self.fading.places])
         sigma = self.stress_weights(mu)
         for rows, slopes in self.stress_by(theta_q):
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
@@ -254,25 +255,25 @@ class History:
     def add_curvature(self, curvature: Curvature, mu: Array) -> None:
         """Add those by g and τ, and those by another.
 
-        In place, to the N states of a `Curvature` that has those of Σ σ_k S_k.
+        In place, to the N states of a `Curvature` that has those of Σ σ_k S_k. A branch's Σ μ_k m_k
+        bends by (g, τ), and by these with Σ μ_k S_k, which moves with ξ and with moduli.
         """
-        fades, elastic, (of_m, of_stress) = self.fading, self.body.elastic_places, self._sums(mu)
-        weights, places = np.stack([0 * of_m, of_m, of_stress]), fades.places
-        curvature.theta[:, places] += np.einsum("cbn,cjbn->njb", weights, fades.by)
-        bent = np.moveaxis(fades.bent(weights), 3, 0)
-        curvature.theta_theta[:, places[:, None], places] += bent
-        sigmas = {}
-        for (j, b), place in np.ndenumerate(places):
-            only = np.zeros_like(fades.a)
-            only[b] = fades.by[2, j, b]
-            sigmas[place] = self.memory.summed(self.memory.spread(only) * mu)
-            pulled = self.body.stresses.pulled(self.xi, sigmas[place], self.theta)
-            curvature.position_theta[:, :, place] += pulled
-        for rows, slopes in self.stress_by(np.eye(len(self.theta))[:, elastic]):
-            for place, sigma in sigmas.items():
-                by = np.einsum("tqp,tp->tq", slopes, sigma[rows])
-                curvature.theta_theta[rows, place, elastic] += by
-                curvature.theta_theta[rows, elastic, place] += by
+        memory, places, at = self.memory, self.fading.places, (self._summed(mu), self.fading.data)
+        elastic, own = self.body.elastic_places, slice(OVERSTRESS.ends[2], None)
+        slopes, bent = OVERSTRESS.step.slopes(*at)[1], OVERSTRESS.step.curvature(*at)
+        curvature.theta[:, places] += np.moveaxis(slopes[0, own], 2, 0)
+        curvature.theta_theta[:, places[:, None], places] += np.moveaxis(bent[own, own], 3, 0)
+        across = bent[own, 1]
+        for number, of_branch in enumerate(memory.spread(np.eye(len(memory.branches)))):
+            weights = memory.summed(of_branch * mu)
+            by_xi = self.body.stresses.pulled(self.xi, weights, self.theta)
+            for place, factor in zip(places[:, number], across[:, number], strict=True):
+                curvature.position_theta[:, :, place] += factor[:, None] * by_xi
+        for rows, by in self.stress_by(np.eye(len(self.theta))[:, elastic]):
+            by_moduli = memory.totals(memory.borne(by) * mu[rows, None])
+            both = np.einsum("jbt,bte->tjbe", across[..., rows], by_moduli)
+            curvature.theta_theta[rows, places[..., None], elastic] += both
+            curvature.theta_theta[rows, elastic, places[..., None]] += both
 
 
 @dataclass(frozen=True, eq=False)
