@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from problems_small import GUESS, measured, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.program.touches import touches
@@ -98,3 +99,12 @@ def test_a_contact_of_few_faces_is_told():
     (wide,) = touches(poked(), cs.simulate(poked(), TRUTH).positions_m.reshape(len(DEPTHS_M), -1))
     assert wide.faces > touch.faces
     assert wide.gap_m < 1e-4
+
+
+def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
+    seen = measured(pressed_cube(6))
+    run = cs.run(cs.Problem([seen], GUESS), seek_causes=False)
+    assert run.refinement is None
+    assert run.result.parameters["mu_pa"].ci95_holds == ("noise",)
+    free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).gripping))
+    assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None

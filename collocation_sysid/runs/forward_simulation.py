@@ -141,11 +141,13 @@ def step_error(
     """What the step does to every parameter and modulus, to first order.
 
     From a Gauss–Newton step towards the forward simulations; None where these are missing or no
-    finer, and where all is static.
+    finer, where all is static, and where something is touched in motion: an impact within a step
+    moves forces by far more than first order tells, and rings in the forward simulation.
     """
     apart: list[Array] = []
     collocation = solution.collocation
-    if all(segment.experiment.static for segment in collocation.segments):
+    moving = [s.experiment for s in collocation.segments if not s.experiment.static]
+    if not moving or any(experiment.obstacles for experiment in moving):
         return None
     for segment, readings in zip(collocation.segments, solution.readings_m, strict=True):
         experiment, rollout = segment.experiment, rollouts.get(segment.experiment.name)
