@@ -42,8 +42,8 @@ class Stretches(Carried):
     called = "stretch"
 
     @property
-    def count(self) -> int:
-        return 3 * self.segment.grid_rows
+    def shape(self) -> tuple[int, int, int]:
+        return 1, self.segment.grid_rows, 3
 
     @property
     def began(self) -> np.ndarray:
@@ -63,7 +63,7 @@ class Stretches(Carried):
 
     @cached_property
     def patterns(self) -> tuple[Pattern, ...]:
-        rows = np.arange(self.count).reshape(1, -1, 3)
+        rows = np.arange(self.count).reshape(self.shape)
         columns = np.arange(self.segment.columns.start, self.segment.columns.stop)
         at = self.looked(columns.reshape(self.segment.grid_rows, -1))
         recursion = Recursion(

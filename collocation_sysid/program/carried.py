@@ -51,8 +51,13 @@ class Carried(ABC):
 
     @property
     @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Of the variables, and of the equations."""
+
+    @property
     def count(self) -> int:
         """Number of variables, and of equations."""
+        return int(np.prod(self.shape))
 
     @property
     def variables(self) -> slice:

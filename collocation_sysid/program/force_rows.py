@@ -61,11 +61,6 @@ class ForceRows(Carried):
         term = self.segment.dynamics.forces.pointwise(self.force_number)[0]
         return term.carries, self.segment.grid_rows - 1, self._points.count
 
-    @property
-    def count(self) -> int:
-        """Number of variables, and of equations."""
-        return int(np.prod(self.shape))
-
     def following(self, part: Part) -> Array:
         """The variables as they follow from positions and parameters."""
         return self._of(part).brought.before[:, 1:].ravel() / self.segment.length_m

@@ -37,11 +37,6 @@ class Reactions(Carried):
         """Grid times from the first with a row on, and dofs."""
         return self.segment.constraint_times, len(self.dofs)
 
-    @property
-    def count(self) -> int:
-        """Number of variables, and of equations."""
-        return self.shape[0] * self.shape[1]
-
     def places_of(self, times: Index, dofs: Index) -> Index:
         """Places (T, k) in z of some grid times and of dofs, by their numbers among `dofs`."""
         first = self.segment.dynamics.first_row

@@ -71,11 +71,6 @@ class Overstress(Carried):
         """Evaluations that bring something, and how many numbers all branches carry."""
         return self.segment.grid_rows - 1, self.segment.body.memory.branches[-1].own.stop
 
-    @property
-    def count(self) -> int:
-        """Number of variables, and of equations."""
-        return self.shape[0] * self.shape[1]
-
     @cached_property
     def unit_pa(self) -> Array:
         """(width,) S̄: the normal entries of dS/dε of an even stretch, on average over the part."""

@@ -60,9 +60,9 @@ class WrenchRows(Carried):
         return 6 * self.channel.count
 
     @property
-    def count(self) -> int:
-        """Number of variables, and of equations."""
-        return self._each * (1 + len(self.channel.lag_phi))
+    def shape(self) -> tuple[int, int, int]:
+        """W and, with a low-pass, Y; samples on the grid; forces and moments."""
+        return 1 + len(self.channel.lag_phi), self.channel.count, 6
 
     @cached_property
     def _unit(self) -> Array:
@@ -102,7 +102,7 @@ class WrenchRows(Carried):
     @cached_property
     def patterns(self) -> tuple[Pattern, ...]:
         """W itself, the moments of the nodes, the tool, and the low-pass."""
-        channel, numbers = self.channel, np.arange(self.count).reshape(-1, self.channel.count, 6)
+        channel, numbers = self.channel, np.arange(self.count).reshape(self.shape)
         wrench, of_wrench = self.places.variable + numbers[0].T, numbers[0].T
         unit, minus = self._unit[:, None], -self._row_unit[:, None]
         own = Numbers(of_wrench, -minus)
