@@ -98,14 +98,15 @@ def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(
     if huber:  # under which most samples count less than they are
         noise_m = 5e-3 * np.random.default_rng(1).standard_normal((21, 9, 3))
         experiment = with_markers(experiment, experiment.markers.positions_m + noise_m)
-    first = solve(Problem([experiment], GUESS, huber=huber), ReducedSpace(tolerance=1e-9))
+    described = Problem([experiment], GUESS, substeps=1, huber=huber)
+    first = solve(described, ReducedSpace(tolerance=1e-9))
     collocation, off = first.collocation, 2e-4
     changes = considered(collocation, first.z, {"calibration_scale": off})
     assert changes.names == ("calibration_scale", "calibration_distortion_1_m2", "clock_rate")
     told = -shifts(linearised_fit(collocation, first.z), changes.blocks)[: len(first.q), 0]
     pivot = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
     tracks = pivot + (1 + off) * (experiment.markers.positions_m - pivot)
-    moved = Problem([with_markers(experiment, tracks)], GUESS, huber=huber)
+    moved = replace(described, experiments=[with_markers(experiment, tracks)])
     again = solve(moved, ReducedSpace(tolerance=1e-9))
     atol = (0.3 if huber else 0.03) * np.abs(told).max()  # weights follow residuals
     np.testing.assert_allclose(again.q - first.q, told, atol=atol)

@@ -32,8 +32,16 @@ def name_of(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+# It makes a recording in another simulator, and identifies the body that was simulated.
+WHOLE_RUN = ROOT / "docs" / "howto" / "from_simulator.md"
+
+
 def pages_with(language: str) -> list:
-    return [pytest.param(page, id=name_of(page)) for page in PAGES if blocks(page, language)]
+    return [
+        pytest.param(page, id=name_of(page), marks=[pytest.mark.long] * (page == WHOLE_RUN))
+        for page in PAGES
+        if blocks(page, language)
+    ]
 
 
 @pytest.fixture
