@@ -39,12 +39,15 @@ class Touching:
         Mean length of an edge of the faces.
     part : int
         Of the body, that has most of the faces.
+    a_face : int
+        Points of each face.
     """
 
     points: ForcePoints
     area_m2: Array
     edge_m: float
     part: int
+    a_face: int
 
     @classmethod
     def of(cls, body: Body, frame: Index, chosen: Selection | None) -> Touching:
@@ -70,7 +73,7 @@ class Touching:
         held = [np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts]
         part = int(np.argmax([area[each].sum() for each in held]))
         edge_m = float(np.linalg.norm(sides, axis=2).mean())
-        return cls(points, np.outer(area, weights).ravel(), edge_m, part)
+        return cls(points, np.outer(area, weights).ravel(), edge_m, part, count)
 
 
 def _quadratic(places: Array) -> Array:

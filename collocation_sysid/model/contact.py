@@ -111,6 +111,10 @@ class ContactLaw:
         """G alone."""
         return Generated(lambda y, _: self.gap(self.seen(y)[0]), 3 * VECTORS, 0, compiled=True)
 
+    def gaps(self, y: Array) -> Array:
+        """(T, i) G at y (12, T, i)."""
+        return self.distance.value(y, _no_data(y))[0]
+
     @cached_property
     def generated(self) -> Generated:
         """The forces, of (y, ẏ, c) or (y, c); data are A."""
@@ -189,8 +193,7 @@ class Contact(Pointwise):
     def acting(self, states: States) -> tuple[Index, Array]:
         """Points within δ at any of the times, and some more, with their y."""
         y = self.points.vectors(states.xi)
-        gap = self.contact.distance.value(y, np.zeros((0, *y.shape[1:])))[0]
-        near = (gap < self.contact.width_m).any(axis=0)
+        near = np.any(self.contact.gaps(y) < self.contact.width_m, axis=0)
         near[np.flatnonzero(~near)[: -near.sum() % AT_A_TIME]] = True
         chosen = np.flatnonzero(near)
         return chosen, y[..., chosen]
@@ -198,7 +201,7 @@ class Contact(Pointwise):
     def deepest(self, x: Array) -> tuple[float, Array]:
         """How far within δ the point is at x (3n,) that is deepest, and the normal (3,) there."""
         y = self.points.vectors(x[None])
-        gap, slopes = self.contact.distance.slopes(y, np.zeros((0, *y.shape[1:])))
+        gap, slopes = self.contact.distance.slopes(y, _no_data(y))
         place = int(gap[0, 0].argmin())
         return self.contact.width_m - float(gap[0, 0, place]), slopes[0, :3, 0, place]
 
@@ -214,6 +217,10 @@ class Contact(Pointwise):
         """A."""
         area = self.contact.surface.area_m2[chosen]
         return np.broadcast_to(area, (1, self.times, len(area)))
+
+
+def _no_data(y: Array) -> Array:
+    return np.zeros((0, *y.shape[1:]))
 
 
 def contacts(experiment: Experiment, times: int) -> tuple[Contact, ...]:

@@ -158,14 +158,19 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
     if best is None:
         fitted = [row for row in rows if row["delta_aic"] is not None]
         return min(fitted, key=lambda r: r["delta_aic"], default=None)
-    as_good = [
+    as_good = _as_good(rows, LIKELY)
+    return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
+
+
+def _as_good(rows: Sequence[Row], errors: float) -> list[Row]:
+    """Models that predict as well as the best, within so many standard errors."""
+    return [
         row
         for row in rows
         if row["converged"]
         and row["log_ratio"] is not None
-        and row["log_ratio"] <= max(ALIKE, LIKELY * row["log_ratio_error"])
+        and row["log_ratio"] <= max(ALIKE, errors * row["log_ratio_error"])
     ]
-    return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
 
 
 def advice(rows: Sequence[Row]) -> str:
@@ -197,14 +202,7 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None or chosen["log_ratio"] is None:
         return []
-    alike = [
-        row
-        for row in rows
-        if row["converged"]
-        and row["log_ratio"] is not None
-        and row["log_ratio"] <= max(ALIKE, SURE * row["log_ratio_error"])
-    ]
-    return disagreements(alike, chosen)
+    return disagreements(_as_good(rows, SURE), chosen)
 
 
 def _lost(row: Row, chosen: Row) -> str:

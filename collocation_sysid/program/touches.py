@@ -24,22 +24,14 @@ class Touch:
     experiment, obstacle : str
     gap_m : float
         The smallest; it touches where that is less than the width of the pressure.
-    points : int
-        Most quadrature points of the surface that touched at a time; none where it never did.
-    a_face : int
-        Those of one face.
+    faces : float
+        Most faces that touched at a time, by their quadrature points; none where it never did.
     """
 
     experiment: str
     obstacle: str
     gap_m: float
-    points: int
-    a_face: int
-
-    @property
-    def faces(self) -> float:
-        """Most faces that touched at a time."""
-        return self.points / self.a_face
+    faces: float
 
 
 def touches(experiment: Experiment, x: Array) -> Iterator[Touch]:
@@ -47,9 +39,7 @@ def touches(experiment: Experiment, x: Array) -> Iterator[Touch]:
     for contact, obstacle in zip(contacts(experiment, 1), experiment.obstacles, strict=True):
         law, least, most = contact.contact, np.inf, 0
         for first in range(0, len(x), AT_ONCE):
-            y = contact.points.vectors(x[first : first + AT_ONCE])
-            gap = law.distance.value(y, np.zeros((0, *y.shape[1:])))[0]
+            gap = law.gaps(contact.points.vectors(x[first : first + AT_ONCE]))
             least = min(least, float(gap.min()))
             most = max(most, int((gap < law.width_m).sum(axis=1).max()))
-        a_face = 3 if experiment.body.element.nodes == 4 else 6
-        yield Touch(experiment.name, obstacle.name, least, most, a_face)
+        yield Touch(experiment.name, obstacle.name, least, most / law.surface.a_face)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,7 +94,11 @@ class Grasp:
 
     def on(self, body: Body, t_s: Array) -> Grasp:
         """The same grasp with the nodes of a body, and matrices as the poses at `t_s`."""
-        nodes, poses = on_body(self.nodes, body), self.poses
+        return self._with_nodes(on_body(self.nodes, body), t_s)
+
+    def _with_nodes(self, nodes: Index, t_s: Array) -> Self:
+        """The same with other nodes, and matrices as the poses at `t_s`."""
+        poses = self.poses
         if not isinstance(poses, PoseSequence):
             poses = PoseSequence.from_matrices(t_s, poses)
         placed = nodes is self.nodes and poses is self.poses

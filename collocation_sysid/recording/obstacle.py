@@ -105,11 +105,8 @@ class Obstacle(Grasp):
 
     def framed(self, frame: Index, t_s: Array) -> Obstacle:
         """The same with the nodes (4,) of its frame, and matrices as the poses at `t_s`."""
-        poses = self.poses
-        if not isinstance(poses, PoseSequence):
-            poses = PoseSequence.from_matrices(t_s, poses)
-        placed = poses is self.poses and np.array_equal(frame, self.nodes)
-        return self if placed else replace(self, nodes=frame, poses=poses)
+        same = np.array_equal(frame, self.nodes)
+        return self._with_nodes(self.nodes if same else frame, t_s)
 
     def surface(self, body: Body) -> Touching:
         """Where it may touch a body; that is kept."""

@@ -118,11 +118,19 @@ class Sphere(Solid):
         return _length(point - ca.DM(self.centre_m)) - self.radius_m
 
 
+def _ends(value: Any) -> Array:
+    ends = floats((2, 3), "ends_m")(value)
+    if (ends[0] == ends[1]).all():
+        raise InputError("the ends of an axis are at the same place; expected two places")
+    return ends
+
+
+@stated
 class _Round(Solid):
     """A solid about an axis between two ends."""
 
-    radius_m: float
-    ends_m: Array
+    radius_m: float = key(Positive)
+    ends_m: Array = key(tuple[Vector, Vector], converter=_ends)
 
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
         """A circle at each end, and four lines between them."""
@@ -135,15 +143,9 @@ class _Round(Solid):
         """How far along the axis from the middle, how far from it, and half of its length."""
         first, last = self.ends_m
         half = float(np.linalg.norm(last - first)) / 2
-        if not half > 0:
-            raise InputError("the ends of an axis are at the same place; expected two places")
         axis, away = ca.DM((last - first) / (2 * half)), point - ca.DM((first + last) / 2)
         along = ca.dot(axis, away)
         return along, _length(away - along * axis), half
-
-
-def _ends(value: Any) -> Array:
-    return floats((2, 3), "ends_m")(value)
 
 
 @stated
@@ -159,8 +161,6 @@ class Cylinder(_Round):
         Radius of its edges.
     """
 
-    radius_m: float = key(Positive)
-    ends_m: Array = key(tuple[Vector, Vector], converter=_ends)
     rounding_m: float = key(NotNegative, default=0.0)
 
     def gap(self, point: ca.SX) -> ca.SX:
@@ -180,9 +180,6 @@ class Capsule(_Round):
     ends_m : (2, 3) array
         Centres of the balls.
     """
-
-    radius_m: float = key(Positive)
-    ends_m: Array = key(tuple[Vector, Vector], converter=_ends)
 
     def gap(self, point: ca.SX) -> ca.SX:
         """From its surface."""

@@ -61,7 +61,8 @@ def concerns(
         yield Concern("solve/no-error-bars", "doubtful")
     yield from allowance_concerns(solution)
     yield from marker_concerns(diagnoses)
-    for part in solution.collocation.parts(solution.z):
+    parts = solution.collocation.parts(solution.z)
+    for part in parts:
         nuisance = part.segment.nuisance
         low, high = nuisance.limits(part.segment.chart.samples)
         # A lag and a tool may well be none.
@@ -71,7 +72,7 @@ def concerns(
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(instabilities(solution.collocation, solution.z))
-    for part in solution.collocation.parts(solution.z):
+    for part in parts:
         yield from contact_concerns(touches(part.segment.experiment, part.x))
     for name, rollout in rollouts.items():
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))

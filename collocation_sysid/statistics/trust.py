@@ -264,7 +264,7 @@ def contact_concerns(found: Iterable[Touch]) -> list[Concern]:
     concerns: list[Concern] = []
     for each in found:
         data = {"experiment": each.experiment, "obstacle": each.obstacle}
-        if not each.points:
+        if not each.faces:
             concerns.append(Concern("contact/never", "doubtful", {**data, "mm": 1e3 * each.gap_m}))
         elif each.faces < FEWEST_FACES:
             concerns.append(Concern("contact/coarse", data={**data, "faces": each.faces}))
