@@ -124,8 +124,12 @@ def energy_j(term, x) -> float:
     if kappa is None:
         young_pa = TRUTH["mu_pa"] * (3 * 200 + 2 * 300) / (200 + 300)
         kappa = 100 * young_pa / law.surface.edge_m
-    near = np.maximum(law.width_m - gap, 0)
-    return float((law.surface.area_m2 * kappa / (3 * law.width_m) * near**3).sum())
+    return float((law.surface.area_m2 * kappa * cubed_m2(gap, law.width_m)).sum())
+
+
+def cubed_m2(gap, width_m: float):
+    """Ψ over A κ."""
+    return (np.maximum(width_m - gap, 0) ** 3 - np.maximum(-gap, 0) ** 3) / (3 * width_m)
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -233,8 +237,8 @@ def squeezed(gap_m: float) -> tuple[float, float, float]:
         return -(mu * (along - 1 / along) + lame * np.log(along * b * b) / along)
 
     def unbalanced(along: float) -> float:
-        near = delta - (edge_m - gap_m - along * edge_m) / 2
-        return pressure(along) - kappa / delta * max(near, 0.0) ** 2
+        gap = (edge_m - gap_m - along * edge_m) / 2
+        return pressure(along) - kappa / delta * (max(delta - gap, 0) ** 2 - max(-gap, 0) ** 2)
 
     along = float(brentq(unbalanced, 0.5, 1.0, xtol=1e-15))  # type: ignore[arg-type]
     return along, across(along), pressure(along)
@@ -363,8 +367,7 @@ def energies_j(experiment: Experiment, positions_m: np.ndarray, scheme: str) -> 
     kappa, delta = 100 * young_pa / law.contact.surface.edge_m, law.contact.width_m
     above_m = law.points.vectors(positions_m.reshape(len(positions_m), -1))[2]
     gap = above_m + body.frame_m[0, 2] + 0.005
-    near = np.maximum(delta - gap, 0)
-    still = (law.contact.surface.area_m2 * kappa / (3 * delta) * near**3).sum(axis=1)
+    still = (law.contact.surface.area_m2 * kappa * cubed_m2(gap, delta)).sum(axis=1)
     still += G_M_S2 * (mass * positions_m[..., 2]).sum(axis=1)
     still += [box().energy(x[:own], **elastic) for x in positions_m]
     x = positions_m

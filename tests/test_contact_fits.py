@@ -23,10 +23,15 @@ def block() -> cs.Body:
     return cs.Body(cs.box_mesh((0.06, 0.06, 0.03), (4, 4, 2)), density_kg_m3=50.0)
 
 
-def poked(higher_m: float = 0.0, place_sigma_m: float | None = 5e-4, **changes) -> Experiment:
+def poked(
+    higher_m: float = 0.0,
+    place_sigma_m: float | None = 5e-4,
+    depths_m: np.ndarray = DEPTHS_M,
+    **changes,
+) -> Experiment:
     """A ball that comes down on the middle of a block, stated so much higher than it is."""
-    t_s = np.arange(len(DEPTHS_M), dtype=float)
-    down = np.outer(-DEPTHS_M + higher_m, [0.0, 0.0, 1.0])
+    t_s = np.arange(len(depths_m), dtype=float)
+    down = np.outer(-depths_m + higher_m, [0.0, 0.0, 1.0])
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
     ball = cs.Obstacle(
         shape=cs.Sphere(0.02, (0.03, 0.03, 0.05)),
@@ -60,6 +65,14 @@ def answer(experiment: Experiment, seed: int = 0, **unknown) -> cs.Run:
 def told(run: cs.Run) -> set[str]:
     assert run.trust is not None
     return {concern.code for concern in run.trust.concerns}
+
+
+def test_a_ball_that_rubs_may_come_deep_into_a_block_from_one_sample_to_the_next():
+    at_once, slowly = (
+        cs.simulate(poked(depths_m=depths_m, friction=friction), TRUTH).wrenches[0][-1, 2]
+        for depths_m, friction in ((np.array([0.0, 4e-3]), 0.5), (np.linspace(0, 4e-3, 9), 0.0))
+    )
+    assert at_once == pytest.approx(slowly, rel=0.1)
 
 
 @pytest.mark.parametrize("off_m", [0.0, 3e-4])

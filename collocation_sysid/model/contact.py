@@ -3,12 +3,14 @@
 At points of the surface with undeformed areas A and the gap g(x, X) to an obstacle whose frame
 is at X, the energy and the dissipation potential are
 
-    Ψ = Σ A κ/(3δ) ⟨δ − g⟩³,    D = Σ μ N (√(|v_t|² + ε²) − ε),    N = A κ/δ ⟨δ − g⟩²,
+    Ψ = Σ A κ/(3δ) (⟨δ − g⟩³ − ⟨−g⟩³),    N = A κ/δ (⟨δ − g⟩² − ⟨−g⟩²),
+    D = Σ μ N (√(|v_t|² + ε²) − ε),
 
 v_t being the velocity along the obstacle's surface against it. Forces are −∂Ψ/∂(x, X) − ∂D/∂(v, V):
 those on the frame are what the obstacle is given, and balance. Ψ has continuous second derivatives
-and joins nothing but the nodes of a face. In a static experiment v is the way since the sample
-before, so that friction holds each point where it was then.
+and joins nothing but the nodes of a face. Inside, N is linear: Newton's method leaves any depth in
+a step, where a parabola would halve it each time. In a static experiment v is the way since the
+sample before, so that friction holds each point where it was then.
 
 An impact rings, and may gain energy, under the midpoint rule; BDF2 and backward Euler lose it.
 """
@@ -129,8 +131,8 @@ class ContactLaw:
         here = ca.SX.sym("place", 3)
         gap, slope = self.gap(here), ca.gradient(self.gap(here), here)
         gap, slope = ca.substitute([gap, slope], [here], [place])
-        near = ca.fmax(self.width_m - gap, 0)
-        normal_n = area * self.stiffness(constants) / self.width_m * near**2
+        near, within = ca.fmax(self.width_m - gap, 0), ca.fmax(-gap, 0)
+        normal_n = area * self.stiffness(constants) / self.width_m * (near**2 - within**2)
         # What turns the frame is as the point is seen along its axes.
         push = normal_n * slope
         force = ca.vertcat(axes @ push, ca.vec(y[:3] @ push.T) / self._size_m)

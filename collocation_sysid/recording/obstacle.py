@@ -60,8 +60,8 @@ class Obstacle(Grasp):
     faces : Selection, optional
         Faces that it may touch: those with all corners there. All by default.
     stiffness_pa_m : float, optional
-        κ of the pressure κ ⟨δ − g⟩²/δ at the gap g; a hundred times E over the length of an edge by
-        default, at the E of the trial.
+        κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; a hundred times E over the length of
+        an edge by default, at the E of the trial.
     width_m : float, optional
         δ, the gap at which it begins; a five-hundredth of an edge by default.
     slip : float, optional
