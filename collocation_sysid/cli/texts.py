@@ -14,7 +14,9 @@ import typer
 
 from ..console import PlainConsole
 from ..display import Shown, Table, on_terminal
-from .common import errors
+from ..errors import located
+from ..tree import as_json
+from .common import errors, show
 from .options import AsJson, command
 
 commands = typer.Typer()
@@ -66,6 +68,44 @@ def schema() -> None:
     from ..problem.schema import ProblemFile
 
     typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topics:
+    """Options of `topics`.
+
+    Attributes
+    ----------
+    log : LOG
+        A ROS bag, an MCAP file, or the folder of a LeRobot dataset.
+    """
+
+    log: Annotated[Path, typer.Argument()]
+    as_json: AsJson = False
+
+
+@command(commands, "topics run.mcap", "topics bags/2026-05-04 --json")
+def topics(options: Topics) -> None:
+    """List what is in a robot's log, what it can serve as, and what to write for it."""
+    from ..recording.formats.topics import listed_topics
+
+    with located(options.log):
+        listed = listed_topics(options.log)
+    if options.as_json:
+        typer.echo(as_json(listed))
+        return
+    rows = tuple(
+        (
+            each.name,
+            each.type,
+            f"{each.messages}",
+            f"{each.rate_hz:.3g}" if each.rate_hz else "",
+            "\n".join((each.serves, *each.write)) if each.serves else "",
+        )
+        for each in listed
+    )
+    heads = ("topic", "type", "messages", "Hz", "serves as, and what to write in place of a file")
+    show(Table("", heads, rows, names=2, texts=1))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from ..errors import InputError
 from ..problem import Problem
 from ..problem.reading import read_problem_file
 from ..problem.schema import ParameterSection, ProblemFile
+from ..recording.formats.logs import stored_files
 from .arguments import require_few
 from .variants import Variant
 
@@ -259,8 +260,9 @@ def _hashes_of_files(content: Any, folder: Path) -> dict[str, str]:
     hashes = {}
     for text in _texts(content):
         with suppress(OSError, ValueError):  # a text that is no file's name
-            if (folder / text).is_file():
-                hashes[text] = hashlib.sha256((folder / text).read_bytes()).hexdigest()
+            if files := stored_files(folder / text):
+                each = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+                hashes[text] = " ".join(each)
     return hashes
 
 

@@ -12,6 +12,7 @@ from ..errors import InputError, hint_at, located
 from ..fem.materials import Energy, Material
 from ..fem.node_force import NodeForce
 from ..files import reason, require_regular
+from ..recording.formats.logs import stored_files
 from ..recording.nuisance import NuisanceRow
 from ..recording.selected import selection
 from .nuisance_schema import OwnRow
@@ -19,7 +20,7 @@ from .schema import CodeSection, NodeForceSection
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:
-    """The file that a key of the problem file names.
+    """The file, or topic of a log, that a key of the problem file names.
 
     Raises
     ------
@@ -28,7 +29,7 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
     """
     file = folder / name
     require_regular(file, key)
-    if not file.is_file():
+    if not stored_files(file):
         fault = "is a folder" if file.is_dir() else "does not exist"
         hint = folder / "README.md"
         see = f"; see {hint} for how to get it" if hint.is_file() else ""

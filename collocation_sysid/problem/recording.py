@@ -33,6 +33,7 @@ from ..recording import (
 )
 from ..recording.arrays import triple
 from ..recording.clock import TIME_TOLERANCE_S
+from ..recording.formats.logs import stored_files
 from ..recording.poses import refuse_untold
 from ..recording.tables import read_gauge, within
 from ..section import stated_in
@@ -115,7 +116,7 @@ class RecordingReader:
 
     def _is_there(self, name: str | None) -> bool:
         """Whether a file is to be read; a simulation does without where there is none."""
-        return not self.simulation or bool(name and (self.folder / name).exists())
+        return not self.simulation or bool(name and stored_files(self.folder / name))
 
     def _existing(self, name: str | None, key: str, what: str = "a file") -> Path:
         if name is None:
@@ -283,7 +284,7 @@ class RecordingReader:
         if not (sensed or section.marked or section.reading):
             message = "nothing is measured: expected markers, the wrench of a grasp, or a reading"
             raise InputError(message, where="markers")
-        there = [s for s in sensed if (self.folder / str(section.file_of(s[1]))).exists()]
+        there = [s for s in sensed if stored_files(self.folder / str(section.file_of(s[1])))]
         if there and not section.marked:
             k, sensor = there[0]
             return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]

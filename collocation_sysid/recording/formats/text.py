@@ -22,6 +22,8 @@ from ...arrays import Array
 from ...errors import InputError, excerpt, located
 from ...files import require_regular
 from ..clock import first_time_fault
+from .logs import Address
+from .topics import table
 from .units import UNITS, si_factor
 
 P = ParamSpec("P")
@@ -70,13 +72,15 @@ def of_file(read: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any,
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return a file's content.
+    """Return a file's content; of a topic of a log that of the table that it is.
 
     Raises
     ------
     InputError
         If it cannot be read.
     """
+    if (address := Address.of(path)) is not None:
+        return table(address)
     require_regular(path)
     try:
         return Path(path).read_bytes()

@@ -1,0 +1,303 @@
+"""Logs of robots: ROS 1 and 2 bags, MCAP files, and LeRobot datasets.
+
+Where a file is expected, a topic of a log may stand: ``run.mcap#/wrench``. It is read as the table
+that `topics` makes of its messages. More may follow, each after a ``#``: two frames, as in
+``run.mcap#/tf#base>tool``, a robot's description, and the episode of a dataset.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Protocol
+
+import numpy as np
+
+from ...arrays import Array
+from ...errors import InputError, hint_at
+from ...files import reason
+
+MARK = "#"
+# Of the positions of joints.
+UNITS = ("rad", "deg")
+_NEEDS = "reading logs needs {}: pip install 'collocation-sysid[logs]'"
+
+
+@dataclass(frozen=True)
+class Address:
+    """A topic of a log, and how it is to be read.
+
+    Attributes
+    ----------
+    log : Path
+        File, or folder of a bag or of a dataset.
+    topic : str
+    frames : tuple of (parent, child) or None
+        The pose of the second in the first is meant.
+    robot : Path or None
+        URDF file, from the log's folder, which makes poses of joints' positions.
+    unit : {"rad", "deg"} or None
+        Of the positions of joints that turn.
+    episode : int or None
+        Of a dataset.
+    """
+
+    log: Path
+    topic: str
+    frames: tuple[str, str] | None = None
+    robot: Path | None = None
+    unit: str | None = None
+    episode: int | None = None
+
+    @classmethod
+    def of(cls, path: str | Path) -> Address | None:
+        """What a path means; None if it is that of a file or of nothing.
+
+        Raises
+        ------
+        InputError
+            If what follows the topic is none of what may.
+        """
+        log, mark, rest = str(path).partition(MARK)
+        if not mark or Path(path).exists() or not Path(log).exists():
+            return None
+        topic, *more = rest.split(MARK)
+        kept: dict[str, Any] = {}
+        for part in more:
+            if ">" in part:
+                parent, _, child = part.partition(">")
+                kept["frames"] = parent.strip(), child.strip()
+            elif part.lower().endswith((".urdf", ".xml")):
+                kept["robot"] = Path(log).parent / part
+            elif part in UNITS:
+                kept["unit"] = part
+            elif part.isdecimal():
+                kept["episode"] = int(part)
+            else:
+                expected = "two frames PARENT>CHILD, a robot.urdf, rad or deg, or an episode"
+                raise InputError(f"found {part!r} behind the topic; expected {expected}")
+        return cls(Path(log), topic, **kept)
+
+
+def stored_files(path: str | Path) -> list[Path]:
+    """The files on disk that a path leads to, those of a log where it names a topic."""
+    address = Address.of(path)
+    place = Path(path) if address is None else address.log
+    if address is not None and place.is_dir():
+        return sorted(each for each in place.rglob("*") if each.is_file())
+    return [place] if place.is_file() else []
+
+
+class Log(Protocol):
+    """Messages by topic.
+
+    Attributes
+    ----------
+    topics : dict of name to (type, number of messages)
+    start_ns : int
+        When the first message was recorded; times of today in seconds are not exact as floats.
+    """
+
+    topics: dict[str, tuple[str, int]]
+    start_ns: int
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield when each was recorded [ns], and the message; its fields are attributes."""
+        ...
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Log]:
+    """A log, by its content.
+
+    Raises
+    ------
+    InputError
+        If it is none, is damaged, or a package that reads it is missing.
+    """
+    if (path / "meta" / "info.json").is_file():
+        log: Any = partial(Dataset, path)
+    elif path.is_file() and path.suffix == ".mcap":
+        log = partial(_Mcap, path)
+    elif path.suffix in (".bag", ".db3") or (path / "metadata.yaml").is_file():
+        log = partial(_Bag, path)
+    else:
+        raise InputError(
+            "is no log; expected a ROS bag (a folder with metadata.yaml, .db3 or .bag), an .mcap "
+            "file, or a LeRobot dataset (a folder with meta/info.json)"
+        )
+    try:
+        with log() as each:
+            yield each
+    except (InputError, ImportError):
+        raise
+    except Exception as error:  # the libraries have exceptions of their own
+        raise InputError(f"is a damaged log, or not what it seems: {reason(error)}") from error
+
+
+def require_topic(log: Log, topic: str) -> None:
+    """Refuse a topic that is not there.
+
+    Raises
+    ------
+    InputError
+        With the one that was probably meant.
+    """
+    if topic not in log.topics:
+        there = ", ".join(log.topics)
+        raise InputError(f"there is no topic {topic!r}; it has {there}{hint_at(topic, log.topics)}")
+
+
+def require_packages(*modules: str) -> None:
+    """Refuse to go on where a package is missing.
+
+    Raises
+    ------
+    InputError
+        Saying how to install it.
+    """
+    for module in modules:
+        if find_spec(module) is None:
+            raise InputError(_NEEDS.format(module))
+
+
+class _Bag:
+    """A ROS bag, through rosbags."""
+
+    def __init__(self, path: Path) -> None:
+        require_packages("rosbags")
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        # Older bags do not hold what their messages are made of.
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        self._reader = AnyReader([path], default_typestore=store)
+
+    def __enter__(self) -> Log:
+        self._reader.open()
+        self.topics = {
+            name: (str(info.msgtype), info.msgcount) for name, info in self._reader.topics.items()
+        }
+        self.start_ns = self._reader.start_time
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        chosen = [each for each in self._reader.connections if each.topic == topic]
+        for connection, at_ns, content in self._reader.messages(chosen):
+            yield at_ns, self._reader.deserialize(content, connection.msgtype)
+
+
+class _Mcap:
+    """An MCAP file with messages of ROS 2, protobuf or JSON."""
+
+    def __init__(self, path: Path) -> None:
+        require_packages("mcap", "mcap_ros2", "mcap_protobuf")
+        self._path = path
+
+    def __enter__(self) -> Log:
+        from mcap.reader import make_reader
+        from mcap_protobuf.decoder import DecoderFactory as Protobuf
+        from mcap_ros2.decoder import DecoderFactory as Ros2
+
+        self._file = self._path.open("rb")
+        decoders: Any = [Ros2(), Protobuf(), _Json()]
+        self._reader = make_reader(self._file, decoder_factories=decoders)
+        summary = self._reader.get_summary()
+        if summary is None or summary.statistics is None:
+            raise InputError("is cut short: it has no summary; `mcap recover` makes one")
+        counts = summary.statistics.channel_message_counts
+        self.topics = {}
+        for key, channel in summary.channels.items():
+            schema = summary.schemas.get(channel.schema_id)
+            before = self.topics.get(channel.topic, ("", 0))[1]
+            kind = schema.name if schema else channel.message_encoding
+            self.topics[channel.topic] = kind, before + counts.get(key, 0)
+        self.start_ns = summary.statistics.message_start_time
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        for _, _, message, content in self._reader.iter_decoded_messages(topics=[topic]):
+            yield message.log_time, content
+
+
+class _Json:
+    """Decodes JSON messages of MCAP files."""
+
+    def decoder_for(self, message_encoding: str, schema: Any) -> Any:
+        if message_encoding != "json":
+            return None
+        return partial(json.loads, object_hook=lambda each: SimpleNamespace(**each))
+
+
+@dataclass
+class Dataset:
+    """A LeRobot dataset: the topics are its features, the messages the frames of an episode.
+
+    Attributes
+    ----------
+    episode : int or None
+        Of which messages are; the only one where there is one.
+    """
+
+    path: Path
+    episode: int | None = None
+    topics: dict[str, tuple[str, int]] = field(default_factory=dict)
+    start_ns: int = 0
+    names: dict[str, list[str]] = field(default_factory=dict)
+
+    def __enter__(self) -> Log:
+        require_packages("pyarrow")
+        info = json.loads((self.path / "meta" / "info.json").read_text(encoding="utf-8"))
+        self._episodes = int(info["total_episodes"])
+        for name, feature in info["features"].items():
+            if feature["dtype"].startswith(("float", "int")) and "index" not in name:
+                self.topics[name] = feature["dtype"], int(info["total_frames"])
+                self.names[name] = _names(feature, name)
+        self.topics.pop("timestamp", None)
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yield times and positions by name."""
+        from pyarrow import dataset
+
+        if self.episode is None and self._episodes > 1:
+            raise InputError(
+                f"has {self._episodes} episodes; expected one, as in {self.path.name}#{topic}#0"
+            )
+        episode = self.episode or 0
+        if episode >= self._episodes:
+            raise InputError(f"has the episodes 0 to {self._episodes - 1}; found {episode}")
+        frames = dataset.dataset(self.path / "data", format="parquet").to_table(
+            columns=["timestamp", topic], filter=dataset.field("episode_index") == episode
+        )
+        values: Array = np.asarray(frames[topic].to_pylist(), dtype=float)
+        for t_s, each in zip(frames["timestamp"].to_pylist(), values, strict=True):
+            yield (
+                round(t_s * 1e9),
+                SimpleNamespace(name=self.names[topic], position=np.atleast_1d(each)),
+            )
+
+
+def _names(feature: Any, name: str) -> list[str]:
+    """What the numbers of a feature are called; older datasets have them one level deeper."""
+    names = feature.get("names")
+    while isinstance(names, dict):
+        names = next(iter(names.values()), None)
+    size = int(np.prod(feature["shape"]))
+    if isinstance(names, list) and len(names) == size:
+        return [str(each) for each in names]
+    return [name] if size == 1 else [f"{name}_{k}" for k in range(size)]

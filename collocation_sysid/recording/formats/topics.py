@@ -1,0 +1,422 @@
+"""What topics of a log can serve as, and the tables that their messages make.
+
+Messages are known by what they hold, not by the names of their types: a wrench has a force and a
+torque, a marker a name and a point, a pose a point and a quaternion.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Array
+from ...errors import InputError, hint_at
+from .logs import Address, Dataset, Log, opened, require_packages, require_topic
+
+AXES = ("x", "y", "z")
+POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+WRENCH = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+# Where messages hold a pose, a point or a single number; the first that is there is it.
+_POSES = (
+    ("pose.pose.position", "pose.pose.orientation"),
+    ("pose.position", "pose.orientation"),
+    ("transform.translation", "transform.rotation"),
+    ("translation", "rotation"),
+    ("position", "orientation"),
+)
+_POINTS = ("pose.pose.position", "pose.position", "position", "translation", "point", "pose")
+_NAMES = ("marker_name", "name", "id", "ns", "child_frame_id")
+_NUMBERS = {"fluid_pressure": "pressure_pa", "range": "range_m", "data": "data", "value": "value"}
+_LISTS = ("transforms", "markers", "poses", "points", "objects", "rigidbodies")
+# A clock that is off by more is another one, such as a simulation's.
+SAME_CLOCK_NS = 86_400 * 10**9
+# Joints go beyond their limits by no more [rad or m].
+SLACK = 0.01
+# So many messages tell what a topic is.
+_FIRST = 20
+
+Row = dict[str, float]
+
+
+@dataclass(frozen=True)
+class LogTopic:
+    """A topic, and what it could serve as.
+
+    Attributes
+    ----------
+    name, type : str
+    messages : int
+    rate_hz : float or None
+    serves : str
+        In words; empty where nothing here reads it.
+    write : tuple of str
+        What to write in a problem file in place of a file, one for each way to read it.
+    """
+
+    name: str
+    type: str
+    messages: int
+    rate_hz: float | None
+    serves: str
+    write: tuple[str, ...]
+
+
+def listed_topics(path: str | Path) -> list[LogTopic]:
+    """What is in a log.
+
+    Raises
+    ------
+    InputError
+        If it is none, is damaged, or a package that reads it is missing.
+    """
+    with opened(Path(path)) as log:
+        if isinstance(log, Dataset):
+            log.episode = 0
+        return [_told(log, Path(path), name) for name in log.topics]
+
+
+def table(address: Address) -> bytes:
+    """A topic as the CSV file that it could have been; times count from the log's first message.
+
+    Raises
+    ------
+    InputError
+        If the topic is not there, holds nothing that is known here, or it takes frames or a robot's
+        description to read it.
+    """
+    with opened(address.log) as log:
+        require_topic(log, address.topic)
+        if isinstance(log, Dataset):
+            log.episode = address.episode
+        messages = list(log.messages(address.topic))
+        if not messages:
+            raise InputError(f"the topic {address.topic} has no messages")
+        if _is_transforms(messages[0][1]):
+            static = address.topic + "_static"
+            more = list(log.messages(static)) if static in log.topics else []
+            return _written(POSE, *_chained(messages, more, address, log.start_ns))
+        times, rows = _rows(messages, log.start_ns)
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    if not columns:
+        raise InputError(
+            f"the topic {address.topic} holds neither poses, points, wrenches, "
+            "positions of joints nor numbers"
+        )
+    values = np.array([[row.get(name, np.nan) for name in columns] for row in rows])
+    if address.robot is not None:
+        return _written(POSE, times, _of_joints(columns, values, address))
+    return _written(columns, times, values)
+
+
+def _told(log: Log, path: Path, name: str) -> LogTopic:
+    kind, count = log.topics[name]
+    first = list(islice(log.messages(name), _FIRST))
+    span = first[-1][0] - first[0][0] if len(first) > 1 else 0
+    rate = 1e9 * (len(first) - 1) / span if span > 0 else None
+    serves, write = "", [f"{path.name}#{name}"]
+    if first and _is_transforms(first[0][1]):
+        edges = _edges(log.messages(name), log.start_ns)
+        serves = "poses of one frame in another: " + ", ".join(f"{p}>{c}" for p, c in edges)
+        write = [f"{write[0]}#{parent}>{child}" for parent, child in edges]
+    elif first:
+        _, rows = _rows(first, log.start_ns)
+        serves = _served(set().union(*rows), first[0][1])
+        if serves.startswith("positions"):
+            write.append(f"{write[0]}#ROBOT.urdf#BASE>TOOL")
+    return LogTopic(name, kind, count, rate, serves, tuple(write if serves else ()))
+
+
+def _served(columns: set[str], message: Any) -> str:
+    if not columns:
+        return ""
+    if columns == {*POSE}:
+        return "poses of a grasp or an obstacle"
+    if columns == {*WRENCH}:
+        return "wrench of a grasp, force of an obstacle"
+    if hasattr(message, "name") and hasattr(message, "position"):
+        return "positions of joints; poses with the robot's URDF"
+    if all(column[-2:] in ("_x", "_y", "_z") for column in columns):
+        return "marker tracks: " + ", ".join(sorted({column[:-2] for column in columns}))
+    return "numbers: a pressure, a tension, a reading"
+
+
+# From messages to rows ----------------------------------------------------------------------------
+
+
+def _rows(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Row]]:
+    """Rows in the order of their times; of several at a time the first."""
+    t_s = np.array([_time_s(message, at_ns, start_ns) for at_ns, message in messages])
+    _, first = np.unique(t_s, return_index=True)
+    return t_s[first], [_row(messages[k][1]) for k in first]
+
+
+def _time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
+    """When a message was measured; when it was recorded where it does not say."""
+    first = next(iter(_items(message)), None)
+    stamps = (_at(message, "header.stamp"), _at(message, "timestamp"), _at(first, "header.stamp"))
+    stamped_ns = next((_nanoseconds(each) for each in stamps if each is not None), 0)
+    if not stamped_ns:
+        return (recorded_ns - start_ns) / 1e9
+    is_another = abs(stamped_ns - recorded_ns) > SAME_CLOCK_NS
+    return (stamped_ns - (0 if is_another else start_ns)) / 1e9
+
+
+def _nanoseconds(stamp: Any) -> int:
+    """Of a stamp in whole seconds and nanoseconds, whatever these are called."""
+    counted = {10**9: ("sec", "seconds", "secs"), 1: ("nanosec", "nsec", "nanos", "nsecs")}
+    return sum(
+        factor * int(next((getattr(stamp, name) for name in names if hasattr(stamp, name)), 0))
+        for factor, names in counted.items()
+    )
+
+
+def _row(message: Any) -> Row:
+    """The numbers of a message by the columns that they stand in."""
+    wrench = _at(message, "wrench") or message
+    if _is_vector(force := _at(wrench, "force")):
+        values = [*_vector(force), *_vector(_at(wrench, "torque"))]
+        return dict(zip(WRENCH, values, strict=True))
+    if hasattr(message, "name") and hasattr(message, "position"):
+        pairs = zip(message.name, message.position, strict=True)
+        return {str(name): float(value) for name, value in pairs}
+    if (pose := _pose(message)) is not None:
+        return dict(zip(POSE, pose, strict=True))
+    points = _points(message)
+    if points:
+        return {f"{name}_{axis}": p[k] for name, p in points.items() for k, axis in enumerate(AXES)}
+    for name, column in _NUMBERS.items():
+        if isinstance(value := _at(message, name), (int, float)):
+            return {column: float(value)}
+        if name == "data" and isinstance(value, (list, np.ndarray)) and len(np.shape(value)) == 1:
+            return {f"{column}_{k}": float(each) for k, each in enumerate(value)}
+    return {}
+
+
+def _pose(message: Any) -> tuple[float, ...] | None:
+    for position, rotation in _POSES:
+        if hasattr(turned := _at(message, rotation), "w"):
+            return *_vector(_at(message, position)), *_vector(turned), turned.w
+    return None
+
+
+def _points(message: Any) -> dict[str, tuple[float, ...]]:
+    """Places by name: one, or those of the first list that has some."""
+    if _is_vector(one := _at(message, "point")):
+        return {_at(message, "header.frame_id") or "point": _vector(one)}
+    places = {_called(item, k): _place(item) for k, item in enumerate(_items(message))}
+    return {key: place for key, place in places.items() if place is not None}
+
+
+def _items(message: Any) -> Any:
+    """The first list of a message that holds what may have places."""
+    lists = (_at(message, name) for name in _LISTS)
+    return next((each for each in lists if each is not None and len(each)), ())
+
+
+def _place(item: Any) -> tuple[float, ...] | None:
+    if _is_vector(item):
+        return _vector(item)
+    return next((_vector(p) for name in _POINTS if _is_vector(p := _at(item, name))), None)
+
+
+def _called(item: Any, k: int) -> str:
+    names = (_at(item, name) for name in _NAMES)
+    return str(next((name for name in names if name not in (None, "")), k + 1))
+
+
+def _at(message: Any, path: str) -> Any:
+    for name in path.split("."):
+        message = getattr(message, name, None)
+    return message
+
+
+def _is_vector(value: Any) -> bool:
+    return all(hasattr(value, axis) for axis in AXES)
+
+
+def _vector(value: Any) -> tuple[float, ...]:
+    return tuple(float(getattr(value, axis)) for axis in AXES)
+
+
+# Frames and joints --------------------------------------------------------------------------------
+
+
+def _is_transforms(message: Any) -> bool:
+    return _at(message, "transforms") is not None or _child(message) is not None
+
+
+def _child(transform: Any) -> tuple[str, str] | None:
+    """The frame that a transform places a child in, and that child."""
+    child = _at(transform, "child_frame_id")
+    parent = _at(transform, "parent_frame_id") or _at(transform, "header.frame_id")
+    is_one = child and parent and _pose(transform) and not hasattr(transform, "twist")
+    return (parent.lstrip("/"), child.lstrip("/")) if is_one else None
+
+
+def _edges(
+    messages: Iterator[tuple[int, Any]] | list[tuple[int, Any]], start_ns: int
+) -> dict[tuple[str, str], dict[float, tuple[float, ...]]]:
+    """Poses by time of each child in its parent."""
+    edges: dict[tuple[str, str], dict[float, tuple[float, ...]]] = {}
+    for at_ns, message in messages:
+        for each in _at(message, "transforms") or [message]:
+            pose = _pose(each)
+            if (edge := _child(each)) is not None and pose is not None:
+                edges.setdefault(edge, {})[_time_s(each, at_ns, start_ns)] = pose
+    return edges
+
+
+def _chained(
+    moving: list[tuple[int, Any]],
+    still: list[tuple[int, Any]],
+    address: Address,
+    start_ns: int,
+) -> tuple[Array, Array]:
+    """Times and poses of one frame in another, through all between them.
+
+    At the times of the one that is told most often; the others are interpolated along screws.
+    """
+    require_packages("pytransform3d")
+    from pytransform3d.trajectories import pqs_from_transforms, transforms_from_pqs
+    from pytransform3d.transform_manager import NumpyTimeseriesTransform as Series
+    from pytransform3d.transform_manager import StaticTransform as Static
+    from pytransform3d.transform_manager import TemporalTransformManager as Manager
+
+    fixed = {edge: {0.0: next(iter(of.values()))} for edge, of in _edges(still, start_ns).items()}
+    edges = fixed | _edges(moving, start_ns)
+    parent, child = _between(edges, address)
+    path = _path(edges, parent, child)
+    told = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]
+    if not told:
+        raise InputError(f"nothing moves between {parent} and {child}; leave poses out instead")
+    first, last = max(t[0] for t in told), min(t[-1] for t in told)
+    times = max((t[(t >= first) & (t <= last)] for t in told), key=len)
+    if not len(times):
+        raise InputError(f"the frames between {parent} and {child} are told at no common time")
+    manager = Manager(check=False)
+    for edge in path:
+        at_s = np.array(sorted(edges[edge]))
+        poses = np.array([edges[edge][t] for t in at_s])[:, [0, 1, 2, 6, 3, 4, 5]]
+        if len(at_s) > 1:
+            series: Any = Series(at_s, poses)
+        else:
+            series = Static(transforms_from_pqs(poses[0]))
+        manager.add_transform(edge[1], edge[0], series)
+    matrices = manager.get_transform_at_time(child, parent, times)
+    return times, pqs_from_transforms(matrices)[:, [0, 1, 2, 4, 5, 6, 3]]
+
+
+def _between(edges: Mapping[tuple[str, str], Any], address: Address) -> tuple[str, str]:
+    frames = list(dict.fromkeys(frame for edge in edges for frame in edge))
+    if address.frames is None:
+        if len(edges) == 1:
+            return next(iter(edges))
+        example = f"{address.log.name}#{address.topic}#{frames[0]}>{frames[-1]}"
+        raise InputError(
+            f"has the frames {', '.join(frames)}; expected two of them, as in {example}"
+        )
+    for frame in address.frames:
+        if frame not in frames:
+            raise InputError(
+                f"there is no frame {frame!r}; it has {', '.join(frames)}{hint_at(frame, frames)}"
+            )
+    return address.frames
+
+
+def _path(edges: Mapping[tuple[str, str], Any], parent: str, child: str) -> list[tuple[str, str]]:
+    """The edges from one frame up to where it meets the other, and down to that."""
+    above = {child: (parent, child) for parent, child in edges}
+
+    def up(frame: str) -> list[tuple[str, str]]:
+        passed: list[tuple[str, str]] = []
+        while frame in above and above[frame] not in passed:
+            passed.append(above[frame])
+            frame = above[frame][0]
+        return passed
+
+    ours, theirs = up(child), up(parent)
+    path = [edge for edge in (*ours, *theirs) if (edge in ours) != (edge in theirs)]
+    roots = {(each[-1][0] if each else frame) for each, frame in ((ours, child), (theirs, parent))}
+    if not path or len(roots) > 1:
+        raise InputError(f"no chain of frames leads from {parent} to {child}")
+    return path
+
+
+def _of_joints(columns: list[str], values: Array, address: Address) -> Array:
+    """Poses of a robot's link by the positions of its joints, in radians and metres."""
+    require_packages("pytransform3d")
+    from pytransform3d.transformations import pq_from_transform
+    from pytransform3d.urdf import UrdfTransformManager
+
+    assert address.robot is not None
+    if address.frames is None:
+        raise InputError(f"expected two frames behind {address.robot.name}, as in #base>tool")
+    robot = UrdfTransformManager(check=False)
+    try:
+        robot.load_urdf(address.robot.read_text(encoding="utf-8"))
+    except Exception as error:  # lxml's and the library's own
+        raise InputError(f"is no URDF file: {error}", address.robot) from error
+    parent, child = address.frames
+    for frame in address.frames:
+        if not robot.has_frame(frame):
+            links = [node for node in robot.nodes if isinstance(node, str)]
+            raise InputError(
+                f"there is no link {frame!r}; it has {', '.join(links)}{hint_at(frame, links)}",
+                address.robot,
+            )
+    degrees = _in_degrees(address)
+    limits = {name: robot.get_joint_limits(name) for name in columns if _has_joint(robot, name)}
+    if not limits:
+        joints = ", ".join(columns)
+        raise InputError(f"has none of the joints {joints}", address.robot)
+    poses = np.empty((len(values), 7))
+    for row, position in enumerate(values):
+        for name, value in zip(columns, position, strict=True):
+            if name in limits:
+                angle = np.radians(value) if degrees else value
+                _refuse_beyond(name, angle, limits[name], address)
+                robot.set_joint(name, angle)
+        poses[row] = pq_from_transform(robot.get_transform(child, parent))[[0, 1, 2, 4, 5, 6, 3]]
+    return poses
+
+
+def _in_degrees(address: Address) -> bool:
+    """Joints of ROS are in radians; a dataset's in what its robot's makers chose."""
+    if address.unit is None and address.episode is not None:
+        raise InputError("does not tell the unit of its joints; expected #rad or #deg behind it")
+    return address.unit == "deg"
+
+
+def _has_joint(robot: Any, name: str) -> bool:
+    try:
+        robot.get_joint_limits(name)
+    except KeyError:
+        return False
+    return True
+
+
+def _refuse_beyond(name: str, angle: float, limits: tuple[float, float], address: Address) -> None:
+    """The library would put the joint at its limit instead."""
+    if not limits[0] - SLACK <= angle <= limits[1] + SLACK:
+        hint = "" if address.unit else "; are these degrees? Then #deg belongs behind the topic"
+        raise InputError(
+            f"the joint {name} is at {angle:.4g}, beyond its limits {limits[0]:.4g} to "
+            f"{limits[1]:.4g} in {address.robot and address.robot.name}{hint}"
+        )
+
+
+def _written(columns: Any, t_s: Array, values: Array) -> bytes:
+    """A table as text; what is missing is blank."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("t_s", *columns))
+    for t, row in zip(t_s.tolist(), values.tolist(), strict=True):
+        writer.writerow((repr(t), *("" if x != x else repr(x) for x in row)))
+    return text.getvalue().encode()

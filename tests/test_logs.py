@@ -1,0 +1,247 @@
+"""Topics of robots' logs in place of files."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from logs_small import KINDS, START_S, URDF, Messages, bag, dataset, json_mcap, recorded
+from problem_files import run_command, write_problem
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.errors import InputError
+from collocation_sysid.live.frames import FrameReader
+from collocation_sysid.problem import Problem
+from collocation_sysid.recording import read_markers, read_poses, read_wrench
+from collocation_sysid.recording.formats.logs import stored_files
+from collocation_sysid.recording.formats.topics import listed_topics
+from collocation_sysid.recording.tables import read_gauge, read_pressure
+
+T_S = np.arange(40) / 50.0
+STILL = (0.0, 0.0, 0.0, 1.0)
+
+
+def about_z(angle: float) -> np.ndarray:
+    return Rotation.from_rotvec([0, 0, angle]).as_quat()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_problem_read_from_a_log_is_the_one_of_its_files(tmp_path: Path, kind: str) -> None:
+    file = write_problem(tmp_path, {"swing": 12})
+    poses = read_poses(tmp_path / "swing_motion.csv")
+    table = read_markers(tmp_path / "swing_markers.csv")
+    lost = table.positions_m.copy()
+    lost[3, 1] = np.nan
+    table = replace(table, positions_m=lost)
+    log = bag(tmp_path / "trial", recorded(poses, table, kind), kind)
+    text = file.read_text().replace("swing_motion.csv", f"{log.relative_to(tmp_path)}#/gripper")
+    text = text.replace("swing_markers.csv", f"{log.relative_to(tmp_path)}#/markers")
+    before = Problem.read(file).experiments[0]
+    file.write_text(text)
+    experiment = Problem.read(file).experiments[0]
+    np.testing.assert_allclose(experiment.t_s, before.t_s, atol=1e-9)
+    moved, moved_before = (e.grasps[0].poses for e in (experiment, before))
+    np.testing.assert_allclose(moved.positions_m, moved_before.positions_m, atol=1e-12)
+    measured, as_files = (e.markers.positions_m for e in (experiment, before))
+    missing = np.isnan(measured)
+    assert missing.sum() == 3
+    assert missing[3, 1].all()
+    np.testing.assert_allclose(measured[~missing], as_files[~missing], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_frame_is_followed_through_a_tree_of_frames_at_rates_of_their_own(
+    tmp_path: Path, kind: str
+) -> None:
+    of = Messages(kind)
+
+    def messages():
+        yield of.tree(
+            0.0, of.transform(0.0, "flange", "tool", (0, 0, 0.1), STILL), topic="/tf_static"
+        )
+        for t in np.arange(0, 0.8001, 0.1):  # a base that slides steadily
+            yield of.tree(t, of.transform(t, "world", "base", (t, 0, 0), STILL))
+        for t in T_S:
+            yield of.tree(t, of.transform(t, "base", "flange", (0, 0, 1), about_z(2 * t)))
+
+    log = bag(tmp_path / "trial", sorted(messages(), key=lambda m: m[0]), kind)
+    poses = read_poses(f"{log}#/tf#world>tool")
+    np.testing.assert_allclose(poses.t_s, T_S, atol=1e-6)
+    np.testing.assert_allclose(poses.positions_m, [(t, 0, 1.1) for t in T_S], atol=1e-6)
+    np.testing.assert_allclose(poses.quaternions_xyzw, [about_z(2 * t) for t in T_S], atol=1e-6)
+    back = read_poses(f"{log}#/tf#tool>world")
+    turned = Rotation.from_quat(back.quaternions_xyzw).apply(poses.positions_m.copy())
+    np.testing.assert_allclose(turned, -back.positions_m, atol=1e-9)
+
+
+def test_wrenches_pressures_and_joints_are_read_as_tables(tmp_path: Path) -> None:
+    of = Messages()
+    messages = [
+        each
+        for t in T_S
+        for each in (
+            of.wrench(t, (1, 2, t, 0.1, 0.2, 0.3)),
+            of.pressure(t, 1e3 + t),
+            of.joints(t, {"turn": t, "slide": 0.1}),
+        )
+    ]
+    log = bag(tmp_path / "trial", messages)
+    t_s, wrench = read_wrench(f"{log}#/wrench")
+    np.testing.assert_allclose(t_s, T_S, atol=1e-9)
+    np.testing.assert_allclose(wrench[5], [1, 2, T_S[5], 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(read_pressure(f"{log}#/chamber")[1], 1e3 + T_S)
+    _, values, names = read_gauge(f"{log}#/joint_states")
+    assert names == ["turn", "slide"]
+    np.testing.assert_allclose(values[:, 0], T_S)
+
+
+def test_joints_make_poses_of_a_link_by_the_robots_description(tmp_path: Path) -> None:
+    of = Messages()
+    log = bag(tmp_path / "trial", [of.joints(t, {"turn": t, "slide": 0.1 + t / 10}) for t in T_S])
+    (tmp_path / "arm.urdf").write_text(URDF)
+    poses = read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
+    reach = 0.3 + T_S / 10
+    expected = np.column_stack([reach * np.cos(T_S), reach * np.sin(T_S), np.full(len(T_S), 0.5)])
+    np.testing.assert_allclose(poses.positions_m, expected, atol=1e-9)
+    np.testing.assert_allclose(poses.quaternions_xyzw, [about_z(t) for t in T_S], atol=1e-9)
+
+
+def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said(
+    tmp_path: Path,
+) -> None:
+    count = 20
+    degrees = {"turn": [*np.linspace(0, 60, count)], "slide": [0.0] * count}
+    folder = dataset(tmp_path / "pick", degrees)
+    (tmp_path / "arm.urdf").write_text(URDF.replace('type="prismatic"', 'type="revolute"'))
+    address = f"{folder}#observation.state#1#arm.urdf#base>upper"
+    with pytest.raises(InputError, match="unit of its joints; expected #rad or #deg"):
+        read_poses(address)
+    poses = read_poses(f"{address}#deg")
+    turned = Rotation.from_quat(poses.quaternions_xyzw).as_rotvec(degrees=True)[:, 2]
+    np.testing.assert_allclose(turned, np.array(degrees["turn"]) + 0.01, atol=1e-5)
+    with pytest.raises(InputError, match="has 2 episodes; expected one, as in pick#observation"):
+        read_gauge(f"{folder}#observation.state")
+
+
+def test_json_messages_of_an_mcap_file_are_read_as_those_of_ros(tmp_path: Path) -> None:
+    def message(t: float) -> dict:
+        stamp = {"sec": int(START_S), "nsec": round(t * 1e9)}
+        pose = {
+            "position": {"x": t, "y": 0.0, "z": 0.0},
+            "orientation": dict(zip("xyzw", STILL, strict=True)),
+        }
+        return {"timestamp": stamp, "frame_id": "world", "pose": pose}
+
+    messages = [(t, message(t)) for t in T_S]
+    log = json_mcap(tmp_path / "run.mcap", {"/tool": ("foxglove.PoseInFrame", messages)})
+    np.testing.assert_allclose(read_poses(f"{log}#/tool").positions_m[:, 0], T_S, atol=1e-9)
+
+
+def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
+    of = Messages()
+    place = {"left": (0, 0, 0), "right": (1, 0, 0)}
+    messages = [
+        each
+        for t in T_S
+        for each in (
+            of.wrench(t, np.ones(6)),
+            of.markers(t, place),
+            of.tree(t, of.transform(t, "base", "tool", (0, 0, t), STILL)),
+        )
+    ]
+    log = bag(tmp_path / "trial", messages)
+    topics = {each["name"]: each for each in json.loads(run_command("topics", log, "--json").out)}
+    assert topics["/markers"]["serves"] == "marker tracks: left, right"
+    assert topics["/tf"]["write"] == ["trial#/tf#base>tool"]
+    assert topics["/wrench"]["rate_hz"] == pytest.approx(50, rel=1e-3)
+    assert topics["/wrench"]["messages"] == len(T_S)
+    assert "trial#/tf#base>tool" in run_command("topics", log).out
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("trial#/wrenhc", "there is no topic '/wrenhc'; it has /tf, /wrench; did you mean"),
+        ("trial#/tf", "has the frames base, arm, tool; expected two of them, as in trial#/tf#base"),
+        ("trial#/tf#base>tol", "there is no frame 'tol'; it has base, arm, tool; did you mean"),
+        ("trial#/tf#base>tool#fast", "found 'fast' behind the topic; expected two frames"),
+        ("trial#/wrench", "expected t_s, x_m, y_m"),
+        ("broken.mcap#/tf", "is a damaged log, or not what it seems"),
+        ("notes#/tf", "is no log; expected a ROS bag"),
+    ],
+)
+def test_what_a_log_does_not_hold_is_refused(tmp_path: Path, address: str, message: str) -> None:
+    of = Messages()
+    arm = of.transform(0.0, "base", "arm", (0, 0, 0), STILL)
+    tool = of.transform(0.0, "arm", "tool", (0, 0, 0), STILL)
+    bag(tmp_path / "trial", [of.tree(0.0, arm, tool), of.wrench(0.0, np.ones(6))])
+    (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(50))
+    (tmp_path / "notes").mkdir()
+    with pytest.raises(InputError) as raised:
+        read_poses(tmp_path / address)
+    assert message in str(raised.value)
+    assert str(tmp_path / address.partition("#")[0]) in str(raised.value)
+
+
+def test_joints_beyond_their_limits_are_refused(tmp_path: Path) -> None:
+    of = Messages()
+    log = bag(tmp_path / "trial", [of.joints(t, {"turn": 30.0, "slide": 0.1}) for t in T_S])
+    (tmp_path / "arm.urdf").write_text(URDF)
+    with pytest.raises(InputError, match=r"turn is at 30, beyond its limits -1.5 to 1.5 .*#deg"):
+        read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
+
+
+def test_a_file_whose_name_has_a_mark_is_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "run#1.csv"
+    file.write_text("t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,0,0,1,0,0,0,1\n")
+    assert read_poses(file).positions_m[1, 2] == 1
+    assert stored_files(file) == [file]
+
+
+def test_frames_without_a_chain_between_them_are_refused(tmp_path: Path) -> None:
+    of = Messages()
+    trees = [
+        of.tree(
+            t,
+            of.transform(t, "a", "b", (0, 0, t), STILL),
+            of.transform(t, "c", "d", (0, 0, 0), STILL),
+        )
+        for t in T_S
+    ]
+    log = bag(tmp_path / "trial", trees)
+    with pytest.raises(InputError, match="no chain of frames leads from a to d"):
+        read_poses(f"{log}#/tf#a>d")
+    assert [each.name for each in listed_topics(log)] == ["/tf"]
+
+
+def test_the_node_of_the_pages_makes_frames_that_live_reads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its subscriptions get messages as ROS would hand them over."""
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "live.md").read_text()
+    code = page.partition("```python ros\n")[2].partition("```")[0]
+    called: dict[str, Callable] = {}
+    subscribe = lambda _, topic, call, __: called.update({topic: call})  # noqa: E731
+    node = SimpleNamespace(create_subscription=subscribe)
+    ros = SimpleNamespace(init=lambda: None, create_node=lambda _: node, spin=lambda _: None)
+    kinds = SimpleNamespace(PoseStamped=None, Markers=None)
+    modules = {"rclpy": ros, "geometry_msgs.msg": kinds, "mocap4r2_msgs.msg": kinds}
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    with socket.socket(type=socket.SOCK_DGRAM) as listening:
+        listening.bind(("127.0.0.1", 0))
+        exec(code.replace("9870", str(listening.getsockname()[1])), {})
+        of = Messages()
+        called["/gripper"](of.pose(0.5, (0, 0, 1), about_z(0.3))[-1])
+        called["/markers"](of.markers(0.5, {"tip": (1, 2, 3)})[-1])
+        frame = FrameReader([1], ["low", "tip"]).read(listening.recv(10_000).decode())
+    assert frame is not None
+    assert frame.t_s == pytest.approx(START_S + 0.5)
+    np.testing.assert_allclose(frame.tracks_m, [[np.nan] * 3, [1, 2, 3]])
