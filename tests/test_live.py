@@ -17,7 +17,7 @@ from matplotlib.image import imread
 from problem_files import Outcome, run_command
 from problems_small import GUESS, IDEAL, TRUTH, hung_cube
 from scipy.spatial.transform import Rotation
-from test_gauge import CLAMPED, accelerometer, instrumented, strain_gauge
+from test_gauge import accelerometer, instrumented, strain_gauge
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
@@ -665,7 +665,10 @@ def test_tables_of_frames_have_readings_in_their_columns():
         ('{"chip": 1}', "a reading 'chip'; expected accelerometer, foil"),
         ('{"foil": [1, 2]}', "the reading 'foil': found 2 numbers; expected 1 numbers"),
         ('{"foil": "much"}', "the reading 'foil': found 'much'; expected 1 numbers"),
-        ('{"foil": {"t_s": 1}}', "a sample of 'foil' has 't_s'; expected t_s and values"),
+        (
+            '{"foil": {"t_s": 1}}',
+            "a sample of the reading 'foil' has 't_s'; expected t_s and values",
+        ),
         ('{"foil": {"t_s": null, "values": 1}}', "t_s is None"),
         ("[1]", r"readings are \[1\]; expected samples by name"),
     ],
@@ -679,10 +682,6 @@ def test_readings_that_are_none_are_told_with_their_line(given, said):
 # What cannot be live --------------------------------------------------------------------------
 
 
-def on_clamp(t_s: np.ndarray) -> cs.Gauge:
-    return cs.Gauge("clamp", CLAMPED["expression"], t_s, np.ones((len(t_s), 3)), 0.1, grasp=0)
-
-
 def test_problems_that_cannot_be_live_are_refused_in_words():
     problem = swing()
     hung = problem.experiments[0]
@@ -690,7 +689,6 @@ def test_problems_that_cannot_be_live_are_refused_in_words():
     for changed, said in (
         ([still], "never move"),
         ([hung, replace(hung, name="again")], "2 experiments"),
-        ([instrumented(hung, on_clamp(hung.t_s))], "the readings 'clamp' of grasps"),
     ):
         with pytest.raises(InputError, match=said):
             Estimator(cs.Problem(changed, GUESS))

@@ -87,6 +87,7 @@ def live(options: Live) -> None:
         estimator.names,
         source,
         estimator.model.experiment.readings,
+        estimator.model.wrenches,
     )
     bad = 0
     with collected_before():

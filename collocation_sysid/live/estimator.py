@@ -33,7 +33,7 @@ from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
 from ..statistics.trust import GROSS_MISFIT, Trust
 from .budget import Budget
-from .frames import Frame, Pose, as_pose, as_readings, as_time, as_tracks
+from .frames import Frame, Pose, as_pose, as_readings, as_time, as_tracks, as_wrenches
 from .intake import LONGEST, Intake
 from .model import TOGETHER, Model, Poses
 from .search import SEEN, Search
@@ -154,7 +154,8 @@ class Estimator:
         model, self.names = self.model, self.model.experiment.markers.names
         far_m, around = FAR * model.size_m, model.samples_around
         self._reach_m = far_m + float(np.linalg.norm(model.segment.body.nodes_m.mean(axis=0)))
-        self.intake = Intake(model.interval_s, model.substeps, around, far_m)
+        arounds = [each.around for each in model.instruments]
+        self.intake = Intake(model.interval_s, model.substeps, around, far_m, arounds)
         self.counts, self.samples = self.intake.counts, 0
         self.budget_s = options.budget_s or SHARE * model.interval_s
         self.rows = options.rows
@@ -182,7 +183,7 @@ class Estimator:
         t_s: float,
         pose: Pose | Mapping[str, Pose] | None,
         markers: ArrayLike | Mapping[str, ArrayLike],
-        wrench: object = None,
+        wrench: Any = None,
         readings: Mapping[str, Any] | None = None,
     ) -> Update:
         """Take a frame.
@@ -195,8 +196,10 @@ class Estimator:
             or by the order of the problem.
         markers : (M, 3) array, or mapping of name to (3,)
             NaN, or left out, where missing.
-        wrench : optional
-            Not read.
+        wrench : (6,) or (3,) array, optional
+            What the grasp gives: fx, fy, fz [N], tx, ty, tz [N m], at the time of the frame; or a
+            mapping with ``t_s`` and ``values``, or a list of such; of several sensors by the number
+            of their grasp. NaN, or None, where missing.
         readings : mapping of name to numbers, optional
             Of readings of one's own, at the time of the frame; or a mapping with ``t_s`` and
             ``values``, or a list of such. NaN, or None, where missing.
@@ -208,7 +211,9 @@ class Estimator:
         """
         poses = as_pose(pose, self.model.moved_grasps + 1)
         tracks = as_tracks(markers, self.names)
-        told = as_readings(readings, self.model.experiment.readings, as_time(t_s))
+        gauges = self.model.experiment.readings
+        told = as_readings(readings, gauges, as_time(t_s))
+        told += as_wrenches(wrench, self.model.wrenches, len(gauges), as_time(t_s))
         return self.take(Frame(as_time(t_s), poses, tracks, wrench is not None, told))
 
     @one_blas_thread()
@@ -296,12 +301,10 @@ class Estimator:
     def _of_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
         """What of a frame can be read."""
         notes = []
-        if frame.has_wrench:
+        if frame.has_wrench and not self.model.wrenches:
             self.counts["with a wrench"] += 1
             if self.counts["with a wrench"] == 1:
-                notes.append(
-                    "wrenches are not read: live takes poses, markers and readings of points"
-                )
+                notes.append("wrenches are left out: no grasp of the problem has a sensor")
         if frame.pose is not None:
             self._held_m = frame.pose[0]
         away_m = np.linalg.norm(frame.tracks_m[:, None] - self._held_m, axis=2)
@@ -343,21 +346,23 @@ class Estimator:
         if track is None:
             return []
         notes, sigma_m = [], self.model.segment.experiment.markers.sigma_m[:, None]
-        for reading in readings:
-            if not track.failed:
-                said = track.sweep.linearised(reading, rows)
-                if not reading.of:
-                    here = said.at(self.model.flat(self.p))
-                    wild = self._wild(here)
-                    if wild.any():
-                        notes.append(self._left_out(wild))
-                        seen = np.where(wild[:, None], np.nan, reading.values)
-                        reading = reading._replace(values=seen)
-                        said.at_zero[wild] = here[wild] = np.nan
-                    near = np.sum((here * sigma_m) ** 2, axis=1)
-                    squares.append(near[np.isfinite(near)])
-                track.read([said])
+        if track.failed:
+            self.log[-1].readings.extend(readings)
+            return notes
+        each_says = track.sweep.linearised([(reading, rows) for reading in readings])
+        for reading, said in zip(readings, each_says, strict=True):
+            if not reading.of:
+                here = said.at(self.model.flat(self.p))
+                wild = self._wild(here)
+                if wild.any():
+                    notes.append(self._left_out(wild))
+                    seen = np.where(wild[:, None], np.nan, reading.values)
+                    reading = reading._replace(values=seen)
+                    said.at_zero[wild] = here[wild] = np.nan
+                near = np.sum((here * sigma_m) ** 2, axis=1)
+                squares.append(near[np.isfinite(near)])
             self.log[-1].readings.append(reading)
+        track.read(each_says)
         return notes
 
     def _wild(self, residual: Array) -> NDArray[np.bool_]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,16 +15,21 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array, Index
 from ..errors import InputError
+from ..recording.formats.columns import FORCES, TORQUES
 from ..recording.formats.text import written_number
 from ..recording.gauge import Gauge
 from ..recording.poses import first_matrix_fault, first_pose_fault
+from ..recording.wrench import Wrench
 
 Pose = Any
 
+WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _KEYS = ("t_s", "pose", "markers", "wrench", "readings")
 _POSE_KEYS = ("position_m", "quaternion_xyzw")
-# A sample of a reading of one's own: its number from 1 on, time, and numbers (m,), NaN if missing.
+_SAMPLE_KEYS = ("t_s", "values")
+# A sample of an instrument: its number from 1 on, time, and numbers (m,), NaN where missing.
+# Instruments are readings of one's own, then sensors of grasps.
 Told = tuple[int, float, Array]
 # Beyond so many metres or seconds numbers no longer tell micrometres and microseconds apart.
 LARGEST = 1e10
@@ -40,7 +46,7 @@ class Frame:
     tracks_m : (M, 3) NaN where missing
     has_wrench : bool
     told : tuple of Told
-        Samples of readings of one's own, at times of their own.
+        Samples of instruments, at times of their own.
     """
 
     t_s: float
@@ -139,24 +145,60 @@ def as_readings(
             known = ", ".join(names) or "none, as the problem has none"
             raise InputError(f"a reading {reprlib.repr(name)}; expected {known}")
         number = names.index(name)
-        several = isinstance(samples, Sequence) and any(isinstance(s, Mapping) for s in samples)
-        for sample in samples if several else [samples]:
-            if sample is not None:
-                found.append((number + 1, *_sample(sample, gauges[number], t_s)))
+        count, what = gauges[number].measured.shape[1], f"the reading '{name}'"
+        found += [(number + 1, *sample) for sample in _samples(samples, what, count, t_s)]
     return tuple(found)
 
 
-def _sample(given: Any, gauge: Gauge, t_s: float) -> tuple[float, Array]:
-    if isinstance(given, Mapping):
-        if set(given) != {"t_s", "values"}:
-            keys = ", ".join(map(reprlib.repr, given)) or "nothing"
-            raise InputError(f"a sample of '{gauge.name}' has {keys}; expected t_s and values")
-        t_s, given = as_time(given["t_s"]), given["values"]
-    one = isinstance(given, (int, float)) and not isinstance(given, bool)
-    try:
-        return t_s, _numbers([given] if one else given, (gauge.measured.shape[1],))
-    except InputError as error:
-        raise InputError(f"the reading '{gauge.name}': {error.message}") from error
+def as_wrenches(
+    given: Any, wrenches: Mapping[int, Wrench], before: int, t_s: float
+) -> tuple[Told, ...]:
+    """Samples of the sensors of grasps, whose numbers follow those of so many instruments before.
+
+    Raises
+    ------
+    InputError
+        For sensors that are not there, or what is no wrench.
+    """
+    if given is None or not wrenches:
+        return ()
+    known = {str(number): k for k, number in enumerate(wrenches)}
+    if not isinstance(given, Mapping) or set(given) & set(_SAMPLE_KEYS):
+        if len(known) > 1:
+            raise InputError(f"one wrench; expected those of the grasps {' and '.join(known)}")
+        given = dict.fromkeys(known, given)
+    if unknown := [name for name in given if name not in known]:
+        expected = ", ".join(known)
+        raise InputError(f"a wrench of grasp {reprlib.repr(unknown[0])}; expected {expected}")
+    found = []
+    for name, samples in given.items():
+        measured, what = wrenches[int(name)].measured, f"the wrench of grasp {name}"
+        for at_s, values in _samples(samples, what, len(measured), t_s, fewest=3):
+            seen = np.where(measured, np.pad(values, (0, 6 - len(values))), np.nan)
+            seen[len(values) :] = np.nan
+            found.append((before + known[name] + 1, at_s, seen))
+    return tuple(found)
+
+
+def _samples(
+    given: Any, what: str, count: int, t_s: float, fewest: int = 0
+) -> Iterator[tuple[float, Array]]:
+    """Those that are there, of so many numbers each; at the time of the frame without their own."""
+    several = isinstance(given, Sequence) and any(isinstance(s, Mapping) for s in given)
+    for sample in given if several else [given]:
+        at_s, values = t_s, sample
+        if isinstance(sample, Mapping):
+            if set(sample) != set(_SAMPLE_KEYS):
+                keys = ", ".join(map(reprlib.repr, sample)) or "nothing"
+                raise InputError(f"a sample of {what} has {keys}; expected t_s and values")
+            at_s, values = as_time(sample["t_s"]), sample["values"]
+        one = isinstance(values, (int, float)) and not isinstance(values, bool)
+        few = np.shape(values) == (fewest,)
+        if values is not None:
+            try:
+                yield at_s, _numbers([values] if one else values, (fewest if few else count,))
+            except InputError as error:
+                raise InputError(f"{what}: {error.message}") from error
 
 
 def _numbers(given: Any, shape: tuple[int, ...]) -> Array:
@@ -186,6 +228,8 @@ class FrameReader:
         For messages.
     gauges : sequence of Gauge
         The problem's readings of one's own; in a table they are in the columns they name.
+    wrenches : mapping of a grasp's number to Wrench
+        Those that the problem has, for what sensors measure.
     """
 
     def __init__(
@@ -194,9 +238,10 @@ class FrameReader:
         names: Sequence[str],
         source: str = "input",
         gauges: Sequence[Gauge] = (),
+        wrenches: Mapping[int, Wrench] = MappingProxyType({}),
     ) -> None:
         self.grasps, self.names, self.source = list(grasps), list(names), source
-        self.gauges = gauges
+        self.gauges, self.wrenches = gauges, wrenches
         self.line = 0
         self._columns: list[str] | None = None
 
@@ -229,10 +274,10 @@ class FrameReader:
             raise InputError("there is no t_s; expected the time in seconds")
         pose = as_pose(found.get("pose"), self.grasps)
         tracks = as_tracks(found.get("markers"), self.names)
-        t_s, has_wrench = as_time(found["t_s"]), found.get("wrench") is not None
-        return Frame(
-            t_s, pose, tracks, has_wrench, as_readings(found.get("readings"), self.gauges, t_s)
-        )
+        t_s, wrench = as_time(found["t_s"]), found.get("wrench")
+        told = as_readings(found.get("readings"), self.gauges, t_s)
+        told += as_wrenches(wrench, self.wrenches, len(self.gauges), t_s)
+        return Frame(t_s, pose, tracks, wrench is not None, told)
 
     def _of_row(self, cells: list[str]) -> Frame | None:
         if self._columns is None:
@@ -245,8 +290,8 @@ class FrameReader:
         pose = None if any(one is None for one in poses) else as_pose(_alone(poses), self.grasps)
         tracks = [[by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")] for m in self.names]
         t_s, told = as_time(by_name["t_s"]), list[Told]()
-        for number, gauge in enumerate(self.gauges, 1):
-            values = np.array([by_name.get(column, np.nan) for column in gauge.columns])
+        for number, columns in enumerate(self._told_columns, 1):
+            values = np.array([by_name.get(column, np.nan) for column in columns])
             if np.isfinite(values).any():
                 told.append((number, t_s, values))
         return Frame(t_s, pose, as_tracks(tracks, self.names), told=tuple(told))
@@ -259,6 +304,13 @@ class FrameReader:
         before = "" if len(self.grasps) == 1 else f"{number}."
         return [before + name for name in POSE_COLUMNS]
 
+    @property
+    def _told_columns(self) -> list[Sequence[str]]:
+        """Of each instrument."""
+        before = ["" if len(self.wrenches) == 1 else f"{number}." for number in self.wrenches]
+        of_wrenches = [[each + name for name in WRENCH_COLUMNS] for each in before]
+        return [*(gauge.columns for gauge in self.gauges), *of_wrenches]
+
     def _checked(self, columns: list[str]) -> list[str]:
         needed = ["t_s", *(name for k in self.grasps for name in self._pose_columns(k))]
         if missing := [name for name in needed if name not in columns]:
@@ -267,7 +319,7 @@ class FrameReader:
                 f"expected {', '.join(needed)} and the markers' columns"
             )
         known = {*needed, *(f"{m}_{a}" for m in self.names for a in ("x", "y", "z"))}
-        known |= {column for gauge in self.gauges for column in gauge.columns}
+        known |= {column for each in self._told_columns for column in each}
         if unknown := [name for name in columns if name not in known]:
             raise InputError(
                 f"a column {reprlib.repr(unknown[0])}; expected {', '.join(sorted(known))}"

@@ -20,7 +20,8 @@ from ..arrays import Array
 from ..program.reading import lagrange_weights
 from ..recording.clock import TIME_TOLERANCE_S
 from .frames import Told
-from .sweep import LATEST, LoggedRow, Sample, rows_around
+from .model import Around
+from .sweep import LATEST, LoggedRow, Sample
 
 # Frames this near in time, in samples, are of one time.
 TOLERANCE = 0.1
@@ -42,6 +43,8 @@ class Intake:
         Samples before and after one that its reading needs.
     leap_m : float
         Farther no grasp goes from a sample to the next.
+    instruments : sequence of Around
+        Rows that a sample of each is read from.
     counts : Counter
         Of what was wrong with frames.
     """
@@ -50,6 +53,7 @@ class Intake:
     substeps: int
     around: int
     leap_m: float = np.inf
+    instruments: Sequence[Around] = ()
     counts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
@@ -222,7 +226,9 @@ class Intake:
         def ready(of: int, t_s: float) -> bool:
             if not of:
                 return t_s <= latest_s
-            return rows_around(self.rows - 1 - (now_s - t_s) / step_s).stop <= self.rows
+            around = self.instruments[of - 1]
+            rows = around.rows(self.rows - 1 - (now_s - t_s) / step_s)
+            return rows.stop + around.late <= self.rows
 
         found = [each for each in self._waiting if ready(*each[:2])]
         self._waiting = [each for each in self._waiting if not ready(*each[:2])]

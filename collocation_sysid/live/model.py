@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
@@ -23,14 +24,19 @@ from ..problem import Problem
 from ..program.channel import Points
 from ..program.collocation import Collocation
 from ..program.gauge import NEIGHBOURS as GAUGE_NEIGHBOURS
-from ..program.gauge import GaugeReading, points_of
+from ..program.gauge import points_of
 from ..program.least_squares import LeastSquares
 from ..program.markers import NEIGHBOURS, MarkerReading
 from ..program.newton import NewtonOptions, Solver
+from ..program.reading import Reading
 from ..program.segment import Segment
 from ..program.sweep import Sweep
+from ..program.wrench import NEIGHBOURS as WRENCH_NEIGHBOURS
+from ..program.wrench_channel import GraspWrench
 from ..recording.experiment import Experiment
 from ..recording.poses import PoseSequence
+from ..recording.wrench import Wrench
+from .felt import LATE, Poses, Sensor
 
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import Room
@@ -44,9 +50,47 @@ WEAK = 2.3
 CAREFUL = NewtonOptions(tolerance=1e-6)
 # Young's modulus that a search without a guess begins at.
 MIDDLE_PA = 1e4
+# Readings this near to a row, in rows, are of that row; others lie between some of them.
+NEAR = 1e-3
 
-# Of each grasp, its rotation (3, 3) and its translation (3,).
-Poses = tuple[tuple[Array, Array], ...]
+
+class Around(NamedTuple):
+    """The rows that samples of an instrument are read from, as in a recording that goes on.
+
+    neighbours : int
+        Rows, where its clock is right.
+    off : float
+        Rows that its clock may be off.
+    first, late : int
+        From which row on there is what it looks at, and how many rows later that is known.
+    """
+
+    neighbours: int
+    off: float = 0.0
+    first: int = 0
+    late: int = 0
+
+    def rows(self, at: float) -> range:
+        """Those of a sample at such a row."""
+        begins, ends = (
+            max(int(np.floor(at + off + NEAR)) - (self.neighbours - 1) // 2, self.first)
+            for off in (-self.off, self.off)
+        )
+        return range(begins, ends + self.neighbours)
+
+
+class LiveInstrument(NamedTuple):
+    """What frames bring numbers of besides markers.
+
+    reading : Reading
+    around : Around
+    looked : slice or int
+        Places among all that are looked at, or the sensor.
+    """
+
+    reading: Reading
+    around: Around
+    looked: slice | int
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,16 +226,52 @@ class Model:
         return MarkerReading.of(origin, *where, earlier=around)
 
     @cached_property
-    def gauges(self) -> tuple[GaugeReading, ...]:
-        """Readings of one's own, which look at as many rows as one sample needs."""
-        pairs = zip(self.segment.gauges, self.looked, strict=True)
-        return tuple(replace(gauge, channel=points) for gauge, points in pairs)
+    def instruments(self) -> tuple[LiveInstrument, ...]:
+        """Readings of one's own, then the sensors of grasps."""
+        found, place, step_s = [], len(self.experiment.markers.names), self.segment.dynamics.step_s
+        points = iter(self.looked)
+        for reading in (*self.segment.gauges, *self.segment.sensors):
+            channel, own = reading.channel, reading in self.segment.gauges
+            around = Around(GAUGE_NEIGHBOURS)
+            if isinstance(channel, GraspWrench):
+                looked = [other for other, _ in self.sensors].index(channel)
+                around = around._replace(first=int(channel.grid[0]), late=LATE)
+                if not own:
+                    off = channel.clock_limit_s / step_s
+                    around = around._replace(neighbours=WRENCH_NEIGHBOURS, off=off)
+            else:
+                here = next(points)
+                reading, looked = replace(reading, channel=here), slice(place, place + here.each)
+                place += here.each
+            found.append(LiveInstrument(reading, around, looked))
+        return tuple(found)
+
+    @cached_property
+    def late(self) -> int:
+        """Most rows that these need beside those that markers do."""
+        spans = (2 * each.around.off + each.around.late for each in self.instruments)
+        return int(np.ceil(max(spans, default=0.0)))
 
     @cached_property
     def looked(self) -> tuple[Points, ...]:
-        """The places they look at."""
+        """The places that readings of points look at."""
         still = self.segment.experiment
-        return tuple(points_of(still, gauge, GAUGE_NEIGHBOURS) for gauge in still.readings)
+        gauges = [gauge for gauge in still.readings if gauge.grasp is None]
+        return tuple(points_of(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges)
+
+    @cached_property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """What looks at a grasp, and its number."""
+        channels = [reading.channel for reading in self.segment.readings]
+        grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
+        feels = (channel for channel in channels if isinstance(channel, GraspWrench))
+        return tuple((channel, grasps.index(id(channel.grasp))) for channel in feels)
+
+    @cached_property
+    def wrenches(self) -> dict[int, Wrench]:
+        """Those that the problem's recording has, by the number of their grasp from 1 on."""
+        pairs = enumerate(self.experiment.grasps, 1)
+        return {number: grasp.wrench for number, grasp in pairs if grasp.wrench is not None}
 
     @cached_property
     def moved_grasps(self) -> Index:
@@ -290,9 +370,8 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("tensions and pressures, which frames do not bring,", "none")
     if experiment.obstacles:
         raise refused("obstacles, which frames do not bring,", "none")
-    if felt := [gauge.name for gauge in experiment.readings if gauge.grasp is not None]:
-        names = ", ".join(map(repr, felt))
-        raise refused(f"the readings {names} of grasps", "readings of points")
+    if experiment.nuisance.sensor_lag_s and any(grasp.wrench for grasp in experiment.grasps):
+        raise refused("a sensor with a low-pass (sensor_lag)", "one without")
     own = (generated(each.force, each.points.dofs) for each in experiment.body.placed_forces)
     if any(law.takes(0) for law in own):
         raise refused("a force that depends on time", "one that does not")
@@ -327,10 +406,18 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
     return replace(
         experiment,
         t_s=t_s,
-        grasps=[replace(g, wrench=None) for g in _held_at(experiment, _first_poses(experiment))],
+        grasps=[
+            replace(grasp, wrench=grasp.wrench and _still_wrench(grasp.wrench, t_s))
+            for grasp in _held_at(experiment, _first_poses(experiment))
+        ],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
         readings=gauges,
     )
+
+
+def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
+    values = np.where(wrench.measured, np.zeros((len(t_s), 1)), np.nan)
+    return replace(wrench, t_s=t_s, values=values)
 
 
 def _first_poses(experiment: Experiment) -> Poses:

@@ -71,10 +71,12 @@ def recorded(experiment: Experiment, model: Model) -> Iterator[Frame]:
     """The frames of an experiment's recording."""
     moved = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moved_grasps]
     turns = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in moved]
+    series = [(gauge.times, gauge.measured) for gauge in experiment.readings]
+    series += [(wrench.t_s, wrench.values) for wrench in model.wrenches.values()]
     told = [
         (number, float(at_s), values)
-        for number, gauge in enumerate(experiment.readings, 1)
-        for at_s, values in zip(gauge.times, gauge.measured, strict=True)
+        for number, each in enumerate(series, 1)
+        for at_s, values in zip(*each, strict=True)
     ]
     frame_of = np.searchsorted(experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in told])
     for k, t_s in enumerate(experiment.t_s):

@@ -10,7 +10,7 @@ reduced-space method. A row whose correction is long is linearised again, alone,
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, NoReturn
 
@@ -20,35 +20,27 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..fem.body import Linearisation
 from ..model.dynamics import StencilRow
-from ..program.channel import Slopes
-from ..program.gauge import NEIGHBOURS
+from ..program.channel import Motion, Slopes
 from ..program.least_squares import LeastSquares
 from ..program.marching import RowEquations, extrapolated, solve_row
 from ..program.newton import NewtonFailure, simulation_error
 from ..program.reading import as_squares, lagrange_weights
 from ..program.rest import start_state
 from ..program.sweep import Columns, Forward, GraspMotion, LastRows, Step
-from .model import TOGETHER, Model, Poses
+from .felt import LATE, Felt, Poses
+from .model import NEAR, TOGETHER, Model
 
 # A row's correction over the body's size: the next one would be its square. Where rows are solved
 # together it may be so many times as long, and another pass follows.
 LAST_STEP, ROUGH = 3e-4, 10
-# Readings this near to a row, in rows, are of that row; others lie between four of them.
-NEAR = 1e-3
 # Readings may come this many samples late.
 LATEST = 5
-
-
-def rows_around(row: float) -> range:
-    """The rows that a reading of one's own is read from, as in a recording that goes on."""
-    first = max(int(np.floor(row + NEAR)) - (NEIGHBOURS - 1) // 2, 0)
-    return range(first, first + NEIGHBOURS)
 
 
 class Sample(NamedTuple):
     """Numbers, NaN where missing, so many rows before the row they are read after.
 
-    Markers are (M, 3); a reading of one's own has a number from 1 on, and is (m,).
+    Markers are (M, 3); an instrument has a number from 1 on, and is (m,).
     """
 
     back: float
@@ -86,8 +78,9 @@ class Said(NamedTuple):
         return self.at_zero + self.slope @ flat
 
 
-# A row, and x and the columns of the markers and then of what readings look at, (3M + …, 1 + m).
-Read = tuple[Kept, Array]
+# A row, x and the columns of the markers and then of what readings look at, (3M + …, 1 + m), and
+# what grasps gave before, with its slopes by all parameters, (sensors, 6, 1 + P).
+Read = tuple[Kept, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +93,7 @@ class State:
         Rows done, and the place of the next one in the template.
     x, force : (rows, 3n) of the template
     given : (rows, g, 1 + m) of grasped dofs
+    felt : Felt
     memory : LastRows, None at first
     read : tuple of rows with their markers, latest last
     """
@@ -109,6 +103,7 @@ class State:
     x: Array
     force: Array
     given: Array
+    felt: Felt
     memory: LastRows | None
     read: tuple[Read, ...]
 
@@ -155,9 +150,9 @@ class LiveSweep:
             np.concatenate(part)
             for part in zip(*((nodes, at.weights) for nodes, at in looks), strict=True)
         )
-        self._ends = np.cumsum([len(nodes) for nodes, _ in looks]).tolist()
         self.longest_m = 0.0
         self.grasped, self.moving = segment.grasping.dofs, segment.moving
+        self.sensed = segment.sensed_dofs
         self.count = 1 + len(self.moving)
         self.mass_kg = self.dynamics.mass.kg[0]
         # Loads are always there: what acts on one row acts on every one.
@@ -172,7 +167,8 @@ class LiveSweep:
     def _begin(self) -> State:
         rows, dofs = self.model.rows, self.segment.dofs
         empty, given = np.zeros((rows, dofs)), np.zeros((rows, len(self.grasped), self.count))
-        return State(0, 0, empty, empty, given, None, ())
+        felt = Felt.nothing(rows, len(self.sensed), self.count, len(self.model.first_poses))
+        return State(0, 0, empty, empty, given, felt, None, ())
 
     def _moved(self, state: State, at: Array) -> State:
         if state.memory is None or (at == self.p).all():
@@ -189,7 +185,7 @@ class LiveSweep:
             for each in (memory.solutions, memory.increments)
         )
         memory = replace(memory, solutions=solutions, increments=increments)
-        kept = [each for each, _ in state.read]
+        kept = [each for each, *_ in state.read]
         whole = np.empty((len(kept), self.segment.dofs, self.count))
         whole[..., 1:] = [each.columns for each in kept]
         whole[..., 0] = whole[..., 1:] @ way + [each.x for each in kept]
@@ -198,8 +194,12 @@ class LiveSweep:
         seen = self._seen(whole)
         seen[..., 1:] *= self.rates[moving]
         moved = [Kept(self.flat, w[:, 0], k.columns) for w, k in zip(whole, kept, strict=True)]
-        read = tuple(zip(moved, seen, strict=True))
-        return replace(state, x=x, force=force, memory=memory, read=read)
+        told = np.array([wrenches for *_, wrenches in state.read])
+        told[..., 0] += told[..., 1:] @ ((self.flat - flat) / was)
+        told[..., 1:] *= self.rates / was
+        read = tuple(zip(moved, seen, told, strict=True))
+        felt = state.felt.at(step, grown)
+        return replace(state, x=x, force=force, felt=felt, memory=memory, read=read)
 
     def _resume(self, state: State) -> None:
         self.row, self.end = state.row, state.end
@@ -208,8 +208,10 @@ class LiveSweep:
         if self.segment.nuisance.moves_grasps:
             grasped = GraspMotion.along(self.solver, self.grasped, self.given)
         self.columns = Columns(self.setting, self.count, step=True, grasped=grasped)
-        self.forward = Forward(self.solver, self.columns, state.memory)
+        self.felt = state.felt.copy()
+        self.forward = Forward(self.solver, self.columns, state.memory, self.felt.held)
         most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4 + TOGETHER
+        most += self.model.late
         self.read: deque[Read] = deque(state.read, maxlen=most)
 
     @property
@@ -221,7 +223,8 @@ class LiveSweep:
     def state(self) -> State:
         """What the next row depends on."""
         arrays = self.x.copy(), self.force.copy(), self.given.copy()
-        return State(self.row, self.end, *arrays, self.forward.last, tuple(self.read))
+        felt = self.felt.copy()
+        return State(self.row, self.end, *arrays, felt, self.forward.last, tuple(self.read))
 
     # Rows -------------------------------------------------------------------------------------
 
@@ -238,6 +241,7 @@ class LiveSweep:
         poses = [self.model.poses_of(each) for each in poses]
         first, count = self._make_room(len(poses)), len(poses)
         goals, slopes = self.model.goals(self.carried, poses)
+        self.felt.place(first, poses)
         self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
         if first < self.dynamics.first_row:
             self.x[first] = self._start(poses[0])
@@ -273,7 +277,7 @@ class LiveSweep:
     def _make_room(self, count: int) -> int:
         surplus = self.end + count - self.model.rows
         if surplus > 0:
-            for each in (self.x, self.force, self.given):
+            for each in (self.x, self.force, self.given, *self.felt.arrays):
                 each[:-surplus] = each[surplus:]
             self.end -= surplus
         return self.end
@@ -332,7 +336,7 @@ class LiveSweep:
                 return found, np.nan
             length = float(np.abs(whole[:, 0]).max(initial=0.0))
             if not length <= limit:
-                self.forward = Forward(solver, self.columns, before)
+                self.forward = Forward(solver, self.columns, before, self.felt.held)
                 return found, length
             self.longest_m = max(self.longest_m, length)
             self.x[t] += whole[:, 0]
@@ -348,7 +352,28 @@ class LiveSweep:
         by_flat = (whole[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
         pairs = zip(self.x[here].copy(), by_flat, strict=True)
         found = [Kept(self.flat, *pair) for pair in pairs]
-        self.read.extend(zip(found, self._seen(whole), strict=True))
+        self.felt.corrected(here, whole[:, self.sensed])
+        self.read.extend(zip(found, self._seen(whole), self._told(here), strict=True))
+        return found
+
+    def _told(self, here: slice) -> Array:
+        """What grasps gave as rows tell it, (rows, sensors, 6, 1 + P); zero where they do not."""
+        sensors, size = self.model.sensors, self.model.size
+        found = np.zeros((here.stop - here.start, len(sensors), 6, 1 + size))
+        if not sensors:
+            return found
+        first = max(here.start, int(sensors[0][0].grid[0]) + LATE)
+        if first >= here.stop:
+            return found
+        *_, w, s = self.model.stencils
+        x, rows = self.x[: here.stop, self.sensed], np.arange(first, here.stop)
+        forced, channels = self.felt.wrenches(sensors, self.setting, x, (w, s), rows)
+        motion = Motion(x, lambda: forced)
+        for k, channel in enumerate(channels):
+            value, slopes = channel.linearised(motion, self.phi, self.moving, size)
+            told = found[first - here.start :, k]
+            told[..., 0] = value.reshape(-1, 6)
+            told[..., 1:] = slopes.by.reshape(-1, 6, size)
         return found
 
     def _seen(self, whole: Array) -> Array:
@@ -375,26 +400,38 @@ class LiveSweep:
 
     # Readings ---------------------------------------------------------------------------------
 
-    def linearised(self, reading: Sample, rows: int = 0) -> Said:
-        """What was read so many `rows` before the last one."""
-        residual, slope = (self._of_gauge if reading.of else self._of_markers)(reading, rows)
-        slope /= self.rates
-        return Said(residual - slope @ self.flat, slope, reading.of)
+    def linearised(self, pairs: Sequence[tuple[Sample, int]]) -> list[Said]:
+        """What each sample says that was read so many rows before the last one."""
+        found: list[Said | None] = [None] * len(pairs)
+        for of in {sample.of for sample, _ in pairs}:
+            here = [k for k, (sample, _) in enumerate(pairs) if sample.of == of]
+            own = [pairs[k] for k in here]
+            each = self._of_instrument(of, own) if of else (self._of_markers(*pair) for pair in own)
+            for k, (residual, slope) in zip(here, each, strict=True):
+                slope /= self.rates
+                found[k] = Said(residual - slope @ self.flat, slope, of)
+        return [said for said in found if said is not None]
 
-    def _of_gauge(self, reading: Sample, rows: int) -> tuple[Array, Array]:
-        """The same as `_of_markers` of a reading of one's own, from the rows around it."""
-        model, gauge = self.model, self.model.gauges[reading.of - 1]
-        row, last = self.row - 1 - reading.back - rows, self.row - 1
-        here = rows_around(row)
-        seen = np.array([self.read[k - last - 1][1] for k in here])
-        looked = slice(3 * self._ends[reading.of - 1], 3 * self._ends[reading.of])
-        seen = seen[:, looked].reshape(len(seen), -1, 3, self.count)
+    def _of_instrument(
+        self, of: int, pairs: Sequence[tuple[Sample, int]]
+    ) -> Iterator[tuple[Array, Array]]:
+        """The same as `_of_markers` of an instrument, from the rows around its samples."""
+        model, (reading, around, looked) = self.model, self.model.instruments[of - 1]
+        at = [self.row - 1 - sample.back - rows for sample, rows in pairs]
+        here = range(around.rows(min(at)).start, around.rows(max(at)).stop)
+        _, seen, told = zip(*(self.read[k + around.late - self.row] for k in here), strict=True)
         step_s, begins_s = model.interval_s / model.substeps, float(model.experiment.t_s[0])
-        at_s = begins_s + step_s * np.array(here)
-        one = gauge.of_one(at_s, begins_s + step_s * row, reading.values)
-        slopes = Slopes.along(self.moving, seen[..., 1:])
-        residual, slope = one.linearised(seen[..., 0], slopes, self.phi, model.size)
-        return np.where(one.components[0], residual[0], np.nan), slope[0]
+        known_s, t_s = (begins_s + step_s * np.array(rows) for rows in (here, at))
+        some = reading.of_some(known_s, t_s, np.array([sample.values for sample, _ in pairs]))
+        if isinstance(looked, slice):
+            columns, place = self.moving, slice(3 * looked.start, 3 * looked.stop)
+            values = np.array(seen)[:, place]
+        else:
+            columns, values = np.arange(model.size), np.array(told)[:, looked]
+        values = values.reshape(len(here), -1, 3, 1 + len(columns))
+        slopes = Slopes.along(columns, values[..., 1:])
+        residual, slope = some.linearised(values[..., 0], slopes, self.phi, model.size)
+        return zip(np.where(some.there(len(here)), residual, np.nan), slope, strict=True)
 
     def _of_markers(self, reading: Sample, rows: int) -> tuple[Array, Array]:
         """Residuals (M, 3) of what was read, NaN where missing, and their slopes (M, 3, P) by p."""
@@ -402,7 +439,7 @@ class LiveSweep:
         back = reading.back + rows
         backs = [back - k * model.substeps for k in range(-around, around + 1)]
         x, seen = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
-        seen = seen[:, : 3 * self._ends[0]]
+        seen = seen[:, : 3 * len(self.shape_functions[0])]
         values = seen[..., 0].reshape(len(seen), -1, 3)
         slopes = markers.channel.slopes_of(x, self.shape_functions, self.moving, seen[..., 1:])
         since_s = (self.row - 1 - back) / model.substeps * model.interval_s
@@ -415,12 +452,12 @@ class LiveSweep:
         nearest = round(back)
         last = len(self.read) - 1
         if abs(back - nearest) <= NEAR or not last:
-            kept, seen = self.read[min(max(last - nearest, 0), last)]
+            kept, seen, _ = self.read[min(max(last - nearest, 0), last)]
             return kept.x, seen
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
         rows = [first + k for k in range(min(4, last + 1))]
         weights = lagrange_weights(back, rows)
-        kept, seen = zip(*(self.read[last - row] for row in rows), strict=True)
+        kept, seen, _ = zip(*(self.read[last - row] for row in rows), strict=True)
         return np.tensordot(weights, [k.x for k in kept], 1), np.tensordot(weights, seen, 1)
 
     def take(self, said: Sequence[Said]) -> None:

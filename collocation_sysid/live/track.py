@@ -145,8 +145,8 @@ class Track:
     def again(self, rows: Sequence[LoggedRow]) -> None:
         """Go on by rows and all that was read after them, as far as is possible at once."""
         done = self.advance([row.poses for row in rows[: self.left]])
-        pairs = [(k, each) for k, row in enumerate(rows[:done], 1) for each in row.readings]
-        self.read([self.sweep.linearised(reading, done - k) for k, reading in pairs])
+        pairs = [(each, done - k) for k, row in enumerate(rows[:done], 1) for each in row.readings]
+        self.read(self.sweep.linearised(pairs))
 
     @property
     def together(self) -> int:

@@ -12,6 +12,7 @@ from ..pipeline import Run, run
 from ..problem import Problem
 from ..recording.clock import STEP_TOLERANCE
 from ..recording.experiment import Experiment
+from ..recording.gauge import Gauge
 from ..recording.poses import PoseSequence
 from .intake import Intake
 from .model import Model
@@ -45,12 +46,18 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
         poses = PoseSequence.from_matrices(t_s, matrices, smooth)
         grasps[number] = replace(grasps[number], poses=poses)
     markers, readings = replace(experiment.markers, t_s=t_s, positions_m=tracks_m), []
-    for number, gauge in enumerate(experiment.readings, 1):
+    for number, gauge in enumerate((*experiment.readings, *model.wrenches), 1):
         told = {when: values for of, when, values in intake.told(log) if of == number}
         inside = [when for when in sorted(told) if when <= len(t_s) - 1]
-        if len(inside) >= FEWEST:
-            own_s = t_s[0] + model.interval_s * np.array(inside)
-            readings.append(replace(gauge, t_s=own_s, values=np.array([told[w] for w in inside])))
+        values = np.array([told[when] for when in inside])
+        if len(inside) < FEWEST or not np.isfinite(values).any():
+            continue
+        seen = {"t_s": t_s[0] + model.interval_s * np.array(inside), "values": values}
+        if isinstance(gauge, Gauge):
+            readings.append(replace(gauge, **seen))
+        else:
+            wrench = replace(model.wrenches[gauge], **seen)
+            grasps[gauge - 1] = replace(grasps[gauge - 1], wrench=wrench)
     return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings)
 
 

@@ -6,8 +6,9 @@ These are those of the polynomial through the five times around a sample.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -79,15 +80,9 @@ class GaugeReading(Reading):
             static=static,
         )
 
-    def of_one(self, at_s: Array, t_s: float, numbers: Array) -> GaugeReading:
-        """That of one sample (m,), of a channel that is known at some times."""
-        measured = np.full((1, 1, self.measured.shape[2]), np.nan)
-        measured[0, 0, : len(numbers)] = numbers
-        there = np.isfinite(measured).reshape(1, -1, GROUP)
-        told = {"measured": measured, "components": there}
-        other = replace(self, t_s=np.array([t_s]), at_s=at_s, **told)
-        vars(other)["_instruments"] = self._instruments
-        return other
+    def of_some(self, known_s: Array, t_s: Array, numbers: Array, **changes: Any) -> GaugeReading:
+        """That of other samples (S, m), of a channel that is known at some times."""
+        return super().of_some(known_s, t_s, numbers, at_s=known_s, **changes)
 
     @cached_property
     def _window(self) -> Window:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -23,7 +23,7 @@ from ..arrays import Array, Index
 from ..model.generated import Generated
 from ..model.nuisance import NuisanceMap
 from .channel import Entries, Points, Slopes
-from .wrench_channel import GraspWrench
+from .wrench_channel import GraspWrench, Grid
 
 GROUP = 3
 
@@ -234,6 +234,20 @@ class Reading(ABC):
     @cached_property
     def _instruments(self) -> dict[tuple[int, int], Instrument]:
         return {}
+
+    def of_some(self, known_s: Array, t_s: Array, numbers: Array, **changes: Any) -> Self:
+        """That of other samples (S, m), of a channel that is known at some times (n,)."""
+        measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
+        measured[:, 0, : numbers.shape[1]] = numbers
+        there = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
+        changes |= {"t_s": t_s, "measured": measured, "components": there}
+        feels = isinstance(self.channel, GraspWrench)
+        when = {"on": Grid.at(known_s)} if feels else {"rows": np.arange(len(known_s))}
+        changes["channel"] = replace(self.channel, **when)
+        other = replace(self, **changes)
+        # Derivatives of the same expression are generated once.
+        vars(other)["_instruments"] = self._instruments
+        return other
 
     def instrument(self, vectors: int, data: int) -> Instrument:
         """That of windows of so many vectors and data."""

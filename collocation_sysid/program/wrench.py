@@ -74,14 +74,9 @@ class WrenchReading(Reading):
         return self.components.reshape(-1, 6)
 
     @property
-    def limit_s(self) -> float:
-        """Largest shift of the clock."""
-        return _limit_s(self.channel)
-
-    @property
     def begins_s(self) -> float:
         """The first sample, however late it is."""
-        return super().begins_s + self.limit_s
+        return super().begins_s + self.channel.clock_limit_s
 
     def covered(self, known: int) -> NDArray[np.bool_]:
         """(S,) samples that the first times suffice for, however the clock is shifted."""
@@ -136,17 +131,12 @@ class WrenchReading(Reading):
         return WrenchReading.of(seen, wrench)
 
 
-def _limit_s(channel: GraspWrench) -> float:
-    here = channel.phi_places(SENSOR_TIME)
-    return float(SENSOR_TIME.high * channel.nuisance.scales[here].sum())
-
-
 def _covered(channel: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
     if not known:
         return np.zeros(len(t_s), dtype=bool)
     first, last = channel.t_s[[0, known - 1]]
     rounding = 1e-6 * channel.on.step_s + TIME_TOLERANCE_S
-    limit_s = _limit_s(channel)
+    limit_s = channel.clock_limit_s
     return (t_s >= first + limit_s - rounding) & (t_s <= last - limit_s + rounding)
 
 

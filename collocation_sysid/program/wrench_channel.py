@@ -27,7 +27,14 @@ from ..model.nuisance import NuisanceMap
 from ..model.recursion import Evolution, Recursion
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
-from ..recording.nuisance import SENSOR_LAG, TOOL_CENTRE, TOOL_MASS, NuisanceRow, rotation
+from ..recording.nuisance import (
+    SENSOR_LAG,
+    SENSOR_TIME,
+    TOOL_CENTRE,
+    TOOL_MASS,
+    NuisanceRow,
+    rotation,
+)
 from ..recording.wrench import Frame
 from .channel import Forced, Motion, Pulled, Slopes
 from .reaction import centred_rows
@@ -172,28 +179,30 @@ class GraspWrench:
         where = nuisance, 3 * len(experiment.body.nodes_m), sensed, places, held
         return cls(number, grasp, frame, point_m, grid, *where)
 
+    @property
+    def clock_limit_s(self) -> float:
+        """Largest shift of the sensor's clock."""
+        here = self.phi_places(SENSOR_TIME)
+        return float(SENSOR_TIME.high * self.nuisance.scales[here].sum())
+
     # Moments ----------------------------------------------------------------------------------
 
     @cached_property
     def frames(self) -> tuple[Array, Array]:
         """Q (n, 3, 3) and o (n, 3)."""
-        turns, shifts = self._poses(self.grid)
+        turns, shifts = self.poses_at(self.grid)
         if self.frame == "grasp":
             return turns, shifts + turns @ self.point_m
         shape = (self.count, 1)
         return np.tile(np.eye(3), (*shape, 1)), np.tile(self.point_m, shape)
 
-    def _poses(self, rows: Index) -> tuple[Array, Array]:
+    def poses_at(self, rows: Index) -> tuple[Array, Array]:
+        """Turns (k, 3, 3) and shifts (k, 3) of the grasp at some rows."""
         return self.grasp.poses.at(self.on.t_s[rows])
 
     @cached_property
-    def moment(self) -> Generated:
-        """Force and torque (6,) of one node, by x_g and R_g; data are Q, o and what is held."""
-        return Generated(_moment, 6, 15)
-
-    @cached_property
     def moment_data(self) -> Array:
-        """(15, n, h)."""
+        """(15, n, h) of `MOMENT`."""
         axes, points = self.frames
         nodes = len(self.held) // 3
         of_time = np.concatenate([axes.reshape(-1, 9), points], axis=1).T
@@ -201,7 +210,7 @@ class GraspWrench:
         return np.concatenate([np.repeat(of_time[:, :, None], nodes, axis=2), held])
 
     def moments_at(self, forced: Forced) -> tuple[Array, Array]:
-        """Inputs (6, n, h) and data of `moment`, at as many times as are told."""
+        """Inputs (6, n, h) and data of `MOMENT`, at as many times as are told."""
         k = self.grid[: self.reached(len(forced.reaction))]
         both = forced.position_m[k], forced.reaction[k + self.on.late]
         shape = len(k), len(self.places) // 3, 3
@@ -210,13 +219,13 @@ class GraspWrench:
 
     def arms(self, forced: Forced) -> tuple[Array, Array]:
         """A and B (n, 6, d) of dW = A dR + B dx, W = A R."""
-        by_u = self.moment.slopes(*self.moments_at(forced))[1]
+        by_u = MOMENT.slopes(*self.moments_at(forced))[1]
         by_u = np.transpose(by_u, (2, 0, 3, 1))
         return _by_dof(by_u[..., 3:]), _by_dof(by_u[..., :3])
 
     def without_tool(self, forced: Forced) -> Array:
         """W (n, 6) of the body alone."""
-        return self.moment.value(*self.moments_at(forced)).sum(axis=2).T
+        return MOMENT.value(*self.moments_at(forced)).sum(axis=2).T
 
     # The tool ---------------------------------------------------------------------------------
 
@@ -252,13 +261,13 @@ class GraspWrench:
         These are Q, the turn of the grasp with its rate, and its shift from o with its rate.
         """
         axes, points = (each[:count] for each in self.frames)
-        turns, shifts = self._poses(self.grid[:count])
-        turn_rates, shift_rates = self._accelerations(count)
+        turns, shifts = self.poses_at(self.grid[:count])
+        turn_rates, shift_rates = self.pose_rates(count)
         parts = (axes, turns, turn_rates, shifts - points, shift_rates)
         data = np.concatenate([each.reshape(count, -1) for each in parts], axis=1)
         return phi[self.tool_phi], data.T
 
-    def _accelerations(self, count: int) -> tuple[Array, Array]:
+    def pose_rates(self, count: int) -> tuple[Array, Array]:
         """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
         step_s, poses = self.on.step_s, self.grasp.poses
         if len(poses.t_s) < 3 or self.on.static:
@@ -351,18 +360,13 @@ class GraspWrench:
         value = self.without_tool(motion.forced)
         axes = self.frames[0][: len(value)]
         data = [axes.reshape(-1, 9), value, np.tile(self.point_m, (len(value), 1))]
-        slopes = self._off.slopes(np.zeros((6, len(value))), np.concatenate(data, axis=1).T)[1]
+        slopes = SEEN_FROM.slopes(np.zeros((6, len(value))), np.concatenate(data, axis=1).T)[1]
         k = self.grid[: len(value)]
         off = np.concatenate([turns[k], shifts[k]], axis=2)
         change = np.einsum("abn,ncb->nac", slopes, off)
         if evolution := self.low_passed(value, phi):
             (change,) = evolution.forward(change[None], np.zeros((1, change.shape[2])))
         return change.reshape(len(change), 2, 3, change.shape[2])
-
-    @cached_property
-    def _off(self) -> Generated:
-        """W (6,) by a turn and a shift of the frame; data are Q, W and the point in the frame."""
-        return Generated(_seen_from, 6, 18)
 
 
 def sensed_dofs(experiment: Experiment) -> Index:
@@ -400,5 +404,9 @@ def _low_pass(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX) -
     return began * now + (1 - began) * (e * before + a * last + (1 - e - a) * now)
 
 
+# Force and torque (6,) of one node, by x_g and R_g; data are Q, o and what is held.
+MOMENT = Generated(_moment, 6, 15)
+# W (6,) by a turn and a shift of the frame; data are Q, W and the point in the frame.
+SEEN_FROM = Generated(_seen_from, 6, 18)
 # Of T by the φ of `lag_phi`; data are whether it is the start, and T / Δt of a φ of one.
 LOW_PASS = Recursion(_low_pass, 1, 1, 1, 2)

@@ -26,7 +26,7 @@ from .pattern_rows import Numbers, Pattern
 from .reaction_rows import Reactions
 from .reading import Reading
 from .segment import RowWeights
-from .wrench_channel import LOW_PASS, GraspWrench
+from .wrench_channel import LOW_PASS, MOMENT, GraspWrench
 
 ITSELF = Generated(lambda u, _: u, 6, 0)
 
@@ -114,7 +114,7 @@ class WrenchRows(Carried):
             for each, unit in zip((self._placed, late), units, strict=True)
         ]
         taken = Numbers(of_wrench[..., None], minus[..., None])
-        found.append(Pattern.of(channel.moment, channel.moment_data, looked, taken))
+        found.append(Pattern.of(MOMENT, channel.moment_data, looked, taken))
         if len(tool := channel.tool_phi):
             data = channel.tool_at(np.zeros(len(self.phi_columns)), channel.count)[1]
             by_phi = Numbers(self.phi_columns[tool][:, None])
