@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from problem_files import replace_text, run_command, write
 from problems_small import TRUTH, hung_cube
 from scipy.integrate import solve_ivp
 
@@ -103,8 +106,71 @@ def test_a_law_that_leaves_something_else_is_refused_in_words():
     def pull(x, v, before, at, pull_n):
         return -pull_n * x, before[:2]
 
-    shapes = r"'pull' leaves what has the shape \(2, 1\); expected \(3, 1\)"
-    with pytest.raises(InputError, match=shapes):
+    with pytest.raises(InputError, match="'pull' returns 2 numbers to carry; expected 3"):
         cs.NodeForce.of(pull, carries=3)
     with pytest.raises(InputError, match="returns three forces and what is carried"):
         cs.NodeForce.of(lambda x, v, before, at, pull_n: -pull_n * x, carries=2, name="pull")
+
+
+# In a file ----------------------------------------------------------------------------------------
+
+FORCE = """density_kg_m3 = 30.0
+[[object.force]]
+file = "mine.py"
+function = "maxwell"
+nodes = { box_m = [[-1, -1, -1], [0.001, 0.001, 0.001]] }
+carries = 6
+"""
+MADE = """
+from collocation_sysid import NodeForce
+
+made = NodeForce.of(lambda x, v, b, at, pull_n: (-pull_n * x, b), carries=3)
+"""
+CONSTANTS = "spring_n_m = { guess = 2.0 }\ncreep_s = { guess = 0.04 }\ngamma_m_1_s = {"
+
+
+@pytest.fixture
+def strutted(tiny: Path) -> Path:
+    """A problem whose force stands in a file."""
+    replace_text("density_kg_m3 = 30.0\n", FORCE)(tiny)
+    replace_text("gamma_m_1_s = {", CONSTANTS)(tiny)
+    write("mine.py", f"import casadi as ca\n\n\n{inspect.getsource(maxwell)}")(tiny)
+    return tiny
+
+
+def test_a_strut_from_a_file_is_the_one_from_python(strutted):
+    read = cs.Problem.read(strutted / "problem.toml", allow_code=True)
+    (experiment,) = read.experiments
+    force = cs.NodeForce.of(maxwell, nodes=[0], carries=6)
+    body = cs.Body(experiment.body.mesh, density_kg_m3=30.0, forces=[force])
+    made = replace(experiment, body=body)
+    found, same = (simulate(each, STATED, "midpoint").markers_m for each in (experiment, made))
+    np.testing.assert_array_equal(found, same)
+    assert np.abs(found - experiment.markers.positions_m).max() > 1e-3, "it does nothing"
+    recorded = replace(read, experiments=[with_markers(experiment, found)])
+    answer = cs.solve(replace(recorded, method=METHODS["reduced-space"]())).parameters
+    assert answer["creep_s"] == pytest.approx(CREEP_S, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (
+            ("carries = 6", "carries = 2.5"),
+            "object.force.0.carries: found 2.5; expected a whole number",
+        ),
+        (
+            ("carries = 6", "carries = -1"),
+            "object.force.0.carries: found -1; expected a number of at least 0",
+        ),
+        (("carries = 6", "carries = 4"), "force 'maxwell' returns 6 numbers to carry; expected 4"),
+        (("carries = 6\n", ""), "force 'maxwell' takes something before at"),
+        (('"maxwell"', '"made"'), "object.force.0.carries: found 6, but the force 'made' says"),
+    ],
+)
+def test_what_a_force_in_a_file_cannot_carry_is_one_message(strutted, edit, said):
+    replace_text(*edit)(strutted)
+    write("mine.py", (strutted / "mine.py").read_text() + MADE)(strutted)
+    done = run_command("check", "problem.toml", "--allow-code")
+    assert done.code == 2
+    assert said in " ".join(done.err.split())

@@ -123,6 +123,11 @@ class NodeForce:
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
         told = {constant.name: constant for constant in constants}
         arguments = list(inspect.signature(law).parameters)[4 if carries else 3 :]
+        if "at" in arguments:
+            raise InputError(
+                f"force {name!r} takes something before at, as what carries numbers from step to "
+                "step does; expected carries to say how many"
+            )
         if unused := sorted(set(told) - set(arguments)):
             raise InputError(
                 f"force {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
@@ -223,11 +228,13 @@ class NodeForce:
                 "of x, v, at and named constants in CasADi operations that returns three forces"
                 + carried
             ) from error
-        for what, each, size in (("has", force, 3), ("leaves what has", after, self.carries)):
-            if each.shape != (size, 1):
-                raise InputError(
-                    f"force {self.name!r} {what} the shape {each.shape}; expected ({size}, 1)"
-                )
+        if force.shape != (3, 1):
+            raise InputError(f"force {self.name!r} has the shape {force.shape}; expected (3, 1)")
+        if after.shape != (self.carries, 1):
+            raise InputError(
+                f"force {self.name!r} returns {after.numel()} numbers to carry; expected "
+                f"{self.carries}, as carries says"
+            )
         still = np.zeros(self.inputs(dofs))
         still[:dofs] = TRIANGLE_M[:dofs]
         still[2 * dofs : 2 * dofs + len(self.constants)] = 1.0

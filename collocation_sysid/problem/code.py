@@ -76,10 +76,15 @@ class Code:
         """
         file, loaded = self.function(section.file, section.function, f"{key}.file")
         nodes = None if section.nodes is None else selection(section.nodes)
+        name, carries = section.function, section.carries
         if isinstance(loaded, NodeForce):
+            if carries not in (0, loaded.carries):
+                message = f"found {carries}, but the force {name!r} says that it carries"
+                message += f" {loaded.carries}; expected the key to be left out"
+                raise InputError(message, where=f"{key}.carries")
             return loaded if nodes is None else replace(loaded, nodes=nodes)
         with located(file):
-            return NodeForce.of(loaded, nodes=nodes, name=section.function, on=section.on)
+            return NodeForce.of(loaded, nodes=nodes, name=name, on=section.on, carries=carries)
 
     def row(self, section: OwnRow) -> NuisanceRow:
         """A nuisance parameter; see `function` for the errors."""

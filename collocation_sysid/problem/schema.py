@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from ..checked import Finite, Flag, Positive, Text
+from ..checked import Count, Finite, Flag, Positive, Text
 from ..fem.elements import ELEMENTS
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..model.parameters import Unknown
@@ -54,10 +54,14 @@ class NodeForceSection(CodeSection):
         Selection of nodes; all by default.
     on : str
         What it acts on: these nodes, or faces of the surface that have all of theirs among them.
+    carries : int
+        How many numbers each of them carries from step to step: the function takes them behind v,
+        and returns the force and those for the next step.
     """
 
     nodes: Nodes | None = None
     on: Literal["nodes", "faces"] = "nodes"
+    carries: Count = 0
 
 
 Material = Annotated[MaterialName | CodeSection, ByForm(str)]
