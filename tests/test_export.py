@@ -17,6 +17,7 @@ from problems_small import IDEAL, nodes_where, smooth_poses, times, vertex_marke
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
@@ -173,6 +174,69 @@ def test_newton_gets_the_constants_of_its_own_energy(run_folder, tmp_path):
     assert set(found["k_lambda"]) == {region.lambda_pa}
     np.testing.assert_array_equal(found["cells"], body.body.cells)
     compile((folder / "body.py").read_text(), "body.py", "exec")
+
+
+def stage_of(folder: Path):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(folder / "body.usda"))
+
+
+def test_usd_gets_mesh_material_masses_and_weight(tmp_path):
+    body = held_bar(values={**MODULI, "gamma_r_s": 0.004})
+    stage = stage_of(exported(body, "usd", tmp_path))
+    mesh, material = map(stage.GetPrimAtPath, ("/World/Body/Mesh", "/World/Materials/body"))
+
+    def told(prim, name):
+        return np.array(prim.GetAttribute(name).Get())
+
+    np.testing.assert_allclose(told(mesh, "points"), body.nodes_m, atol=1e-8)
+    np.testing.assert_array_equal(told(mesh, "tetVertexIndices"), body.body.cells)
+    assert told(mesh, "physics:masses").sum() == pytest.approx(body.node_mass_kg.sum(), rel=1e-6)
+    for name, value in (("youngsModulus", 5e4), ("poissonsRatio", 0.3), ("density", 900.0)):
+        assert told(material, f"physics:{name}") == pytest.approx(value)
+    assert told(material, "collocationSysid:gammaR_s") == pytest.approx(0.004)
+    assert mesh.GetRelationship("material:binding:physics").GetTargets() == [material.GetPath()]
+    scene = stage.GetPrimAtPath("/World/Physics")
+    assert told(scene, "physics:gravityMagnitude") == pytest.approx(9.81)
+    np.testing.assert_allclose(told(scene, "physics:gravityDirection"), (0, 0, -1))
+    outside = told(mesh, "surfaceFaceVertexIndices")
+    assert {tuple(sorted(f)) for f in outside} == {tuple(sorted(f)) for f in body.body.mesh.surface}
+
+
+def test_usd_gets_the_motion_of_the_gripper_and_what_it_holds(tmp_path):
+    body = held_bar(moving=True)
+    stage = stage_of(exported(body, "usd", tmp_path))
+    gripper, grasp = map(stage.GetPrimAtPath, ("/World/Gripper_1", "/World/Gripper_1/Grasp"))
+    np.testing.assert_array_equal(
+        grasp.GetAttribute("physics:indices0").Get(), np.flatnonzero(body.grasped)
+    )
+    from pxr import UsdGeom
+
+    local = np.array(grasp.GetAttribute("physics:coords1").Get())
+    for k, t in enumerate(body.experiment.t_s):
+        # USD's matrices act on rows.
+        matrix = np.array(UsdGeom.Xformable(gripper).ComputeLocalToWorldTransform(float(t)))
+        there = local @ matrix[:3, :3] + matrix[3, :3]
+        held = body.experiment.grasped([t])[1][0][body.grasped]
+        np.testing.assert_allclose(there, held, atol=1e-7, err_msg=f"sample {k}")
+
+
+def test_usd_gets_a_material_for_each_region_and_says_what_simulators_make_of_them(tmp_path):
+    bar = box_mesh(BAR_M, DIVISIONS)
+    regions = [Region("soft-end", np.arange(6)), Region("grip", np.arange(6, 30))]
+    body = Body(bar, "neo-hookean", 900.0, regions=regions)
+    still = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
+    t_s = times(8)
+    markers = vertex_markers(body, nodes_where(body, 0, BAR_M[0]), t_s)
+    experiment = Experiment(body, t_s, [still], markers, nuisance=IDEAL)
+    values = {f"{r.name}.{n}": v for r in regions for n, v in {**MODULI, **OTHERS}.items()}
+    body_ = Identified("a bar", "good", (), {}, body, body.theta(values), experiment, None)
+    stage = stage_of(exported(body_, "usd", tmp_path))
+    subset = stage.GetPrimAtPath("/World/Body/Mesh/soft_end")
+    assert len(subset.GetAttribute("indices").Get()) == 6
+    text = (tmp_path / "usd" / "body.usda").read_text()
+    assert "takes that of the largest" in text
 
 
 def test_febio_gets_energy_and_memory(tmp_path):
@@ -407,3 +471,13 @@ def test_mujoco_has_the_frequency_of_other_energies(tmp_path):
     body = held_bar("neo-hookean")
     (frequency,) = verify_export(body, "mujoco", exported(body, "mujoco", tmp_path))
     assert abs(frequency.relative) < 0.03
+
+
+@pytest.mark.long
+def test_newton_opens_the_stage_and_sags_alike_with_the_same_energy(tmp_path):
+    pytest.importorskip("newton")
+    pytest.importorskip("newton_usd_schemas")
+    body = held_bar("stable-neo-hookean")
+    (sag,) = verify_export(body, "usd", exported(body, "usd", tmp_path))
+    assert sag.ours > 0.1 * BAR_M[0]  # not small
+    assert abs(sag.relative) < 1e-3

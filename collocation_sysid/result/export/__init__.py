@@ -12,7 +12,7 @@ from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
 from ...tree import as_json
 from ..writers import run_folder
-from . import calculix, febio, mujoco, newton, sofa
+from . import calculix, febio, mujoco, newton, sofa, usd
 from .identified import Identified
 from .target import Comparison, Exported, Target
 
@@ -22,6 +22,7 @@ NUMBERS = "identified.json"
 TARGETS: dict[str, Target] = {
     "mujoco": Target("MuJoCo", mujoco.export, mujoco.verify),
     "newton": Target("Newton", newton.export),
+    "usd": Target("OpenUSD", usd.export, usd.verify),
     "sofa": Target("SOFA", sofa.export),
     "febio": Target("FEBio", febio.export),
     "calculix": Target("CalculiX", calculix.export, calculix.verify),

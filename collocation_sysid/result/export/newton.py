@@ -73,7 +73,7 @@ def export(body: Identified) -> Exported:
         *HOLDS.lost(body),
         "SolverSemiImplicit takes other constants for the same material, k_mu = 4/3 μ and "
         "k_lambda = λ + 5/6 μ, and another damping",
-        "positions are single precision; a USD file would hold E, ν and density, but no damping",
+        "positions are single precision",
     ]
     k_mu, k_lambda, k_damp = np.concatenate(constants).T
     numbers = {

@@ -1,0 +1,224 @@
+"""OpenUSD: a tetrahedral mesh with the schemas for deformable bodies, as Newton and Isaac read it.
+
+The schemas are those of the proposal for deformables in USD physics; they know Young's modulus,
+Poisson's ratio, density and masses, and no damping, which stands in attributes of our own.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...arrays import Array, Index
+from ...errors import InputError
+from ...program.rest import rest_state
+from ...recording import Grasp
+from .identified import Identified, IdentifiedRegion
+from .target import Comparison, Exported, Holds, heading, linear_cells
+
+STAGE = "body.usda"
+OWN = "collocationSysid"
+# To rest, in Newton: what is left of velocities after each step.
+BRAKE = 0.95
+ITERATIONS, STEPS, STEP_S = 20, 400, 2e-3
+HOLDS = Holds(
+    {},
+    "{material} becomes whatever energy the simulator has for E and ν: Newton's is the stable "
+    "neo-Hookean one",
+    "damping γ_r is no part of the schemas: it stands as an attribute of our own",
+    "γ_m = {gamma_m_1_s:.4g} 1/s is no part of the schemas: it stands as an attribute of our own",
+    motion=True,
+)
+SINGLE = "numbers are single precision"
+REGIONS = (
+    "regions are subsets of tetrahedra, each with its material; a simulator that takes one "
+    "material a body, as Newton 1.8, takes that of the largest"
+)
+TIED = "point masses on nodes are left out"
+AXES = "nodes that are held along single axes only are free"
+
+
+def export(body: Identified) -> Exported:
+    """The stage.
+
+    Raises
+    ------
+    InputError
+        If usd-core is not installed.
+    """
+    pxr = _library()
+    limits = [*HOLDS.lost(body), SINGLE]
+    limits += [TIED] * bool(body.tied_kg.any())
+    limits += [REGIONS] * (len(body.regions) > 1)
+    limits += [AXES] * bool((body.held.any(axis=1) != body.grasped).any())
+    stage = pxr.Usd.Stage.CreateInMemory()
+    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    pxr.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(1.0)  # time codes are seconds
+    world = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
+    stage.SetDefaultPrim(world)
+    world.SetDocumentation(heading(body, limits, ""))
+    scene = pxr.UsdPhysics.Scene.Define(stage, "/World/Physics")
+    gravity = body.experiment.gravity_m_s2
+    size = float(np.linalg.norm(gravity))
+    scene.CreateGravityMagnitudeAttr(size)
+    scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist()))
+    placed_m = np.where(body.held, body.held_m, body.nodes_m)
+    _mesh(pxr, stage, body, placed_m)
+    for k, grasp in enumerate(body.experiment.grasps, start=1):
+        _gripper(pxr, stage, k, grasp, body, placed_m)
+    return Exported({STAGE: stage.GetRootLayer().ExportToString()}, tuple(limits))
+
+
+def _library() -> Any:
+    """The modules of usd-core by name."""
+    try:
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+    except ImportError as error:
+        raise InputError("USD needs usd-core: pip install 'collocation-sysid[usd]'") from error
+    modules = (Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt)
+    return SimpleNamespace(**{each.__name__.rpartition(".")[2]: each for each in modules})
+
+
+def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
+    """Tetrahedra, masses and materials of the body."""
+    whole = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
+    whole.AddAppliedSchema("PhysicsDeformableBodyAPI")
+    mesh, cells = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh"), linear_cells(body)
+    prim = mesh.GetPrim()
+    prim.AddAppliedSchema("PhysicsVolumeDeformableSimAPI")
+    pxr.UsdPhysics.CollisionAPI.Apply(prim)
+    mesh.CreatePointsAttr(placed_m.astype(np.float32))
+    mesh.CreateTetVertexIndicesAttr(np.concatenate(cells).astype(np.int32))
+    mesh.CreateSurfaceFaceVertexIndicesAttr(pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh))
+    number = pxr.Sdf.ValueTypeNames
+    rest = prim.CreateAttribute("physics:restShapePoints", number.Point3fArray, False)
+    rest.Set(body.nodes_m.astype(np.float32))
+    masses = prim.CreateAttribute("physics:masses", number.FloatArray, False)
+    masses.Set(_masses_kg(body, cells).astype(np.float32))
+    _token(pxr, prim, "physics:masses:elementType", "tetrahedron")
+    held = prim.CreateAttribute(f"{OWN}:graspedPoints", number.IntArray)
+    held.Set(np.flatnonzero(body.grasped).astype(np.int32))
+    materials = [_material(pxr, stage, region) for region in body.regions]
+    _bind(pxr, prim, materials[int(np.argmax([len(each) for each in cells]))])
+    firsts = np.cumsum([0, *map(len, cells)])
+    for k, material in enumerate(materials if len(cells) > 1 else ()):
+        numbers = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
+        told = _named(body.regions[k].name), pxr.UsdGeom.Tokens.tetrahedron, numbers, "materialBind"
+        _bind(pxr, pxr.UsdGeom.Subset.CreateGeomSubset(mesh, *told).GetPrim(), material)
+
+
+def _masses_kg(body: Identified, cells: list[Index]) -> Array:
+    """Of the tetrahedra."""
+    edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
+    volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
+    pairs = zip(body.regions, volumes, strict=True)
+    return np.concatenate([region.density_kg_m3 * volume for region, volume in pairs])
+
+
+def _material(pxr: Any, stage: Any, region: IdentifiedRegion) -> Any:
+    material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{_named(region.name)}")
+    prim = material.GetPrim()
+    prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
+    told = {
+        "physics:youngsModulus": region.young_pa,
+        "physics:poissonsRatio": region.poisson,
+        "physics:density": region.density_kg_m3,
+        f"{OWN}:gammaR_s": region.gamma_r_s,
+        f"{OWN}:gammaM_1_s": region.gamma_m_1_s,
+    }
+    told |= {f"{OWN}:{name}": value for name, value in region.constants.items()}
+    number = pxr.Sdf.ValueTypeNames
+    for name, value in told.items():
+        prim.CreateAttribute(name, number.Float, name.startswith(OWN)).Set(float(value))
+    for name, text in (("material", region.material), ("damping", region.damping)):
+        prim.CreateAttribute(f"{OWN}:{name}", number.String).Set(text)
+    return material
+
+
+def _bind(pxr: Any, prim: Any, material: Any) -> None:
+    binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
+    binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
+
+
+def _token(pxr: Any, prim: Any, name: str, text: str) -> None:
+    kind, fixed = pxr.Sdf.ValueTypeNames.Token, pxr.Sdf.VariabilityUniform
+    prim.CreateAttribute(name, kind, False, fixed).Set(text)
+
+
+def _gripper(
+    pxr: Any, stage: Any, number: int, grasp: Grasp, body: Identified, placed_m: Array
+) -> None:
+    """A rigid body that is driven along the grasp's poses, and holds its nodes."""
+    path = f"/World/Gripper_{number}"
+    gripper = pxr.UsdGeom.Xform.Define(stage, path)
+    pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
+    t_s = body.experiment.t_s
+    matrices, positions_m = grasp.poses.at(t_s)
+    wxyz = Rotation.from_matrix(matrices).as_quat(scalar_first=True)
+    place = gripper.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
+    turn = gripper.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble)
+    for k, time in enumerate([pxr.Usd.TimeCode.Default(), *t_s.tolist()]):
+        row = max(k - 1, 0)
+        place.Set(pxr.Gf.Vec3d(*positions_m[row].tolist()), time)
+        turn.Set(pxr.Gf.Quatd(*wxyz[row].tolist()), time)
+    held = np.intersect1d(grasp.nodes, np.flatnonzero(body.grasped))
+    prim, types = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment"), pxr.Sdf.ValueTypeNames
+    for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
+        prim.CreateRelationship(f"physics:{name}", False).SetTargets([pxr.Sdf.Path(target)])
+    for name, text in (("type0", "point"), ("type1", "xform")):
+        _token(pxr, prim, f"physics:{name}", text)
+    local_m = (placed_m[held] - positions_m[0]) @ matrices[0]
+    for name, kind, values in (
+        ("indices0", types.IntArray, held.astype(np.int32)),
+        ("coords1", types.Vector3fArray, local_m.astype(np.float32)),
+    ):
+        prim.CreateAttribute(f"physics:{name}", kind, False).Set(values)
+
+
+def _named(name: str) -> str:
+    """A name that USD takes."""
+    text = re.sub(r"\W", "_", name)
+    return text if re.match(r"[A-Za-z_]", text) else f"_{text}"
+
+
+def verify(body: Identified, folder: Path) -> list[Comparison]:
+    """The largest displacement at rest, from Newton.
+
+    Raises
+    ------
+    InputError
+        If Newton is not installed.
+    """
+    try:
+        import newton
+    except ImportError as error:
+        raise InputError("install Newton to verify the export: pip install newton") from error
+
+    builder = newton.ModelBuilder()
+    # Its rigid bodies would be simulated too; what they hold stands still instead.
+    builder.add_usd(str(folder / STAGE), ignore_paths=["/World/Gripper_.*"])
+    held = np.flatnonzero(body.grasped)
+    for k in held:
+        builder.particle_mass[k] = 0.0
+    builder.color()
+    model = builder.finalize(device="cpu")
+    solver = newton.solvers.SolverVBD(model, iterations=ITERATIONS)
+    before: Any = model.state()
+    after, control = model.state(), model.control()
+    for _ in range(STEPS):
+        solver.step(before, after, control, None, STEP_S)
+        before, after = after, before
+        before.particle_qd.assign(BRAKE * before.particle_qd.numpy())
+    theirs = before.particle_q.numpy().astype(float) - body.nodes_m
+    alone = replace(body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf)
+    ours = rest_state(alone, body.theta).reshape(-1, 3) - body.nodes_m
+    sagged, sag = (float(np.linalg.norm(way, axis=1).max()) for way in (theirs, ours))
+    return [Comparison("largest displacement at rest", sagged, sag, "m")]
