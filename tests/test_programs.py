@@ -145,14 +145,19 @@ OF_OBSTACLES = Nuisance.none(obstacle_offset_m=1e-3, obstacle_tilt_rad=0.02, obs
 
 
 def touched(
-    friction: float | str = 0.0, scheme: str = "midpoint", felt: bool = False, **changes
+    friction: float | str = 0.0,
+    scheme: str = "midpoint",
+    felt: bool = False,
+    relaxed: float | None = None,
+    **changes,
 ) -> Collocation:
-    """Pressed by a ball and a plate, which may measure the force."""
+    """Pressed by a ball and a plate, which may measure the force, or be of hard contact."""
     pressed = pressed_cube(4, friction, **changes)
     if felt:
         held, ball, plate = pressed.grasps
         forces = cs.Wrench(pressed.t_s, np.full((5, 3), 0.05), 0.3)
         pressed = replace(pressed, grasps=[held, replace(ball, wrench=forces), plate])
+    pressed = pressed.with_obstacles([replace(o, relaxed=relaxed) for o in pressed.obstacles])
     own = {friction: cs.Unknown(0.5)} if isinstance(friction, str) else {}
     known = Parameters((*GUESS.items, *Parameters.of(own).items))
     return program(measured(pressed) if not own else pressed, parameters=known, scheme=scheme)
@@ -354,6 +359,14 @@ PROGRAMS: dict[str, Make] = {
     "contact, static": lambda: touched(kind="static", felt=True),
     "contact, static, friction": lambda: touched(
         "friction", kind="static", felt=True, nuisance=OF_OBSTACLES
+    ),
+    **{
+        f"hard contact, {scheme}": lambda scheme=scheme: touched(scheme=scheme, relaxed=0.3)
+        for scheme in ("midpoint", "bdf2")
+    },
+    "hard contact, wrench": lambda: touched(relaxed=0.3, felt=True, nuisance=OF_OBSTACLES),
+    "hard contact, static": lambda: touched(
+        relaxed=0.3, kind="static", felt=True, nuisance=OF_OBSTACLES
     ),
     "carried by a force": lambda: in_field(creeping, carries=3),
     "carried by a force, bdf2": lambda: in_field(creeping, "bdf2", carries=3),

@@ -14,6 +14,7 @@ from ..checked import Count, Finite, NotNegative, Options, Positive, Text, Whole
 from ..program.collocation import Collocation
 from . import nlpsol
 from .callbacks import NlpFunctions
+from .complementarity import hardened, require_smooth
 from .condensed import condensed
 from .recorder import Recorder
 from .solution import Solution, Status, Watch
@@ -86,6 +87,10 @@ class InteriorPoint(Options):
         Added to the Hessian's diagonal at the positions, most of which is zero otherwise. It
         changes the steps a little and the answer not at all, and spares the linear solver
         factorisations that rounding spoils (wrong inertia).
+    contact : {"energy", "complementarity"}
+        What holds a body off obstacles: an energy that grows as it comes near, or pressures as
+        further variables with 0 ≤ pressure ⟂ gap ≥ 0, whose product is brought down in a few more
+        solves. Those take no friction.
     linear_solver : str
         IPOPT's linear solver; the wheel brings "mumps" and "spral".
     tolerance : float
@@ -103,6 +108,7 @@ class InteriorPoint(Options):
     hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
     warm_up: NotNegative = 0.1
     proximal: NotNegative = 1e-5
+    contact: Literal["energy", "complementarity"] = "energy"
     linear_solver: Text = "mumps"
     tolerance: Positive = 1e-8
     max_iterations: Count = 200
@@ -119,6 +125,19 @@ class InteriorPoint(Options):
         InputError
             If IPOPT does not know an option.
         """
+        touched = [o for segment in collocation.segments for o in segment.experiment.obstacles]
+        is_hard = self.contact == "complementarity" and bool(touched)
+        if is_hard:
+            require_smooth(touched)
+        found = self._solved(collocation, watch, start)
+        if not is_hard or not found.status.converged:
+            return found
+        return hardened(found, lambda relaxed, z: self._solved(relaxed, watch, z))
+
+    def _solved(
+        self, collocation: Collocation, watch: Watch | None, start: Array | None
+    ) -> Solution:
+        """The answer with contact as obstacles have it."""
         recorder = Recorder(self.name, collocation, watch)
         with recorder.stopwatch.building():
             program = condensed(collocation.made_explicit())
@@ -153,9 +172,11 @@ class InteriorPoint(Options):
             settings["ipopt.hessian_approximation"] = "limited-memory"
         else:
             settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
-            sharpness = _sharpness(functions.collocation)
+            collocation = functions.collocation
+            sharpness = _sharpness(collocation)
             settings |= {
-                "ipopt.perturb_always_cd": "yes",
+                # Rows of pressures are nearly dependent where a surface lies on another.
+                "ipopt.perturb_always_cd": "no" if collocation.added("pressure") else "yes",
                 "ipopt.jacobian_regularization_exponent": 0.0,
                 "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
             }

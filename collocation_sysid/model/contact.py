@@ -12,6 +12,11 @@ and joins nothing but the nodes of a face. Inside, N is linear: Newton's method 
 a step, where a parabola would halve it each time. In a static experiment v is the way since the
 sample before, so that friction holds each point where it was then.
 
+Contact as complementarity, 0 ≤ b ⟂ g ≥ 0 of a pressure κ b, is relaxed to b g = r δ², which is less
+the smaller r is, see `Obstacle.relaxed`: that has one motion, as the energy has, and all points
+act. Programs that have b as variables have it as b + g − √((b − g)² + 4 r δ²) = 0, whose slopes are
+of order one wherever the point is, and which holds for positive b and g alone.
+
 An impact rings, and may gain energy, under the midpoint rule; BDF2 and backward Euler lose it.
 """
 
@@ -33,13 +38,15 @@ from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .force_term import Slots, States
 from .generated import Generated
-from .point_forces import Pointwise
+from .point_forces import Brought, Pointwise
 
 # κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample: by up to that much
 # a body creeps that lies where it is held by friction.
 STIFFNESS, WIDTH, SLIP = 100.0, 0.002, (0.01, 1e-4)
 # Evaluations are of so many points at a time, or a multiple: that few sizes are compiled.
 AT_A_TIME = 16
+# Widths that b of relaxed contact has at most, also where a gap is not positive.
+MOST = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +115,19 @@ class ContactLaw:
         """G at a place so seen."""
         return self.obstacle.shape.gap(place + ca.DM(self.body.frame_m[0]))
 
+    def near(self, gap: ca.SX, product: ca.SX) -> ca.SX:
+        """B, the pressure over κ, where its product with the gap is as relaxed."""
+        if not self.obstacle.relaxed:
+            near, within = ca.fmax(self.width_m - gap, 0), ca.fmax(-gap, 0)
+            return (near**2 - within**2) / self.width_m
+        return product / ca.fmax(gap, product / (MOST * self.width_m))
+
+    @property
+    def data(self) -> Array:
+        """(2, i) area A, and r δ²."""
+        relaxed = (self.obstacle.relaxed or 0.0) * self.width_m**2
+        return np.array([self.surface.area_m2, np.full(len(self.surface.area_m2), relaxed)])
+
     @cached_property
     def distance(self) -> Generated:
         """G alone."""
@@ -119,20 +139,36 @@ class ContactLaw:
 
     @cached_property
     def generated(self) -> Generated:
-        """The forces, of (y, ẏ, c) or (y, c); data are A."""
+        """The forces, of (y, ẏ, c) or (y, c), and of data."""
         moving = 3 * VECTORS * self.obstacle.rubs
-        return Generated(self.force, 3 * VECTORS + moving + len(self.columns), 1, compiled=True)
+        return Generated(self.force, 3 * VECTORS + moving + len(self.columns), 2, compiled=True)
 
-    def force(self, u: ca.SX, area: ca.SX) -> ca.SX:
-        """(12,) on the ways to the point and to the ends of the frame."""
+    @cached_property
+    def pressed(self) -> Generated:
+        """The forces at b, and what is zero where b is right, of (y, c, b)."""
+        return Generated(self._pressed, 3 * VECTORS + len(self.columns) + 1, 2, compiled=True)
+
+    def _pressed(self, u: ca.SX, data: ca.SX) -> ca.SX:
+        own, b = ca.vertsplit(u, [0, u.numel() - 1, u.numel()])
+        gap = self.gap(self.seen(own[: 3 * VECTORS])[0])
+        apart = b + gap - ca.sqrt((b - gap) ** 2 + 4 * data[1])
+        return ca.vertcat(self.force(own, data, b), apart)
+
+    @cached_property
+    def pressing(self) -> Generated:
+        """B of a gap."""
+        return Generated(lambda gap, data: self.near(gap, data[1]), 1, 2)
+
+    def force(self, u: ca.SX, data: ca.SX, pressing: ca.SX | None = None) -> ca.SX:
+        """(12,) on the ways to the point and to the ends of the frame, at b as it is or given."""
         size = 3 * VECTORS
         y, constants = u[:size], u[u.numel() - len(self.columns) :]
         place, axes = self.seen(y)
         here = ca.SX.sym("place", 3)
         gap, slope = self.gap(here), ca.gradient(self.gap(here), here)
         gap, slope = ca.substitute([gap, slope], [here], [place])
-        near, within = ca.fmax(self.width_m - gap, 0), ca.fmax(-gap, 0)
-        normal_n = area * self.stiffness(constants) / self.width_m * (near**2 - within**2)
+        near = self.near(gap, data[1]) if pressing is None else pressing
+        normal_n = data[0] * self.stiffness(constants) * near
         # What turns the frame is as the point is seen along its axes.
         push = normal_n * slope
         force = ca.vertcat(axes @ push, ca.vec(y[:3] @ push.T) / self._size_m)
@@ -158,11 +194,15 @@ class Contact(Pointwise):
     contact : ContactLaw
     times : int
     share : float
+    brought : Brought, optional
+        Of a program that has b as variables: these; they follow from the gap by default.
     """
 
     contact: ContactLaw
     times: int
     share: float = 1.0
+    brought: Brought | None = None
+    weighed: Array | None = None
     size, slides = 0, True
 
     @property
@@ -173,7 +213,23 @@ class Contact(Pointwise):
     @property
     def law(self) -> Generated:
         """That of the obstacle."""
-        return self.contact.generated
+        return self.contact.generated if self.brought is None else self.contact.pressed
+
+    @property
+    def relaxed(self) -> bool:
+        """Whether it is complementarity."""
+        return self.contact.obstacle.relaxed is not None
+
+    @property
+    def carries(self) -> int:  # type: ignore[override]
+        """Where b is given."""
+        return int(self.brought is not None)
+
+    def pressing(self, xi: Array) -> Array:
+        """(1, T, i) b at states (T, 3n)."""
+        gaps = self.contact.gaps(self.points.vectors(xi))
+        data = np.broadcast_to(self.contact.data[:, None], (2, *gaps.shape))
+        return self.contact.pressing.value(gaps[None], data)
 
     @property
     def by_velocity(self) -> bool:
@@ -192,9 +248,11 @@ class Contact(Pointwise):
         """Obstacles move with their frames, as grasps do."""
         return self
 
-    def acting(self, states: States) -> tuple[Index, Array]:
-        """Points within δ at any of the times, and some more, with their y."""
+    def acting(self, states: States) -> tuple[Index | None, Array]:
+        """Points within δ at any of the times, and some more, with their y; all if relaxed."""
         y = self.points.vectors(states.xi)
+        if self.relaxed:
+            return None, y
         near = np.any(self.contact.gaps(y) < self.contact.width_m, axis=0)
         near[np.flatnonzero(~near)[: -near.sum() % AT_A_TIME]] = True
         chosen = np.flatnonzero(near)
@@ -216,9 +274,9 @@ class Contact(Pointwise):
         return self.contact.columns
 
     def data(self, chosen: Index | None) -> Array:
-        """A."""
-        area = self.contact.surface.area_m2[chosen]
-        return np.broadcast_to(area, (1, self.times, len(area)))
+        """Of the law."""
+        data = self.contact.data[:, slice(None) if chosen is None else chosen]
+        return np.broadcast_to(data[:, None], (2, self.times, data.shape[1]))
 
 
 def _no_data(y: Array) -> Array:

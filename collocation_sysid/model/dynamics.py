@@ -21,6 +21,7 @@ from ..arrays import Array
 from ..fem.body import Body, Linearisation
 from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
+from .force_history import ForceHistory
 from .forces import Forces
 from .histories import AnyHistory, histories, onto
 from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
@@ -224,6 +225,14 @@ class Dynamics:
         states = self.evaluated_at(x)
         known = self.until_next_s[here], self.loaded_since_s, brought or {}
         return histories(self.forces.rows(here), states, *known)
+
+    def pressed(self, x: Array, pressed: Mapping[int, Array]) -> tuple[AnyHistory, ...]:
+        """Contact at b (1, N, i) that is given, by the number of the force, as histories are."""
+        states, since_s = self.evaluated_at(x), np.zeros(len(x))
+        return tuple(
+            ForceHistory.of(self.forces, number, *states, since_s, b)
+            for number, b in pressed.items()
+        )
 
     def evaluated_at(self, x: Array) -> tuple[Array, Array]:
         """ξ and ν at all evaluations of x (N, 3n), or its first rows, a given start included."""

@@ -21,7 +21,7 @@ from ..fem.body import Body, Curvature, Linearisation
 from ..fem.memory import Past
 from ..fem.pattern import Joined, SymmetricPattern
 from ..recording.experiment import Experiment
-from .contact import contacts
+from .contact import Contact, contacts
 from .force_term import ForceTerm, Potential, Slots, States
 from .point_forces import Pointwise, point_forces
 from .weight import Mass, Weight
@@ -266,6 +266,12 @@ class Forces:
     def carrying(self) -> list[int]:
         """Numbers of the further terms that carry something."""
         return [k for k, term in enumerate(self.further) if term.carries]
+
+    @property
+    def pressing(self) -> list[int]:
+        """Numbers of those that are contact as complementarity."""
+        further = enumerate(self.further)
+        return [k for k, term in further if isinstance(term, Contact) and term.relaxed]
 
     def _widened(self, by_theta: Array) -> Array:
         """(…, U) slopes by θ with room for those by the inputs of the terms."""

@@ -79,6 +79,11 @@ class Carried(ABC):
         """(k,) where in z the experiment's φ are."""
         return self.first_phi + self.segment.local.places - self.segment.nq
 
+    @property
+    def least(self) -> float:
+        """Lower bound of the variables."""
+        return -np.inf
+
     def given(self, part: Part, z: Array) -> Part:
         """The experiment with what it takes of these variables."""
         return part

@@ -53,7 +53,7 @@ from .sharing import locals_of, shared_charts
 
 def carried_over(z: Array, of: Collocation, to: Collocation) -> Array:
     """Variables of a program as the same one has them that is explicit, or is not."""
-    return z if of.variables == to.variables else to.pack(*of.unpack(z))
+    return z if len(z) == to.variables else to.pack(*of.unpack(z))
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,8 @@ class Collocation:
     def made_explicit(self) -> Collocation:
         """The same program with `explicit`; itself where nothing is carried or measured so."""
         feels = any(len(s.sensed_dofs) for s in self.segments)
-        if self.explicit or not (self.remembers or feels):
+        presses = any(s.dynamics.forces.pressing for s in self.segments)
+        if self.explicit or not (self.remembers or feels or presses):
             return self
         other = replace(self, explicit=True)
         vars(other)["segments"] = self.segments
@@ -339,10 +340,10 @@ class Collocation:
         """Lower and upper bounds of z; equal for what is given."""
         lower, upper = self.bounds_p
         lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
-        free = np.full(self.added(), np.inf)
+        least = [np.full(each.count, each.least) for each in self.carried]
         return (
-            np.concatenate([self._packed(lower, lows), -free]),
-            np.concatenate([self._packed(upper, highs), free]),
+            np.concatenate([self._packed(lower, lows), *least]),
+            np.concatenate([self._packed(upper, highs), np.full(self.added(), np.inf)]),
         )
 
     # Objective --------------------------------------------------------------------------------

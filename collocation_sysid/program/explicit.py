@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from .carried import Carried, Places
 from .force_rows import ForceRows
+from .pressure_rows import PressureRows
 from .reaction_rows import Reactions
 from .segment import Segment
 from .viscoelastic_rows import Overstress
@@ -13,7 +14,8 @@ from .wrench_rows import WrenchRows
 
 
 def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> tuple[Carried, ...]:
-    """Of each experiment the reactions of grasps with a sensor, its memory, and its wrenches.
+    """Of each experiment the reactions of grasps with a sensor, its memory, what forces carry, the
+    pressures of contact as complementarity, and its wrenches.
 
     Parameters
     ----------
@@ -38,6 +40,10 @@ def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> t
             places, histories = found[-1].after, 1
         for history, force in enumerate(segment.dynamics.forces.carrying, histories):
             found.append(ForceRows(*here, places, history, force, reactions))
+            places = found[-1].after
+            histories = history + 1
+        for history, force in enumerate(segment.dynamics.forces.pressing, histories):
+            found.append(PressureRows(*here, places, history, force, reactions))
             places = found[-1].after
         for wrench in wrenches:
             assert reactions is not None

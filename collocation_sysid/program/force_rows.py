@@ -47,6 +47,16 @@ class ForceRows(Carried):
     called = "force"
 
     @property
+    def first(self) -> int:
+        """The evaluation that the first b is of."""
+        return 1
+
+    @property
+    def unit_m(self) -> float:
+        """Of b and of the equations."""
+        return self.segment.length_m
+
+    @property
     def history(self) -> int:
         """Which of the histories of the motion it is."""
         return self.along
@@ -132,7 +142,7 @@ class ForceRows(Carried):
             pairs = np.flatnonzero(rows.number[of_pairs] >= 0)
             dofs = of_pairs[pairs]
             for lag, weights in enumerate(dynamics.tables.w.T):
-                k = np.arange(max(1, first_row), dynamics.rows - lag)[:, None]
+                k = np.arange(max(self.first, first_row), dynamics.rows - lag)[:, None]
                 if not len(k) or not weights[lag:].any():
                     continue
                 row = rows.first + (k + lag - first_row) * rows.per_time + rows.number[dofs]
@@ -151,13 +161,13 @@ class ForceRows(Carried):
             yield Outer([rows[:, here][..., instance]], [x])
         yield Outer([rows[:, None]], [self._moving[:, None, None]])
         for pairs, k, row, _ in self._motion():
-            yield Outer([row], [columns[:, k[:, None] - 1, instance[pairs]]])
+            yield Outer([row], [columns[:, k[:, None] - self.first, instance[pairs]]])
 
     def _hessian(self) -> Iterator[Outer]:
         """In the columns of b: by b, by x, and by what moves the body."""
         columns, (i, j) = self.places.variable + self._own, np.triu_indices(self.shape[0])
         yield Outer([columns[i]], [columns[j]])
-        for here, x, *_ in self._lags(1):
+        for here, x, *_ in self._lags(self.first):
             yield Outer([x], [columns[:, here][..., self._points.pairs[0]]])
         yield Outer([self._moving[:, None, None, None]], [columns])
 
@@ -178,11 +188,15 @@ class ForceRows(Carried):
         found += [length_m * each for each in self._by_x(0, by)]
         of_inputs = part.setting.by_p[:-1][:, places]
         found.append(np.einsum("acti,tcm->amti", by.c, of_inputs))
+        found += self._motion_by_b(slopes)
+        return self.values(part, z), np.concatenate([each.ravel() for each in found])
+
+    def _motion_by_b(self, slopes: Parts) -> Iterator[Array]:
+        """Slopes of the rows of motion, from those at all evaluations."""
         instance, local, *_ = self._points.pairs
         for pairs, k, _, weight in self._motion():
             by_b = slopes.b[local[pairs], :, :, instance[pairs]][:, :, k]
-            found.append(length_m * by_b.transpose(1, 2, 0) * weight)
-        return self.values(part, z), np.concatenate([each.ravel() for each in found])
+            yield self.unit_m * by_b.transpose(1, 2, 0) * weight
 
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
@@ -191,10 +205,11 @@ class ForceRows(Carried):
         history, mu = self.weighed(part, multipliers)
         assert isinstance(history, ForceHistory)
         length_m, places = self.segment.length_m, history.columns
-        by = Parts(*(length_m * e[:, :, 1:] for e in history.bent(mu, weights.forces)))
-        found = [length_m * by.b[np.triu_indices(self.shape[0])]]
+        bent, first = history.bent(mu, weights.forces), self.first
+        by = Parts(*(self.unit_m * each[:, :, first:] for each in bent))
+        found = [self.unit_m * by.b[np.triu_indices(self.shape[0])]]
         across = Parts(*(each.swapaxes(0, 1) for each in by))
-        found += [length_m * each for each in self._by_x(1, across)]
-        of_inputs = part.setting.by_p[1:][:, places]
+        found += [length_m * each for each in self._by_x(first, across)]
+        of_inputs = part.setting.by_p[first:][:, places]
         found.append(np.einsum("cati,tcm->mati", by.c, of_inputs))
         return np.concatenate([each.ravel() for each in found])

@@ -29,6 +29,9 @@ class Part:
     x : (N, 3n) positions [m], or its first rows
     brought : mapping
         Of what is carried, by number, what evaluations bring, where that does not follow from x.
+    pressed : mapping
+        Of contact as complementarity, by the number of the force, b (1, N, i), see `model.contact`,
+        where that does not follow from x.
     given : mapping
         Of readings, by their numbers, what they look at where that does not follow from x.
     bent : bool
@@ -40,6 +43,7 @@ class Part:
     phi: Array
     x: Array
     brought: Mapping[int, Array] = field(default_factory=dict)
+    pressed: Mapping[int, Array] = field(default_factory=dict)
     given: Mapping[int, Array] = field(default_factory=dict)
     bent: bool = True
 
@@ -51,7 +55,9 @@ class Part:
     @cached_property
     def along(self) -> tuple[AnyHistory, ...]:
         """What the evaluations went through, of all that is carried."""
-        return self.setting.dynamics.histories(self.x, self.brought)
+        dynamics = self.setting.dynamics
+        pressed = dynamics.pressed(self.x, self.pressed)
+        return (*dynamics.histories(self.x, self.brought), *pressed)
 
     @cached_property
     def sensing(self) -> Sensing:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Array
-from ..model.contact import contacts
+from ..model.contact import Contact, contacts
 from ..recording.experiment import Experiment
 
 # Samples whose gaps are looked at together.
@@ -32,6 +32,13 @@ class Touch:
     obstacle: str
     gap_m: float
     faces: float
+
+
+def nearest(contact: Contact, x: Array) -> Array:
+    """(i,) the smallest gap of each point in a motion x (T, 3n)."""
+    chunks = (x[first : first + AT_ONCE] for first in range(0, len(x), AT_ONCE))
+    gaps = (contact.contact.gaps(contact.points.vectors(chunk)).min(axis=0) for chunk in chunks)
+    return np.min([*gaps], axis=0)
 
 
 def touches(experiment: Experiment, x: Array) -> Iterator[Touch]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import KW_ONLY
+from collections.abc import Callable, Iterable
+from dataclasses import KW_ONLY, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -161,6 +161,10 @@ class Experiment:
     def obstacles(self) -> tuple[Obstacle, ...]:
         """What it may touch, the last of the grasps."""
         return tuple(grasp for grasp in self.grasps if isinstance(grasp, Obstacle))
+
+    def with_obstacles(self, obstacles: Iterable[Obstacle]) -> Experiment:
+        """The same with others in the place of its obstacles."""
+        return replace(self, grasps=(*self.gripping, *obstacles))
 
     @property
     def static(self) -> bool:

@@ -69,6 +69,9 @@ class Obstacle(Grasp):
         seven tenths of its limit.
     wrench : Wrench, optional
         What it was measured to give the body.
+    relaxed : float, optional
+        Of contact as complementarity, without friction: in shares of κδ², what pressure times gap
+        is. The energy's by default.
 
     Raises
     ------
@@ -87,6 +90,7 @@ class Obstacle(Grasp):
     stiffness_pa_m: float | None = key(Positive | None, default=None, kw_only=True)
     width_m: float | None = key(Positive | None, default=None, kw_only=True)
     slip: float | None = key(Positive | None, default=None, kw_only=True)
+    relaxed: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._begin()

@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import Array, root_mean
 from ..errors import SimulationError
 from ..fem.kernels import side_by_side
+from ..methods.complementarity import with_energy
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, reading_rms, wrench_rms
 from ..model.schemes import MOST_STEPS, as_scheme
@@ -74,7 +75,7 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     try:
         segment, phi = _seen(experiment, solution)
         trajectory = simulate(
-            segment.corrected(phi),
+            with_energy(segment.corrected(phi)),
             experiment.body.theta(solution.parameters),
             integrator,
             timestep_s=_step_s(problem, segment),
@@ -114,7 +115,7 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     """The experiment with its φ: those of the fit, or fitted with θ as found."""
     collocation = solution.collocation
     for part in collocation.parts(solution.z):
-        if part.segment.experiment is experiment:
+        if part.segment.experiment.name == experiment.name:
             return part.segment, part.phi
     values, body = solution.parameters, experiment.body
     alone = replace(
