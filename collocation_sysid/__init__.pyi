@@ -4,6 +4,7 @@ from . import live
 from .errors import InputError, SimulationError
 from .fem.body import Body
 from .fem.constants import Constant
+from .fem.field import Field
 from .fem.materials import Material, Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
@@ -62,6 +63,7 @@ __all__ = [
     "Cuboid",
     "Cylinder",
     "Experiment",
+    "Field",
     "Force",
     "Gauge",
     "Grasp",

@@ -50,7 +50,7 @@ from collocation_sysid.result.pictures.confidence import ellipse
 from collocation_sysid.result.pictures.jacobian import RASTER, SHOWN_STEPS
 from collocation_sysid.result.pictures.mesh import apart
 from collocation_sysid.result.pictures.scene import Drawn, View, sheet
-from collocation_sysid.result.pictures.shapes import COLOURS, Field
+from collocation_sysid.result.pictures.shapes import COLOURS, Coloured
 from collocation_sysid.result.pictures.spectrum import spectral_density
 from collocation_sysid.result.replay import Replay
 from collocation_sysid.result.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
@@ -358,7 +358,7 @@ def test_a_field_colours_each_shape_by_its_values_there():
     seen = replay()
     count = len(seen.surface)
     values = np.arange(1.0, 2 * count + 1).reshape(2, count)
-    pressure = Field("pressure [Pa]", lambda positions_m: values[: len(positions_m)])
+    pressure = Coloured("pressure [Pa]", lambda positions_m: values[: len(positions_m)])
     figure = shapes(seen, 2, pressure)
     sheet_axes = figure.axes[0]
     assert any(text.get_text() == "pressure [Pa]" for text in sheet_axes.texts)

@@ -141,6 +141,22 @@ def in_field(
     return program(replace(cube, body=body), parameters=known, scheme=scheme)
 
 
+def differing(moved: Experiment, scheme: str = "midpoint", values=GUESS, **body) -> Collocation:
+    """Stiffness from place to place, of a body that is uneven already."""
+    field = cs.Field(0.1, modes=3)
+    made = cs.Body(moved.body.mesh, density_kg_m3=30.0, **({"field": field} | body))
+    known = values.with_fields([made])
+    uneven = {name: 0.4 * (-1) ** k for k, name in enumerate(made.mode_names)}
+    return program(replace(moved, body=made), parameters=known.with_guess(uneven), scheme=scheme)
+
+
+def differing_core() -> Collocation:
+    """A region beside what differs, which differs by itself, in its damping."""
+    field = cs.Field((0.05, 0.1), "gamma_r_s", 2)
+    core = cs.Region("core", np.arange(12), field=field)
+    return differing(measured(hung_cube(4)), regions=[core])
+
+
 OF_OBSTACLES = Nuisance.none(obstacle_offset_m=1e-3, obstacle_tilt_rad=0.02, obstacle_time_s=2e-3)
 
 
@@ -368,6 +384,16 @@ PROGRAMS: dict[str, Make] = {
     "hard contact, static": lambda: touched(
         relaxed=0.3, kind="static", felt=True, nuisance=OF_OBSTACLES
     ),
+    "field": lambda: differing(swung()),
+    "field, bdf2": lambda: differing(swung(), "bdf2"),
+    "field, paper's damping": lambda: differing(swung(), damping="rayleigh"),
+    "field, shear": lambda: differing(swung(), field=cs.Field(0.1, "mu_pa", 2)),
+    "field, regions": differing_core,
+    "field, memory": lambda: differing(
+        measured(hung_cube(3, (1, 1, 2))), values=guesses(TWO, 1.1), prony=["prony_1", "prony_2"]
+    ),
+    "field, wrench": lambda: differing(sensing(hung_cube(4, (1, 1, 2)), frame="grasp")),
+    "field, static": lambda: differing(measured(block("z", gravity_m_s2=HANGING))),
     "carried by a force": lambda: in_field(creeping, carries=3),
     "carried by a force, bdf2": lambda: in_field(creeping, "bdf2", carries=3),
     "carried by a force, memory": lambda: in_field(

@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from .constants import Constant
 from .discretisation import Discretisation
+from .field import Field
 from .materials import Damping, Energy, Material, Prony
 from .memory import Past
 from .mesh import TetMesh
@@ -109,6 +110,8 @@ class Body(Discretisation):
         Names of the branches of the material's memory.
     forces : sequence of NodeForce
         Of the user's own, on its nodes, such as the drag of the air.
+    field : Field, optional
+        A constant that differs from place to place within what no region claims.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
         for a material that vector code cannot evaluate.
@@ -148,10 +151,11 @@ class Body(Discretisation):
         regions: Sequence[Region] = (),
         prony: Sequence[str | Prony] = (),
         forces: Sequence[NodeForce] = (),
+        field: Field | None = None,
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
-        parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony)
+        parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony, field)
         super().__init__(parts, tuple(forces), mesh, element, evaluator, threads)
         # (3n,) of each part.
         self._lumped_m3 = [np.repeat(self._lumped(part), 3) for part in self.parts]
@@ -235,12 +239,12 @@ class Body(Discretisation):
 
     @cached_property
     def elastic_places(self) -> list[int]:
-        """Where in θ the constants of the materials are."""
-        return [
-            start + k
-            for part, start in zip(self.parts, self.starts, strict=False)
-            for k in range(len(part.material.constants))
-        ]
+        """Where in θ what stress depends on is: constants of the materials, and fields."""
+        found: list[int] = []
+        for part, start, modes in zip(self.parts, self.starts, self.mode_places, strict=False):
+            found += [*range(start, start + len(part.material.constants))]
+            found += [*range(modes.start, modes.stop)]
+        return found
 
     @property
     def mass_kg(self) -> float:
@@ -372,17 +376,26 @@ class Body(Discretisation):
         width = len(self.constants) * size
         # Slices: `numpy.split` takes as long as the elements of a small body.
         ends = list(accumulate([0, size, entries, entries, width]))
+        whole = self._width_without_fields("linearisation")
         force, by_position, by_velocity, by_theta, skew = (
-            rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], None], strict=True)
+            rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], whole], strict=True)
         )
         drag = self._drag(theta, tied_kg)
         force -= drag * v
         by_velocity[:, self.pattern.diagonal] -= drag
         by_theta = by_theta.reshape(len(x), size, -1)
+        for number, own in self._of_fields("linearisation", rows):
+            self.spreads[number].nodal(own["by_theta"], by_theta[:, :, self.mode_places[number]])
         for column, slope in self._drag_slopes(theta, tied_kg):
             by_theta[:, :, column] = -slope * v
         self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta, skew, skew[:, :0])
+
+    def _of_fields(self, name: str, rows: Array) -> Iterator[tuple[int, dict[str, Array]]]:
+        """Of each part with a field, what its cells add by the logarithm, by output."""
+        places = self.of_cells(name)
+        for number in self.spreads:
+            yield number, {out: rows[:, at] for (of, out), at in places.items() if of == number}
 
     def _spread_stiffening(self, by_theta: Array, carried: Past | None) -> None:
         """Turn ∂f/∂s (…, k), in the column of a part's first branch, into those by its memory."""
@@ -425,13 +438,27 @@ class Body(Discretisation):
             rows = self._evaluate("curvature", [x, v, w], theta, out)
         size, entries, k = self.pattern.size, self.pattern.entries, len(self.constants)
         xx, xv, x_theta, v_theta, theta_theta, by_theta, skew = np.split(
-            rows, np.cumsum([entries, entries, k * size, k * size, k * k, k]), axis=1
+            rows[:, : self._width_without_fields("curvature")],
+            np.cumsum([entries, entries, k * size, k * size, k * k, k]),
+            axis=1,
         )
         x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
         for column, slope in self._drag_slopes(theta, tied_kg):
             v_theta[:, :, column] = -slope * w
             by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
         theta_theta = theta_theta.reshape(len(x), k, k)
+        for number, own in self._of_fields("curvature", rows):
+            here, spread = self.mode_places[number], self.spreads[number]
+            spread.nodal(own["position_theta"], x_theta[:, :, here])
+            spread.nodal(own["velocity_theta"], v_theta[:, :, here])
+            by_theta[:, here] = own["gradient_theta"] @ spread.shapes
+            first, points = self.starts[number], self.parts[number].of_points
+            twice = own["theta_theta"].reshape(len(x), len(spread.shapes), -1)
+            mixed = np.einsum("tek,em->tkm", twice[:, :, :points], spread.shapes)
+            theta_theta[:, first : first + points, here] = mixed
+            theta_theta[:, here, first : first + points] = mixed.swapaxes(1, 2)
+            bent = twice[:, :, points, None] * spread.shapes
+            theta_theta[:, here, here] = spread.shapes.T @ bent
         for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
             self._spread_stiffening(values, carried)
         if carried is not None:

@@ -95,6 +95,8 @@ MASS = Constant("mass_kg", "m", "mass of the whole body", (1e-6, 1e3))
 FRICTION = Constant(
     "friction", "friction", "coefficient of friction", (0.0, 2.0), "linear", 0.1, 0.3, at_least=0.0
 )
+# Of a field, see `field`: how much of its first shape, of its second and so on.
+MODE = Constant("field", "", "share of a shape", (-1e3, 1e3), "linear", 1.0, 0.0)
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
 )
@@ -153,7 +155,18 @@ def constant_named(name: str) -> Constant:
     own = bare(name)
     if own not in KNOWN and own.endswith(f"_{FRICTION.name}"):
         return replace(FRICTION, name=own, symbol=own.replace("_", " "))
-    return KNOWN.get(own, Constant(own))
+    return replace(MODE, name=own) if is_mode(own) else KNOWN.get(own, Constant(own))
+
+
+def mode(number: int) -> Constant:
+    """The share of a shape of a field."""
+    return replace(MODE, name=f"{MODE.name}_{number + 1}")
+
+
+def is_mode(name: str) -> bool:
+    """Whether a constant is the share of a shape of a field."""
+    word, _, number = bare(name).rpartition("_")
+    return word == MODE.name and number.isdigit()
 
 
 def is_modulus(name: str) -> bool:

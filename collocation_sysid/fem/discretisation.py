@@ -14,13 +14,20 @@ from ..arrays import Array, Index
 from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
 from .expressions import KERNELS, Law, energy_kernel
+from .field import Spread
 from .kernels import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
 from .memory import Past, PointLayout
 from .mesh import Nodes, TetMesh
 from .node_force import NodeForce
-from .pattern import SymmetricPattern, element_destinations, in_ascending_order
+from .pattern import SymmetricPattern, dofs_of, element_destinations, in_ascending_order
 from .regions import BodyPart, Model, Theta
 from .selection import Selection
+
+# The outputs that have columns for θ: one more, cell by cell, for the logarithm of a field.
+BY_FIELD = {
+    "linearisation": ("by_theta",),
+    "curvature": ("position_theta", "velocity_theta", "theta_theta", "gradient_theta"),
+}
 
 
 class Discretisation(Model):
@@ -60,9 +67,8 @@ class Discretisation(Model):
         self._evaluators: dict[str, list[Evaluator]] = {}
         self._choice = EvaluatorChoice(evaluator)
         # Derivatives need no operations but those of the energy and the ones every evaluator has.
-        for part in self.parts:
-            law = Law(part.material, part.damping)
-            self._choice.check(energy_kernel(self.element, law).pieces)
+        for number in range(len(self.parts)):
+            self._choice.check(energy_kernel(self.element, self.law(number)).pieces)
 
     def select(self, selection: Selection) -> Index:
         """Return the nodes of a `selection.Selection`, sorted.
@@ -99,6 +105,58 @@ class Discretisation(Model):
             numbers[part.cells] = k
         return numbers
 
+    def law(self, number: int, memory: bool = False) -> Law:
+        """What the points of a part obey."""
+        part = self.parts[number]
+        scaled = part.field.scaled if part.field else ()
+        return Law(part.material, part.damping, memory, scaled)
+
+    def brought(self, number: int, theta: Theta, carried: Array | None = None) -> Array | None:
+        """What the points of a part carry (T, any), then the logarithms of its field."""
+        field = self.parts[number].field
+        if field is None:
+            return carried
+        logs = (field.shapes @ np.asarray(theta)[self.mode_places[number]])[None]
+        if carried is None:
+            return logs
+        return np.hstack([carried, np.broadcast_to(logs, (len(carried), logs.shape[1]))])
+
+    @cached_property
+    def spreads(self) -> dict[int, Spread]:
+        """How the fields of parts add up, by the number of the part."""
+        found = {}
+        for number, part in enumerate(self.parts):
+            if part.field is not None:
+                cells, _ = self._laid_out(part)
+                found[number] = Spread(part.field.shapes, dofs_of(cells), self.pattern.size)
+        return found
+
+    def _laid_out(self, part: BodyPart) -> tuple[Index, Array]:
+        """Elements of a part, and their geometry, as its kernels have them."""
+        cells, geometry = self.cells[part.cells], self.geometry[part.cells]
+        if part.damping.stress is None:
+            return cells, geometry
+        # So that an element's lower triangles are parts of the whole's: of a skew matrix, the
+        # other triangle has another sign.
+        return in_ascending_order(cells, geometry)
+
+    def of_cells(self, name: str) -> dict[tuple[int, str], slice]:
+        """Where, in a timestep's row, slopes by the logarithms of fields in each cell are.
+
+        By the number of the part and the output; of each cell d numbers of a vector, or one, and of
+        ∂²φ/∂θ² those with each θ of the points, the logarithm's, and the first again.
+        """
+        start, places = self._width_without_fields(name), {}
+        for number, spread in self.spreads.items():
+            cells, dofs = spread.dofs.shape
+            twice = 2 * self.parts[number].of_points + 1
+            sizes = {"theta_theta": twice, "gradient_theta": 1}
+            for output in BY_FIELD.get(name, ()):
+                size = cells * sizes.get(output, dofs)
+                places[number, output] = slice(start, start + size)
+                start += size
+        return places
+
     @property
     def remembers(self) -> bool:
         """Whether any part has a memory."""
@@ -124,15 +182,12 @@ class Discretisation(Model):
     @cached_property
     def linearisation_width(self) -> int:
         """Length of one timestep's row of `linearise`."""
-        entries = (2 + self.unsymmetric) * self.pattern.entries
-        return (1 + len(self.constants)) * self.pattern.size + entries
+        return self._width("linearisation")
 
     @cached_property
     def curvature_width(self) -> int:
         """Length of one timestep's row of `curvature`."""
-        k = len(self.constants)
-        entries = (2 + self.unsymmetric) * self.pattern.entries
-        return 2 * k * self.pattern.size + entries + k * (k + 1)
+        return self._width("curvature")
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
         """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
@@ -208,32 +263,36 @@ class Discretisation(Model):
         for k, evaluate in enumerate(self._evaluators[name]):
             values = shares[k][: self.parts[k].of_points].copy()
             if not self.parts[k].prony or name == "energy":
-                evaluate(fields, values, out, self.threads, add=k > 0)
+                own = self.brought(k, theta)
+                evaluate(fields, values, out, self.threads, k > 0, own)
                 continue
             past = carried or self.memory.nothing(len(out))
             for rows, values[-1] in past.runs(k):
-                here, own = [field[rows] for field in fields], past.overstress[rows]
+                here = [field[rows] for field in fields]
+                own = self.brought(k, theta, past.overstress[rows])
                 evaluate(here, values, out[rows], self.threads, k > 0, own)
         return out
 
     def _width(self, name: str) -> int:
+        ends = (place.stop for place in self.of_cells(name).values())
+        return max(ends, default=self._width_without_fields(name))
+
+    def _width_without_fields(self, name: str) -> int:
+        k, size = len(self.constants), self.pattern.size
+        entries = (2 + self.unsymmetric) * self.pattern.entries
         return {
             "energy": 1,
-            "force": self.pattern.size,
-            "linearisation": self.linearisation_width,
-            "curvature": self.curvature_width,
+            "force": size,
+            "linearisation": (1 + k) * size + entries,
+            "curvature": 2 * k * size + entries + k * (k + 1),
         }[name]
 
     def _batch(self, name: str, number: int) -> Batch:
         """Lay a part's outputs out in one row: vectors, lower triangles, columns for all of θ."""
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
-        kernel = KERNELS[name](self.element, Law(part.material, part.damping, memory))
-        cells, geometry = self.cells[part.cells], self.geometry[part.cells]
-        if part.damping.stress is not None:
-            # So that an element's lower triangles are parts of the whole's: of a skew matrix, the
-            # other triangle has another sign.
-            cells, geometry = in_ascending_order(cells, geometry)
+        kernel = KERNELS[name](self.element, self.law(number, memory))
+        cells, geometry = self._laid_out(part)
         vector, lower = element_destinations(self.pattern, cells)
         total, count = len(self.constants), len(cells)
         # γ_m and the density come after the constants of the points and need no elements.
@@ -256,12 +315,36 @@ class Discretisation(Model):
             "by_position_skew": (lower, self.pattern.entries),
             "position_velocity_skew": (lower, self.pattern.entries),
         }
-        used = [places[output] for output in kernel.contractions]
-        starts = np.cumsum([0] + [length for _, length in used])
-        destinations = np.hstack(
-            [place + start for (place, _), start in zip(used, starts[:-1], strict=True)]
-        )
-        own = self.memory.of_part(number) if memory else None
-        if own is not None and name == "curvature":
-            own = np.concatenate([own, own + self.memory.width], axis=-1)
+        used = {output: places[output] for output in kernel.contractions}
+        starts = np.cumsum([0] + [length for _, length in used.values()])
+        laid = {
+            output: place + start
+            for (output, (place, _)), start in zip(used.items(), starts, strict=False)
+        }
+        for (of, output), here in self.of_cells(name).items():
+            if of == number:
+                own = np.arange(here.start, here.stop).reshape(count, -1)
+                laid[output] = _with_own(laid[output], own, output, part.of_points)
+        destinations = np.hstack(list(laid.values()))
+        carried, width = np.zeros((count, geometry.shape[1], 0), dtype=np.int64), 0
+        if memory:
+            places_of, width = self.memory.of_part(number), self.memory.width
+            sets = 2 if name == "curvature" else 1
+            carried = np.concatenate([places_of + k * width for k in range(sets)], axis=-1)
+            width *= sets
+        if part.field is not None:
+            logs = np.broadcast_to(width + np.arange(count)[:, None, None], (*carried.shape[:2], 1))
+            carried = np.concatenate([carried, logs], axis=-1)
+        own = carried if carried.shape[-1] else None
         return Batch(kernel, cells, geometry, destinations, self._width(name), own)
+
+
+def _with_own(places: Index, own: Index, output: str, constants: int) -> Index:
+    """(E, …) where columns by θ go, and those by the logarithm in each cell, (E, …) of its own."""
+    if output != "theta_theta":
+        return np.hstack([places, own])
+    count, size = len(places), constants + 1
+    whole = np.empty((count, size, size), dtype=np.int64)
+    whole[:, :-1, :-1] = places.reshape(count, constants, constants)
+    whole[:, -1], whole[:, :-1, -1] = own[:, :size], own[:, size:]
+    return whole.reshape(count, -1)

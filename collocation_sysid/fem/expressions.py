@@ -8,7 +8,8 @@ v        3·nodes       node velocities [m/s]
 w        3·nodes       weights on the node forces (Lagrange multipliers)
 geometry 3·nodes + 1   shape gradients ∂N_a/∂X_j at 3a + j, then the volume [m³]
 theta    k             constants of the material, then of the damping law, then s
-carried  6             H; for second derivatives 12, H and the weights σ of S
+carried  6             H; for second derivatives 12, H and the weights σ of S; then, where there
+                       is a field, its logarithm
 ======== ============= ==============================================================
 
 and outputs that are summed over points and elements. Matrices are given by the lower triangles of
@@ -41,11 +42,13 @@ class Law:
     """What a quadrature point obeys: a material and a damping law, with or without memory.
 
     θ holds the material's constants, those of the damping law and, with memory, the stiffening s.
+    Those at the places `scaled` are multiplied by a field.
     """
 
     material: Material
     damping: Damping
     memory: bool = False
+    scaled: tuple[int, ...] = ()
 
     @property
     def constants(self) -> int:
@@ -82,6 +85,14 @@ class Law:
         return {c.name: own[k] for k, c in enumerate(self.damping.constants)}
 
 
+def point_of(
+    element: Element, law: Law, *fields: str, carried: int | None = None
+) -> QuadraturePoint:
+    """A point of an element that obeys a law."""
+    brought = law.carried if carried is None else carried
+    return QuadraturePoint.of(element, law.constants, *fields, carried=brought, scaled=law.scaled)
+
+
 def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKernel:
     """The kernel of derivatives of scalars of a point."""
     if point.stretches:
@@ -98,13 +109,14 @@ def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKerne
 
 
 def _energy(point: QuadraturePoint, law: Law) -> ca.SX:
-    return point.volume * law.psi(point.felt, point.theta)
+    return point.volume * law.psi(point.felt, point.constants)
 
 
 def _potential(point: QuadraturePoint, law: Law) -> ca.SX:
     """Θ of one point, whose slope by x is an internal force but for the sign."""
     energy = _energy(point, law)
-    damped = energy + law.damping_potential(energy, point.strain, point.strain_rate, point.theta)
+    drag = law.damping_potential(energy, point.strain, point.strain_rate, point.constants)
+    damped = energy + drag
     if not law.memory:
         return damped
     return damped + point.theta[-1] * energy + carried_energy(point)
@@ -132,7 +144,7 @@ def six_of(matrix: ca.SX) -> ca.SX:
 
 def first_piola(point: QuadraturePoint, law: Law) -> ca.SX:
     """P (9,) = ∂ψ/∂F."""
-    return ca.gradient(law.psi(point.felt, point.theta), point.gradients["x"])
+    return ca.gradient(law.psi(point.felt, point.constants), point.gradients["x"])
 
 
 def second_piola(point: QuadraturePoint, law: Law) -> ca.SX:
@@ -142,19 +154,19 @@ def second_piola(point: QuadraturePoint, law: Law) -> ca.SX:
 
 def _damping(point: QuadraturePoint, law: Law) -> tuple[ca.SX, ca.SX] | None:
     """V P_v of one point, and its slope by F."""
-    found = law.damping_stress(ca.vec(point.felt), point.felt_rate, point.theta)
+    found = law.damping_stress(ca.vec(point.felt), point.felt_rate, point.constants)
     return None if found is None else (point.volume * found[0], point.volume * found[1])
 
 
 def energy_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic energy Ψ of the point [J]."""
-    point = QuadraturePoint.of(element, law.constants, "x")
+    point = point_of(element, law, "x", carried=0)
     return kernel_of("energy", point, {"energy": (Derivative(_energy(point, law), ()),)})
 
 
 def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
-    point = QuadraturePoint.of(element, law.constants, "x", "v", carried=law.carried)
+    point = point_of(element, law, "x", "v")
     force = (Derivative(-_potential(point, law), ("x",)),)
     if found := _damping(point, law):
         stress = -found[0]
@@ -164,7 +176,7 @@ def force_kernel(element: Element, law: Law) -> PointKernel:
 
 def linearisation_kernel(element: Element, law: Law) -> PointKernel:
     """Force with its derivatives by position, velocity and θ (Rayleigh: −K − γ_r D_vK, −γ_r K)."""
-    point = QuadraturePoint.of(element, law.constants, "x", "v", carried=law.carried)
+    point = point_of(element, law, "x", "v")
     potential = -_potential(point, law)
     outputs: Outputs = {
         "force": (Derivative(potential, ("x",)),),
@@ -177,7 +189,7 @@ def linearisation_kernel(element: Element, law: Law) -> PointKernel:
         # Half the power lost, which is quadratic in the rate: its slope by that is the stress.
         lost = ca.dot(stress, point.felt_rate) / 2
         by_rate = ca.jacobian(stress, point.gradients["v"])
-        by_theta = ca.jacobian(stress, point.theta)
+        by_theta = ca.jacobian(stress, point.varied)
         outputs["force"] += (Derivative(lost, ("v",), known=stress),)
         outputs["by_position"] += (Derivative(lost, ("v", "x"), "symmetric", slope),)
         outputs["by_velocity"] += (Derivative(lost, ("v", "v"), known=by_rate),)
@@ -192,10 +204,10 @@ def curvature_kernel(element: Element, law: Law) -> PointKernel:
     ∂²φ/∂v² vanishes. ∂²φ/∂x∂v is symmetric where the force follows from a potential (Rayleigh:
     −γ_r D_wK).
     """
-    point = QuadraturePoint.of(element, law.constants, "x", "v", "w", carried=2 * law.carried)
+    point = point_of(element, law, "x", "v", "w", carried=2 * law.carried)
     power = -point.along_w(_potential(point, law))
     if law.memory:
-        power += ca.dot(point.carried[6:], second_piola(point, law))
+        power += ca.dot(point.brought[6:], second_piola(point, law))
     if found := _damping(point, law):
         power -= ca.dot(found[0], point.felt_weight)
     mixed = Derivative(power, ("x", "v"), "symmetric" if found else "whole")

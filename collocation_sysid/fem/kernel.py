@@ -247,7 +247,9 @@ class QuadraturePoint:
         Where the element averages the dilatation, the logarithm m of the stretch that does so and,
         with v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
     carried : SX
-        What the point brings from the past, see `memory`.
+        What the point brings from the past, see `memory`; with a field, the logarithm comes last.
+    scaled : tuple of int
+        Places in θ of the constants that a field multiplies, see `field`.
     """
 
     nodes: int
@@ -257,10 +259,16 @@ class QuadraturePoint:
     gradients: dict[str, ca.SX]
     stretches: tuple[ca.SX, ...]
     carried: ca.SX
+    scaled: tuple[int, ...] = ()
 
     @classmethod
     def of(
-        cls, element: Element, constants: int, *fields: str, carried: int = 0
+        cls,
+        element: Element,
+        constants: int,
+        *fields: str,
+        carried: int = 0,
+        scaled: tuple[int, ...] = (),
     ) -> QuadraturePoint:
         """A point of an element, with θ of so many constants, that carries so many numbers."""
         stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
@@ -271,8 +279,27 @@ class QuadraturePoint:
             ca.SX.sym("theta", constants),
             {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
             tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
-            ca.SX.sym("carried", carried),
+            ca.SX.sym("carried", carried + bool(scaled)),
+            scaled,
         )
+
+    @property
+    def constants(self) -> ca.SX:
+        """θ as it is here."""
+        here = ca.SX(self.theta)
+        for place in self.scaled:
+            here[place] *= ca.exp(self.carried[-1])
+        return here
+
+    @property
+    def varied(self) -> ca.SX:
+        """What derivatives by "theta" are by: θ, and the logarithm of the field."""
+        return ca.vertcat(self.theta, self.carried[-1]) if self.scaled else self.theta
+
+    @property
+    def brought(self) -> ca.SX:
+        """What is carried but the logarithm of the field."""
+        return self.carried[:-1] if self.scaled else self.carried
 
     @property
     def volume(self) -> ca.SX:
@@ -313,7 +340,7 @@ class QuadraturePoint:
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
         """A derivative of a scalar, by the fields' gradients for the fields."""
-        inputs = [self.theta if name == "theta" else self.gradients[name] for name in by]
+        inputs = [self.varied if name == "theta" else self.gradients[name] for name in by]
         if not inputs:
             return scalar
         if len(inputs) < 2:

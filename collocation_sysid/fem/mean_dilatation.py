@@ -154,7 +154,7 @@ class _Chain:
             self.key("second"): ("none", ca.vec(mirrored(by_m))),
             self.key("slopes_by_theta"): (
                 "none",
-                ca.vec(ca.jacobian(self.by_stretch, self.shape.point.theta)),
+                ca.vec(ca.jacobian(self.by_stretch, self.shape.point.varied)),
             ),
         }
         for field in self.fields:
@@ -171,7 +171,7 @@ class _Chain:
         if len(nodal) == 1:
             gradient = ca.gradient(self.scalar, point.gradients[nodal[0]])
             gradient += (self._lifted(nodal[0])[9:, :]).T @ self.by_stretch
-            return gradient if len(by) == 1 else ca.jacobian(gradient, point.theta)
+            return gradient if len(by) == 1 else ca.jacobian(gradient, point.varied)
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
         by_s, _ = _slopes(shape.volumes, shape.volume, self.slopes)
@@ -219,7 +219,7 @@ def _coupling(
     shape: _Shape, chains: dict[int, _Chain], outputs: Outputs, order: int
 ) -> ca.Function:
     """C or D of each output; see `kernel`."""
-    count, constants = shape.count, shape.point.theta.numel()
+    count, constants = shape.count, shape.point.varied.numel()
     sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
     blocks, seconds, by_thetas = {"volumes": slice(0, count)}, {}, {}
     if order > 1:

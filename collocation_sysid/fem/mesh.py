@@ -224,25 +224,20 @@ class TetMesh:
         """Lowest and highest coordinates, (2, 3)."""
         return np.array([self.points_m.min(axis=0), self.points_m.max(axis=0)])
 
-    @cached_property
+    @property
     def surface(self) -> np.ndarray:
         """Boundary triangles, (F, 3) int64, counter-clockwise when seen from outside."""
-        faces = self.tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
-        return _read_only(faces[self._outer_faces])
+        return self._boundary[0]
 
     @property
     def surface_cells(self) -> np.ndarray:
         """(F,) the element that each boundary triangle is a face of."""
-        return self._outer_faces // 4
+        return self._boundary[1]
 
     @cached_property
-    def _outer_faces(self) -> np.ndarray:
-        """Which of the elements' faces, four of each in turn, no other element has."""
-        faces = self.tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
-        _, first, count = np.unique(
-            np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-        )
-        return np.sort(first[count == 1])
+    def _boundary(self) -> tuple[np.ndarray, np.ndarray]:
+        faces, owners = boundary_of(self.tetrahedra)
+        return _read_only(faces), _read_only(owners)
 
     @cached_property
     def edges(self) -> np.ndarray:
@@ -272,6 +267,16 @@ class TetMesh:
         ratios = mean_ratios(self.points_m, self.tetrahedra)
         edges_m = lengths.min(), lengths.mean(), lengths.max()
         return MeshQuality(*map(float, (*edges_m, ratios.min(), np.median(ratios))))
+
+
+def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
+    """Faces (F, 3) that no other cell has, counter-clockwise from outside, and whose they are."""
+    faces = tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    outer = np.sort(first[count == 1])
+    return faces[outer], outer // 4
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError, hint_at
-from .constants import DENSITY, GAMMA_M, MASS, Constant
+from .constants import DENSITY, GAMMA_M, MASS, Constant, is_mode
+from .field import Field, FieldModes
 from .materials import Damping, Energy, Material, Prony, as_branches, as_damping, as_material
 from .mesh import TetMesh
 from .moduli import Source, elastic_names, source_of
@@ -35,6 +36,8 @@ class Region:
     cells : selection of cells, or (E,) bool, or (k,) int array
     material, damping, density_kg_m3, prony
         The body's where they are left out.
+    field : Field, optional
+        A constant that differs from place to place within the region.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Region:
     density_kg_m3: float | None = None
     damping: str | Damping | None = None
     prony: Sequence[str | Prony] | None = None
+    field: Field | None = None
 
     def __post_init__(self) -> None:
         if not self.name or not self.name.replace("_", "").replace("-", "").isalnum():
@@ -73,6 +77,8 @@ class BodyPart:
         Whether it is stated for this part, not for the body.
     free_density : bool
         Whether the density is one of its constants.
+    field : FieldModes or None
+        What differs from place to place within it.
     """
 
     name: str
@@ -84,13 +90,15 @@ class BodyPart:
     per_mass_1_m3: float = 0.0
     own_density: bool = False
     free_density: bool = False
+    field: FieldModes | None = None
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
-        """Of material, damping law, memory, and the mass, as they follow one another in θ."""
+        """Of material, damping law, memory, mass and field, as they follow one another in θ."""
         of_memory = [constant for branch in self.prony for constant in branch.constants]
         law = (*self.material.constants, *self.damping.constants, *of_memory, GAMMA_M)
-        return (*law, DENSITY) if self.free_density else law
+        law = (*law, DENSITY) if self.free_density else law
+        return law if self.field is None else (*law, *self.field.constants)
 
     @property
     def of_law(self) -> int:
@@ -120,6 +128,7 @@ def parts_of(
     mass_kg: float | None,
     regions: Sequence[Region],
     prony: Sequence[str | Prony] = (),
+    field: Field | None = None,
 ) -> tuple[BodyPart, ...]:
     """The parts of a body: what no region claims, where there is any, then the regions.
 
@@ -135,19 +144,30 @@ def parts_of(
     )
     branches = as_branches(prony)
     whole = BodyPart("", rest, as_material(material), as_damping(damping), own[0], branches)
-    parts = [whole] if rest.size else []
+    if field is not None and not rest.size:
+        raise InputError(
+            "the field is of what no region claims, and all is claimed; expected it of a region"
+        )
+    parts = [_with_field(whole, field, mesh)] if rest.size else []
     for region, cells, density in zip(regions, claimed, own[1:], strict=True):
         try:
             law = whole.material if region.material is None else as_material(region.material)
             drag = whole.damping if region.damping is None else as_damping(region.damping)
             memory = branches if region.prony is None else as_branches(region.prony)
+            has_own = region.density_kg_m3 is not None
+            part = BodyPart(region.name, cells, law, drag, density, memory, own_density=has_own)
+            parts.append(_with_field(part, region.field, mesh))
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
-        has_own = region.density_kg_m3 is not None
-        part = BodyPart(region.name, cells, law, drag, density, memory, own_density=has_own)
-        parts.append(part)
     mass = sum(part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum()) for part in parts)
     return tuple(replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts)
+
+
+def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
+    if field is None:
+        return part
+    law = (*part.material.constants, *part.damping.constants)
+    return replace(part, field=FieldModes.of(field, mesh, part.cells, law))
 
 
 def _densities(
@@ -284,7 +304,10 @@ class Model:
         """
         return [
             source_of(
-                part.name, part.material, part.constants[len(part.material.constants) :], known
+                part.name,
+                part.material,
+                [c for c in part.constants[len(part.material.constants) :] if not is_mode(c.name)],
+                known,
             )
             for part in self.parts
         ]
@@ -292,6 +315,7 @@ class Model:
     def used_names(self, known: Sequence[str]) -> set[str]:
         """Those of the names that are known which give its constants."""
         own = {name for source in self.sources(known) for name in source.names.values()}
+        own.update(self.mode_names)
         further = (force.constants for force in self.forces)
         return own.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
@@ -318,7 +342,11 @@ class Model:
             found = source.constants(values)
             if source.names.get(DENSITY.name) == MASS.name:
                 found[DENSITY.name] *= part.per_mass_1_m3
-            theta += [found[c.name] for c in part.constants]
+            # A field that nothing is said of is as its mean everywhere.
+            theta += [
+                values.get(part.full_name(c.name), 0.0) if is_mode(c.name) else found[c.name]
+                for c in part.constants
+            ]
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
                 raise InputError(
@@ -362,6 +390,18 @@ class Model:
     def split(self, theta: Any) -> list[Any]:
         """θ, numbers or a CasADi expression, part by part."""
         return [theta[a:b] for a, b in pairwise(self.starts)]
+
+    @property
+    def mode_names(self) -> tuple[str, ...]:
+        """Of the shares of shapes of fields."""
+        return tuple(name for name in self.constants if is_mode(name))
+
+    @cached_property
+    def mode_places(self) -> list[slice]:
+        """Where in θ those of each part are."""
+        counts = (part.field.field.modes if part.field else 0 for part in self.parts)
+        ends = self.starts[1:]
+        return [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
 
     @cached_property
     def starts(self) -> list[int]:

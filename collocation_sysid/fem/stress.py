@@ -20,7 +20,7 @@ import numpy as np
 from ..arrays import Array, Index
 from .discretisation import Discretisation
 from .elements import Element
-from .expressions import Law, carried_energy, first_piola, second_piola, six_of
+from .expressions import Law, carried_energy, first_piola, point_of, second_piola, six_of
 from .kernel import Contraction, PointKernel, QuadraturePoint
 from .kernels import COMPILING, Batch, Evaluator
 from .pattern import dofs_of
@@ -29,9 +29,10 @@ Expression = Callable[[QuadraturePoint, Law], ca.SX]
 
 
 def _stress_by_theta(point: QuadraturePoint, law: Law) -> ca.SX:
-    """∂S/∂θ by the material's constants, column after column."""
-    slope = ca.jacobian(second_piola(point, law), point.theta)
-    return ca.vec(slope[:, : len(law.material.constants)])
+    """∂S by the material's constants and the logarithm of a field, column after column."""
+    slope = ca.jacobian(second_piola(point, law), point.varied)
+    of_field = slope[:, law.constants :]
+    return ca.vec(ca.horzcat(slope[:, : len(law.material.constants)], of_field))
 
 
 def _stress_along(point: QuadraturePoint, law: Law) -> ca.SX:
@@ -45,7 +46,7 @@ def _stress_along(point: QuadraturePoint, law: Law) -> ca.SX:
 
 def _pulled(point: QuadraturePoint, law: Law) -> ca.SX:
     """(∂S/∂x)ᵀ σ of what the points carry."""
-    return ca.gradient(ca.dot(point.carried, second_piola(point, law)), point.gradients["x"])
+    return ca.gradient(ca.dot(point.brought, second_piola(point, law)), point.gradients["x"])
 
 
 def _carried_force(point: QuadraturePoint, law: Law) -> ca.SX:
@@ -56,7 +57,7 @@ def _carried_force(point: QuadraturePoint, law: Law) -> ca.SX:
 def _against(point: QuadraturePoint, law: Law) -> ca.SX:
     """(∂f_H/∂H)ᵀ v."""
     power = ca.jtimes(-carried_energy(point), point.gradients["x"], point.gradients["v"])
-    return ca.gradient(power, point.carried)
+    return ca.gradient(power, point.brought)
 
 
 def _stress_slope(point: QuadraturePoint, law: Law) -> ca.SX:
@@ -66,7 +67,7 @@ def _stress_slope(point: QuadraturePoint, law: Law) -> ca.SX:
 
 def _force_slope(point: QuadraturePoint, law: Law) -> ca.SX:
     """∂f_H/∂H, column after column."""
-    return ca.jacobian(_carried_force(point, law), point.carried)
+    return ca.jacobian(_carried_force(point, law), point.brought)
 
 
 # Of each: its expression, fields, how many numbers the points carry, and its contraction.
@@ -85,10 +86,10 @@ KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
 def stress_kernel(name: str, element: Element, law: Law) -> PointKernel:
     """That of a line of the table."""
     expression, fields, carried, contraction = KERNELS[name]
-    point = QuadraturePoint.of(element, law.constants, *fields, carried=carried)
+    point = point_of(element, law, *fields, carried=carried)
     piece = expression(point, law)
     if not ca.depends_on(piece, point.carried):  # H has gone from what is linear in it
-        point = replace(point, stretches=(), carried=ca.SX(0, 1))
+        point = replace(point, stretches=(), carried=ca.SX(0, 1), scaled=())
     last = point.phase(name, {name: (contraction, piece)})
     return PointKernel(last.pieces, fields, last.contractions)
 
@@ -128,13 +129,19 @@ class Stresses:
         for number, part in enumerate(body.parts):
             if part.prony:
                 count, places = len(part.material.constants), body.memory.of_part(number)
-                out = np.zeros((len(x), count * places.size))
+                field = part.field
+                out = np.zeros((len(x), (count + bool(field)) * places.size))
                 self._run("stress_by_theta", number, [x], theta, out, add=False)
                 first = body.starts[number]
                 here = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
-                by_constant = out.reshape(len(x), count, places.size)
+                by_constant = out.reshape(len(x), -1, places.size)
                 for k, j in zip(*np.nonzero(theta_q[first : first + count]), strict=True):
                     found[:, j, here] += theta_q[first + k, j] * by_constant[:, k]
+                if field:
+                    logs = field.shapes @ theta_q[body.mode_places[number]]
+                    for j in np.flatnonzero(logs.any(axis=0)):
+                        of_points = np.tile(np.repeat(logs[:, j], body.geometry.shape[1]), 6)
+                        found[:, j, here] += of_points * by_constant[:, count]
         return found
 
     def along(self, x: Array, direction: Array, theta: Array, out: Array | None = None) -> Array:
@@ -211,6 +218,7 @@ class Stresses:
                 self._evaluators[key] = body.make_evaluator(self._batch(name, number))
         first = body.starts[number]
         values = np.array(theta[first : first + body.parts[number].of_law], dtype=float)
+        brought = body.brought(number, theta, carried)
         threads = body.threads if len(out) > FEW else 1
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],
@@ -218,14 +226,14 @@ class Stresses:
             out,
             threads,
             add,
-            None if carried is None else np.ascontiguousarray(carried),
+            None if brought is None else np.ascontiguousarray(brought),
         )
 
     def _batch(self, name: str, number: int) -> Batch:
         """Every point as an element of its own."""
         body = self.body
         part, places = body.parts[number], body.memory.of_part(number)
-        kernel = stress_kernel(name, body.element, Law(part.material, part.damping))
+        kernel = stress_kernel(name, body.element, body.law(number))
         points = body.geometry.shape[1]
         cells = np.repeat(body.cells[part.cells], points, axis=0)
         geometry = body.geometry[part.cells].reshape(len(cells), 1, -1)
@@ -238,12 +246,18 @@ class Stresses:
         elif "nodes" in kernel.contractions.values():
             destinations, length = dofs_of(cells), body.pattern.size
         elif name == "stress_by_theta":
-            columns = places.size * np.arange(len(part.material.constants))
+            count = len(part.material.constants) + bool(part.field)
+            columns = places.size * np.arange(count)
             destinations = (columns[:, None] + own - places[0, 0, 0]).reshape(len(cells), -1)
             length = places.size * len(columns)
         else:
             destinations, length = own.reshape(len(cells), 6), self.width
-        carried = own if kernel.carried else None
+        carried = own if KERNELS[name][2] else own[..., :0]
+        if part.field:
+            width = self.width if KERNELS[name][2] else 0
+            logs = width + np.repeat(np.arange(len(part.cells)), points)
+            carried = np.concatenate([carried, logs[:, None, None]], axis=-1)
+        carried = carried[..., : kernel.carried] if kernel.carried else None
         return Batch(kernel, cells, geometry, destinations, length, carried)
 
 

@@ -256,6 +256,13 @@ class Parameters:
         """Parameters by name; a number is a fixed value."""
         return cls(tuple(parameter(name, value) for name, value in given.items()))
 
+    def with_fields(self, bodies: Iterable[Body]) -> Parameters:
+        """With the shares of the shapes of fields, of which no word was said."""
+        names = dict.fromkeys(name for body in bodies for name in body.mode_names)
+        prior = Unknown(0.0, prior=(0.0, 1.0))
+        further = (parameter(name, prior) for name in names if name not in self.names)
+        return Parameters((*self.items, *further))
+
     def fixed_at(self, values: Mapping[str, float]) -> Parameters:
         """Those of these names, all with these values."""
         own = (item for item in self.items if item.name in values)

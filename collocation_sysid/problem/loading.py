@@ -11,12 +11,14 @@ from typing import Any
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.constants import FRICTION, Constant, constant_named
+from ..fem.field import Field
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
 from ..recording.selected import selection
+from ..section import Section, stated_in
 from ..stated import keys_of, tables_of
 from ..statistics.plausible import oddities
 from .code import Code, existing_file
@@ -125,6 +127,9 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
     def branches(region: str | None) -> list[str]:
         return [branch.name for branch in section.prony if branch.region == region]
 
+    def field(section: Section | None, where: str) -> Field | None:
+        return None if section is None else Field(**stated_in(section, Field, where))
+
     regions = [
         Region(
             region.name,
@@ -133,6 +138,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
             region.density_kg_m3,
             region.damping,
             branches(region.name) or None,
+            field(region.field, f"region.{k}.field"),
         )
         for k, region in enumerate(section.region)
     ]
@@ -146,6 +152,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
         regions=regions,
         prony=branches(None),
         forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
+        field=field(section.field, "field"),
         evaluator=section.evaluator,
     )
 

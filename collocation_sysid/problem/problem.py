@@ -81,6 +81,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         vars(self)["experiments"] = _weighed(self.experiments, self.parameters)
+        vars(self)["parameters"] = self.parameters.with_fields(self.bodies)
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
         odd = (oddity.sentence for body in self.bodies for oddity in oddities(body))
         still = (c.sentence for c in stillness_concerns(self.experiments, self.parameters))

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from ..checked import Count, Finite, Flag, Positive, Text
 from ..fem.elements import ELEMENTS
+from ..fem.field import Field as MaterialField
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..model.parameters import Unknown
 from ..model.schemes import MOST_STEPS, SCHEMES
@@ -22,8 +23,9 @@ DampingName = Annotated[str, Among(tuple(DAMPINGS))]
 ElementName = Annotated[str, Among(tuple(ELEMENTS))]
 SchemeName = Annotated[str, Among(tuple(SCHEMES))]
 if TYPE_CHECKING:
-    RolloutSection = UncertaintySection = Section
+    FieldSection = RolloutSection = UncertaintySection = Section
 else:
+    FieldSection = section_of(MaterialField, "FieldSection")
     RolloutSection = section_of(RolloutOptions, "RolloutSection")
     UncertaintySection = section_of(UncertaintyOptions, "UncertaintySection")
 
@@ -77,6 +79,8 @@ class RegionSection(Section):
     cells : Nodes
         Selection of cells, by their centres: a table of box_m, ball_m or indices, or the name of a
         cell array or of a physical group.
+    field : FieldSection, optional
+        A constant that differs from place to place within the region.
     """
 
     name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")]
@@ -84,6 +88,7 @@ class RegionSection(Section):
     material: Material | None = None
     damping: DampingName | None = None
     density_kg_m3: Positive | None = None
+    field: FieldSection | None = None
 
 
 class PronySection(Section):
@@ -146,6 +151,8 @@ class ObjectSection(Section):
         [[object.prony]] tables: a material with memory, branch by branch.
     force : list of NodeForceSection
         [[object.force]] tables: forces of the user's own on the nodes.
+    field : FieldSection, optional
+        A constant that differs from place to place: parameter, length_m, modes, amplitude.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated.
     """
@@ -164,6 +171,7 @@ class ObjectSection(Section):
     region: list[RegionSection] = Field(default_factory=list)
     prony: list[PronySection] = Field(default_factory=list)
     force: list[NodeForceSection] = Field(default_factory=list)
+    field: FieldSection | None = None
     evaluator: Literal["auto", "simd", "casadi"] = "auto"
 
     @model_validator(mode="after")

@@ -21,10 +21,9 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..fem.body import Body
 from ..fem.elements import Element
-from ..fem.expressions import kernel_of
-from ..fem.kernel import Derivative, PointKernel, QuadraturePoint
+from ..fem.expressions import Law, kernel_of, point_of
+from ..fem.kernel import Derivative, PointKernel
 from ..fem.kernels import Batch, Evaluator
-from ..fem.materials import Material
 
 NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
@@ -48,12 +47,14 @@ class ElementFields:
     def of(cls, body: Body, theta: Array) -> ElementFields:
         """Compile the fields of a body's materials."""
         evaluators = []
-        for part in body.parts:
-            kernel = field_kernel(body.element, part.material)
+        for number, part in enumerate(body.parts):
+            kernel = field_kernel(body.element, body.law(number))
             # Every element has a place of its own, where its points add up.
             places = len(NAMES) * part.cells[:, None] + np.arange(len(NAMES))
             width = len(NAMES) * len(body.cells)
-            batch = Batch(kernel, body.cells[part.cells], body.geometry[part.cells], places, width)
+            cells, geometry = body.cells[part.cells], body.geometry[part.cells]
+            logs = np.broadcast_to(np.arange(len(cells))[:, None, None], (*geometry.shape[:2], 1))
+            batch = Batch(kernel, cells, geometry, places, width, logs if part.field else None)
             evaluators.append(body.make_evaluator(batch))
         volumes = body.geometry[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)
@@ -68,16 +69,16 @@ class ElementFields:
         sums = np.empty((len(x), len(NAMES) * len(self._volumes)))
         shares = body.split(self.theta)
         for k, (part, evaluate) in enumerate(zip(body.parts, self._evaluators, strict=True)):
-            constants = np.array(shares[k][: len(part.material.constants)], dtype=float)
-            evaluate([x], constants, sums, body.threads, add=k > 0)
+            constants = np.array(shares[k][: part.of_law], dtype=float)
+            evaluate([x], constants, sums, body.threads, k > 0, body.brought(k, self.theta))
         means = sums.reshape(len(x), -1, len(NAMES)) / self._volumes[:, None]
         return {name: means[:, :, k] for k, name in enumerate(NAMES)}
 
 
-def field_kernel(element: Element, material: Material) -> PointKernel:
+def field_kernel(element: Element, law: Law) -> PointKernel:
     """The fields at a quadrature point times its volume, see `expressions` for the inputs."""
-    point = QuadraturePoint.of(element, len(material.constants), "x")
-    fields = ca.vertcat(*_point_fields(material, point.theta))
+    point = point_of(element, law, "x")
+    fields = ca.vertcat(*_point_fields(law, point.constants))
     felt = ca.substitute(fields, _F, ca.vec(point.felt))
     return kernel_of("fields", point, {"fields": (Derivative(point.volume * felt, ()),)})
 
@@ -85,11 +86,11 @@ def field_kernel(element: Element, material: Material) -> PointKernel:
 _F = ca.SX.sym("F", 9)
 
 
-def _point_fields(material: Material, theta: ca.SX) -> tuple[ca.SX, ...]:
+def _point_fields(law: Law, theta: ca.SX) -> tuple[ca.SX, ...]:
     """J, ψ and the von Mises stress at the deformation gradient `_F`, column after column."""
     f = ca.reshape(_F, 3, 3)
     j = ca.det(f)
-    psi = material.psi(f, theta)
+    psi = law.psi(f, theta)
     cauchy = ca.reshape(ca.gradient(psi, _F), 3, 3) @ f.T / j
     deviator = cauchy - ca.trace(cauchy) / 3 * ca.SX.eye(3)
     return j, psi, ca.sqrt(1.5 * ca.sumsqr(deviator))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..arrays import Array
-from ..methods.solution import Solution
+from ..fem.body import Body
 from ..recording.experiment import Experiment
 from ..runs.answer import Answer
 from ..runs.forward_simulation import Rollout
@@ -29,7 +31,6 @@ def write_run(finished: Answer, folder: str | Path, frames: bool = True) -> Path
     pictures, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several experiments the
     arrays' names and the frames' folders have the experiment's name in front.
     """
-    solution = finished.solution
     result = result_of(finished)
     with run_folder(folder) as place:
         origin = finished.problem.origin
@@ -43,7 +44,7 @@ def write_run(finished: Answer, folder: str | Path, frames: bool = True) -> Path
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
         _write_pictures(finished, result, seen, place)
         if frames:
-            _write_all_frames(solution, place)
+            _write_all_frames(finished, place)
     return Path(folder)
 
 
@@ -56,7 +57,17 @@ def _write_pictures(finished: Answer, result: Result, seen: Sequence[Replay], pl
     save_pictures(place, album(seen, result) | {"jacobian": jacobian})
 
 
-def _write_all_frames(solution: Solution, place: Path) -> None:
+def _told_of_cells(finished: Answer, body: Body) -> dict[str, Any]:
+    """What is the same in every frame: regions, and what differs from place to place."""
+    told: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
+    for name, values in _in_cells(finished, body).items():
+        heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
+        told |= dict(zip(heads, values.T, strict=True))
+    return told
+
+
+def _write_all_frames(finished: Answer, place: Path) -> None:
+    solution = finished.solution
     collocation = solution.collocation
     for part in collocation.parts(solution.z):
         segment, positions = part.segment, part.x.reshape(len(part.x), -1, 3)
@@ -75,7 +86,7 @@ def _write_all_frames(solution: Solution, place: Path) -> None:
             body.nodes_m,
             {"residual_force_n": residual.reshape(positions.shape)},
             fields=ElementFields.of(body, body.theta(solution.parameters)),
-            cell_data={"region": body.part_of_cells} if len(body.parts) > 1 else None,
+            cell_data=_told_of_cells(finished, body),
         )
 
 
@@ -100,8 +111,20 @@ def replays(finished: Answer) -> list[Replay]:
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _places_m(finished, experiment.name)
             read = _sensed(finished, experiment), _own_readings(finished, experiment)
-            seen.append(Replay.of(experiment, fit, rolled_out, natural, places_m, *read))
+            replay = Replay.of(experiment, fit, rolled_out, natural, places_m, *read)
+            seen.append(replace(replay, fields=_in_cells(finished, experiment.body)))
     return seen
+
+
+def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:
+    """(E, 4) of each constant that differs from place to place, NaN where other regions are."""
+    found = {}
+    for part in body.parts:
+        if part.field is not None:
+            name = part.full_name(part.field.field.parameter)
+            found[name] = np.full((len(body.cells), 4), np.nan)
+            found[name][part.cells] = finished.fields[name].by_element
+    return found
 
 
 def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:

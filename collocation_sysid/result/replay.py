@@ -25,8 +25,8 @@ from ..recording.experiment import Experiment
 from ..runs.result import Result
 
 ARRAYS_FILE = "trajectory.npz"
-# What stands before the number of a wrench, and the name of a reading of one's own.
-WRENCH, READING = "wrench_", "reading_"
+# What stands before the number of a wrench, and the names of readings of one's own and of fields.
+WRENCH, READING, FIELD = "wrench_", "reading_", "field_"
 # Of the body, and so the same for all experiments of a run.
 OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes,
@@ -90,6 +90,9 @@ class Replay:
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
     obstacles_m : (T, o, 3) points of the obstacles' outlines, NaN after each line
+    fields : mapping of name to (E, 4)
+        Constants that differ from place to place: value, the ends of its interval, and its
+        deviation over the prior's, NaN where another region is.
     """
 
     name: str
@@ -116,6 +119,7 @@ class Replay:
     tendons_m: Array | None = None
     readings: Mapping[str, Array] = field(default_factory=dict)
     obstacles_m: Array | None = None
+    fields: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -184,6 +188,7 @@ class Replay:
         stored["residuals_m"] = None if self.markers_m is None else self.markers_m - self.measured_m
         stored |= {f"{WRENCH}{k}": values for k, values in enumerate(self.wrenches, start=1)}
         stored |= {f"{READING}{name}": values for name, values in self.readings.items()}
+        stored |= {f"{FIELD}{name}": values for name, values in self.fields.items()}
         there = {key: value for key, value in stored.items() if value is not None}
         return {key if key in OF_BODY else prefix + key: value for key, value in there.items()}
 
@@ -206,6 +211,8 @@ class Replay:
         stored["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
         said = f"{prefix}{READING}"
         stored["readings"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
+        said = f"{prefix}{FIELD}"
+        stored["fields"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)
         stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
@@ -268,6 +275,9 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
     for name, said in arrays["readings"].items():
         if said.dtype.kind != "f" or said.ndim != 2 or said.shape[1] % 3 != 1 or said.size < 4:
             raise ValueError(f"{READING}{name} is {said.dtype} of shape {said.shape}")
+    for name, said in arrays["fields"].items():
+        if said.dtype.kind != "f" or said.shape != (len(arrays["tetrahedra"]), 4):
+            raise ValueError(f"{FIELD}{name} is {said.dtype} of shape {said.shape}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
             raise ValueError(f"{key} names nodes that are not there")

@@ -49,6 +49,8 @@ SHOWN_BUDGETS, SHOWN_SOURCES, LITTLE = 3, 3, 0.01
 
 CAPTIONS = {
     "shapes": "The body at times of the recording; orange: measured markers.",
+    "field": "What differs from place to place, between the ends of its 95 % interval; below, cut "
+    "open. Pale is what the data do not tell: it is as the prior has it.",
     "mesh": "The mesh, its grasped nodes and the markers' places as found.",
     "tracks": "Measured, fitted and simulated markers, the residual below.",
     "wrench": "Wrench of a grasp: measured, fitted and simulated.",
@@ -159,6 +161,7 @@ def _parameters(result: Result) -> Section:
     heads = ("", "value", "±", "95 % interval", "whole interval", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
     parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
+    parts += [field.sentence(name) for name, field in result.fields.items()]
     if holds:
         moving = any(not each.static for each in result.fit.experiments.values())
         left = [f"the {k}" for k in ("step", "mesh")[not moving :] if k not in holds]

@@ -19,6 +19,7 @@ from ..statistics.budget import BudgetLine, Sources, budget
 from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
+from ..statistics.fields import FieldEstimate, fields_of
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
@@ -155,8 +156,9 @@ class Answer:
             self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
         )
         numerical = numerical_concerns(self.estimates, self.refinement)
+        of_fields = [concern for field in self.fields.values() for concern in field.concerns]
         if not self.missing:
-            return Trust.of((*cause_concerns(self.causes), *of_fit, *numerical))
+            return Trust.of((*cause_concerns(self.causes), *of_fit, *of_fields, *numerical))
         interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.missing})
         return Trust.of((interrupted, *(of_fit if self.uncertainty is not None else ())))
 
@@ -164,6 +166,14 @@ class Answer:
     def motions(self) -> dict[str, Motion]:
         """How each experiment's body oscillates with the answer, by name."""
         return motions_of(self.problem, self.solution)
+
+    @cached_property
+    def fields(self) -> dict[str, FieldEstimate]:
+        """The constants that differ from place to place, by name."""
+        collocation, q = self.solution.collocation, self.solution.q
+        bodies = dict.fromkeys(segment.body for segment in collocation.segments)
+        known = (fields_of(b, collocation.parameters, q, self.uncertainty) for b in bodies)
+        return {field.name: field for each in known for field in each}
 
     @property
     def noise_rms_m(self) -> float:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..arrays import Array
+from ..display import short
 from ..errors import InputError
+from ..fem.constants import is_mode, symbol_of, unit_of
 from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
 from ..statistics.diagnostics import MarkerDiagnosis
@@ -54,6 +56,48 @@ class FoundNuisance:
     value: float
     prior: float
     std_error: float | None
+
+
+@dataclass(frozen=True)
+class FoundField:
+    """A constant that differs from place to place; its arrays are in ``trajectory.npz``.
+
+    Attributes
+    ----------
+    range : (least, most)
+        Of its values in the elements.
+    share_told : float or None
+        Of the volume, where the interval is less than half as wide as the prior's.
+    identified : int or None
+        How many independent shapes the data tell, of `modes`.
+    detail_m : float
+        Half the wave length of the finest shape.
+    finer : float
+        Deviation of the logarithm that is left to finer shapes.
+    likelier : mapping of length in metres to the logarithm of how much likelier it is
+    """
+
+    length_m: float
+    amplitude: float
+    modes: int
+    range: tuple[float, float]
+    share_told: float | None
+    identified: int | None
+    detail_m: float
+    finer: float
+    likelier: Mapping[str, float]
+
+    def sentence(self, name: str) -> str:
+        """What it is, in a line."""
+        least, most = self.range
+        said = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
+        if self.identified is None or self.share_told is None:
+            return said
+        told = f"{self.share_told:.0%} of the volume better than the prior by half"
+        return (
+            f"{said}: the data tell {self.identified} of {self.modes} shapes of its field, and "
+            f"{told} (details above {short(1e3 * self.detail_m)} mm)"
+        )
 
 
 @dataclass(frozen=True)
@@ -229,6 +273,7 @@ class Result:
     probes: tuple[Probe, ...]
     places: Mapping[str, Mapping[str, Place]]
     nuisance: Mapping[str, Mapping[str, FoundNuisance]]
+    fields: Mapping[str, FoundField]
     uncertainty: FoundUncertainty | None
     scan: FoundScan | None
     fit: FoundFit
@@ -259,8 +304,9 @@ class Result:
 
     @property
     def values(self) -> dict[str, FoundValue]:
-        """Parameters, then moduli that follow."""
-        return {**self.parameters, **self.derived}
+        """Parameters, then moduli that follow; but the shares of a field."""
+        both = {**self.parameters, **self.derived}
+        return {name: each for name, each in both.items() if not is_mode(name)}
 
     @property
     def holds(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import Array, root_mean
 from ..display import short
-from ..fem.constants import GAMMA_R
+from ..fem.constants import GAMMA_R, is_mode
 from ..files import SCHEMA
 from ..methods.solution import pooled_wrench_rms, reading_rms
 from ..model.schemes import as_scheme
@@ -20,6 +20,7 @@ from ..problem import Problem
 from ..program.collocation import Part
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, in_unit_for_people
+from ..statistics.fields import FieldEstimate
 from ..statistics.identifiability import verdicts
 from ..statistics.scale import relative_sentence
 from ..statistics.uncertainty import Place
@@ -29,6 +30,7 @@ from .forward_simulation import Rollout
 from .result import (
     FittedExperiment,
     FoundDynamics,
+    FoundField,
     FoundFit,
     FoundNuisance,
     FoundProfile,
@@ -63,6 +65,7 @@ def result_of(answer: Answer) -> Result:
         probes=answer.probes,
         places=answer.places,
         nuisance=_nuisance(answer),
+        fields={name: _field(field) for name, field in answer.fields.items()},
         uncertainty=_uncertainty(answer),
         scan=None if solution.scan is None else alike(FoundScan, solution.scan),
         fit=_fit(answer),
@@ -121,9 +124,14 @@ def _uncertainty(answer: Answer) -> FoundUncertainty | None:
     known = answer.uncertainty
     if known is None:
         return None
+    told = [k for k, name in enumerate(known.names) if not is_mode(name)]
     return alike(
         FoundUncertainty,
         known,
+        names=tuple(known.names[k] for k in told),
+        correlation=known.correlation[np.ix_(told, told)],
+        covariance=known.covariance[np.ix_(told, told)],
+        quantiles=known.quantiles[told],
         noise_factors=known.level.factors,
         autocorrelation=known.dependence.lag1,
         verdicts=tuple(verdicts(known)),
@@ -137,11 +145,30 @@ def _uncertainty(answer: Answer) -> FoundUncertainty | None:
     )
 
 
+def _field(found: FieldEstimate) -> FoundField:
+    modes = found.modes
+    volumes = modes.volumes_m3 / modes.volumes_m3.sum()
+    known = bool(np.isfinite(found.deviation).all())
+    return FoundField(
+        modes.length_m,
+        modes.field.amplitude,
+        modes.field.modes,
+        (float(found.value.min()), float(found.value.max())),
+        float(volumes[found.told].sum()) if known else None,
+        found.identified if known else None,
+        modes.detail_m,
+        modes.left_out,
+        {f"{each:g}": found.likelier(each) for each in modes.field.lengths_m} if known else {},
+    )
+
+
 def _recordings(answer: Answer) -> dict[str, RecordingsAgreement] | None:
     if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
         return None
     q, agreements = answer.solution.q, {}
     for k, item in enumerate(answer.solution.collocation.parameters.free):
+        if is_mode(item.name):
+            continue
         away = q[k] + scatter.away[:, k]
         values = [item.value(float(x)) if np.isfinite(x) else np.nan for x in away]
         deviations = scatter.deviations[:, k].tolist()

@@ -57,7 +57,8 @@ class Earlier:
         InputError
             If it is damaged.
         """
-        values = {name: each.value for name, each in result.values.items()}
+        both = {**result.parameters, **result.derived}
+        values = {name: each.value for name, each in both.items()}
         nuisance = {
             f"{experiment}: {name}": each.value
             for experiment, named in result.nuisance.items()

@@ -282,6 +282,18 @@ TOPICS: Mapping[str, Topic] = {
             "{there_gb:.2g} GB: {remedy}",
         },
     ),
+    "field": Topic(
+        "The field",
+        "field",
+        "Give the amplitude or lengths that the data want, or tell apart by regions what is known "
+        "to differ: a prior that is too tight makes intervals too narrow.",
+        {
+            "amplitude": "{name} differs more from place to place than its field allows for: the "
+            "data want an amplitude of about {likely:.2g}, not {stated:.2g}",
+            "length": "{name} changes over less than the length of its field: the data want about "
+            "{likely:.2g} m, not {stated:.2g} m; give length_m several to choose from",
+        },
+    ),
     "solve": Topic(
         "The solve",
         "trust",

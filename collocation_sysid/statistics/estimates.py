@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..fem.constants import SHARE, TAU, bare, constant_named, is_damping
+from ..fem.constants import MODE, SHARE, TAU, bare, constant_named, is_damping, is_mode
 from ..model.parameters import Parameter, Parameters
 from .autocorrelation import Dependence
 from .linearised import Derived, LinearisedFit
@@ -71,7 +71,7 @@ def correlation_of(covariance: Array) -> Array:
 def user_estimates(
     parameters: Parameters, q: Array, of_q: Array, bounded: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
-    """Estimates of the user's parameters, by name.
+    """Estimates of the user's parameters, by name; shares of a field have values alone.
 
     Parameters
     ----------
@@ -82,7 +82,10 @@ def user_estimates(
     found = {name: Estimate(value) for name, value in parameters.values(q).items()}
     partners = np.abs(np.nan_to_num(correlation_of(of_q)))
     np.fill_diagonal(partners, 0.0)
+    partners[:, [is_mode(item.name) for item in parameters.free]] = 0.0
     for k, item in enumerate(parameters.free):
+        if is_mode(item.name):
+            continue
         value = item.value(float(q[k]))
         if bounded[k]:
             found[item.name] = _at_bound(value)
@@ -110,11 +113,15 @@ def user_estimates(
 
 
 def relative_slopes(parameters: Parameters, q: Array) -> Array:
-    """(nq,) derivative of each parameter by its q over its size: one for a logarithm."""
+    """(nq,) derivative of each parameter by its q over its size: one for a logarithm.
+
+    One also for a share of a field, which is added to one.
+    """
     slopes = []
     for item, coordinate in zip(parameters.free, q, strict=True):
         value = item.value(float(coordinate))
-        slopes.append(item.per_value(value) / max(abs(value), 1e-300))
+        size = 1.0 if is_mode(item.name) else max(abs(value), 1e-300)
+        slopes.append(item.per_value(value) / size)
     return np.array(slopes)
 
 
@@ -202,7 +209,7 @@ NOTEWORTHY = 1.1
 def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -> list[str]:
     """Parameters at a bound, not determined, or not identifiable."""
     notes, reasons = [], {}
-    for item in parameters.free:
+    for item in (each for each in parameters.free if not is_mode(each.name)):
         name, found = item.name, estimates[item.name]
         if found.at_bound:
             nearer = min(
@@ -328,8 +335,13 @@ def scatter_notes(fit: LinearisedFit, scatter: Scatter | None) -> list[str]:
     if scatter is None:
         return []
     return [
-        f"the recordings disagree on {fit.names[k]} (χ² {scatter.chi_squared[k]:.3g} for "
+        f"the recordings disagree on {told_of(fit.names[k])} (χ² {scatter.chi_squared[k]:.3g} for "
         f"{scatter.freedom[k]} degrees of freedom): model error decides, and its interval holds "
         "what they disagree by"
         for k in np.flatnonzero(scatter.disagreeing).tolist()
     ]
+
+
+def told_of(name: str) -> str:
+    """What an estimated parameter is called where it is told of: a share is its field."""
+    return f"the {MODE.name} (share {name})" if is_mode(name) else name

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import listed
-from ..fem.constants import bare
+from ..fem.constants import bare, is_mode
 from ..fem.moduli import ELASTIC
 from .estimates import CONFOUNDED, Estimate
 from .uncertainty import Uncertainty
@@ -53,7 +53,8 @@ def _one_by_one(uncertainty: Uncertainty) -> list[str]:
 
 def _combinations(uncertainty: Uncertainty) -> list[str]:
     deviations = np.sqrt(np.diag(uncertainty.covariance))
-    known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0))
+    modes = np.array([is_mode(name) for name in uncertainty.names], dtype=bool)
+    known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0) & ~modes)
     if len(known) < 2:
         return []
     correlation = uncertainty.correlation[np.ix_(known, known)]

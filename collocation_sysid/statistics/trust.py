@@ -14,6 +14,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from ..arrays import Array
+from ..fem.constants import is_mode
 from ..program.stability import Instability
 from ..program.touches import Touch
 from ..recording.experiment import Experiment
@@ -21,7 +22,7 @@ from ..recording.turning import FAST, fastest_turn
 from .concern import Concern, concerned
 from .diagnostics import MOST_WILD, MarkerDiagnosis
 from .distributions import normal_isf
-from .estimates import Estimate
+from .estimates import Estimate, told_of
 from .hypothesis import Hypothesis
 from .noise import NoiseLevel
 from .numerical import Refinement
@@ -147,7 +148,7 @@ def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """Recordings that disagree on what they share."""
     scatter = uncertainty.scatter
     disagreeing = [] if scatter is None else np.flatnonzero(scatter.disagreeing).tolist()
-    names = [uncertainty.names[k] for k in disagreeing]
+    names = [told_of(uncertainty.names[k]) for k in disagreeing]
     return concerned(bool(names), False, "residuals/recordings", names=names)
 
 
@@ -167,7 +168,8 @@ def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
 
 def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """Parameters at their bounds, and those that the data do not tell."""
-    estimates = {name: uncertainty.estimates[name] for name in uncertainty.names}
+    told = (name for name in uncertainty.names if not is_mode(name))
+    estimates = {name: uncertainty.estimates[name] for name in told}
     bounded = [name for name, found in estimates.items() if found.at_bound]
     vague = [n for n, found in estimates.items() if not found.at_bound and found.std_error is None]
     several = len(bounded) > 1

@@ -57,7 +57,8 @@ class Evaluator(Protocol):
     ) -> None:
         """Overwrite `out` (T, width), or add to it.
 
-        From `fields`, each (T, 3n), θ (k,) and, for points with a memory, `carried` (T, any).
+        From `fields`, each (T, 3n), θ (k,) and, for points that carry something, `carried`
+        (T, any), or (1, any) where it is the same at all times.
         """
         ...
 
@@ -99,7 +100,7 @@ class CasadiEvaluator:
         for t in range(len(out)):
             inputs = [field[t][self._dofs] for field in fields]
             if self._carried is not None and carried is not None:
-                own = [carried[t][self._carried]]
+                own = [carried[t if len(carried) > 1 else 0][self._carried]]
             else:
                 own = []
             outputs = self._mapped.call([*inputs, self._geometry, theta, *own])

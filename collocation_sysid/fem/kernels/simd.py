@@ -95,7 +95,8 @@ class SimdEvaluator:
         addresses = [address(field) for field in fields]
         constants = [*self._tables, address(theta), address(out)]
         if self._carried is not None and carried is not None:
-            constants += [carried.shape[1], address(self._carried), address(carried)]
+            length = carried.shape[1] if len(carried) > 1 else 0
+            constants += [length, address(self._carried), address(carried)]
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:

@@ -15,6 +15,7 @@ from ...runs.result import Result
 from ..replay import Replay, read_run, reading_run
 from ..style import RESOLUTION_DPI
 from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
+from .field import field_picture
 from .mesh import elements_picture, mesh_picture
 from .over_time import error_over_time, readings_picture, tracks
 from .search import convergence, scan_picture
@@ -35,7 +36,7 @@ def album(
     truth : mapping, optional
         See `convergence`.
     """
-    names = [name for name, item in result.parameters.items() if not item.fixed]
+    names = [n for n, item in result.parameters.items() if not item.fixed and n in result.values]
     pictures = {"convergence": convergence(result.history, names, truth)} if result.history else {}
     if (scan := result.scan) is not None:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, scan.best)
@@ -49,6 +50,8 @@ def album(
         body = replays[0]
         pictures["mesh"] = mesh_picture(body)
         pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
+        for name, values in body.fields.items():
+            pictures[f"field_{name}"] = field_picture(body, name, values)
     for replay in replays:
         pictures |= _of_experiment(replay)
     return pictures

@@ -31,7 +31,7 @@ COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256)))
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class Coloured:
     """What colours a body.
 
     Attributes
@@ -45,7 +45,7 @@ class Field:
     at: Callable[[Array], Array]
 
 
-def shapes(seen: Replay, count: int = SHOWN, field: Field | None = None) -> Figure:
+def shapes(seen: Replay, count: int = SHOWN, field: Coloured | None = None) -> Figure:
     """Draw `count` of the body's shapes at evenly spaced samples, side by side in one scale.
 
     Heights are true; sideways the shapes are moved together. Samples of a simulation that went
@@ -84,7 +84,7 @@ def shapes(seen: Replay, count: int = SHOWN, field: Field | None = None) -> Figu
     return figure
 
 
-def _coloured(axes: Axes, field: Field, positions_m: Array) -> Array:
+def _coloured(axes: Axes, field: Coloured, positions_m: Array) -> Array:
     """Colours (k, F, 3) of the triangles at positions (k, n, 3), with their bar on the sheet."""
     values = field.at(positions_m)
     low, high = np.nanmin(values), np.nanmax(values)
@@ -129,10 +129,10 @@ def portrait(
     return shapes(replay, count, None if field is None else _on_surface(body, constants, field))
 
 
-def _on_surface(body: Body, constants: Mapping[str, float], field: str) -> Field:
+def _on_surface(body: Body, constants: Mapping[str, float], field: str) -> Coloured:
     elements, cells = ElementFields.of(body, body.theta(constants)), body.mesh.surface_cells
 
     def at(positions_m: Array) -> Array:
         return elements.at(positions_m)[field][:, cells]
 
-    return Field(FIELDS[field], at)
+    return Coloured(FIELDS[field], at)

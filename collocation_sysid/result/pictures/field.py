@@ -1,0 +1,75 @@
+"""A constant that differs from place to place, with the ends of its interval, inside and out."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from ...arrays import Array
+from ...fem.constants import with_unit
+from ...fem.mesh import boundary_of
+from ..replay import Replay
+from ..style import PAGE_MM, SMALL_PT
+from .camera import Camera
+from .scene import Drawn, View, draw_directions, draw_scale, sheet, width_over_height
+from .shapes import COLOURS
+
+HEAD_MM, FOOT_MM, CORNER_MM, BAR_ROOM_MM, GAP_MM, TALLEST_MM = 5.0, 8.0, 14.0, 20.0, 3.0, 55.0
+TITLES = "lower end", "estimate", "upper end"
+# From here on the data tell less and less, to where all is the prior's.
+TOLD, UNTOLD, PALEST = 0.5, 1.0, 0.8
+OTHERS = np.array([0.85, 0.85, 0.85])
+
+
+def field_picture(seen: Replay, name: str, values: Array) -> Figure:
+    """Draw the ends of the interval and the estimate on the body, and on a cut through it.
+
+    Parameters
+    ----------
+    seen : Replay
+    name : str
+    values : (E, 4) see `Replay.fields`
+    """
+    nodes_m, cells = seen.undeformed_m, np.asarray(seen.tetrahedra, dtype=np.int64)
+    camera = Camera.facing(nodes_m[None], seen.up)
+    # An upright cut, if it is looked at from above.
+    across = camera.axes[2] - (camera.axes[2] @ seen.up) * seen.up
+    near = nodes_m[cells].mean(axis=1) @ across
+    behind = np.flatnonzero(near <= np.median(near))
+    rows = np.arange(len(cells)), behind
+    aspect = width_over_height(camera, nodes_m)
+    width = (PAGE_MM - CORNER_MM - BAR_ROOM_MM - 2 * GAP_MM) / 3
+    height = min(width / aspect, TALLEST_MM)
+    total = HEAD_MM + 2 * height + GAP_MM + FOOT_MM
+    figure, axes = sheet(PAGE_MM, total)
+    known = values[np.isfinite(values[:, 0])]
+    # The ends of where nothing is told would leave no colours to what is.
+    low, high = np.quantile(known[:, 1], 0.05), np.quantile(known[:, 2], 0.95)
+    scale = ScalarMappable(LogNorm(low, high), COLOURS)
+    untold = np.clip((values[:, 3] - TOLD) / (UNTOLD - TOLD), 0.0, PALEST)[:, None]
+    none = np.zeros(len(nodes_m), dtype=bool)
+    for row, own in enumerate(rows):
+        faces, owners = boundary_of(cells[own])
+        for column, (title, place) in enumerate(zip(TITLES, (1, 0, 2), strict=True)):
+            corner = CORNER_MM + column * (width + GAP_MM), FOOT_MM + (1 - row) * (height + GAP_MM)
+            view = View.fitting(camera, nodes_m, (width, height), corner)
+            colours = scale.to_rgba(values[:, place])[:, :3]
+            colours = (1 - np.nan_to_num(untold)) * colours + np.nan_to_num(untold)
+            colours[np.isnan(values[:, place])] = OTHERS
+            Drawn(axes, view, faces).show(nodes_m, none, np.zeros((0, 3)), colours[own[owners]])
+            if row == 0:
+                middle = corner[0] + width / 2, total - HEAD_MM / 2
+                axes.text(*middle, title, ha="center", va="center", fontsize=SMALL_PT)
+    place = (PAGE_MM - BAR_ROOM_MM + 4, FOOT_MM, 2.5, total - HEAD_MM - FOOT_MM - 4)
+    beside = axes.inset_axes(place, transform=axes.transData)
+    bar = figure.colorbar(scale, cax=beside, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%.3g")
+    bar.ax.minorticks_off()
+    bar.ax.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=1.5)
+    end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}
+    axes.text(PAGE_MM - 1, total - 1.0, with_unit(name), **end)
+    draw_directions(axes, camera, (6.0, FOOT_MM))
+    draw_scale(axes, view.mm_per_m, (CORNER_MM + width + GAP_MM, 3.5))
+    return figure

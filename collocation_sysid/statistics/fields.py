@@ -1,0 +1,185 @@
+"""Constants that differ from place to place: value and interval in every element, and how likely.
+
+With the posterior covariance C of the shares a and of all else that is estimated, the logarithm in
+an element has the variance gᵀC g + d², where g are the element's shapes and the slopes of the mean,
+and d is the deviation that finer shapes would add. The prior of the shares is N(0, I). So what the
+data say of them by themselves has the information H = C_a⁻¹ − I, and with a prior N(0, D), as of
+another length or amplitude, the data would be more likely, to first order, by
+
+    ln Z(D) − ln Z(I),   ln Z(D) = −½ ln |I + H D| + ½ bᵀ D (I + H D)⁻¹ b,   b = C_a⁻¹ a
+
+(Laplace's approximation, with all others as they are).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array, Index
+from ..fem.body import Body
+from ..fem.field import ALL_MODULI, FieldModes
+from ..fem.moduli import engineering
+from ..model.generated import Generated
+from ..model.parameters import NOTHING, Parameters, ThetaMap
+from .concern import Concern
+from .estimates import relative_slopes
+from .uncertainty import Uncertainty
+
+# The data tell an element whose interval is less than this share of the prior's.
+TOLD = 0.5
+# Another amplitude, or length, is worth a word where it is likelier by this factor's logarithm.
+LIKELIER = 3.0
+AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldEstimate:
+    """What was found of a field.
+
+    Attributes
+    ----------
+    name : str
+        The constant, with its region in front.
+    modes : FieldModes
+    cells : (k,) numbers of the elements
+    value : (k,) the constant in each
+    deviation : (k,) standard deviation of its logarithm; NaN without error bars
+    quantile : float
+        Half width of the 95 % intervals, in deviations.
+    shares : (m,) a
+    covariance : (m, m) of these
+    """
+
+    name: str
+    modes: FieldModes
+    cells: Index
+    value: Array
+    deviation: Array
+    quantile: float
+    shares: Array
+    covariance: Array
+
+    @property
+    def ci95(self) -> tuple[Array, Array]:
+        """(k,) lower and upper ends of the 95 % intervals."""
+        factor = np.exp(self.quantile * self.deviation)
+        return self.value / factor, self.value * factor
+
+    @property
+    def over_prior(self) -> Array:
+        """(k,) deviation over that of the prior about the mean."""
+        return self.deviation / self.modes.field.amplitude
+
+    @property
+    def told(self) -> NDArray[np.bool_]:
+        """(k,) bool, which elements the data tell."""
+        return self.over_prior < TOLD
+
+    @property
+    def identified(self) -> int:
+        """How many independent shapes the data tell better than the prior does, by half."""
+        known = np.linalg.eigvalsh(np.nan_to_num(self.covariance, nan=1.0))
+        return int((known < TOLD).sum())
+
+    @property
+    def by_element(self) -> Array:
+        """(k, 4) value, ends of its interval, and its deviation over the prior's."""
+        return np.column_stack([self.value, *self.ci95, self.over_prior])
+
+    @cached_property
+    def _of_data(self) -> tuple[Array, Array]:
+        """H and b."""
+        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
+        # Rounding, or error bars that are wider than the fit's: no less than nothing.
+        values = np.clip(values, 1e-12, 1.0)
+        alone = vectors * (1 / values - 1) @ vectors.T
+        return alone, vectors @ ((vectors.T @ self.shares) / values)
+
+    def likelier(self, length_m: float | None = None, factor: float = 1.0) -> float:
+        """Ln Z(D) − ln Z(I) with another length, or with the amplitude times a factor."""
+        if not np.isfinite(self.covariance).all() or length_m == self.modes.length_m:
+            return 0.0
+        size = len(self.shares)
+        prior = factor**2 * np.eye(size)
+        if length_m is not None:
+            other = np.linalg.lstsq(self.modes.shapes, self.modes.at(length_m).shapes, rcond=None)
+            prior = factor**2 * other[0] @ other[0].T
+        return self._evidence(prior) - self._evidence(np.eye(size))
+
+    def _evidence(self, prior: Array) -> float:
+        alone, pulled = self._of_data
+        both = np.eye(len(alone)) + alone @ prior
+        return (
+            float(pulled @ prior @ np.linalg.solve(both, pulled) - np.linalg.slogdet(both)[1]) / 2
+        )
+
+    @property
+    def concerns(self) -> list[Concern]:
+        """An amplitude that is too small, or a length that is too long, by what the data say."""
+        field, said = self.modes.field, dict[str, dict[str, float]]()
+        best = max(AMPLITUDES, key=lambda factor: self.likelier(factor=factor))
+        if best > 1 and self.likelier(factor=best) > LIKELIER:
+            said["amplitude"] = {"stated": field.amplitude, "likely": best * field.amplitude}
+        if self.likelier(self.modes.length_m / 2) > LIKELIER:
+            said["length"] = {"stated": self.modes.length_m, "likely": self.modes.length_m / 2}
+        return [Concern(f"field/{what}", data={"name": self.name, **v}) for what, v in said.items()]
+
+
+def fields_of(
+    body: Body, parameters: Parameters, q: Array, known: Uncertainty | Array | None
+) -> list[FieldEstimate]:
+    """The fields of a body at q, with error bars or the covariance (nq, nq) where there is one."""
+    size, names = len(q), [item.name for item in parameters.free]
+    covariance, quantile = np.full((size, size), np.nan), np.nan
+    if isinstance(known, Uncertainty):
+        sizes = relative_slopes(parameters, q)
+        covariance = known.covariance / np.outer(sizes, sizes)
+        quantile = float(np.nanmax(known.quantiles))
+    elif known is not None:
+        covariance, quantile = known, 1.96
+    found, constants = [], ThetaMap(parameters, body)
+    theta, by_q = constants.theta(q), constants.slopes(q)
+    for number, part in enumerate(body.parts):
+        if (modes := part.field) is None:
+            continue
+        here = body.mode_places[number]
+        mean, slopes = _mean(constants, number, modes).slopes(q, NOTHING)
+        gradient = slopes + modes.shapes @ by_q[here]
+        # What is at a bound has no variance: it is taken for known.
+        used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
+        own = gradient[:, used]
+        variance = np.einsum("ei,ij,ej->e", own, covariance[np.ix_(used, used)], own)
+        deviation = np.sqrt(variance + modes.left_out**2)
+        free = [names.index(name) for name in [*body.constants][here] if name in names]
+        found.append(
+            FieldEstimate(
+                part.full_name(modes.field.parameter),
+                modes,
+                part.cells,
+                np.exp(mean[0] + modes.shapes @ theta[here]),
+                deviation if known is not None else np.full_like(deviation, np.nan),
+                quantile,
+                theta[here],
+                covariance[np.ix_(free, free)],
+            )
+        )
+    return found
+
+
+def _mean(constants: ThetaMap, number: int, modes: FieldModes) -> Generated:
+    """The logarithm of the mean of a part's field, by q."""
+    body, part = constants.body, constants.body.parts[number]
+
+    def logarithm(q: ca.SX, _: ca.SX) -> ca.SX:
+        own = body.split(constants.expression(q))[number]
+        if modes.field.parameter != ALL_MODULI:
+            return ca.log(own[modes.scaled[0]])
+        lame = part.material.lame(own[: len(part.material.constants)])
+        return ca.log(engineering(lame[0], lame[1])[0])
+
+    return Generated(logarithm, len(constants.parameters.free), 0)

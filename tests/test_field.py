@@ -1,0 +1,195 @@
+"""A constant that differs from place to place: its prior, its slopes, and what data tell of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from checks import assert_derivative
+from problems_small import IDEAL, point_markers, smooth_poses, times
+
+import collocation_sysid as cs
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.constants import MU
+from collocation_sysid.fem.field import FieldModes, Laplacian
+from collocation_sysid.statistics.fields import FieldEstimate, fields_of
+from collocation_sysid.statistics.uncertainty import covariance
+
+SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
+KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
+
+
+def bar(field: cs.Field | None = None, stiff: np.ndarray | None = None, **changes) -> Body:
+    regions = [] if stiff is None else [cs.Region("stiff", stiff)]
+    mesh = cs.box_mesh(SIZE_M, (2, 2, 6))
+    return Body(mesh, density_kg_m3=100.0, field=field, regions=regions, **changes)
+
+
+def centres(body: Body) -> np.ndarray:
+    return body.mesh.points_m[body.mesh.tetrahedra].mean(axis=1)
+
+
+def swung(body: Body, above_m: float = 0.119, steps: int = 15) -> cs.Experiment:
+    """The bar, held above a height, with markers all over its surface."""
+    t_s, x = times(steps), body.nodes_m
+    outer = np.unique(body.mesh.surface)
+    places = x[outer[x[outer, 2] < 0.119]]
+    grasp = cs.Grasp(np.flatnonzero(x[:, 2] > above_m), smooth_poses(t_s))
+    markers = replace(point_markers(body, places, t_s), sigma_m=np.full(len(places), SIGMA_M))
+    return cs.Experiment(body, t_s, [grasp], markers, nuisance=IDEAL)
+
+
+@cache
+def problem(ratio: float = 1.0, above_m: float = 0.119, **stated) -> cs.Problem:
+    """A bar whose lower half is stiffer, which no description tells."""
+    true = bar(stiff=centres(bar())[:, 2] < 0.06)
+    values = {**KNOWN, "young_pa": YOUNG_PA, "stiff.young_pa": ratio * YOUNG_PA}
+    tracks = cs.simulate(swung(true, above_m), values, "midpoint").markers_m
+    noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
+    field = cs.Field(**({"length_m": 0.05, "modes": 20} | stated))
+    seen = cs.with_markers(swung(bar(field), above_m), tracks + noise)
+    return cs.Problem([seen], {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}, substeps=1)
+
+
+@cache
+def found(ratio: float = 1.0, above_m: float = 0.119, **stated) -> FieldEstimate:
+    solution = cs.solve(problem(ratio, above_m, **stated))
+    assert solution.status.converged
+    collocation = solution.collocation
+    known = covariance(collocation, solution.z)
+    (field,) = fields_of(collocation.segments[0].body, collocation.parameters, solution.q, known)
+    return field
+
+
+def truth(ratio: float) -> np.ndarray:
+    return np.log(YOUNG_PA * np.where(centres(bar())[:, 2] < 0.06, ratio, 1.0))
+
+
+def held_share(field: FieldEstimate, ratio: float) -> float:
+    """Of the elements that the data tell, those whose interval holds the truth."""
+    low, high = np.log(field.ci95)
+    return float(((low < truth(ratio)) & (truth(ratio) < high))[field.told].mean())
+
+
+def test_the_prior_falls_off_as_materns_does():
+    mesh = cs.box_mesh((1.0, 1.0, 1.0), (12, 12, 12))
+    modes = FieldModes.of(cs.Field(0.15, modes=120), mesh, np.arange(len(mesh.tetrahedra)), (MU,))
+    middles = mesh.points_m[mesh.tetrahedra].mean(axis=1)
+    away_m = np.linalg.norm(middles - middles[5000], axis=1)
+    correlation = modes.shapes @ modes.shapes[5000] / 0.25
+    for away in (0.15, 0.2, 0.3, 0.4):
+        here = np.abs(away_m - away) < 0.02
+        assert correlation[here].mean() == pytest.approx(np.exp(-away / 0.15), abs=0.06)
+    variance = (modes.shapes**2).sum(axis=1) + modes.left_out**2
+    np.testing.assert_allclose(variance, 0.25)
+
+
+def test_shapes_have_their_share_of_all():
+    mesh, length_m = cs.box_mesh(SIZE_M, (3, 3, 9)), 0.03
+    few = Laplacian.of(mesh, np.arange(len(mesh.tetrahedra)), 20)
+    all_values = np.linalg.eigvalsh(few.matrix.toarray())[1:]
+    np.testing.assert_allclose(few.values, all_values[:20], rtol=1e-8)
+    weights = (1 / length_m**2 + all_values) ** -2
+    assert few.share(length_m) == pytest.approx(weights[:20].sum() / weights.sum(), rel=0.01)
+
+
+def test_pieces_that_do_not_touch_have_a_stiffness_each():
+    mesh = cs.box_mesh(SIZE_M, (2, 2, 6))
+    layer = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2] // 0.02
+    apart = np.flatnonzero((layer < 1) | (layer > 4))
+    first = Laplacian.of(mesh, apart, 5).vectors[0]
+    lower, upper = (first[part] for part in (layer[apart] < 1, layer[apart] > 4))
+    assert np.ptp(lower) < 1e-6 * abs(lower[0])
+    assert upper[0] == pytest.approx(-lower[0])
+
+
+@pytest.mark.parametrize(
+    "kind", [{"element": "tet10-p0"}, {"evaluator": "casadi"}, {"prony": ["slow"]}], ids=str
+)
+def test_slopes_by_the_shares_are_those_of_differences(kind: dict, rng):
+    body = bar(cs.Field(0.05, modes=4), **kind)
+    memory = {"slow.share": 0.3, "slow.tau_s": 0.1}
+    shares = dict(zip(body.mode_names, rng.normal(size=4), strict=True))
+    theta = body.theta({**KNOWN, **memory, "young_pa": YOUNG_PA, **shares})
+    x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
+    v, w = rng.normal(size=(2, *x.shape))
+    scale = np.zeros(len(theta))
+    scale[body.mode_places[0]] = 0.1
+    by_theta, curvature = body.linearise(x, v, theta).by_theta[0], body.curvature(x, v, w, theta)
+    assert_derivative(
+        lambda p: body.force(x, v, p)[0], lambda d: by_theta @ d, theta, rng, scale=scale
+    )
+    assert_derivative(
+        lambda p: body.curvature(x, v, w, p).theta[0],
+        lambda d: curvature.theta_theta[0] @ d, theta, rng, scale=scale,
+    )  # fmt: skip
+
+
+def test_a_hidden_stiff_half_is_found():
+    field = found(2.0)
+    z_m = centres(bar())[:, 2]
+    upper, lower = (np.log(field.value[part]).mean() for part in (z_m > 0.08, z_m < 0.04))
+    assert np.exp(lower - upper) == pytest.approx(2.0, rel=0.15)
+    assert held_share(field, 2.0) >= 0.9
+    assert field.told.mean() > 0.9
+    assert 5 < field.identified <= 20
+
+
+def test_an_even_body_is_found_even():
+    field = found(1.0)
+    assert held_share(field, 1.0) >= 0.95
+    assert not field.concerns
+
+
+def test_what_does_not_deform_is_as_the_prior_has_it():
+    field = found(1.0, 0.055)
+    above = (bar().nodes_m[bar().cells, 2] > 0.055).all(axis=1)
+    assert field.over_prior[above & (centres(bar())[:, 2] > 0.1)].min() > 0.9
+    assert field.over_prior[~above].max() < 0.5
+
+
+def test_an_amplitude_that_is_too_small_is_told():
+    codes = [concern.code for concern in found(3.0, amplitude=0.05).concerns]
+    assert "field/amplitude" in codes
+    assert not found(3.0, amplitude=1.0).concerns
+
+
+def test_evidence_is_that_of_a_normal_marginal_likelihood(rng):
+    body = bar(cs.Field(0.05, modes=6))
+    modes, slopes, noise = body.parts[0].field, rng.normal(size=(30, 6)), 0.7
+    data = rng.normal(size=30)
+    posterior = np.linalg.inv(np.eye(6) + slopes.T @ slopes / noise**2)
+    shares = posterior @ slopes.T @ data / noise**2
+    many = np.ones(len(modes.shapes))
+    field = FieldEstimate("young_pa", modes, np.arange(1), many, many, 1.96, shares, posterior)
+
+    def exact(prior: np.ndarray) -> float:
+        total = slopes @ prior @ slopes.T + noise**2 * np.eye(30)
+        return -float(data @ np.linalg.solve(total, data) + np.linalg.slogdet(total)[1]) / 2
+
+    for length_m, factor in ((None, 3.0), (0.02, 1.0), (0.1, 0.5)):
+        other = modes if length_m is None else modes.at(length_m)
+        turn = factor * np.linalg.lstsq(modes.shapes, other.shapes, rcond=None)[0]
+        expected = exact(turn @ turn.T) - exact(np.eye(6))
+        assert field.likelier(length_m, factor) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"parameter": "density_kg_m3"}, "expected one of young_pa, lambda_pa, mu_pa, gamma_r_s"),
+        ({"modes": 1000}, "expected at most 60, with 63 nodes"),
+        ({"length_m": 0.0}, "length_m of a field is 0; expected a number above 0"),
+        ({"length_m": []}, "length_m of a field is"),
+    ],
+)
+def test_a_field_that_cannot_be_is_refused(stated: dict, message: str):
+    with pytest.raises(cs.InputError, match=message):
+        bar(cs.Field(**({"length_m": 0.05} | stated)))
+
+
+def test_a_field_of_nothing_is_refused():
+    with pytest.raises(cs.InputError, match="all is claimed"):
+        bar(cs.Field(0.05), np.ones(144, dtype=bool))
