@@ -31,8 +31,9 @@ from problem_files import (
 from rich.console import Console
 
 import collocation_sysid as cs
-from collocation_sysid import pipeline
-from collocation_sysid.cli import common
+from collocation_sysid import cli, pipeline
+from collocation_sysid.cli import common, options
+from collocation_sysid.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
@@ -553,6 +554,17 @@ def test_a_run_from_python_is_written_like_any_other(tiny):
     folder = finished.save(tiny / "mine", frames=False)
     assert result_in(folder)["status"] == "converged"
     assert not (folder / "frames").exists()
+
+
+def test_a_terminal_is_told_what_is_waited_for_before_anything_heavy(monkeypatch, tiny):
+    screen = io.StringIO()
+    terminal = PlainConsole(file=screen, force_terminal=True, width=100)
+    for module in (cli, options):
+        monkeypatch.setattr(module, "errors", terminal)
+    assert cli.Commands().get_command(None, "check") is not None
+    assert "starting" in screen.getvalue()
+    options.OfProblem(problem=Path("problem.toml")).read()
+    assert "reading" in screen.getvalue()
 
 
 def test_a_terminal_gets_lines_that_break_between_words(monkeypatch):

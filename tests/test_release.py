@@ -57,3 +57,24 @@ def test_no_package_host_is_named():
         text = (ROOT / name).read_text()
         assert "index-url" not in text
         assert "://" not in text
+
+
+def test_the_conda_recipe_has_the_same_dependencies():
+    """Under the names that conda has for them."""
+    recipe = (ROOT / "scripts" / "conda" / "meta.yaml").read_text()
+    listed = re.findall(r"^    - ([\w-]+) >=([\d.]+)$", recipe.partition("  run:")[2], re.MULTILINE)
+    renamed = {"matplotlib": "matplotlib-base"}
+    wanted = [re.fullmatch(r"([\w-]+)>=([\d.]+)", each) for each in PROJECT["dependencies"]]
+    python = ("python", PROJECT["requires-python"].removeprefix(">="))
+    assert listed == [python, *((renamed.get(m[1], m[1]), m[2]) for m in wanted if m)]
+
+
+def test_every_dependency_has_its_licence_told():
+    page = (ROOT / "docs" / "licences.md").read_text()
+    extras = PROJECT["optional-dependencies"]
+    told = ["surface", "c3d", "logs", "cluster", "view", "film", "usd", "mujoco", "large"]
+    for requirement in [
+        *PROJECT["dependencies"],
+        *(each for extra in told for each in extras[extra]),
+    ]:
+        assert re.match(r"[\w-]+", requirement)[0] in page, requirement

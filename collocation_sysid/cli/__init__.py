@@ -51,7 +51,8 @@ class Commands(TyperGroup):
         """One of them, or None."""
         if cmd_name not in _written():
             return None
-        family = import_module(_written()[cmd_name][0]).commands.registered_commands
+        with errors.status("starting"):  # on a terminal only; it takes a second
+            family = import_module(_written()[cmd_name][0]).commands.registered_commands
         info = next(each for each in family if each.callback.__name__ == cmd_name)
         how = {"pretty_exceptions_short": False, "rich_markup_mode": None}
         return get_command_from_info(info, **how)

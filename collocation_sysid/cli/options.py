@@ -33,6 +33,7 @@ from typer.models import OptionInfo, ParameterInfo
 from ..checked import Options
 from ..errors import InputError
 from ..stated import attributes
+from .common import errors
 
 if TYPE_CHECKING:
     from ..problem import Problem  # which takes a second to import
@@ -163,9 +164,11 @@ class OfProblem:
 
     def read(self, simulation: bool = False) -> Problem:
         """The problem."""
-        from ..problem import Problem
+        with errors.status(f"reading {self.problem}"):
+            from ..problem import Problem
 
-        return Problem.read(self.problem, self.set_ or (), self.allow_code, simulation=simulation)
+            how = self.set_ or (), self.allow_code
+            return Problem.read(self.problem, *how, simulation=simulation)
 
 
 @dataclass(frozen=True, kw_only=True)
