@@ -135,7 +135,10 @@ def run(
         As `solve` does.
     """
     say = log or (lambda _: None)
-    answer = Run(problem, solve(problem, method, watch, start, scheduler), {}, None)
+    solution = solve(problem, method, watch, start, scheduler)
+    bodies = (segment.body for segment in solution.collocation.segments)
+    problem = problem.with_lengths({k: v for body in bodies for k, v in body.lengths_m.items()})
+    answer = Run(problem, solution, {}, None)
     missing = "no forward simulation has checked the answer, and there are no error bars"
     try:
         answer, fit = _checked(problem, answer.solution, say)

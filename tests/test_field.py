@@ -8,12 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 from checks import assert_derivative
+from matplotlib.figure import Figure
 from problems_small import IDEAL, point_markers, smooth_poses, times
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import MU
 from collocation_sysid.fem.field import FieldModes, Laplacian
+from collocation_sysid.result.pictures.field import field_picture
+from collocation_sysid.result.replay import read_run
 from collocation_sysid.statistics.fields import FieldEstimate, fields_of
 from collocation_sysid.statistics.uncertainty import covariance
 
@@ -193,3 +196,45 @@ def test_a_field_that_cannot_be_is_refused(stated: dict, message: str):
 def test_a_field_of_nothing_is_refused():
     with pytest.raises(cs.InputError, match="all is claimed"):
         bar(cs.Field(0.05), np.ones(144, dtype=bool))
+
+
+def test_the_likeliest_of_several_lengths_is_taken():
+    several = replace(problem(2.0), experiments=[_of_lengths(0.005, 0.05)])
+    run = cs.run(several, seek_causes=False)
+    assert run.problem.lengths_m == {"young_pa": 0.05}
+    found = run.result.fields["young_pa"]
+    assert found.length_m == 0.05
+    assert found.likelier["0.05"] == 0.0 > found.likelier["0.005"]
+    assert "length 0.05 m, ln evidence of 0.005 m -" in str(run)
+
+
+def _of_lengths(*lengths_m: float) -> cs.Experiment:
+    (known,) = problem(2.0).experiments
+    return replace(known, body=bar(cs.Field(lengths_m, modes=20)))
+
+
+def test_a_run_folder_has_the_field_in_every_element(tmp_path):
+    run = cs.run(problem(2.0), seek_causes=False)
+    assert run.trust.verdict == "good" or not any("field" in r for r in run.trust.reasons)
+    run.save(tmp_path / "run")
+    result, (replay,) = read_run(tmp_path / "run")
+    stored, field = replay.fields["young_pa"], run.fields["young_pa"]
+    assert result.fields["young_pa"].identified == field.identified
+    np.testing.assert_array_equal(stored[field.cells, 0], field.value)
+    assert (stored[:, 1] < stored[:, 0]).all()
+    assert (stored[:, 0] < stored[:, 2]).all()
+    frame = (tmp_path / "run" / "frames" / "frame_0000.vtu").read_text()
+    assert 'Name="young_pa_over_prior"' in frame
+    said = str(run)
+    assert "field_1" not in said
+    assert "E from " in said
+    untold = stored.copy()
+    untold[:, 3] = 1.0
+    told, pale = (field_picture(replay, "young_pa", values) for values in (stored, untold))
+    assert _brightness(pale) > _brightness(told) + 0.1
+
+
+def _brightness(figure: Figure) -> float:
+    axes = figure.axes[0]
+    drawn = [each.get_facecolor() for each in axes.collections]
+    return float(np.concatenate(drawn)[:, :3].mean())

@@ -15,7 +15,7 @@ without it, it has relaxed.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
@@ -196,6 +196,25 @@ class Body(Discretisation):
             vars(other).pop(name, None)
         Model.__init__(other, free, self.forces, self.frictions)
         other._evaluators, other._framed = {}, {}
+        return other
+
+    @property
+    def lengths_m(self) -> dict[str, float]:
+        """Of its fields, by the names of their constants."""
+        return {part.field_name: part.field.length_m for part in self.parts if part.field}
+
+    def with_lengths(self, lengths_m: Mapping[str, float]) -> Body:
+        """The same body, with fields of other lengths by the names of their constants."""
+        parts = [
+            replace(part, field=part.field.at(lengths_m.get(part.field_name, part.field.length_m)))
+            if part.field
+            else part
+            for part in self.parts
+        ]
+        other = copy(self)
+        for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
+            vars(other).pop(name, None)
+        other.parts, other._framed = tuple(parts), {}
         return other
 
     def with_frames(

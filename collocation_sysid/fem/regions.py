@@ -115,6 +115,11 @@ class BodyPart:
         """How many numbers the quadrature points need: those, and the stiffening by memory."""
         return self.of_law + bool(self.prony)
 
+    @property
+    def field_name(self) -> str:
+        """The constant that differs from place to place."""
+        return self.full_name(self.field.field.parameter) if self.field else ""
+
     def full_name(self, own: str) -> str:
         """The name of a constant with the region in front."""
         return f"{self.name}.{own}" if self.name else own

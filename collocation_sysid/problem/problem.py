@@ -141,6 +141,20 @@ class Problem:
         return tuple({id(e.body): e.body for e in self.experiments}.values())
 
     @property
+    def lengths_m(self) -> dict[str, float]:
+        """Of the fields of its bodies, by the names of their constants."""
+        return {name: each for body in self.bodies for name, each in body.lengths_m.items()}
+
+    def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
+        """The same with fields of other lengths."""
+        if dict(lengths_m) == self.lengths_m:
+            return self
+        bodies = {id(body): body.with_lengths(lengths_m) for body in self.bodies}
+        return replace(
+            self, experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments]
+        )
+
+    @property
     def first_substeps(self) -> int:
         """Grid steps between samples of the first solve, and of all that solves nothing."""
         return 1 if self.substeps == "auto" else self.substeps

@@ -121,9 +121,8 @@ def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:
     found = {}
     for part in body.parts:
         if part.field is not None:
-            name = part.full_name(part.field.field.parameter)
-            found[name] = np.full((len(body.cells), 4), np.nan)
-            found[name][part.cells] = finished.fields[name].by_element
+            found[part.field_name] = np.full((len(body.cells), 4), np.nan)
+            found[part.field_name][part.cells] = finished.fields[part.field_name].by_element
     return found
 
 

@@ -94,9 +94,13 @@ class FoundField:
         if self.identified is None or self.share_told is None:
             return said
         told = f"{self.share_told:.0%} of the volume better than the prior by half"
+        chosen = ""
+        if len(self.likelier) > 1:
+            each = (f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
+            chosen = f"; length {self.length_m:g} m, ln evidence of {', '.join(each)}"
         return (
             f"{said}: the data tell {self.identified} of {self.modes} shapes of its field, and "
-            f"{told} (details above {short(1e3 * self.detail_m)} mm)"
+            f"{told} (details above {short(1e3 * self.detail_m)} mm{chosen})"
         )
 
 

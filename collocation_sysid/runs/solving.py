@@ -17,6 +17,7 @@ from ..methods.workers import Workers, workers_of
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
+from ..statistics.fields import fields_by_information
 from ..statistics.linearised import values_of
 from .check.cost import require_memory
 from .warm_start import Earlier
@@ -75,7 +76,34 @@ def solve(
             "--scheduler",
         )
     with workers_of(scheduler) as workers:
-        return _solved(problem, solver, watch, start, workers)
+        return _likeliest(problem, solver, watch, start, workers)
+
+
+def _likeliest(
+    problem: Problem,
+    solver: Method,
+    watch: Watch | None,
+    start: str | Path | Earlier | None,
+    workers: Workers | None,
+) -> Solution:
+    """Solve with the likeliest of the lengths that fields have to choose from.
+
+    An answer tells, to first order, which of them that is, see `statistics.fields`; with that it is
+    solved again from there, until it is the likeliest by its own answer or one that was tried.
+    """
+    solution, tried = _solved(problem, solver, watch, start, workers), [problem.lengths_m]
+    fields = {part.field for body in problem.bodies for part in body.parts if part.field}
+    if all(len(field.field.lengths_m) == 1 for field in fields):
+        return solution
+    while solution.status.converged:
+        known = fields_by_information(solution.collocation, solution.z)
+        best = {name: max(f.modes.field.lengths_m, key=f.likelier) for name, f in known.items()}
+        if best in tried:
+            break
+        tried.append(best)
+        problem = problem.with_lengths(best)
+        solution = _solved(problem, solver, watch, Earlier.of(solution), workers)
+    return solution
 
 
 def _solved(

@@ -26,8 +26,10 @@ from ..fem.field import ALL_MODULI, FieldModes
 from ..fem.moduli import engineering
 from ..model.generated import Generated
 from ..model.parameters import NOTHING, Parameters, ThetaMap
+from ..program.collocation import Collocation
 from .concern import Concern
 from .estimates import relative_slopes
+from .linearised import information, linearised_fit
 from .uncertainty import Uncertainty
 
 # The data tell an element whose interval is less than this share of the prior's.
@@ -158,7 +160,7 @@ def fields_of(
         free = [names.index(name) for name in [*body.constants][here] if name in names]
         found.append(
             FieldEstimate(
-                part.full_name(modes.field.parameter),
+                part.field_name,
                 modes,
                 part.cells,
                 np.exp(mean[0] + modes.shapes @ theta[here]),
@@ -168,6 +170,17 @@ def fields_of(
                 covariance[np.ix_(free, free)],
             )
         )
+    return found
+
+
+def fields_by_information(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
+    """Those of a solution, by name, with the covariance for independent errors of the σ stated."""
+    covariance = information(linearised_fit(collocation, z)).fit.covariance()
+    nq, found = collocation.nq, dict[str, FieldEstimate]()
+    for body in dict.fromkeys(segment.body for segment in collocation.segments):
+        known = covariance[:nq, :nq]
+        for field in fields_of(body, collocation.parameters, z[:nq], known):
+            found.setdefault(field.name, field)
     return found
 
 
