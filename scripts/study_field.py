@@ -8,10 +8,13 @@ scheme that fits them, each with noise of its own, on a mesh whose elements meet
 do.
 
     nice -n 15 python scripts/study_field.py --twins 10
+    nice -n 15 python scripts/study_field.py --cost
 """
 
 from __future__ import annotations
 
+import argparse
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +24,15 @@ from synthetic import swing
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.statistics.fields import FieldEstimate, fields_of
+from collocation_sysid.statistics.uncertainty import covariance
 
-SIZE_M, EDGE_M, STEP_S, SIGMA_M = (0.04, 0.04, 0.12), 0.0133, 1 / 60, 1e-4
+Array = NDArray[np.float64]
+SIZE_M, EDGE_M, STEP_S, SIGMA_M = (0.04, 0.04, 0.12), 0.01, 1 / 60, 1e-4
 YOUNG_PA = 3e4
 BESIDE = {"poisson": 0.45, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
-BALL_M, RADIUS_M = np.array([0.026, 0.02, 0.06]), 0.015
+BALL_M, RADIUS_M = np.array([0.022, 0.02, 0.06]), 0.015
 
 
 @dataclass(frozen=True)
@@ -54,10 +61,8 @@ def stiff_cells(kind: str, mesh: cs.TetMesh) -> NDArray[np.bool_]:
 
 def hung(body: Body, count: int, steps: int) -> cs.Experiment:
     """The block in the hand, with markers on its surface that nobody has seen yet."""
-    t_s = STEP_S * np.arange(steps)
-    poses = swing(
-        t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, Rotation.identity()
-    )
+    t_s, upright = STEP_S * np.arange(steps), Rotation.identity()
+    poses = swing(t_s, (0.02, 0.02, 0.01), (0.3, 0.3, 0.5), (1.7, 2.3, 1.3), 0.2, upright)
     x, high = body.nodes_m, np.array(SIZE_M)
     surface = np.flatnonzero(
         ((x < 1e-9) | (x > high - 1e-9)).any(axis=1) & (x[:, 2] < high[2] - 0.01)
@@ -70,7 +75,7 @@ def hung(body: Body, count: int, steps: int) -> cs.Experiment:
     return cs.Experiment(body, t_s, [grasp], markers, nuisance=cs.Nuisance.none())
 
 
-def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, NDArray[np.float64]]:
+def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
     """Its problem, and the truth: the logarithm of E in every cell."""
     mesh = cs.box_mesh(SIZE_M, tuple(round(size / EDGE_M) for size in SIZE_M))
     stiff = stiff_cells(twin.kind, mesh)
@@ -86,3 +91,111 @@ def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, NDArray[np.float64]]:
     guesses = {n: cs.Unknown(0.7 * values[n]) for n in ("young_pa", "gamma_r_s")}
     problem = cs.Problem([experiment], {**BESIDE, **guesses}, substeps=1)
     return problem, np.log(YOUNG_PA * np.where(stiff, twin.ratio, 1.0))
+
+
+TWINS = (
+    Twin("stiff half, twice", "half", 2.0, 0.04, 60),
+    Twin("the same, length of 3", "half", 2.0, (0.01, 0.04, 0.16), 60),
+    Twin("the same, 12 markers", "half", 2.0, 0.04, 60, markers=12),
+    Twin("stiff ball, twice", "ball", 2.0, 0.03, 80),
+    Twin("stiff ball, three times", "ball", 3.0, 0.03, 80),
+    Twin("even", "none", 1.0, 0.04, 60),
+    Twin("half, amplitude 0.1", "half", 2.0, 0.04, 60, 0.1),
+    Twin("half, length 0.4 m", "half", 2.0, 0.4, 60),
+    Twin("half, length 0.004 m", "half", 2.0, 0.004, 60),
+)
+
+
+def found_of(twin: Twin, seed: int) -> tuple[FieldEstimate, Array, cs.TetMesh, float]:
+    """Its field with error bars, the truth, the mesh, and the seconds of processor time."""
+    problem, truth = problem_of(twin, seed)
+    began = time.process_time()
+    solution = cs.solve(problem)
+    assert solution.status.converged, solution.message
+    collocation, took_s = solution.collocation, time.process_time() - began
+    known = covariance(collocation, solution.z)
+    body = collocation.segments[0].body
+    (field,) = fields_of(body, collocation.parameters, solution.q, known)
+    return field, truth, body.mesh, took_s
+
+
+def told(twin: Twin, seeds: range) -> str:
+    """A row of the table: means over twins."""
+    rows, said = [], set[str]()
+    for seed in seeds:
+        field, truth, mesh, took_s = found_of(twin, seed)
+        low, high = np.log(field.ci95)
+        held = (low < truth) & (truth < high)
+        stiff, log = stiff_cells(twin.kind, mesh), np.log(field.value)
+        ratio = np.exp(log[stiff].mean() - log[~stiff].mean()) if stiff.any() else np.nan
+        z_m = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2]
+        step_mm = 1e3 * step_of(z_m, log) if twin.kind == "half" else np.nan
+        share, width = field.told.mean(), np.median(field.deviation)
+        error = np.sqrt(np.mean((log - truth) ** 2))
+        inside = held[field.told].mean() if field.told.any() else np.nan
+        rows.append(
+            (share, inside, held.mean(), error, width, ratio, step_mm, field.identified, took_s)
+        )
+        said |= {concern.code for concern in field.concerns}
+        said |= {f"length {field.modes.length_m:g}"} if isinstance(twin.length_m, tuple) else set()
+    mean = np.mean(rows, axis=0)
+    cells = (
+        f"{mean[0]:.0%}", f"{mean[1]:.1%}", f"{mean[2]:.1%}", f"{mean[3]:.3f}", f"{mean[4]:.3f}",
+        f"{mean[5]:.2f}", f"{mean[6]:.1f}", f"{mean[7]:.0f} of {twin.modes}", f"{mean[8]:.0f}",
+    )  # fmt: skip
+    return f"| {twin.name} | {' | '.join(cells)} | {', '.join(sorted(said))} |"
+
+
+def step_of(z_m: Array, log: Array) -> float:
+    """Height at which a step that fits best is, of the layers' means."""
+    edges = np.linspace(0, SIZE_M[2], 61)[5:-5]
+    misfits = [
+        sum(((part - part.mean()) ** 2).sum() for part in (log[z_m < at], log[z_m >= at]))
+        for at in edges
+    ]
+    return float(edges[np.array(misfits) < min(misfits) * (1 + 1e-9)].mean())
+
+
+def cost() -> None:
+    """What a mode costs: processor time of a solve an iteration, over that without a field."""
+    print("| modes | nodes | s an iteration | over that without |\n|---|---|---|---|")
+    without = 0.0
+    for modes in (0, 10, 20, 40, 80):
+        twin = Twin("", "half", 2.0, 0.04, max(1, modes))
+        problem, _ = problem_of(twin, 1)
+        if not modes:
+            fixed = {name: 0.0 for name in problem.bodies[0].mode_names}
+            problem = cs.Problem(
+                problem.experiments, problem.parameters.with_fixed(fixed), substeps=1
+            )
+        best = np.inf
+        for _ in range(2):
+            began = time.process_time()
+            solution = ReducedSpace()(problem.collocation())
+            best = min(best, (time.process_time() - began) / solution.iterations)
+        without = without or best
+        nodes = len(problem.bodies[0].nodes_m)
+        print(f"| {modes} | {nodes} | {best:.2f} | {best / without:.2f} |", flush=True)
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--twins", type=int, default=10)
+    parser.add_argument("--cost", action="store_true")
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    if options.cost:
+        cost()
+        return
+    print(
+        "| twin | told | held of these | held of all | error | ± | ratio | step mm | shapes | s | |"
+    )
+    print("|---|" + "---|" * 10)
+    for twin in TWINS:
+        if options.only in twin.name:
+            print(told(twin, range(options.twins)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -15,6 +15,7 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import MU
 from collocation_sysid.fem.field import FieldModes, Laplacian
+from collocation_sysid.fem.refinement import refined
 from collocation_sysid.result.pictures.field import field_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.statistics.fields import FieldEstimate, fields_of
@@ -27,7 +28,7 @@ KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
 def bar(field: cs.Field | None = None, stiff: np.ndarray | None = None, **changes) -> Body:
     regions = [] if stiff is None else [cs.Region("stiff", stiff)]
     mesh = cs.box_mesh(SIZE_M, (2, 2, 6))
-    return Body(mesh, density_kg_m3=100.0, field=field, regions=regions, **changes)
+    return Body(mesh, density_kg_m3=100.0, field=field, **({"regions": regions} | changes))
 
 
 def centres(body: Body) -> np.ndarray:
@@ -45,14 +46,14 @@ def swung(body: Body, above_m: float = 0.119, steps: int = 15) -> cs.Experiment:
 
 
 @cache
-def problem(ratio: float = 1.0, above_m: float = 0.119, **stated) -> cs.Problem:
+def problem(ratio: float = 1.0, above_m: float = 0.119, steps: int = 15, **stated) -> cs.Problem:
     """A bar whose lower half is stiffer, which no description tells."""
     true = bar(stiff=centres(bar())[:, 2] < 0.06)
     values = {**KNOWN, "young_pa": YOUNG_PA, "stiff.young_pa": ratio * YOUNG_PA}
-    tracks = cs.simulate(swung(true, above_m), values, "midpoint").markers_m
+    tracks = cs.simulate(swung(true, above_m, steps), values, "midpoint").markers_m
     noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
     field = cs.Field(**({"length_m": 0.05, "modes": 20} | stated))
-    seen = cs.with_markers(swung(bar(field), above_m), tracks + noise)
+    seen = cs.with_markers(swung(bar(field), above_m, steps), tracks + noise)
     return cs.Problem([seen], {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}, substeps=1)
 
 
@@ -138,6 +139,15 @@ def test_a_hidden_stiff_half_is_found():
     assert held_share(field, 2.0) >= 0.9
     assert field.told.mean() > 0.9
     assert 5 < field.identified <= 20
+
+
+@pytest.mark.parametrize("method", [cs.InteriorPoint(), cs.Shooting()], ids=type)
+def test_other_methods_find_the_same_field(method):
+    expected = cs.solve(problem(2.0, steps=3, modes=3))
+    solution = cs.solve(problem(2.0, steps=3, modes=3), method)
+    assert solution.status.converged
+    for name, value in expected.parameters.items():
+        assert solution.parameters[name] == pytest.approx(value, rel=1e-4, abs=1e-4)
 
 
 def test_an_even_body_is_found_even():
@@ -238,3 +248,23 @@ def _brightness(figure: Figure) -> float:
     axes = figure.axes[0]
     drawn = [each.get_facecolor() for each in axes.collections]
     return float(np.concatenate(drawn)[:, :3].mean())
+
+
+def test_a_finer_mesh_has_the_same_field():
+    core = cs.Region("core", np.arange(30), field=cs.Field((0.02, 0.04), "mu_pa", 3))
+    body = bar(cs.Field(0.05, modes=4), regions=[core])
+    body = body.with_lengths(body.lengths_m | {"core.mu_pa": 0.04})
+    finer = refined(body)
+    assert finer.lengths_m == {"young_pa": 0.05, "core.mu_pa": 0.04}
+    for coarse, fine in zip(body.parts, finer.parts, strict=True):
+        np.testing.assert_array_equal(fine.field.shapes, np.repeat(coarse.field.shapes, 8, axis=0))
+    shares = dict.fromkeys(body.mode_names, 0.3)
+    values = {"poisson": 0.3, **shares, "young_pa": YOUNG_PA}
+    stretched = np.diag([1.02, 0.99, 1.05])
+    energies = [
+        each.energy(
+            each.nodes_m @ stretched, **{n: v for n, v in values.items() if "gamma" not in n}
+        )
+        for each in (body, finer)
+    ]
+    assert energies[1] == pytest.approx(energies[0], rel=1e-12)

@@ -188,15 +188,13 @@ class Body(Discretisation):
 
     def with_free_densities(self, parts: Collection[str]) -> Body:
         """The same body, with the densities of the parts of these names among its constants."""
-        free = tuple(replace(part, free_density=part.name in parts) for part in self.parts)
-        if all(a.free_density == b.free_density for a, b in zip(free, self.parts, strict=True)):
-            return self
-        other = copy(self)
-        for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
-            vars(other).pop(name, None)
-        Model.__init__(other, free, self.forces, self.frictions)
-        other._evaluators, other._framed = {}, {}
-        return other
+        free = tuple(
+            part
+            if (part.name in parts) == part.free_density
+            else replace(part, free_density=part.name in parts)
+            for part in self.parts
+        )
+        return self if free == self.parts else self.with_parts(free)
 
     @property
     def lengths_m(self) -> dict[str, float]:
@@ -205,16 +203,18 @@ class Body(Discretisation):
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Body:
         """The same body, with fields of other lengths by the names of their constants."""
-        parts = [
-            replace(part, field=part.field.at(lengths_m.get(part.field_name, part.field.length_m)))
-            if part.field
-            else part
-            for part in self.parts
-        ]
+        fields = (part.field and part.field.at(lengths_m[part.field_name]) for part in self.parts)
+        return self.with_parts(
+            tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
+        )
+
+    def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
+        """The same body, whose parts of the same cells have other constants."""
         other = copy(self)
         for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
             vars(other).pop(name, None)
-        other.parts, other._framed = tuple(parts), {}
+        Model.__init__(other, parts, self.forces, self.frictions)
+        other._evaluators, other._framed = {}, {}
         return other
 
     def with_frames(

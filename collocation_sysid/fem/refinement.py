@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,7 +88,12 @@ def refined(body: Body) -> Body:
         evaluator=body.evaluator,
         threads=body.threads,
     )
-    return finer.with_free_densities([part.name for part in body.parts if part.free_density])
+    finer = finer.with_free_densities([part.name for part in body.parts if part.free_density])
+    if not body.lengths_m:
+        return finer
+    fields = [part.field and part.field.split_in_eight() for part in body.parts]
+    parts = zip(finer.parts, fields, strict=True)
+    return finer.with_parts(tuple(replace(part, field=field) for part, field in parts))
 
 
 def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array, Index
-from ...errors import InputError
+from ...errors import InputError, listed
 from ...fem.body import Body
 from ...fem.moduli import engineering
 from ...problem import Problem
@@ -142,6 +142,7 @@ class Identified:
         with reading_run(folder):
             warnings = _warnings(result)
         problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
+        problem = problem.with_lengths({n: each.length_m for n, each in result.fields.items()})
         if problem.parameters.free:
             problem = answer.started(problem)  # which may state no guess itself
         collocation = problem.collocation()
@@ -169,7 +170,7 @@ class Identified:
             problem.title,
             result.trust.verdict,
             warnings,
-            result.parameters,
+            {n: each for n, each in result.parameters.items() if n in result.values},
             body,
             body.theta(values),
             corrected,
@@ -310,6 +311,10 @@ def _warnings(result: Result) -> tuple[str, ...]:
         warnings.append("the run did not converge")
     if (verdict := result.trust.verdict) != "good":
         warnings.append(f"the verdict on the run is {verdict!r}: {'; '.join(result.trust.reasons)}")
+    if result.fields:
+        warnings.append(
+            f"{listed(result.fields)} differs from place to place: the mean is exported"
+        )
     for name, each in result.parameters.items():
         if each.at_bound and not each.fixed:
             warnings.append(
