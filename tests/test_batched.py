@@ -108,15 +108,27 @@ def test_forcing_vector_code_without_llvmlite_names_the_remedy(small_mesh, witho
 # Vector code ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("lanes", [1, 2, 4, 8])
-def test_vectors_of_any_width_give_the_same(small_mesh, make_body, lanes, monkeypatch):
+@pytest.mark.parametrize(
+    ("lanes", "quickly"), [(1, True), (2, False), (4, True), (8, True), (8, False)]
+)
+def test_vectors_of_any_width_give_the_same(small_mesh, make_body, lanes, quickly, monkeypatch):
     monkeypatch.setattr(simd, "vector_lanes", lambda: lanes)
+    monkeypatch.setattr(simd, "REPAID", 10_000 if quickly else 0)
     x = squeezed(small_mesh)
     body, reference = new_body(small_mesh, evaluator="simd"), make_body("neo-hookean", "casadi")
     found, expected = (each.elastic_force(x, **ELASTIC) for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
     found, expected = (each.stiffness(x, **ELASTIC).toarray() for each in (body, reference))
     assert relative_error(found, expected) < 1e-12
+
+
+def test_code_that_was_compiled_quickly_is_not_taken_for_optimised_code(small_mesh, cache):
+    new_body(small_mesh, evaluator="simd").elastic_force(squeezed(small_mesh), **ELASTIC)
+    quickly = set(cache.iterdir())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simd, "REPAID", 0)
+        new_body(small_mesh, evaluator="simd").elastic_force(squeezed(small_mesh), **ELASTIC)
+    assert len(set(cache.iterdir()) - quickly) == len(quickly) > 0
 
 
 def distance_and_slopes() -> ca.Function:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from itertools import chain
 
 import casadi as ca
@@ -455,15 +454,28 @@ PROGRAMS: dict[str, Make] = {
 }
 
 
-@cache
-def made_of(name: str) -> Collocation:
-    """What collecting the tests asks is asked of the programs that they check."""
-    return PROGRAMS[name]()
+# By name, so that nothing is built before its tests run; these check what is said here.
+REMEMBERING = [n for n in PROGRAMS if "memory" in n or "carried" in n or n == "wrench, several"]
+# Where nothing but the last rows is left out: what moves the body moves it along its equations.
+ALONG = [name for name in PROGRAMS if name not in REMEMBERING and "fixed" not in name]
+WITH_ROWS = [
+    *("undeformed, backward-euler", "equilibrium, midpoint", "given, midpoint", "undeformed, bdf2"),
+    *("nobody holds", "static", "let go, rows", "wrench, rows"),
+]
+SIMULATED = [name for name in PROGRAMS if name not in (*WITH_ROWS, "all fixed")]
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_matrices_are_those_of_differences_and_laid_out_in_order(name: str, rng):
-    made = made_of(name).made_explicit()
+@pytest.fixture(scope="module", params=PROGRAMS)
+def made(request: pytest.FixtureRequest) -> Collocation:
+    """The tests of a program follow each other."""
+    found = PROGRAMS[request.param]()
+    assert found.remembers == (request.param in REMEMBERING)
+    assert found.explicit_grasps == (request.param in WITH_ROWS)
+    return found
+
+
+def test_matrices_are_those_of_differences_and_laid_out_in_order(made: Collocation, rng):
+    made = made.made_explicit()
     z, y = some_point(made, rng), rng.normal(size=made.constraints)
 
     def slope(at: np.ndarray) -> np.ndarray:
@@ -487,9 +499,12 @@ def test_matrices_are_those_of_differences_and_laid_out_in_order(name: str, rng)
     assert (rows <= columns).all(), "an entry below the diagonal"
 
 
-@pytest.mark.parametrize("name", ["places unknown", "places unknown, huber", "wrench, huber"])
-def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(name: str, rng):
-    made = made_of(name).made_explicit()
+FAR_OFF = ["places unknown", "places unknown, huber", "wrench, huber"]
+
+
+@pytest.mark.parametrize("made", FAR_OFF, indirect=True)
+def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(made: Collocation, rng):
+    made = made.made_explicit()
     z = some_point(made, rng)
     convex = np.linalg.eigvalsh(made.hessian(z, 1.0, None).toarray())
     assert convex[0] > -1e-12 * convex[-1]
@@ -498,13 +513,8 @@ def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(name: str,
         assert np.linalg.eigvalsh(exact)[0] < -1e-6 * convex[-1]
 
 
-# Where nothing but the last rows is left out: what moves the body moves it along its equations.
-ALONG = [name for name in PROGRAMS if not made_of(name).remembers and "fixed" not in name]
-
-
-@pytest.mark.parametrize("name", ALONG)
-def test_sensitivities_keep_the_linearised_constraints(name: str, rng):
-    made = made_of(name)
+@pytest.mark.parametrize("made", ALONG, indirect=True)
+def test_sensitivities_keep_the_linearised_constraints(made: Collocation, rng):
     z = some_point(made, rng)
     jacobian, found = made.jacobian(z), []
     for part in made.parts(z):
@@ -522,14 +532,10 @@ def test_sensitivities_keep_the_linearised_constraints(name: str, rng):
         assert np.abs(change).max() <= 1e-9 * np.abs(forced).max()
 
 
-def can_be_simulated(name: str) -> bool:
-    made = made_of(name)
-    return len(made.guess_p) > 0 and not made.explicit_grasps
-
-
-@pytest.mark.parametrize("name", [name for name in PROGRAMS if can_be_simulated(name)])
-def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(name: str, rng):
-    made = made_of(name)
+@pytest.mark.parametrize("made", SIMULATED, indirect=True)
+def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(
+    made: Collocation, rng
+):
     q, phi = made.parameters.guess_q, 0.1 + 0.3 * np.abs(rng.normal(size=made.nphi))
     p = np.clip(np.concatenate([q, phi]), *made.bounds_p)
     z = simulated(made, p)

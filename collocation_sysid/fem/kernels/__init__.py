@@ -4,10 +4,10 @@ An `EvaluatorChoice` takes the SIMD evaluator where llvmlite can be imported and
 material's operations, and CasADi's ``Function.map`` otherwise; ``COLLOCATION_SYSID_EVALUATOR`` or
 the argument forces either.
 
-What is not in the cache is compiled at once, however small the body: it costs as much as CasADi
-takes for some 10,000 points (elements times points times states), which a solve of 72 elements and
-9 samples evaluates many times over. Begun with CasADi and compiled after 500 or after 10,000 points
-that solve, from an empty cache, took 3.3 and 3.1 s of processor time in place of 3.1 s.
+What is not in the cache is compiled at once, however small the body; of a body of fewer than
+`simd.REPAID` quadrature points as it is written: the kernels of 48 elements, with their curvature,
+then take LLVM 0.5 s of processor time in place of 2.5 s. Of a larger body optimising repays itself:
+1,296 elements at 20 states are linearised in 9 ms in place of 16 ms.
 """
 
 from __future__ import annotations

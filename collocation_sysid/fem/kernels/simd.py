@@ -37,6 +37,9 @@ from .jit import (
 )
 from .threads import in_slices
 
+# Bodies of fewer quadrature points do not evaluate so often that optimised code repays its making.
+REPAID = 200
+
 
 class SimdEvaluator:
     """Evaluate a `Batch` with native vector code, timesteps shared among threads."""
@@ -80,6 +83,7 @@ class SimdEvaluator:
             "run",
             key,
             signature,
+            quickly=count * self._points < REPAID,
         )
 
     def __call__(
