@@ -134,6 +134,22 @@ def test_in_wide_bands_the_skew_part_is_solved_for_whether_or_not_it_is_small(
     assert factor.positive_definite
 
 
+@pytest.mark.parametrize("choice", ["band", "sparse"])
+@pytest.mark.parametrize("stiffness", [1.0, -1.0])
+def test_in_wide_bands_pivots_tell_whether_what_slides_is_stable(choice, stiffness: float):
+    """A pressure that grows along z, and pushes along x by friction: half of that is symmetric."""
+    values, skew = np.zeros(WIDE.entries), np.zeros(WIDE.entries)
+    values[WIDE.diagonal] = stiffness
+    values[WIDE.diagonal[2::3]] = 1000.0
+    pushed = np.flatnonzero((WIDE.rows % 3 == 2) & (WIDE.columns == WIDE.rows - 2))
+    values[pushed], skew[pushed] = 250.0, -250.0  # a force along x, by what z is
+    assert len(pushed) == 300
+    factor = Factoriser(WIDE, np.arange(WIDE.size), choice).factorise(values, skew)
+    assert factor.positive_definite == (stiffness > 0)
+    right = np.random.default_rng(3).normal(size=WIDE.size)
+    np.testing.assert_allclose(whole(WIDE, values, skew) @ factor.solve(right), right, atol=1e-9)
+
+
 def test_factors_that_live_together_do_not_share_their_memory():
     """Also where memory is given back and taken again."""
     free, right = without_first_nodes(FULL), np.ones(FULL.size - 12)

@@ -255,22 +255,26 @@ class Factoriser:
             return within
         if not (np.isfinite(values).all() and np.isfinite(skew).all()):
             raise np.linalg.LinAlgError("the matrix has entries that are not finite")
-        symmetric = (self._within(values, NONE, room) if skew.size else None) or (
-            self._cholesky(values) or self._sparse(values)
+        definite = (self._within(values, NONE, room) if skew.size else None) or self._definite(
+            values
         )
         if not skew.size:
-            return symmetric
-        definite = symmetric.positive_definite
+            # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
+            return definite or _SparseFactor(self._superlu(values, pivot_below=0.1), False)
+        if not definite:
+            # Where a body slides under friction it never is: the pivots of the whole tell then.
+            lu = self._superlu(values, pivot_below=0.1, skew=skew)
+            return _SparseFactor(lu, _positive(lu))
 
         @cache
         def whole() -> Factor:
-            return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), definite)
+            return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), True)
 
         entries = self._signs * skew[self._full_source]
-        return _RefinedFactor(symmetric, self._matrix(entries), whole) if definite else whole()
+        return _RefinedFactor(definite, self._matrix(entries), whole)
 
-    def _cholesky(self, values: Array) -> Factor | None:
-        """The factor of a matrix that is positive definite, where SuperLU is not chosen."""
+    def _definite(self, values: Array) -> Factor | None:
+        """The factor of a symmetric matrix that is positive definite."""
         if self.supernodal:
             try:
                 pardiso = self._pool.pop()
@@ -278,7 +282,10 @@ class Factoriser:
                 pardiso = self._pardiso()
             factor = SupernodalFactor(pardiso, self._pool)
             return factor if pardiso.factorise(values[self._upper[2]]) else None
-        if not self.banded or self.skyline:
+        if not self.banded:
+            lu = self._superlu(values, pivot_below=0.0)
+            return _SparseFactor(lu, positive_definite=True) if _positive(lu) else None
+        if self.skyline:
             return None
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
         band.T.reshape(-1)[self._band_places] = values[self._kept]
@@ -342,14 +349,6 @@ class Factoriser:
         in_slices(run, count, threads)
         return [factors[k] for k in range(count)]
 
-    def _sparse(self, values: Array) -> Factor:
-        if not self.banded and not self.supernodal:
-            lu = self._superlu(values, pivot_below=0.0)
-            if (lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all():
-                return _SparseFactor(lu, positive_definite=True)
-        # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
-        return _SparseFactor(self._superlu(values, pivot_below=0.1), positive_definite=False)
-
     def _matrix(self, entries: Array) -> sp.csc_array:
         places = self._full_rows, self._full_columns
         return sp.csc_array((entries, places), shape=(self._size, self._size))
@@ -367,6 +366,11 @@ class Factoriser:
             )
         except RuntimeError as error:
             raise np.linalg.LinAlgError(str(error)) from error
+
+
+def _positive(lu: SuperLU) -> bool:
+    """Whether pivots were taken in their order, and are positive."""
+    return bool((lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all())
 
 
 @lru_cache(maxsize=8)
