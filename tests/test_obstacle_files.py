@@ -8,12 +8,16 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from problems_small import TRUTH, measured, pressed_cube
+from problems_small import TRUTH, as_theta, measured, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.live.model import Model
+from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.force_term import States
+from collocation_sysid.program.touches import on_surface
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
+from collocation_sysid.result.pictures.shapes import contact_shapes
 from collocation_sysid.result.replay import Replay
 
 PROBLEM = """
@@ -164,3 +168,35 @@ def test_pictures_have_outlines_where_obstacles_are_and_keep_them():
     kept = Replay.from_arrays(cube.name, seen.arrays())
     np.testing.assert_array_equal(kept.obstacles_m, seen.obstacles_m)
     assert Replay.of(replace(cube, grasps=cube.gripping)).obstacles_m is None
+
+
+def test_pictures_show_where_something_presses_and_how_far_the_rest_is():
+    both, theta = pressed_cube(4), as_theta(TRUTH)
+    held, _, plate = both.grasps
+    cube = replace(both, grasps=[held, plate])
+    motion = cs.simulate(cube, TRUTH, "bdf2")
+    x = motion.positions_m.reshape(len(motion.t_s), -1)
+    touched = gaps_m, pressures_pa = on_surface(cube, theta, x)
+    (term,) = contacts(cube, len(x))
+    force = term.force(States(x, np.zeros_like(x), theta)).reshape(len(x), -1, 3)
+    own, surface = cube.body.mesh.points_m, cube.body.mesh.surface
+    areas_m2 = np.linalg.norm(
+        np.cross(own[surface[:, 1]] - own[surface[:, 0]], own[surface[:, 2]] - own[surface[:, 0]]),
+        axis=1,
+    )
+    given_n = np.linalg.norm(force[:, : len(own)].sum(axis=1), axis=1)
+    assert given_n[-1] > 0
+    np.testing.assert_allclose(pressures_pa @ areas_m2 / 2, given_n, rtol=1e-9)
+    assert np.all(gaps_m[pressures_pa == 0] >= term.contact.width_m)
+    seen = Replay.of(cube, (motion.positions_m, motion.markers_m), touched=touched)
+    kept = Replay.from_arrays(cube.name, seen.arrays())
+    assert set(contact_shapes(kept)) == {"pressure", "gap"}
+    assert contact_shapes(Replay.of(cube)) == {}
+
+
+def test_recordings_with_other_obstacles_are_of_one_body():
+    cube = pressed_cube(4)
+    fewer = replace(cube, grasps=cube.grasps[:2], name="fewer")
+    both = [Replay.of(each).arrays(f"{each.name}/") for each in (cube, fewer)]
+    stored = both[0] | both[1]
+    assert Replay.from_arrays("fewer", stored).held.shape[1] == len(cube.body.mesh.points_m)

@@ -358,7 +358,7 @@ def test_a_field_colours_each_shape_by_its_values_there():
     seen = replay()
     count = len(seen.surface)
     values = np.arange(1.0, 2 * count + 1).reshape(2, count)
-    pressure = Coloured("pressure [Pa]", lambda positions_m: values[: len(positions_m)])
+    pressure = Coloured("pressure [Pa]", lambda samples: values[: len(samples)])
     figure = shapes(seen, 2, pressure)
     sheet_axes = figure.axes[0]
     assert any(text.get_text() == "pressure [Pa]" for text in sheet_axes.texts)

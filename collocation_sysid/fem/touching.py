@@ -41,6 +41,7 @@ class Touching:
         Of the body, that has most of the faces.
     a_face : int
         Points of each face.
+    faces : (f,) rows of the mesh's surface
     """
 
     points: ForcePoints
@@ -48,13 +49,15 @@ class Touching:
     edge_m: float
     part: int
     a_face: int
+    faces: Index
 
     @classmethod
     def of(cls, body: Body, frame: Index, chosen: Selection | None) -> Touching:
         """That of a body, or some of its faces, and the frame (4,) of an obstacle."""
-        triangles = body.mesh.surface
+        rows = np.arange(len(body.mesh.surface))
         if chosen is not None:
-            triangles = triangles[chosen.resolve_faces(body.mesh)]
+            rows = chosen.resolve_faces(body.mesh)
+        triangles = body.mesh.surface[rows]
         faces = body.nodes.on_faces(triangles)
         corners = body.mesh.points_m[triangles]
         sides = np.roll(corners, -1, axis=1) - corners
@@ -73,7 +76,7 @@ class Touching:
         held = [np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts]
         part = int(np.argmax([area[each].sum() for each in held]))
         edge_m = float(np.linalg.norm(sides, axis=2).mean())
-        return cls(points, np.outer(area, weights).ravel(), edge_m, part, count)
+        return cls(points, np.outer(area, weights).ravel(), edge_m, part, count, rows)
 
 
 def _quadratic(places: Array) -> Array:

@@ -72,9 +72,8 @@ def within_reach(experiment: Experiment, x: Array) -> list[Obstacle]:
     """Obstacles that touch no faces but those that came near in a motion x (T, 3n)."""
     found, mesh = [], experiment.body.mesh
     for contact, obstacle in zip(contacts(experiment, 1), experiment.obstacles, strict=True):
-        surface, faces = contact.contact.surface, mesh.surface
-        if obstacle.faces is not None:
-            faces = faces[obstacle.faces.resolve_faces(mesh)]
+        surface = contact.contact.surface
+        faces = mesh.surface[surface.faces]
         gaps = nearest(contact, x).reshape(-1, surface.a_face).min(axis=1)
         if len(touched := np.unique(faces[gaps < REACH * surface.edge_m])):
             obstacle = replace(obstacle, faces=Indices(mesh.file_index[touched].tolist()))

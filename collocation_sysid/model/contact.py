@@ -95,6 +95,10 @@ class ContactLaw:
         lame = material.lame(constants[: len(material.constants)])
         return STIFFNESS / self.surface.edge_m * engineering(lame[0], lame[1])[0]
 
+    def stiffness_at(self, theta: Array) -> float:
+        """The same of a body of constants θ (k,)."""
+        return float(ca.evalf(self.stiffness(ca.SX(ca.DM(theta[self.columns])))))
+
     def friction(self, constants: ca.SX) -> ca.SX:
         """μ."""
         stated = self.obstacle.friction

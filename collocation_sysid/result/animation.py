@@ -27,6 +27,7 @@ from .pictures.scene import (
     key,
     sheet,
     width_over_height,
+    with_outlines,
 )
 from .replay import Replay, headline, read_run, reading_run
 from .style import TEXT_PT
@@ -173,13 +174,15 @@ class Film:
             (names[0], replay.positions_m, replay.markers_m),
             (names[1], replay.rolled_out_positions_m, replay.rolled_out_m),
         )
-        there = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
+        told = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
         # A forward simulation that goes astray may leave the picture; fit and markers may not.
-        outer = there[0][1][:, np.unique(replay.surface)]
-        outer = outer[np.isfinite(outer).all(axis=(1, 2))]
+        outer = told[0][1][:, np.unique(replay.surface)]
+        there = np.isfinite(outer).all(axis=(1, 2))
+        outer, outlines_m = outer[there], replay.obstacles_m
         camera = Camera.facing(outer, replay.up)
-        everything = np.vstack([outer.reshape(-1, 3), replay.measured_m.reshape(-1, 3)])
-        width = WIDTH_MM / len(there)
+        beside = with_outlines(outer, None if outlines_m is None else outlines_m[there])
+        everything = np.vstack([beside.reshape(-1, 3), replay.measured_m.reshape(-1, 3)])
+        width = WIDTH_MM / len(told)
         aspect = width_over_height(camera, everything)
         height = float(np.clip((width - 8) / aspect, LOWEST_MM, TALLEST_MM))
         head = HEAD_MM + (LINE_MM if headline else 0.0)
@@ -188,7 +191,7 @@ class Film:
         self.figure.set_facecolor("white")
         axes.text(WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
         self.panels = []
-        for k, (name, positions, markers) in enumerate(there):
+        for k, (name, positions, markers) in enumerate(told):
             corner = (k * width + 4, FOOT_MM)
             view = View.fitting(camera, everything, (width - 8, height), corner)
             top = total - 3 - (head - HEAD_MM)

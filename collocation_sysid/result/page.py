@@ -120,6 +120,7 @@ def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
         "opening": int(np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()),
         "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
         "held": _packed(replay.held[kept][:, outer], "u1"),
+        "outlines": "" if replay.obstacles_m is None else _packed(replay.obstacles_m[kept], "<f4"),
         "measured": _packed(replay.measured_m[kept], "<f4"),
         "shapes": {name: _packed(x, "<f4") for name, x in shapes.items()},
         "axes": Camera.facing(there, replay.up).axes.tolist(),

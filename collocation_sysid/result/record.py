@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..fem.body import Body
+from ..program.touches import on_surface
 from ..recording.experiment import Experiment
 from ..runs.answer import Answer
 from ..runs.forward_simulation import Rollout
@@ -106,14 +107,28 @@ def replays(finished: Answer) -> list[Replay]:
         if isinstance(rollout, Rollout):
             rolled_out = rollout.trajectory.positions_m, rollout.trajectory.markers_m
         fit = fitted.get(experiment.name)
-        if fit is not None or rolled_out is not None:
+        if (shown := fit or rolled_out) is not None:
             motion = finished.motions.get(experiment.name)
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _places_m(finished, experiment.name)
             read = _sensed(finished, experiment), _own_readings(finished, experiment)
-            replay = Replay.of(experiment, fit, rolled_out, natural, places_m, *read)
+            own = places_m, *read, _touched(finished, experiment, shown[0])
+            replay = Replay.of(experiment, fit, rolled_out, natural, *own)
             seen.append(replace(replay, fields=_in_cells(finished, experiment.body)))
     return seen
+
+
+def _touched(
+    finished: Answer, experiment: Experiment, positions_m: Array
+) -> tuple[Array, Array] | None:
+    """Gaps and pressures of the surface; None where there is nothing to touch."""
+    if not experiment.obstacles:
+        return None
+    for part in finished.solution.collocation.parts(finished.solution.z):
+        if part.segment.experiment.name == experiment.name:
+            experiment = part.segment.corrected(part.phi)
+    theta = experiment.body.theta(finished.solution.parameters)
+    return on_surface(experiment, np.array(theta), positions_m.reshape(len(positions_m), -1))
 
 
 def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:

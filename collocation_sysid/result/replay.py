@@ -50,6 +50,8 @@ LAYOUT = {
     "natural_hz": ("f", "k"),
     "tendons_m": ("f", "p3"),
     "obstacles_m": ("f", "To3"),
+    "gaps_m": ("f", "TF"),
+    "pressures_pa": ("f", "TF"),
 }
 # A plane is shown so many times as long as the body.
 LONGER = 1.4
@@ -93,6 +95,7 @@ class Replay:
     fields : mapping of name to (E, 4)
         Constants that differ from place to place: value, the ends of its interval, and its
         deviation over the prior's, NaN where another region is.
+    gaps_m, pressures_pa : (T, F) of the surface as fitted, or simulated, where there are obstacles
     """
 
     name: str
@@ -119,6 +122,8 @@ class Replay:
     tendons_m: Array | None = None
     readings: Mapping[str, Array] = field(default_factory=dict)
     obstacles_m: Array | None = None
+    gaps_m: Array | None = None
+    pressures_pa: Array | None = None
     fields: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
@@ -131,24 +136,30 @@ class Replay:
         places_m: Array | None = None,
         wrenches: Sequence[Array] = (),
         readings: Mapping[str, Array] | None = None,
+        touched: tuple[Array, Array] | None = None,
     ) -> Replay:
         """Gather an experiment with (positions, markers) as fitted, and as simulated.
 
-        Its markers are at `places_m` (M, 3), where they were estimated.
+        Its markers are at `places_m` (M, 3), where they were estimated; gaps and pressures of its
+        surface are `touched`.
         """
         body, markers = experiment.body, experiment.markers
-        given_m = markers.observe(body.nodes_m)
+        given_m, nodes_m = markers.observe(body.nodes_m), body.nodes.points_m
+        # Frames of obstacles are left out: experiments of a run have one body, but not as many.
+        fitted, rolled_out = (
+            each and (each[0][:, : len(nodes_m)], each[1]) for each in (fitted, rolled_out)
+        )
         pull = np.linalg.norm(experiment.gravity_m_s2)
         return cls(
             experiment.name,
             experiment.t_s,
-            body.nodes_m,
+            nodes_m,
             body.mesh.tetrahedra,
             body.mesh.surface,
             body.part_of_cells[body.mesh.surface_cells],
             nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
-            np.asarray(experiment.held(experiment.t_s).any(axis=2)),
+            np.asarray(experiment.held(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
             -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
             markers.names,
             given_m if places_m is None else places_m,
@@ -162,6 +173,7 @@ class Replay:
             _apart([tendon.points_m for tendon in experiment.tendons]),
             readings or {},
             _outlines(experiment),
+            *(touched or (None, None)),
         )
 
     @property

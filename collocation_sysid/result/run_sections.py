@@ -52,6 +52,8 @@ CAPTIONS = {
     "field": "What differs from place to place, between the ends of its 95 % interval; below, cut "
     "open. Pale is what the data do not tell: it is as the prior has it.",
     "mesh": "The mesh, its grasped nodes and the markers' places as found.",
+    "pressure": "Pressure that obstacles give the body.",
+    "gap": "How far the body's surface is from obstacles.",
     "tracks": "Measured, fitted and simulated markers, the residual below.",
     "wrench": "Wrench of a grasp: measured, fitted and simulated.",
     "reading": "A reading of your own: measured, fitted and simulated.",

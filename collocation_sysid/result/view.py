@@ -27,6 +27,8 @@ from .writers import FRAMES_FILE
 
 WINDOW = (1100, 800)
 FIELD = "von_mises_pa"
+# Of the surface, in replays of what touches something.
+CONTACT = ("pressures_pa", "gaps_m")
 
 
 def export_page(
@@ -41,8 +43,9 @@ def export_page(
     experiment : str, optional
         By default the first.
     field : str, optional
-        Which of the frames' point or cell data colours the body as fitted; by default the strain
-        of the body as fitted and as simulated forward.
+        Which of the frames' point or cell data colours the body as fitted, or "pressures_pa" or
+        "gaps_m" of what it touches; by default the strain of the body as fitted and as simulated
+        forward.
 
     Raises
     ------
@@ -59,6 +62,8 @@ def export_page(
 
 def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
     """A field of the frames (T, F) on the boundary's faces, at each sample that of the nearest."""
+    if field in CONTACT and (touched := getattr(replay, field)) is not None:
+        return touched
     frames = frame_files(Path(run), replay.name)
     cells = cells_of_faces(replay.tetrahedra, replay.surface)
     with _reading_frames(Path(run)):
@@ -194,6 +199,14 @@ class _Scene:
         """Show the frame nearest to a time."""
         mesh = self.meshes[int(np.abs(self.times - time_s).argmin())]
         sample = int(np.abs(self.replay.t_s - time_s).argmin())
+        if self.replay.obstacles_m is not None:
+            points = self.replay.obstacles_m[sample]
+            pairs = np.array([np.arange(len(points) - 1), np.arange(1, len(points))]).T
+            # Lines end where a point is no number.
+            pairs = pairs[np.isfinite(points[pairs]).all(axis=(1, 2))]
+            drawn = np.hstack([np.full((len(pairs), 1), 2), pairs])
+            lines = self.pv.PolyData(np.nan_to_num(points), lines=drawn)
+            self.plotter.add_mesh(lines, color=BLACK, name="obstacles", reset_camera=False)
         bar = {"title": self.field, "color": "black", "vertical": True, "fmt": "%.3g"}
         bar |= {"title_font_size": 16, "label_font_size": 16, "position_x": 0.86}
         self.plotter.add_mesh(

@@ -19,7 +19,7 @@ from .field import field_picture
 from .mesh import elements_picture, mesh_picture
 from .over_time import error_over_time, readings_picture, tracks
 from .search import convergence, scan_picture
-from .shapes import shapes
+from .shapes import contact_shapes, shapes
 from .spectrum import spectrum
 
 
@@ -76,6 +76,8 @@ def _of_experiment(replay: Replay) -> dict[str, Figure]:
         pictures[f"reading_{replay.name}_{name}"] = readings_picture(said, names)
     if replay.has_shapes:
         pictures[f"shapes_{replay.name}"] = shapes(replay)
+        coloured = contact_shapes(replay).items()
+        pictures |= {f"{name}_{replay.name}": figure for name, figure in coloured}
     return pictures
 
 

@@ -82,6 +82,16 @@ def _extent(camera: Camera, points_m: Array) -> tuple[Array, Array]:
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
 
 
+def with_outlines(points_m: Array, outlines_m: Array | None) -> Array:
+    """Points (T, n, 3) of a body, and what of outlines (T, o, 3) is no farther than half of it."""
+    if outlines_m is None:
+        return points_m
+    low, high = np.nanmin(points_m, axis=1), np.nanmax(points_m, axis=1)
+    far = (high - low).max(axis=1, keepdims=True) / 2
+    near_m = np.clip(outlines_m, (low - far)[:, None], (high + far)[:, None])
+    return np.concatenate([points_m, near_m], axis=1)
+
+
 class Drawn:
     """A body with its grasped nodes and markers on a sheet; it can be moved.
 

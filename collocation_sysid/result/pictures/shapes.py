@@ -13,21 +13,21 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ...arrays import Array
+from ...arrays import Array, Index
 from ...errors import InputError, hint_at
 from ...fem.body import Body
 from ..fields import ElementFields
 from ..replay import Replay
 from ..style import PAGE_MM, SMALL_PT
-from .camera import Camera
-from .scene import Drawn, View, draw_directions, draw_key, draw_scale, key, sheet
+from .camera import ELEVATION_DEG, Camera
+from .scene import Drawn, View, draw_directions, draw_key, draw_scale, key, sheet, with_outlines
 
 SHOWN = 6
 HEAD_MM, FOOT_MM, CORNER_MM = 5.0, 5.0, 14.0
 TALLEST_MM, GAP_MM = 60.0, 4.0
 BAR_MM, BAR_ROOM_MM = 2.5, 20.0
 # From pale to dark, on which markers and grasped nodes stand out; its darkest fifth is left out.
-COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256)))
+COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(bad="0.85")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +38,16 @@ class Coloured:
     ----------
     title : str, with its unit
     at : callable
-        Its values (k, F) on the triangles of the surface at positions (k, n, 3).
+        Its values (k, F) on the triangles of the surface at samples (k,).
     """
 
     title: str
-    at: Callable[[Array], Array]
+    at: Callable[[Index], Array]
 
 
-def shapes(seen: Replay, count: int = SHOWN, field: Coloured | None = None) -> Figure:
+def shapes(
+    seen: Replay, count: int = SHOWN, field: Coloured | None = None, camera: Camera | None = None
+) -> Figure:
     """Draw `count` of the body's shapes at evenly spaced samples, side by side in one scale.
 
     Heights are true; sideways the shapes are moved together. Samples of a simulation that went
@@ -56,8 +58,10 @@ def shapes(seen: Replay, count: int = SHOWN, field: Coloured | None = None) -> F
     there = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
     shown = there[np.unique(np.linspace(0, len(there) - 1, count).astype(int))]
     outer = positions_m[:, np.unique(seen.surface)]
-    camera = Camera.facing(outer[there], seen.up)
-    places = camera.project(np.concatenate([outer[shown], measured_m[shown]], axis=1))
+    camera = camera or Camera.facing(outer[there], seen.up)
+    outlines_m = None if seen.obstacles_m is None else seen.obstacles_m[shown]
+    beside = with_outlines(np.concatenate([outer[shown], measured_m[shown]], axis=1), outlines_m)
+    places = camera.project(beside)
     left, right = np.nanmin(places[..., 0], axis=1), np.nanmax(places[..., 0], axis=1)
     low, high = float(np.nanmin(places[..., 1])), float(np.nanmax(places[..., 1]))
     width = PAGE_MM - CORNER_MM - (BAR_ROOM_MM if field else 0.0)
@@ -66,27 +70,27 @@ def shapes(seen: Replay, count: int = SHOWN, field: Coloured | None = None) -> F
     gap = GAP_MM + (room - scale * float((right - left).sum())) / len(shown)
     total = HEAD_MM + scale * (high - low) + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
-    skins = [None] * len(shown) if field is None else _coloured(axes, field, positions_m[shown])
+    skins = [None] * len(shown) if field is None else _coloured(axes, field, shown)
     start = CORNER_MM + (gap - GAP_MM) / 2
     for t, first, last, skin in zip(shown, left, right, skins, strict=True):
         view = View(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
         body = Drawn(axes, view, seen.surface, seen.surface_parts, seen.surface_nodes)
-        outlines_m = None if seen.obstacles_m is None else seen.obstacles_m[t]
-        body.show(positions_m[t], seen.held[t], measured_m[t], skin, outlines_m)
+        around = None if seen.obstacles_m is None else seen.obstacles_m[t]
+        body.show(positions_m[t], seen.held[t], measured_m[t], skin, around)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)
         start += scale * (last - first) + gap
-    draw_directions(axes, camera, (6.0, FOOT_MM + 3.0))
+    draw_directions(axes, camera, (7.5, FOOT_MM + 3.0))
     draw_scale(axes, scale, (2.0, total - 2.5))
     marks = ("measured", "behind the body") if np.isfinite(measured_m).any() else ()
     draw_key(axes, key("grasped", *marks), (PAGE_MM * 0.3, total - 1.0))
     return figure
 
 
-def _coloured(axes: Axes, field: Coloured, positions_m: Array) -> Array:
-    """Colours (k, F, 3) of the triangles at positions (k, n, 3), with their bar on the sheet."""
-    values = field.at(positions_m)
+def _coloured(axes: Axes, field: Coloured, samples: Index) -> Array:
+    """Colours (k, F, 3) of the triangles at samples (k,), with their bar on the sheet."""
+    values = field.at(samples)
     low, high = np.nanmin(values), np.nanmax(values)
     scale = ScalarMappable(Normalize(0.0 if 0 <= low < high / 5 else low, high), COLOURS)
     height = axes.get_ylim()[1]
@@ -98,6 +102,31 @@ def _coloured(axes: Axes, field: Coloured, positions_m: Array) -> Array:
     end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}
     axes.text(PAGE_MM - 1, height - 1.0, field.title, **end)
     return scale.to_rgba(values)[..., :3]
+
+
+def contact_shapes(seen: Replay) -> dict[str, Figure]:
+    """The same coloured by pressure and by gap, from where most of the pressure is seen."""
+    positions_m, gaps_m, pressures_pa = seen.shapes_m, seen.gaps_m, seen.pressures_pa
+    if positions_m is None or gaps_m is None or pressures_pa is None:
+        return {}
+    camera = _towards(seen, positions_m, pressures_pa)
+    fields = {
+        "pressure": Coloured("pressure [Pa]", lambda samples: pressures_pa[samples]),
+        "gap": Coloured("gap [mm]", lambda samples: 1e3 * gaps_m[samples]),
+    }
+    return {name: shapes(seen, SHOWN, field, camera) for name, field in fields.items()}
+
+
+def _towards(seen: Replay, positions_m: Array, weights: Array) -> Camera:
+    """Of views from above and below, from the front and behind, that of most weights (T, F)."""
+    there = np.isfinite(positions_m).all(axis=(1, 2))
+    front = Camera.facing(positions_m[there][:, np.unique(seen.surface)], seen.up)
+    low = front.raised(-2 * ELEVATION_DEG)
+    views = [front, low, front.turned(180.0, seen.up), low.turned(180.0, seen.up)]
+    corners = positions_m[there][:, seen.surface]
+    normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+    shown = [(np.maximum(normals @ view.axes[2], 0) * weights[there]).sum() for view in views]
+    return views[int(np.argmax(shown))]
 
 
 FIELDS = {
@@ -126,13 +155,15 @@ def portrait(
     if field is not None and field not in FIELDS:
         expected = f"expected one of {', '.join(FIELDS)}{hint_at(field, list(FIELDS))}"
         raise InputError(f"no field {field!r}; {expected}")
-    return shapes(replay, count, None if field is None else _on_surface(body, constants, field))
+    coloured = None if field is None else _on_surface(replay, body, constants, field)
+    return shapes(replay, count, coloured)
 
 
-def _on_surface(body: Body, constants: Mapping[str, float], field: str) -> Coloured:
+def _on_surface(seen: Replay, body: Body, constants: Mapping[str, float], field: str) -> Coloured:
     elements, cells = ElementFields.of(body, body.theta(constants)), body.mesh.surface_cells
 
-    def at(positions_m: Array) -> Array:
-        return elements.at(positions_m)[field][:, cells]
+    def at(samples: Index) -> Array:
+        assert seen.shapes_m is not None
+        return elements.at(seen.shapes_m[samples])[field][:, cells]
 
     return Coloured(FIELDS[field], at)
