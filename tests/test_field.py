@@ -18,6 +18,7 @@ from collocation_sysid.fem.field import FieldModes, Laplacian
 from collocation_sysid.fem.refinement import refined
 from collocation_sysid.result.pictures.field import field_picture
 from collocation_sysid.result.replay import read_run
+from collocation_sysid.runs.check.body import body_finding
 from collocation_sysid.statistics.fields import FieldEstimate, fields_of
 from collocation_sysid.statistics.uncertainty import covariance
 
@@ -268,3 +269,12 @@ def test_a_finer_mesh_has_the_same_field():
         for each in (body, finer)
     ]
     assert energies[1] == pytest.approx(energies[0], rel=1e-12)
+
+
+@pytest.mark.parametrize(("length_m", "codes"), [(0.05, []), (0.003, ["field/shapes"])])
+def test_a_check_tells_what_the_shapes_can_show(length_m: float, codes: list[str]):
+    body = bar(cs.Field(length_m, modes=10))
+    seen = body_finding(body, body.theta({**KNOWN, "young_pa": YOUNG_PA}), ("swing",))
+    assert [each.code for each in seen.concerns if each.topic == "field"] == codes
+    assert seen.fields["young_pa"].modes == 10
+    assert "field_1" not in seen.guess

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array
 from ..checked import AtLeastOne, Options, Positive
 from ..errors import InputError, SimulationError
+from ..fem.constants import is_mode
 from ..pipeline import Run
 from ..problem import Problem
 from ..program.lapack import one_blas_thread
@@ -489,7 +490,8 @@ class Estimator:
         grave = concerned(bool(code), True, code)
         if self.track is None or self.track.failed:
             values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
-            return {name: Estimate(value) for name, value in values.items()}, Trust.of(grave)
+            told = {name: Estimate(v) for name, v in values.items() if not is_mode(name)}
+            return told, Trust.of(grave)
         if self.counts["looked"] % LOOK_EVERY == 0:
             self.scatter = self._joined.scatter(self.model.flat(self.p))
         self.counts["looked"] += 1

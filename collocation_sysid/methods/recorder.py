@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
+from ..fem.constants import is_mode
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
 from .solution import Iteration, Solution, Status, Timing, Watch
@@ -93,7 +95,9 @@ class Recorder:
         self.add(line)
 
     def add(self, line: Iteration) -> None:
-        """Add a line to the history, and show it to who watches."""
+        """Add a line to the history, and show it to who watches, but for shares of a field."""
+        told = {name: value for name, value in line.parameters.items() if not is_mode(name)}
+        line = replace(line, parameters=told)
         self.history.append(line)
         if self.watch is not None:
             self.watch(line)

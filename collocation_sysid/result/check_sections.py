@@ -54,6 +54,12 @@ def _body_section(body: BodyFinding) -> Table:
             "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
+        }
+        | {
+            f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
+            f"variance, of length {1e3 * each.length_m:.3g} mm; details above "
+            f"{1e3 * each.detail_m:.3g} mm"
+            for name, each in body.fields.items()
         },
     )
 

@@ -290,6 +290,9 @@ TOPICS: Mapping[str, Topic] = {
         {
             "amplitude": "{name} differs more from place to place than its field allows for: the "
             "data want an amplitude of about {likely:.2g}, not {stated:.2g}",
+            "shapes": "the {modes} shapes of the field of {name} have only {share:.0%} of its "
+            "variance with a length of {length_m:.2g} m: what is finer than {detail_m:.2g} m is "
+            "left to the intervals; raise modes or length_m",
             "length": "{name} changes over less than the length of its field: the data want about "
             "{likely:.2g} m, not {stated:.2g} m; give length_m several to choose from",
         },

@@ -71,7 +71,7 @@ def correlation_of(covariance: Array) -> Array:
 def user_estimates(
     parameters: Parameters, q: Array, of_q: Array, bounded: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
-    """Estimates of the user's parameters, by name; shares of a field have values alone.
+    """Estimates of the user's parameters, by name, but the shares of a field.
 
     Parameters
     ----------
@@ -79,12 +79,13 @@ def user_estimates(
     bounded : (nq,) which of q are at a bound
     quantiles : (nq,) half widths of the 95 % intervals, in deviations
     """
-    found = {name: Estimate(value) for name, value in parameters.values(q).items()}
+    values = parameters.values(q).items()
+    found = {name: Estimate(value) for name, value in values if not is_mode(name)}
     partners = np.abs(np.nan_to_num(correlation_of(of_q)))
     np.fill_diagonal(partners, 0.0)
     partners[:, [is_mode(item.name) for item in parameters.free]] = 0.0
     for k, item in enumerate(parameters.free):
-        if is_mode(item.name):
+        if item.name not in found:
             continue
         value = item.value(float(q[k]))
         if bounded[k]:
@@ -209,7 +210,7 @@ NOTEWORTHY = 1.1
 def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -> list[str]:
     """Parameters at a bound, not determined, or not identifiable."""
     notes, reasons = [], {}
-    for item in (each for each in parameters.free if not is_mode(each.name)):
+    for item in (each for each in parameters.free if each.name in estimates):
         name, found = item.name, estimates[item.name]
         if found.at_bound:
             nearer = min(

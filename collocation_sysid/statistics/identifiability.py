@@ -43,7 +43,8 @@ def _one_by_one(uncertainty: Uncertainty) -> list[str]:
     factors = {
         name: factor
         for name in uncertainty.names
-        if (factor := _factor(uncertainty.estimates[name])) is not None
+        if name in uncertainty.estimates
+        and (factor := _factor(uncertainty.estimates[name])) is not None
     }
     well = [f"{name} to {_spread(f)}" for name, f in factors.items() if f <= WELL_FIXED]
     badly = [f"{name} only to {_spread(f)}" for name, f in factors.items() if f > WELL_FIXED]

@@ -14,7 +14,6 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from ..arrays import Array
-from ..fem.constants import is_mode
 from ..program.stability import Instability
 from ..program.touches import Touch
 from ..recording.experiment import Experiment
@@ -168,8 +167,8 @@ def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
 
 def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """Parameters at their bounds, and those that the data do not tell."""
-    told = (name for name in uncertainty.names if not is_mode(name))
-    estimates = {name: uncertainty.estimates[name] for name in told}
+    known = uncertainty.estimates
+    estimates = {name: known[name] for name in uncertainty.names if name in known}
     bounded = [name for name, found in estimates.items() if found.at_bound]
     vague = [n for n, found in estimates.items() if not found.at_bound and found.std_error is None]
     several = len(bounded) > 1

@@ -77,7 +77,7 @@ class Uncertainty:
     correlation : (nq, nq) NaN likewise
     quantiles : (nq,) half widths of the 95 % intervals, in standard deviations
         1.96, or Student's for a variance that was estimated.
-    estimates : by name, all parameters of the user
+    estimates : by name, all parameters of the user but the shares of a field
     derived : by name, the moduli of the other convention
     nuisance : by name, standard deviation of each parameter of a single experiment
         In the unit it is estimated in, that is deviations of its prior; NaN at a bound.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...fem.body import Body
+from ...fem.constants import is_mode
 from ...fem.mesh import TetMesh
 from ...fem.mesh_checks import edge_lengths, mean_ratios
 from ...fem.moduli import engineering
@@ -153,6 +155,20 @@ def _areas(triangles: Array) -> Array:
     return np.linalg.norm(normals, axis=1) / 2
 
 
+# Shapes that hold less of a field's variance leave most of it to the interval.
+FEW_SHAPES = 0.5
+
+
+@dataclass(frozen=True)
+class FieldShapes:
+    """The shapes of a field, what of its variance they have, and half the shortest wave length."""
+
+    modes: int
+    length_m: float
+    share: float
+    detail_m: float
+
+
 @dataclass(frozen=True)
 class BodyFinding:
     """One body.
@@ -169,6 +185,7 @@ class BodyFinding:
     guess : mapping of the constants, and of E and ν at small strain, to their values at the guess
     concerns : tuple of Concern
         What the elements will do to the answer; `warnings` are their sentences.
+    fields : by the name of its constant, what differs from place to place
     """
 
     TOLD: ClassVar = ("warnings",)
@@ -187,6 +204,7 @@ class BodyFinding:
     cells_across: float
     guess: dict[str, float]
     concerns: tuple[Concern, ...]
+    fields: dict[str, FieldShapes]
 
     @property
     def diagonal_m(self) -> float:
@@ -201,7 +219,12 @@ class BodyFinding:
 
 def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyFinding:
     """Measure a body, with the constants θ at the guess."""
-    mesh = body.mesh
+    mesh, modes = body.mesh, {part.field_name: part.field for part in body.parts}
+    fields = {
+        name: FieldShapes(each.field.modes, each.length_m, each.share, each.detail_m)
+        for name, each in modes.items()
+        if each is not None
+    }
     quality, worst, shape = mesh.quality(), worst_elements(mesh), slenderness(mesh)
     x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
     return BodyFinding(
@@ -218,8 +241,16 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
         worst_elements=worst,
         cells_across=shape.cells_across,
         guess=_guess(body, theta),
-        concerns=tuple(element_concerns(body, theta, shape, worst[0])),
+        concerns=(*element_concerns(body, theta, shape, worst[0]), *_field_concerns(fields)),
+        fields=fields,
     )
+
+
+def _field_concerns(fields: Mapping[str, FieldShapes]) -> Iterator[Concern]:
+    """Too few shapes for how fast a field may change."""
+    for name, field in fields.items():
+        if field.share < FEW_SHAPES:
+            yield Concern("field/shapes", data={"name": name, **vars(field)})
 
 
 def _guess(body: Body, theta: Array) -> dict[str, float]:
@@ -227,7 +258,8 @@ def _guess(body: Body, theta: Array) -> dict[str, float]:
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering(*lame)
         moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
-    return moduli | dict(zip(body.constants, theta.tolist(), strict=True))
+    constants = zip(body.constants, theta.tolist(), strict=True)
+    return moduli | {name: value for name, value in constants if not is_mode(name)}
 
 
 # Of the mean edge: nodes this near the held ones' box belong to it or not by chance.
