@@ -158,7 +158,7 @@ class Identified:
         with reading_run(folder):
             replay = Replay.from_arrays(segment.experiment.name, read_arrays(folder))
             body = segment.body
-            if replay.undeformed_m.shape != body.nodes_m.shape:
+            if replay.undeformed_m.shape != body.nodes.points_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
         corrected, rolled_out_m = segment.corrected(phi), replay.rolled_out_positions_m
         touched = tuple(obstacle.name for obstacle in corrected.obstacles)
