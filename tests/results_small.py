@@ -69,6 +69,7 @@ def a_result(parameters: Mapping[str, FoundValue] | None = None, **changes: Any)
         probes=(),
         places={},
         nuisance={},
+        fields={},
         uncertainty=None,
         scan=None,
         fit=FIT,
