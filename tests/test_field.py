@@ -204,6 +204,16 @@ def test_a_field_that_cannot_be_is_refused(stated: dict, message: str):
         bar(cs.Field(**({"length_m": 0.05} | stated)))
 
 
+def test_bodies_of_other_meshes_do_not_share_a_field():
+    (one,) = problem().experiments
+    other = Body(
+        cs.box_mesh(SIZE_M, (2, 2, 5)), density_kg_m3=100.0, field=cs.Field(0.05, modes=20)
+    )
+    second = replace(swung(other), name="second")
+    with pytest.raises(cs.InputError, match="two bodies have a field of young_pa"):
+        cs.Problem([one, second], {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)})
+
+
 def test_a_field_of_nothing_is_refused():
     with pytest.raises(cs.InputError, match="all is claimed"):
         bar(cs.Field(0.05), np.ones(144, dtype=bool))

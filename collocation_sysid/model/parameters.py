@@ -26,6 +26,7 @@ from ..fem.constants import (
     bare,
     constant_named,
     is_density,
+    is_mode,
     is_modulus,
     usual_value,
 )
@@ -249,7 +250,8 @@ class Parameters:
                 )
 
     def __repr__(self) -> str:
-        return f"Parameters({', '.join(map(_stated, self.items))})"
+        told = (item for item in self.items if not is_mode(item.name))
+        return f"Parameters({', '.join(map(_stated, told))})"
 
     @classmethod
     def of(cls, given: Mapping[str, Unknown | Tied | float]) -> Parameters:

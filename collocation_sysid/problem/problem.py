@@ -7,6 +7,9 @@ from dataclasses import KW_ONLY, field, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
+from ..arrays import Array
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..methods import METHODS, require_method
@@ -204,6 +207,7 @@ class Problem:
                 where="transcription.substeps",
             )
         self.parameters.fit(self.bodies)
+        _require_one_of_each_field(self.bodies)
         locals_of([each for each in self.experiments if not each.validation], 0)
         for experiment in self.experiments:
             with located(where=f"experiment '{experiment.name}'"):
@@ -218,6 +222,19 @@ class Problem:
                     f"found {name!r}; expected estimated parameters, {', '.join(free)}",
                     where="uncertainty.profile",
                 )
+
+
+def _require_one_of_each_field(bodies: Iterable[Body]) -> None:
+    """Refuse shapes that differ and would share what is estimated of them."""
+    found: dict[str, Array] = {}
+    for part in (part for body in bodies for part in body.parts if part.field):
+        assert part.field is not None
+        shapes = part.field.shapes
+        if not np.array_equal(found.setdefault(part.field_name, shapes), shapes):
+            raise InputError(
+                f"two bodies have a field of {part.field_name}, whose shapes differ as their "
+                "meshes do; expected one body, or fields of regions with names of their own"
+            )
 
 
 def _weighed(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[Experiment, ...]:
