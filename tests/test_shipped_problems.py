@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from collocation_sysid import Problem, run, solve
+from collocation_sysid import Problem, run, simulate, solve
 from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
 from collocation_sysid.pipeline import Run
 from collocation_sysid.program.wrench import without_sensors
@@ -179,6 +179,50 @@ def test_pressed_cylinders_are_predicted_within_their_repeatability():
     floor_n = np.sqrt(np.mean(np.var(loads_n, axis=0, ddof=1)))
     missed_n = [found.rollouts[name].wrench_rms[0] for name in ("A2", "A4")]
     assert np.sqrt(np.mean(np.square(missed_n))) < 1.2 * floor_n
+
+
+STROKE = {"c10_pa": 1.2e4, "c20_pa": -250.0, "c30_pa": 35.0, "kappa_pa": 2e6}
+
+
+def pressed_n(problem: Problem, friction: float) -> np.ndarray:
+    """Loads of a whole specimen."""
+    still = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    found = simulate(problem.experiments[0], {**STROKE, **still, "platen_friction": friction})
+    return -4 * found.wrenches[0][:, 2]
+
+
+def test_an_eighth_of_a_cylinder_stands_for_the_whole_and_its_friction_resists(tmp_path: Path):
+    """Without friction the state is uniform, and what the load is can be written down."""
+    compressed_mm = np.array([0.0, 3.0, 6.0])
+    rows = [f"{6 * mm:g},{mm:g},0,{-mm / 30:.9f}" for mm in compressed_mm]
+    head = "Time (s),Compression (mm),Load (N),Engineering Strain [-]"
+    for name in ("A1", "A2", "A3", "A4", "A5"):
+        (tmp_path / f"EF30_0T_{name}.csv").write_text("\n".join([head, *rows]) + "\n")
+    folder = PROBLEMS / "phantom_compression"
+    changes = ["experiment.A1.every=1", f"object.mesh={folder / 'eighth.vtu'}"]
+    problem = Problem.read(folder / "whole_stroke.toml", changes, folder=tmp_path)
+    stretch = 1 - compressed_mm / 30
+    past = stretch**2 + 2 / stretch - 3
+    slope_pa = STROKE["c10_pa"] + 2 * STROKE["c20_pa"] * past + 3 * STROKE["c30_pa"] * past**2
+    uniform_n = 2 * (1 / stretch**2 - stretch) * slope_pa * np.pi * 0.025**2
+    sliding_n, rubbing_n = pressed_n(problem, 0.0), pressed_n(problem, 0.4)
+    np.testing.assert_allclose(sliding_n[1:], uniform_n[1:], rtol=0.01)
+    # Of a thin slab that slides all over, the mean pressure grows by about μ d/(3 h).
+    slab = 0.4 * 50 / 30 / 3 / stretch**1.5
+    more = rubbing_n[1:] / sliding_n[1:] - 1
+    assert (0.5 * slab[1:] < more).all()
+    assert (more < 1.5 * slab[1:]).all()
+
+
+@pytest.mark.slow
+def test_one_silicone_and_one_friction_press_to_a_third_of_the_height():
+    problem = measured("phantom_compression", "PHANTOM_DATA", "whole_stroke.toml")
+    alone = solve(replace(problem, experiments=problem.experiments[:1]))
+    assert alone.status.converged
+    largest_n = np.abs(alone.collocation.segments[0].experiment.obstacles[0].wrench.values).max()
+    assert pooled_wrench_rms(alone)[0] < 0.002 * largest_n
+    assert 6.8e4 < 6 * alone.parameters["c10_pa"] < 7.9e4
+    assert 0.15 < alone.parameters["platen_friction"] < 0.6
 
 
 @pytest.mark.slow
