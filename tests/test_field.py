@@ -224,7 +224,7 @@ def test_the_likeliest_of_several_lengths_is_taken():
     run = cs.run(several, seek_causes=False)
     assert run.problem.lengths_m == {"young_pa": 0.05}
     found = run.result.fields["young_pa"]
-    assert found.length_m == 0.05
+    assert found.shapes.length_m == 0.05
     assert found.likelier["0.05"] == 0.0 > found.likelier["0.005"]
     assert "length 0.05 m, ln evidence of 0.005 m -" in str(run)
 

@@ -131,6 +131,27 @@ class Laplacian:
         return float(own / (own + (splu(operator).solve(finer) ** 2).sum() / PROBES))
 
 
+@dataclass(frozen=True)
+class FieldShapes:
+    """What the shapes of a field can show.
+
+    Attributes
+    ----------
+    modes : int
+    length_m, amplitude : float
+    share : float
+        What of its variance they have; the rest is of finer ones.
+    detail_m : float
+        Half the shortest wave length.
+    """
+
+    modes: int
+    length_m: float
+    amplitude: float
+    share: float
+    detail_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class FieldModes:
     """A field as the body evaluates it.
@@ -196,9 +217,11 @@ class FieldModes:
         return tuple(mode(k) for k in range(self.field.modes))
 
     @property
-    def detail_m(self) -> float:
-        """Half the wave length of the finest shape."""
-        return float(np.pi / np.sqrt(self.laplacian.values[-1]))
+    def told(self) -> FieldShapes:
+        """The same in numbers."""
+        detail_m = float(np.pi / np.sqrt(self.laplacian.values[-1]))
+        own = self.field.modes, self.length_m, self.field.amplitude
+        return FieldShapes(*own, self.share, detail_m)
 
     def split_in_eight(self) -> FieldModes:
         """The same field of a mesh whose cells are cut in eight."""

@@ -10,6 +10,7 @@ from ..arrays import Array
 from ..display import short
 from ..errors import InputError
 from ..fem.constants import is_mode, symbol_of, unit_of
+from ..fem.field import FieldShapes
 from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
 from ..statistics.diagnostics import MarkerDiagnosis
@@ -69,22 +70,14 @@ class FoundField:
     share_told : float or None
         Of the volume, where the interval is less than half as wide as the prior's.
     identified : int or None
-        How many independent shapes the data tell, of `modes`.
-    detail_m : float
-        Half the wave length of the finest shape.
-    finer : float
-        Deviation of the logarithm that is left to finer shapes.
+        How many independent shapes the data tell.
     likelier : mapping of length in metres to the logarithm of how much likelier it is
     """
 
-    length_m: float
-    amplitude: float
-    modes: int
+    shapes: FieldShapes
     range: tuple[float, float]
     share_told: float | None
     identified: int | None
-    detail_m: float
-    finer: float
     likelier: Mapping[str, float]
 
     def sentence(self, name: str) -> str:
@@ -93,15 +86,13 @@ class FoundField:
         said = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
         if self.identified is None or self.share_told is None:
             return said
+        shapes = f"{self.identified} of {self.shapes.modes} shapes of its field"
         told = f"{self.share_told:.0%} of the volume better than the prior by half"
-        chosen = ""
+        beside = [f"details above {short(1e3 * self.shapes.detail_m)} mm"]
         if len(self.likelier) > 1:
-            each = (f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
-            chosen = f"; length {self.length_m:g} m, ln evidence of {', '.join(each)}"
-        return (
-            f"{said}: the data tell {self.identified} of {self.modes} shapes of its field, and "
-            f"{told} (details above {short(1e3 * self.detail_m)} mm{chosen})"
-        )
+            each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
+            beside.append(f"length {self.shapes.length_m:g} m, ln evidence of {each}")
+        return f"{said}: the data tell {shapes}, and {told} ({'; '.join(beside)})"
 
 
 @dataclass(frozen=True)

@@ -146,20 +146,13 @@ def _uncertainty(answer: Answer) -> FoundUncertainty | None:
 
 
 def _field(found: FieldEstimate) -> FoundField:
-    modes = found.modes
-    volumes = modes.volumes_m3 / modes.volumes_m3.sum()
-    known = bool(np.isfinite(found.deviation).all())
-    return FoundField(
-        modes.length_m,
-        modes.field.amplitude,
-        modes.field.modes,
-        (float(found.value.min()), float(found.value.max())),
-        float(volumes[found.told].sum()) if known else None,
-        found.identified if known else None,
-        modes.detail_m,
-        modes.left_out,
-        {f"{each:g}": found.likelier(each) for each in modes.field.lengths_m} if known else {},
-    )
+    modes, volumes_m3 = found.modes, found.modes.volumes_m3
+    ends, told = (float(found.value.min()), float(found.value.max())), found.told
+    if not np.isfinite(found.deviation).all():
+        return FoundField(modes.told, ends, None, None, {})
+    share = float(volumes_m3[told].sum() / volumes_m3.sum())
+    likelier = {f"{each:g}": found.likelier(each) for each in modes.field.lengths_m}
+    return FoundField(modes.told, ends, share, found.identified, likelier)
 
 
 def _recordings(answer: Answer) -> dict[str, RecordingsAgreement] | None:

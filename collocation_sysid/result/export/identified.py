@@ -142,7 +142,9 @@ class Identified:
         with reading_run(folder):
             warnings = _warnings(result)
         problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
-        problem = problem.with_lengths({n: each.length_m for n, each in result.fields.items()})
+        problem = problem.with_lengths(
+            {n: each.shapes.length_m for n, each in result.fields.items()}
+        )
         if problem.parameters.free:
             problem = answer.started(problem)  # which may state no guess itself
         collocation = problem.collocation()

@@ -11,6 +11,7 @@ import numpy as np
 from ...arrays import Array
 from ...fem.body import Body
 from ...fem.constants import is_mode
+from ...fem.field import FieldShapes
 from ...fem.mesh import TetMesh
 from ...fem.mesh_checks import edge_lengths, mean_ratios
 from ...fem.moduli import engineering
@@ -160,16 +161,6 @@ FEW_SHAPES = 0.5
 
 
 @dataclass(frozen=True)
-class FieldShapes:
-    """The shapes of a field, what of its variance they have, and half the shortest wave length."""
-
-    modes: int
-    length_m: float
-    share: float
-    detail_m: float
-
-
-@dataclass(frozen=True)
 class BodyFinding:
     """One body.
 
@@ -219,12 +210,8 @@ class BodyFinding:
 
 def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyFinding:
     """Measure a body, with the constants θ at the guess."""
-    mesh, modes = body.mesh, {part.field_name: part.field for part in body.parts}
-    fields = {
-        name: FieldShapes(each.field.modes, each.length_m, each.share, each.detail_m)
-        for name, each in modes.items()
-        if each is not None
-    }
+    mesh = body.mesh
+    fields = {part.field_name: part.field.told for part in body.parts if part.field}
     quality, worst, shape = mesh.quality(), worst_elements(mesh), slenderness(mesh)
     x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
     return BodyFinding(
