@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,8 +22,20 @@ from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.recording import Experiment, Grasp, PoseSequence
+from collocation_sysid.recording import (
+    Capsule,
+    Cuboid,
+    Cylinder,
+    Experiment,
+    Grasp,
+    Obstacle,
+    Plane,
+    PoseSequence,
+    Solid,
+    Sphere,
+)
 from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
+from collocation_sysid.result.export.identified import alone
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
@@ -464,6 +477,69 @@ def test_mujoco_swings_alike(tmp_path):
     assert abs(frequency.relative) < 1e-6  # the same energy, mesh and masses
     assert motion.ours > 1e-3
     assert abs(motion.relative) < 0.03
+
+
+def laid_block(shape: Solid) -> Identified:
+    """A block let go a millimetre above something, as if a run had identified it."""
+    block = Body(box_mesh((0.04, 0.04, 0.04), (2, 2, 2)), "st-venant-kirchhoff", 300.0)
+    t_s = np.linspace(0.0, 0.3, 31)
+    table = Obstacle(shape=shape, name="table", friction=0.5)
+    seen = vertex_markers(block, np.array([0]), t_s)
+    fallen = Experiment(block, t_s, [table], seen, start="undeformed", nuisance=IDEAL)
+    values = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.02, "gamma_m_1_s": 0.0}
+    motion = simulate(fallen, values, "bdf2", substeps=4).positions_m
+    still = alone(fallen)
+    theta, shapes = still.body.theta(values), motion[:, : len(block.nodes_m)]
+    return Identified("b", "good", (), {}, still.body, theta, still, shapes, fallen.obstacles)
+
+
+LAID_ON = {
+    "plane": Plane(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -0.001])),
+    "box": Cuboid(np.array([(-0.1, -0.1, -0.05), (0.1, 0.1, -0.001)])),
+}
+
+
+@needs_mujoco
+@pytest.mark.parametrize("name", LAID_ON)
+def test_a_block_rests_as_high_on_what_mujoco_gets(name, tmp_path):
+    import mujoco
+
+    body = laid_block(LAID_ON[name])
+    model = mujoco.MjModel.from_xml_path(str(exported(body, "mujoco", tmp_path) / "body.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    while data.time < 0.3:
+        mujoco.mj_step(model, data)
+    height_m = (data.qpos.reshape(-1, 3) + body.nodes_m)[:, 2].mean()
+    assert body.rolled_out_m is not None
+    fallen_m = body.nodes_m[:, 2].mean() - body.rolled_out_m[-1, :, 2].mean()
+    assert fallen_m > 1e-3
+    assert height_m == pytest.approx(body.rolled_out_m[-1, :, 2].mean(), abs=0.05 * fallen_m)
+
+
+def test_all_solids_are_geoms_and_what_a_geom_lacks_is_said(tmp_path):
+    ends = np.array([(0.0, 0.0, -0.01), (0.0, 0.04, -0.01)])
+    body = laid_block(LAID_ON["plane"])
+    solids = [
+        Sphere(0.01, np.array([0.02, 0.02, -0.02])),
+        Cylinder(0.005, ends, 0.001),
+        Capsule(0.005, ends),
+    ]
+    others = [replace(body.obstacles[0], shape=s, name=f"it {k}") for k, s in enumerate(solids)]
+    several = replace(body, obstacles=(*body.obstacles, *others))
+    model = exported(several, "mujoco", tmp_path)
+    geoms = ElementTree.parse(model / "body.xml").findall(".//geom")
+    assert [geom.get("type") for geom in geoms] == ["plane", "sphere", "cylinder", "capsule"]
+    assert {geom.get("friction") for geom in geoms} == {"0.5 0 0"}
+    told = json.loads((model / "identified.json").read_text())
+    assert told["obstacles"][1]["shape"]["sphere_m"]["radius_m"] == 0.01
+    said = " ".join(told["not_expressed"])
+    assert "it 1: its edges are not rounded" in said
+    assert "table" not in said
+    for other in ("calculix", "febio", "newton"):
+        folder = exported(several, other, tmp_path)
+        left_out = json.loads((folder / "identified.json").read_text())["not_expressed"]
+        assert any("what it may touch is not exported: table, it 0" in each for each in left_out)
 
 
 @needs_mujoco

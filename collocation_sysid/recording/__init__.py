@@ -27,6 +27,7 @@ from .solids import Capsule as Capsule
 from .solids import Cuboid as Cuboid
 from .solids import Cylinder as Cylinder
 from .solids import Plane as Plane
+from .solids import Solid as Solid
 from .solids import Sphere as Sphere
 from .tables import displaced_axes as displaced_axes
 from .tables import read_displacement as read_displacement

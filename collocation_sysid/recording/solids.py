@@ -297,6 +297,11 @@ KINDS: dict[str, type[Solid]] = {
 }
 
 
+def name_of(solid: Solid) -> str:
+    """What files call its kind."""
+    return next(name for name, kind in KINDS.items() if isinstance(solid, kind))
+
+
 def solid_of(section: SolidSection) -> Solid:
     """What a table states."""
     ((name, own),) = ((name, own) for name, own in section if own is not None)

@@ -52,7 +52,7 @@ def export_run(body: Identified, to: str, folder: str | Path) -> Exported:
             (place / name).write_text(text, encoding="utf-8")
         content = {**body.as_dict(), "not_expressed": exported.limits}
         (place / NUMBERS).write_text(as_json(content) + "\n", encoding="utf-8")
-        for k, grasp in enumerate(body.experiment.grasps, start=1):
+        for k, grasp in enumerate((*body.experiment.grasps, *body.obstacles), start=1):
             write_poses_csv(place / f"poses_{k}.csv", grasp.poses)
     return exported
 

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array, Index
-from ...errors import InputError, listed
+from ...errors import InputError, listed, located
 from ...fem.body import Body
 from ...fem.moduli import engineering
 from ...problem import Problem
-from ...recording import Experiment
+from ...recording import Experiment, Obstacle
+from ...recording.solids import name_of
 from ...runs.result import FoundValue, Result
 from ...runs.warm_start import Earlier
 from ..replay import Replay, read_arrays, reading_run
@@ -74,15 +75,19 @@ class IdentifiedRegion:
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
 
-def _alone(experiment: Experiment, folder: Path) -> Experiment:
-    """The experiment without obstacles, which no export has."""
+def alone(experiment: Experiment) -> Experiment:
+    """The experiment without obstacles, which targets have beside the body if at all."""
+    own = len(experiment.body.nodes.points_m)
+    started = {
+        name: None if (given := getattr(experiment, name)) is None else given[:own]
+        for name in ("start_positions_m", "start_velocities_m_s")
+    }
     try:
-        return replace(experiment, grasps=experiment.gripping)
+        return replace(experiment, grasps=experiment.gripping, **started)
     except InputError as error:
         raise InputError(
-            "exports leave obstacles out, and nothing else carries this body; expected a recording "
-            "in which it is grasped",
-            folder,
+            "exports have no equilibrium of a body that obstacles alone carry; expected a "
+            "recording in which it is grasped, or that starts undeformed"
         ) from error
 
 
@@ -102,8 +107,8 @@ class Identified:
     experiment : Experiment
         With gravity and grasps as they were found.
     rolled_out_m : (T, n, 3) our prediction at the samples, or None
-    obstacles : tuple of str
-        Names of what it may touch, which is left out.
+    obstacles : tuple of Obstacle
+        What it may touch, where it was found to be; frictions are numbers.
     """
 
     title: str
@@ -114,7 +119,7 @@ class Identified:
     theta: Array
     experiment: Experiment
     rolled_out_m: Array | None
-    obstacles: tuple[str, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
 
     @classmethod
     def read(
@@ -163,9 +168,13 @@ class Identified:
             if replay.undeformed_m.shape != body.nodes.points_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
         corrected, rolled_out_m = segment.corrected(phi), replay.rolled_out_positions_m
-        touched = tuple(obstacle.name for obstacle in corrected.obstacles)
+        touched = tuple(
+            replace(o, friction=values[o.friction]) if isinstance(o.friction, str) else o
+            for o in corrected.obstacles
+        )
         if touched:
-            corrected = _alone(corrected, folder)
+            with located(folder):
+                corrected = alone(corrected)
             body = corrected.body
             rolled_out_m = None if rolled_out_m is None else rolled_out_m[:, : len(body.nodes_m)]
         return cls(
@@ -301,6 +310,17 @@ class Identified:
                     "pose_quaternions_xyzw": grasp.poses.quaternions_xyzw,
                 }
                 for grasp in e.grasps
+            ],
+            "obstacles": [
+                {
+                    "name": each.name,
+                    "shape": {name_of(each.shape): each.shape},
+                    "friction": each.friction,
+                    "pose_t_s": each.poses.t_s,
+                    "pose_positions_m": each.poses.positions_m,
+                    "pose_quaternions_xyzw": each.poses.quaternions_xyzw,
+                }
+                for each in self.obstacles
             ],
             "node_loads_n": self.loads_n,
         }

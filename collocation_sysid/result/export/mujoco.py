@@ -17,7 +17,8 @@ from ...arrays import Array
 from ...errors import InputError
 from ...model.forces import Forces
 from ...program.modes import natural_modes
-from ...recording import Grasp
+from ...recording import Capsule, Cuboid, Cylinder, Grasp, Plane, Solid, Sphere
+from ...recording.solids import name_of
 from .identified import Identified
 from .target import Comparison, Exported, Holds, heading, linear_cells, numbers
 
@@ -40,6 +41,7 @@ HOLDS = Holds(
     "damping by mass, γ_m = {gamma_m_1_s:.4g} 1/s, is not known, and MuJoCo refuses dampers on the "
     "nodes of a flex",
     motion=True,
+    obstacles=True,
 )
 
 
@@ -65,11 +67,12 @@ def export(body: Identified) -> Exported:
             "set position and velocity of the free joints at every step, as --verify does"
         )
     step_s = _step_s(body)
+    limits += _lost_of_obstacles(body)
     x = heading(body, limits, "<!-- ", " -->")
     x += f"<mujoco model={quoteattr(body.title or 'body')}>\n"
     gravity = numbers(body.experiment.gravity_m_s2)
     x += f'<option timestep="{step_s!r}" gravity="{gravity}" jacobian="sparse"/>\n'
-    x += f"<worldbody>\n{_grasps(body)}{_nodes(body)}</worldbody>\n"
+    x += f"<worldbody>\n{_grasps(body)}{_obstacles(body, step_s)}{_nodes(body)}</worldbody>\n"
     x += f"<deformable>\n{_flexes(body)}</deformable>\n"
     x += f"<equality>\n{_welds(body, step_s)}</equality>\n"
     x += f"<keyframe>\n{_start(body)}</keyframe>\n"
@@ -92,6 +95,66 @@ def _grasps(body: Identified) -> str:
             f'diaginertia="{turning!r} {turning!r} {turning!r}"/></body>\n'
         )
     return lines
+
+
+def _obstacles(body: Identified, step_s: float) -> str:
+    """Of each a mocap body with its solid, as hard as the step allows, and its friction.
+
+    It is as much smaller as the flex has a skin, so that they touch where ours do.
+    """
+    lines, skin = "", SKIN * _edge_m(body)
+    for k, each in enumerate(body.obstacles):
+        position, turn = _pose(each, body.start_s)
+        rubs = float(each.friction)
+        lines += (
+            f'<body name="obstacle{k}" mocap="true" pos="{numbers(position)}" '
+            f'quat="{numbers(turn)}"><geom name={quoteattr(each.name)} {_geom(each.shape, skin)} '
+            f'priority="1" condim="{3 if rubs else 1}" friction="{rubs!r} 0 0" '
+            f'solref="{2 * step_s!r} 1"/></body>\n'
+        )
+    return lines
+
+
+def _geom(solid: Solid, skin: float) -> str:
+    """Type, place and size of a geom that is so much smaller."""
+    if isinstance(solid, Plane):
+        turn = Rotation.align_vectors(solid.normal[None], np.array([[0.0, 0.0, 1.0]]))[0]
+        place = solid.point_m - skin * solid.normal
+        at = f'pos="{numbers(place)}" quat="{numbers(np.roll(turn.as_quat(), 1))}"'
+        return f'type="plane" size="0 0 1" {at}'
+    if isinstance(solid, Sphere):
+        return (
+            f'type="sphere" size="{_less(solid.radius_m, skin)!r}" pos="{numbers(solid.centre_m)}"'
+        )
+    if isinstance(solid, Cuboid):
+        half = [_less(each, skin) for each in np.diff(solid.corners_m, axis=0)[0] / 2]
+        return f'type="box" size="{numbers(half)}" pos="{numbers(solid.middle_m)}"'
+    assert isinstance(solid, (Cylinder, Capsule))
+    middle, size = solid.ends_m.mean(axis=0), _less(solid.radius_m, skin)
+    half = float(np.linalg.norm(np.diff(solid.ends_m, axis=0))) / 2
+    share = _less(half, skin) / half if isinstance(solid, Cylinder) else 1.0
+    ends = middle + share * (solid.ends_m - middle)
+    return f'type="{name_of(solid)[:-2]}" size="{size!r}" fromto="{numbers(ends)}"'
+
+
+def _less(length_m: float, by_m: float) -> float:
+    """So much less, but not less than half."""
+    return max(float(length_m) - by_m, float(length_m) / 2)
+
+
+def _lost_of_obstacles(body: Identified) -> list[str]:
+    """What of them it does not hold."""
+    said = []
+    for each in body.obstacles:
+        if getattr(each.shape, "rounding_m", 0.0):
+            said.append(f"{each.name}: its edges are not rounded")
+        if each.faces is not None:
+            said.append(f"{each.name}: all of the body may touch it")
+        if len(each.poses.t_s) > 1:
+            said.append(
+                f"{each.name} is where it is at the first sample; its poses have the motion"
+            )
+    return said
 
 
 def _welds(body: Identified, step_s: float) -> str:
@@ -267,6 +330,8 @@ def _drive(body: Identified, mujoco: ModuleType, data: Any, step: tuple[float, f
         mujoco.mju_subQuat(turning, there[1], here[1])
         data.qpos[7 * k : 7 * k + 7] = np.concatenate(here)
         data.qvel[6 * k : 6 * k + 6] = np.concatenate([there[0] - here[0], turning]) / step_s
+    for k, each in enumerate(body.obstacles, len(body.experiment.grasps)):
+        data.mocap_pos[k], data.mocap_quat[k] = _pose(each, min(t_s, last_s))
 
 
 def _rms(way: Array) -> float:

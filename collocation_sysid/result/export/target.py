@@ -99,6 +99,8 @@ class Holds:
         where they are not held.
     forces : str
         What is said where forces act on nodes, empty where they are held.
+    obstacles : bool
+        What the body may touch.
     tried : bool
         Whether the simulator itself has ever read such files.
     """
@@ -112,11 +114,15 @@ class Holds:
     motion: bool = False
     forces: str = "forces on nodes are left out"
     quadratic: bool = False
+    obstacles: bool = False
     tried: bool = True
 
     def lost(self, body: Identified) -> list[str]:
         """What it does not hold of a body, and what was done instead."""
         said = [*_never_held(body)]
+        if body.obstacles and not self.obstacles:
+            names = ", ".join(each.name for each in body.obstacles)
+            said.append(f"what it may touch is not exported: {names}")
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             told = [
@@ -147,8 +153,6 @@ def _never_held(body: Identified) -> Iterator[str]:
         yield "tendons and pressures are not exported"
     if e.body.forces:
         yield f"{', '.join(f.name for f in e.body.forces)} of your own is not exported"
-    if body.obstacles:
-        yield f"what it may touch is not exported: {', '.join(body.obstacles)}"
     if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
         yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.holds(times).all() for grasp in e.grasps):
