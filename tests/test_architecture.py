@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
+from functools import cache
 from graphlib import TopologicalSorter
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import pytest
@@ -44,12 +45,18 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+@cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse(MODULES[name].read_text())
+
+
+@cache
 def imports(name: str) -> set[str]:
     """Modules of the package that one imports, also those inside functions and for types alone."""
     path = MODULES[name]
     folder = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
     found = set()
-    for statement in ast.walk(ast.parse(path.read_text())):
+    for statement in ast.walk(tree_of(name)):
         if not isinstance(statement, ast.ImportFrom) or statement.level == 0:
             continue
         base = folder[: len(folder) - statement.level + 1]
@@ -91,7 +98,7 @@ TWICE = (
 
 
 def test_a_class_name_occurs_once():
-    trees = [ast.parse(path.read_text()) for path in MODULES.values()]
-    names = Counter(n.name for tree in trees for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
+    nodes = chain.from_iterable(ast.walk(tree_of(name)) for name in MODULES)
+    names = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
     twice = {name for name, count in names.items() if count > 1}
     assert twice <= set(TWICE.split())
