@@ -55,6 +55,8 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 
 def new_body(mesh, material: str | Callable = "neo-hookean", evaluator: str = "auto") -> Body:
+    """As in a process of its own."""
+    jit.compiled.cache_clear()
     return Body(mesh, material, 30.0, damping="rayleigh", evaluator=evaluator)
 
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import casadi as ca
 
@@ -36,8 +37,11 @@ from .kernel import Derivative, Outputs, Pieces, PointKernel, QuadraturePoint
 from .materials import Damping, Material
 from .mean_dilatation import averaging_kernel
 
+# Bodies of the same law and element share their kernels: so many of these are kept.
+KEPT = 64
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True)
 class Law:
     """What a quadrature point obeys: a material and a damping law, with or without memory.
 
@@ -158,12 +162,14 @@ def _damping(point: QuadraturePoint, law: Law) -> tuple[ca.SX, ca.SX] | None:
     return None if found is None else (point.volume * found[0], point.volume * found[1])
 
 
+@lru_cache(KEPT)
 def energy_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic energy Ψ of the point [J]."""
     point = point_of(element, law, "x", carried=0)
     return kernel_of("energy", point, {"energy": (Derivative(_energy(point, law), ()),)})
 
 
+@lru_cache(KEPT)
 def force_kernel(element: Element, law: Law) -> PointKernel:
     """Elastic and damping force on the nodes [N]."""
     point = point_of(element, law, "x", "v")
@@ -174,6 +180,7 @@ def force_kernel(element: Element, law: Law) -> PointKernel:
     return kernel_of("force", point, {"force": force})
 
 
+@lru_cache(KEPT)
 def linearisation_kernel(element: Element, law: Law) -> PointKernel:
     """Force with its derivatives by position, velocity and θ (Rayleigh: −K − γ_r D_vK, −γ_r K)."""
     point = point_of(element, law, "x", "v")
@@ -198,6 +205,7 @@ def linearisation_kernel(element: Element, law: Law) -> PointKernel:
     return kernel_of("linearisation", point, outputs)
 
 
+@lru_cache(KEPT)
 def curvature_kernel(element: Element, law: Law) -> PointKernel:
     """Second derivatives of φ = wᵀ f(x, v; θ) + σ·S, and ∂φ/∂θ, which the chain rule needs.
 

@@ -112,6 +112,14 @@ class PointKernel:
         """All of them, the last one included."""
         return (*self.earlier, Phase(self.pieces, self.contractions | self.coupled))
 
+    @cached_property
+    def source(self) -> str:
+        """What tells it from others."""
+        functions = [phase.pieces for phase in self.phases]
+        functions += [self.coupling] if self.coupling else []
+        contractions = f"{[phase.contractions for phase in self.phases]}"
+        return contractions + " ".join(function.serialize() for function in functions)
+
     def element_function(self, points: int) -> ca.Function:
         """The sum over an element, of fields, geometry (3·nodes + 1, points), θ and the like."""
         names = self.phases[0].pieces.name_in()

@@ -65,10 +65,10 @@ def combine_with_numpy(plan: Plan) -> Combiner:
 
 def combine_natively(plan: Plan) -> Combiner:
     """The same through a compiled loop."""
-    from .jit import CompiledFunction
+    from .jit import NativeCode, compiled
 
-    signature = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 7
-    run = CompiledFunction(_emit, "combine", "combine", signature)
+    signature = (*[ctypes.c_int64] * 3, *[ctypes.c_void_p] * 7)
+    run = compiled(NativeCode("combine", "combine", signature, _emit))
     constants = [
         array.ctypes.data for array in (plan.tasks, plan.coefficients, plan.targets, plan.sources)
     ]

@@ -47,13 +47,13 @@ def instances_by_casadi(function: ca.Function) -> Instances:
 def instances_natively(function: ca.Function) -> Instances:
     """The same in vector code, whose lanes are instances."""
     from .instructions import check_operations
-    from .jit import CompiledFunction, address, vector_lanes
+    from .jit import NativeCode, address, compiled, vector_lanes
 
     check_operations(function)
     lanes, arrays = vector_lanes(), function.n_in() + function.n_out()
     key = f"instances {lanes} {hashlib.sha256(function.serialize().encode()).hexdigest()}"
-    signature = [ctypes.c_int64, *[ctypes.c_void_p] * arrays]
-    run = CompiledFunction(lambda: _emit(function, lanes), "instances", key, signature)
+    signature = (ctypes.c_int64, *[ctypes.c_void_p] * arrays)
+    run = compiled(NativeCode("instances", key, signature, lambda: _emit(function, lanes)))
 
     def evaluate(inputs: list[Array]) -> list[Array]:
         count = inputs[0].shape[1]

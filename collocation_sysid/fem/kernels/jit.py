@@ -16,7 +16,8 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,9 @@ from platformdirs import user_cache_path
 DOUBLE, I32, I64 = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 DOUBLES, I32S = DOUBLE.as_pointer(), I32.as_pointer()
 Builder = Value = Any  # llvmlite is not annotated, and what is inferred of it is wrong
+
+# So many functions stay in memory for further bodies.
+KEPT = 128
 
 
 @contextmanager
@@ -90,37 +94,46 @@ def vector_lanes() -> int:
     return 4 if features.get("avx2") else 2
 
 
-class CompiledFunction:
-    """A native function, called through ctypes (which releases the interpreter lock).
+@dataclass(frozen=True)
+class NativeCode:
+    """A native function that is wanted.
 
-    Parameters
+    Attributes
     ----------
-    build : callable
-        Returns the IR module that defines `name`; only called when nothing is cached.
     name : str
         The function to look up.
     key : str
         Identifies the code: while the files of this folder stay, equal keys must mean equal IR.
-    signature : list of ctypes types
+    signature : tuple of ctypes types
+    build : callable
+        Returns the IR module that defines `name`; only called when nothing is cached.
     quickly : bool
         Compile it as it is written, in a fifth of the time; it then runs up to twice as long.
     """
 
-    def __init__(
-        self,
-        build: Callable[[], ir.Module],
-        name: str,
-        key: str,
-        signature: list[type],
-        quickly: bool = False,
-    ) -> None:
-        machine = _target_machine(quickly)
+    name: str
+    key: str
+    signature: tuple[type, ...]
+    build: Callable[[], ir.Module] = field(compare=False)
+    quickly: bool = False
+
+
+@lru_cache(KEPT)
+def compiled(code: NativeCode) -> CompiledFunction:
+    """The function, of which one serves all bodies."""
+    return CompiledFunction(code)
+
+
+class CompiledFunction:
+    """A native function, called through ctypes (which releases the interpreter lock)."""
+
+    def __init__(self, code: NativeCode) -> None:
+        machine = _target_machine(code.quickly)
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        code = _cached_object(build, key, machine, quickly)
-        self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        self._engine.add_object_file(llvm.ObjectFileRef.from_data(_cached_object(code, machine)))
         self._engine.finalize_object()
-        address = self._engine.get_function_address(name)
-        self._call = ctypes.CFUNCTYPE(None, *signature)(address)
+        address = self._engine.get_function_address(code.name)
+        self._call = ctypes.CFUNCTYPE(None, *code.signature)(address)
 
     def __call__(self, *arguments: object) -> None:
         """Run it on integers and addresses, as in the signature."""
@@ -135,17 +148,15 @@ def address(array: NDArray[Any]) -> int:
         return array.ctypes.data
 
 
-def _cached_object(
-    build: Callable[[], ir.Module], key: str, machine: llvm.TargetMachine, quickly: bool
-) -> bytes:
+def _cached_object(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
-    whole_key = f"{host}\n{_generation()}\n{key}" + "\nquickly" * quickly
-    code = load(whole_key)
-    if code is None:
-        code = _compile(build(), machine, quickly)
-        store(whole_key, code)
-    return code
+    whole_key = f"{host}\n{_generation()}\n{code.key}" + "\nquickly" * code.quickly
+    found = load(whole_key)
+    if found is None:
+        found = _compile(code.build(), machine, code.quickly)
+        store(whole_key, found)
+    return found
 
 
 @cache

@@ -29,9 +29,10 @@ from .jit import (
     I32S,
     I64,
     Builder,
-    CompiledFunction,
+    NativeCode,
     Value,
     address,
+    compiled,
     counting,
     vector_lanes,
 )
@@ -68,23 +69,14 @@ class SimdEvaluator:
             self._carried = _block_major(batch.carried[lane_element], by_block)
         tables = self._geometry, self._nodes, self._destinations
         self._tables = [address(table) for table in tables]
-        functions = [phase.pieces for phase in kernel.phases]
-        if kernel.coupling:
-            functions.append(kernel.coupling)
-        source = f"{[phase.contractions for phase in kernel.phases]}"
-        source += " ".join(function.serialize() for function in functions)
-        key = f"{lanes} {self._points} {hashlib.sha256(source.encode()).hexdigest()}"
+        key = f"{lanes} {self._points} {hashlib.sha256(kernel.source.encode()).hexdigest()}"
         # What points carry adds the length of its row, its places and itself.
         signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
         if kernel.carried:
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
-        self._run = CompiledFunction(
-            lambda: _Emitter(kernel, self._points, lanes).emit(),
-            "run",
-            key,
-            signature,
-            quickly=count * self._points < REPAID,
-        )
+        points = self._points
+        build, quickly = lambda: _Emitter(kernel, points, lanes).emit(), count * points < REPAID
+        self._run = compiled(NativeCode("run", key, tuple(signature), build, quickly))
 
     def __call__(
         self,

@@ -11,7 +11,6 @@ import ctypes
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,8 +26,10 @@ from .jit import (
     I64,
     Builder,
     CompiledFunction,
+    NativeCode,
     Value,
     address,
+    compiled,
     counting,
     vector_lanes,
 )
@@ -147,14 +148,13 @@ def _addresses(*arrays: NDArray[Any]) -> list[int]:
     return [address(array) for array in arrays]
 
 
-@cache
 def _compiled(name: str, sides: int) -> CompiledFunction:
     emit: Callable[[_Emitter], ir.Module] = getattr(_Emitter, name)
     integers, *arrays = ARGUMENTS[name]
     lanes = vector_lanes()
-    signature = [ctypes.c_int64] * integers + [ctypes.c_void_p] * sum(arrays)
+    signature = (*[ctypes.c_int64] * integers, *[ctypes.c_void_p] * sum(arrays))
     key = f"skyline {name} {sides} {lanes}"
-    return CompiledFunction(lambda: emit(_Emitter(lanes, sides)), name, key, signature)
+    return compiled(NativeCode(name, key, signature, lambda: emit(_Emitter(lanes, sides))))
 
 
 class _Emitter:
