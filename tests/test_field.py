@@ -28,7 +28,7 @@ KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
 
 def bar(field: cs.Field | None = None, stiff: np.ndarray | None = None, **changes) -> Body:
     regions = [] if stiff is None else [cs.Region("stiff", stiff)]
-    mesh = cs.box_mesh(SIZE_M, (2, 2, 6))
+    mesh = cs.box_mesh(SIZE_M, changes.pop("divisions", (2, 2, 6)))
     return Body(mesh, density_kg_m3=100.0, field=field, **({"regions": regions} | changes))
 
 
@@ -110,26 +110,44 @@ def test_pieces_that_do_not_touch_have_a_stiffness_each():
     assert upper[0] == pytest.approx(-lower[0])
 
 
-@pytest.mark.parametrize(
-    "kind", [{"element": "tet10-p0"}, {"evaluator": "casadi"}, {"prony": ["slow"]}], ids=str
-)
-def test_slopes_by_the_shares_are_those_of_differences(kind: dict, rng):
-    body = bar(cs.Field(0.05, modes=4), **kind)
+REMEMBERING, AVERAGING = {"prony": ["slow"]}, {"element": "tet10-p0"}
+SLOWLY = AVERAGING | {"evaluator": "casadi"}  # whose second derivatives take long to compile
+
+
+def uneven(kind: dict, rng: np.random.Generator) -> tuple[Body, list[np.ndarray], np.ndarray]:
+    """A body, places, velocities and weights of its nodes, and θ with shares at its end."""
+    body = bar(cs.Field(0.05, modes=4), divisions=(1, 1, 3), **kind)
     memory = {"slow.share": 0.3, "slow.tau_s": 0.1}
     shares = dict(zip(body.mode_names, rng.normal(size=4), strict=True))
-    theta = body.theta({**KNOWN, **memory, "young_pa": YOUNG_PA, **shares})
     x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
-    v, w = rng.normal(size=(2, *x.shape))
-    scale = np.zeros(len(theta))
-    scale[body.mode_places[0]] = 0.1
-    by_theta, curvature = body.linearise(x, v, theta).by_theta[0], body.curvature(x, v, w, theta)
-    assert_derivative(
-        lambda p: body.force(x, v, p)[0], lambda d: by_theta @ d, theta, rng, scale=scale
-    )
-    assert_derivative(
-        lambda p: body.curvature(x, v, w, p).theta[0],
-        lambda d: curvature.theta_theta[0] @ d, theta, rng, scale=scale,
-    )  # fmt: skip
+    theta = body.theta({**KNOWN, **memory, "young_pa": YOUNG_PA, **shares})
+    return body, [x, *rng.normal(size=(2, *x.shape))], theta
+
+
+def share_steps(body: Body) -> np.ndarray:
+    return 0.1 * np.isin(np.arange(len(body.constants)), np.r_[body.mode_places[0]])
+
+
+@pytest.mark.parametrize("kind", [REMEMBERING, AVERAGING, SLOWLY], ids=str)
+def test_slopes_by_the_shares_are_those_of_differences(kind: dict, rng):
+    body, (x, v, _), theta = uneven(kind, rng)
+    by_theta = body.linearise(x, v, theta).by_theta[0]
+
+    def force(at: np.ndarray) -> np.ndarray:
+        return body.force(x, v, at)[0]
+
+    assert_derivative(force, lambda d: by_theta @ d, theta, rng, scale=share_steps(body))
+
+
+@pytest.mark.parametrize("kind", [REMEMBERING, SLOWLY], ids=str)
+def test_curvature_by_the_shares_is_that_of_differences(kind: dict, rng):
+    body, (x, v, w), theta = uneven(kind, rng)
+    by_both = body.curvature(x, v, w, theta).theta_theta[0]
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        return body.curvature(x, v, w, at).theta[0]
+
+    assert_derivative(slope, lambda d: by_both @ d, theta, rng, scale=share_steps(body))
 
 
 def test_a_hidden_stiff_half_is_found():
