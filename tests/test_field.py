@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -297,6 +298,20 @@ def test_a_finer_mesh_has_the_same_field():
         for each in (body, finer)
     ]
     assert energies[1] == pytest.approx(energies[0], rel=1e-12)
+
+
+def test_a_file_states_fields_of_the_body_and_of_a_region(tiny: Path):
+    own = ["length_m=0.1", "modes=3", "parameter=gamma_r_s"]
+    core = "[{name = 'core', cells = {box_m = [[-1, -1, -1], [1, 1, 0.05]]}}]"
+    stated = [*(f"object.field.{each}" for each in own), f"object.region={core}"]
+    inside = ["object.region.core.field.length_m=[0.1, 0.2]", "object.region.core.field.modes=2"]
+    read = cs.Problem.read(tiny / "problem.toml", [*stated, *inside])
+    assert read.lengths_m == {"gamma_r_s": 0.1, "core.young_pa": 0.1}
+    free = [item.name for item in read.parameters.free if "field" in item.name]
+    assert free == ["field_1", "field_2", "field_3", "core.field_1", "core.field_2"]
+    wrong = "object.region.core.field.parameter=E"
+    with pytest.raises(cs.InputError, match=r"object.region 'core': parameter of a field is 'E'"):
+        cs.Problem.read(tiny / "problem.toml", [*stated, *inside, wrong])
 
 
 @pytest.mark.parametrize(("length_m", "codes"), [(0.05, []), (0.003, ["field/shapes"])])

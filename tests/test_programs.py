@@ -392,6 +392,7 @@ PROGRAMS: dict[str, Make] = {
         measured(hung_cube(3, (1, 1, 2))), values=guesses(TWO, 1.1), prony=["prony_1", "prony_2"]
     ),
     "field, wrench": lambda: differing(sensing(hung_cube(4, (1, 1, 2)), frame="grasp")),
+    "field, contact": lambda: differing(measured(pressed_cube(4, 0.0))),
     "field, static": lambda: differing(measured(block("z", gravity_m_s2=HANGING))),
     "carried by a force": lambda: in_field(creeping, carries=3),
     "carried by a force, bdf2": lambda: in_field(creeping, "bdf2", carries=3),
