@@ -116,9 +116,9 @@ def test_yeohs_material_is_recognised_at_large_strain(steps, tmp_path: Path):
     assert neo_hookean["log_ratio"] > np.log(1.2)
     assert set(yeoh["predictions"]) == set(steps)
     said = advice(rows)
-    assert said.startswith("Use yeoh: it misses what is held out by")
+    assert said.startswith("Use yeoh: it predicts what is held out to")
     assert "2 parameters more" in said
-    assert said.endswith("That is sure, as far as these recordings go.")
+    assert said.endswith("These recordings leave no doubt about that.")
 
 
 def test_yeohs_is_not_preferred_on_data_of_a_neo_hookean(tmp_path: Path):
@@ -127,7 +127,7 @@ def test_yeohs_is_not_preferred_on_data_of_a_neo_hookean(tmp_path: Path):
     assert yeoh["delta_aic"] > 0
     # 0.5 mm in three directions
     assert neo_hookean["held_out_rms"] == pytest.approx(5e-4 * np.sqrt(3), rel=0.15)
-    assert advice(rows).startswith("Use neo-hookean: it misses what is held out by")
+    assert advice(rows).startswith("Use neo-hookean: it predicts what is held out to")
 
 
 # Forces alone -----------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ def test_forces_rank_the_platens_where_there_are_no_markers():
     assert sliding["held_out_rms"] > 3 * sticking["held_out_rms"]
     assert sliding["delta_aic"] > 10
     assert sliding["parameters"]["mu_pa"] > 1.05 * sticking["parameters"]["mu_pa"]
-    assert re.search(r"^Use xyz: it misses what is held out by \S+ N, z by \S+ N", advice(rows))
+    assert re.search(r"^Use xyz: it predicts what is held out to \S+ N, z to \S+ N", advice(rows))
 
 
 def test_of_one_pressing_the_end_of_its_load_is_held_out():
@@ -520,7 +520,7 @@ def test_a_model_that_cannot_be_simulated_elsewhere_is_named():
     large = row_of("large", 6, {"a": [], "b": []}, 700, failure="the step at row 7 failed")
     said = advice(rows_of(small, large))
     assert said.startswith("Use small: no other predicts what is held out. large does not predict")
-    assert "but fits all better (AIC is 71.4 for it)" in said
+    assert "but fits all of them better (AIC puts it 71.4 ahead)" in said
 
 
 # The command line -------------------------------------------------------------------------------

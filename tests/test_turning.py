@@ -77,7 +77,7 @@ def test_a_fast_turn_is_warned_of_with_the_substeps_that_cure_it():
     cube = swung(8.0)
     (concern,) = turn_concerns(cube, 1)
     warning = concern.sentence
-    assert "turns by 0.08 rad a grid step of 10 ms at t = 0.07 s (7.97 rad" in warning
+    assert "turns by 0.08 rad within a step of 10 ms at t = 0.07 s (7.97 rad" in warning
     assert warning.endswith("set transcription.substeps = 2")
     assert turn_concerns(cube, 2) == []
     assert turn_concerns(swung(4.0), 1) == []
@@ -102,13 +102,13 @@ def test_a_run_says_that_a_turn_is_too_fast_for_its_step_and_is_to_be_checked():
     slow, fast = (
         run(Problem([measured(swung(rate))], unknown, substeps=1)) for rate in (4.0, 14.0)
     )
-    assert not any("rad a grid step" in said for said in (*slow.all_notes, *slow.trust.reasons))
+    assert not any("rad within a step" in said for said in (*slow.all_notes, *slow.trust.reasons))
     assert any("set transcription.substeps = 3" in note for note in fast.all_notes)
-    assert any("rad a grid step" in reason for reason in fast.trust.reasons)
+    assert any("rad within a step" in reason for reason in fast.trust.reasons)
     assert fast.trust.verdict != "good"
 
 
 def test_check_warns_of_a_fast_turn(tiny: Path):
     findings = check_problem(Problem.read(tiny / "problem.toml"))
-    (warning,) = (warning for warning in findings.warnings if "rad a grid step" in warning)
-    assert "'swing' turns by 0.078 rad a grid step of 10 ms" in warning
+    (warning,) = (warning for warning in findings.warnings if "rad within a step" in warning)
+    assert "'swing' turns by 0.078 rad within a step of 10 ms" in warning

@@ -185,8 +185,8 @@ def advice(rows: Sequence[Row]) -> str:
     if chosen["held_out_rms"] is None:
         rival = min(others, key=lambda row: row["delta_aic"])
         return (
-            f"{use}, by AIC alone, for nothing could be predicted: ΔAIC of {rival['model']} is "
-            f"{rival['delta_aic']:.3g}."
+            f"{use}, by AIC alone, as nothing could be predicted: it is {rival['delta_aic']:.3g} "
+            f"ahead of {rival['model']}."
         )
     predicted = [row for row in others if row["log_ratio"] is not None]
     lost = [_lost(row, chosen) for row in others if row["log_ratio"] is None]
@@ -212,23 +212,23 @@ def _lost(row: Row, chosen: Row) -> str:
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
         return f"{said}."
     return (
-        f"{said}, but fits all better (AIC is {more:.3g} for it): what its parameters need was "
-        "seen there alone, and more such recordings would decide."
+        f"{said}, but fits all of them better (AIC puts it {more:.3g} ahead): only there was seen "
+        "what its parameters need, and more such recordings would decide."
     )
 
 
 def _compared(chosen: Row, rival: Row) -> str:
-    missed = f"it misses what is held out by {_size(chosen)}"
+    missed = f"it predicts what is held out to {_size(chosen)}"
     ratio, error = _between(chosen, rival)
     more = chosen["free"] - rival["free"]
     count = f"{abs(more)} parameter{'s' * (abs(more) > 1)}"
     size = f" with {count} {'more' if more > 0 else 'fewer'}" if more else ""
     support = rival["delta_aic"] - chosen["delta_aic"]
-    side = "for it" if support > 0 else "against it"
+    better, worse = (chosen, rival) if support > 0 else (rival, chosen)
     return (
-        f"{missed}{size}, {rival['model']} by {_size(rival)}, "
-        f"{exp(ratio):.3g} times as much (±{100 * error:.2g} %), and AIC is "
-        f"{abs(support):.3g} {side}"
+        f"{missed}{size}, {rival['model']} to {_size(rival)}, {exp(ratio):.3g} times as far off "
+        f"(±{100 * error:.2g} %). AIC puts {better['model']} {abs(support):.3g} ahead of "
+        f"{worse['model']}"
     )
 
 
@@ -253,7 +253,7 @@ def _sureness(chosen: Row, rival: Row) -> str:
     ratio, error = _between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
     if ratio > SURE * error and support > NO_SUPPORT:
-        return "That is sure, as far as these recordings go."
+        return "These recordings leave no doubt about that."
     if ratio > LIKELY * error and support > SUPPORT:
         return "That is likely, but not sure."
     if support < -NO_SUPPORT:
@@ -275,7 +275,8 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
     evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
     worth = ""
     if counted is not None and evidence is not None:
-        worth = f" The {evidence['measurements']} measurements are worth {counted:.0f} independent."
+        worth = f" The {evidence['measurements']} measurements tell as much as {counted:.0f} "
+        worth += "independent ones would."
     return [
         f"Held out is {kept}; ± is the standard error of the ratio to the best.{worth}",
         *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),

@@ -344,7 +344,9 @@ def _turned(
 def _times(row: Row) -> str:
     if row["log_ratio"] is None:
         return "–"
-    return f"{exp(row['log_ratio']):.2f} ± {exp(row['log_ratio']) * row['log_ratio_error']:.2f}"
+    times = exp(row["log_ratio"])
+    form = ".2f" if times < 100 else ".2g"
+    return f"{times:{form}} ± {times * row['log_ratio_error']:{form}}"
 
 
 def _view(

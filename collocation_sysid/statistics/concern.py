@@ -38,7 +38,7 @@ class Topic:
 
 
 MODE = "the first mode of '{experiment}' ({frequency_hz:.3g} Hz at the guess)"
-TURN = "the grasp of '{experiment}' turns by {angle_rad:.2g} rad a grid step of {step_ms:.3g} ms"
+TURN = "the grasp of '{experiment}' turns by {angle_rad:.2g} rad within a step of {step_ms:.3g} ms"
 SAMPLE = (
     "the sample at t = {t_s:.4g} s, off by {deviations:.2g} sigma, alone has {percent:.0f} % of "
     "the residuals' power: "
@@ -166,7 +166,7 @@ TOPICS: Mapping[str, Topic] = {
             f"the sag tells; {FIX_DAMPING}",
             "rate": f"{MODE} has only {{samples:.1f}} samples a period, too few to see it: record "
             "at {needed_hz:.2g} Hz or more",
-            "short": f"{MODE} takes longer for a period than the {{duration_s:.3g}} s recorded, "
+            "short": f"one period of {MODE} is longer than the {{duration_s:.3g}} s recorded, "
             "which leaves the damping uncertain: record longer",
         },
     ),
@@ -215,8 +215,8 @@ TOPICS: Mapping[str, Topic] = {
             "coarse": f"{MODE} has only {{steps:.1f}} steps a period and is slowed down by "
             "{error:.0%}: {remedy}",
             "turn": TURN,
-            "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s), which is "
-            "computed along the chord and spoils what is found, damping most of all: {remedy}",
+            "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Steps go along "
+            "the chord of a turn, which spoils the estimates, damping most of all: {remedy}",
         },
     ),
     "stability": Topic(

@@ -53,8 +53,8 @@ PATIENCE_S = 10.0
 # Agreement with fourth-order central differences that rounding allows.
 AGREEMENT = 1e-6
 CHOSEN = (
-    "numbers of steps hold for one a sample: solve takes as many as the error bars ask for, up to "
-    f"{MOST_SUBSTEPS}, where transcription.substeps states none"
+    "one step a sample is counted here. Where transcription.substeps is not given, solve "
+    f"takes as many as the error bars need, up to {MOST_SUBSTEPS}"
 )
 
 
