@@ -1,21 +1,31 @@
-"""Contact against Hertz: a sphere and a long cylinder that press a block.
+"""Contact against Hertz: a sphere and a long cylinder that press a block; and twins of a poked one.
 
-    python scripts/study_contact.py [sphere] [cylinder]
+    python scripts/study_contact.py [sphere] [cylinder] [poked]
 
 Meshes have ever more elements to the half-width of the contact. What is compared is the force with
 that which Hertz has for the width that is found, from the second moment of the pressures: neither
-depends on how far away the block ends.
+depends on how far away the block ends. Of problems/poked_block a hundred twins are solved, each
+with noise and beginnings of contact of its own, and so is Hertz' formula with the same forces.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
+import make_poked_block as gel
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+from scipy.stats import sem
+from scipy.stats import t as student
 
 import collocation_sysid as cs
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.contact import contacts
 from collocation_sysid.recording.solids import Solid
+from collocation_sysid.statistics.uncertainty import covariance
 
 YOUNG_PA, POISSON = 1e4, 0.3
 LAW = {
@@ -43,14 +53,7 @@ def ticks(cells: int, fine_m: float, size_m: float, growth: float) -> np.ndarray
 
 def block(*edges: np.ndarray) -> cs.Body:
     """Between these places along x, y and z."""
-    cells = [len(each) - 1 for each in edges]
-    even = cs.box_mesh((1.0,) * 3, cells)
-    places = [
-        np.interp(even.points_m[:, k], np.linspace(0, 1, len(each)), each)
-        for k, each in enumerate(edges)
-    ]
-    mesh = cs.TetMesh(np.column_stack(places), even.tetrahedra)
-    return cs.Body(mesh, density_kg_m3=1.0, element="tet10")
+    return cs.Body(gel.graded(*edges), density_kg_m3=1.0, element="tet10")
 
 
 def pressed(
@@ -94,7 +97,8 @@ def pressed(
     x = seen.positions_m.reshape(1, -1)
     place = term.points.vectors(x)[:, 0]
     gap_m = term.contact.distance.value(place[:, None], np.zeros((0, 1, place.shape[1])))[0, 0]
-    push = term.contact.surface.area_m2 * np.maximum(term.contact.width_m - gap_m, 0) ** 2
+    near, within = np.maximum(term.contact.width_m - gap_m, 0), np.maximum(-gap_m, 0)
+    push = term.contact.surface.area_m2 * (near**2 - within**2)
     x_m, y_m, _ = place[:3] + term.contact.body.frame_m[0][:, None]
     r2_m2 = x_m**2 + (y_m**2 if isinstance(shape, cs.Sphere) else 0.0)
     return -float(seen.wrenches[0][0, 2]), float((push * r2_m2).sum() / push.sum())
@@ -128,7 +132,84 @@ def cylinder(cells: float, kappa: float = 100.0, delta: float = 0.002) -> tuple[
     return 2 * force_n / edge_m / length_force, len(body.nodes_m)
 
 
+@dataclass(frozen=True)
+class Twin:
+    """What was found of one: E with its interval, by the model and by Hertz' formula.
+
+    Attributes
+    ----------
+    model_pa, hertz_pa : (3,)
+        E, and where its 95 % interval begins and ends.
+    places_held : int
+        Beginnings of contact that are within two standard errors of the truth.
+    """
+
+    model_pa: np.ndarray
+    hertz_pa: np.ndarray
+    places_held: int
+
+
+def hertz_pa(depths_m: np.ndarray, force_n: np.ndarray) -> float:
+    """E by F = 4/3 E/(1 − ν²) √R d^1.5, with d from where the fit is best."""
+    (radius_m, poisson) = 0.0032, gel.TRUTH["poisson"]
+
+    def missed(unknown: np.ndarray) -> np.ndarray:
+        deep_m = np.maximum(depths_m - 1e-3 * unknown[1], 0)
+        stiff = 4 / 3 * 1e4 * unknown[0] / (1 - poisson**2) * np.sqrt(radius_m)
+        return (stiff * deep_m**1.5 - force_n) / gel.NOISE_N
+
+    return 1e4 * float(least_squares(missed, [1.0, 0.0]).x[0])
+
+
+def twins(count: int) -> Iterator[Twin]:
+    """Of the problem as it ships, each solved from the answer to the one before."""
+    guess = f"parameters.young_pa.guess={gel.TRUTH['young_pa']}"
+    problem = cs.Problem.read(gel.FOLDER / "problem.toml", [guess])
+    reach_m = np.arange(-5e-4, 2.5e-3, 2e-5)
+    exact_n = CubicSpline(reach_m, gel.forces_n(problem.experiments[0], reach_m))
+    spread, z = student.ppf(0.975, gel.PLACES - 1), None
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        onset_m = gel.ONSET_M * rng.normal(size=gel.PLACES)
+        force_n = exact_n(gel.DEPTHS_M - onset_m[:, None])
+        force_n += gel.NOISE_N * rng.normal(size=force_n.shape)
+        measured = []
+        for experiment, own_n in zip(problem.experiments, force_n, strict=True):
+            *held, tip = experiment.grasps
+            assert tip.wrench is not None
+            values = np.full(tip.wrench.values.shape, np.nan)
+            values[:, 2] = -own_n / gel.QUARTERS
+            read = replace(tip, wrench=replace(tip.wrench, values=values))
+            measured.append(replace(experiment, grasps=[*held, read]))
+        twin = replace(problem, experiments=measured).collocation()
+        solution = ReducedSpace()(twin, start=z)
+        z, told = solution.z, covariance(solution.collocation, solution.z)
+        places = [part.phi[0] for part in solution.collocation.parts(solution.z)]
+        off = np.abs(np.array(places) - onset_m / gel.ONSET_M) / list(told.nuisance.values())
+        simple = np.array([hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n])
+        half = spread * sem(simple) * np.array([0, -1, 1])
+        found = told.estimates["young_pa"]
+        assert found.ci95 is not None
+        yield Twin(np.array([found.value, *found.ci95]), simple.mean() + half, int(sum(off < 1.96)))
+
+
+def poked(count: int = 100) -> None:
+    """Print how often the truth is in the intervals, and how far off estimates are."""
+    found = list(twins(count))
+    for name in ("model_pa", "hertz_pa"):
+        value, low, high = (
+            np.array([getattr(each, name) for each in found]).T / gel.TRUTH["young_pa"]
+        )
+        inside = int(((low < 1) & (high > 1)).sum())
+        print(name, f"held by {inside} of {count}: {value.mean():.4f} ± {value.std(ddof=1):.4f}")
+        print(f"  half width of an interval {np.mean(high - low) / 2:.4f}")
+    print(f"beginnings held: {sum(each.places_held for each in found)} of {count * gel.PLACES}")
+
+
 if __name__ == "__main__":
+    if "poked" in sys.argv:
+        poked()
+        sys.argv.remove("poked")
     for name in sys.argv[1:]:
         law = {"sphere": sphere, "cylinder": cylinder}[name]
         for cells in (1.5, 3.0) if name == "sphere" else (2.0, 4.0, 8.0):

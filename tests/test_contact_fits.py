@@ -10,11 +10,15 @@ import pytest
 from problems_small import GUESS, measured, pressed_cube
 
 import collocation_sysid as cs
-from collocation_sysid.program.touches import touches
+from collocation_sysid.program.touches import Touch, touches
 from collocation_sysid.recording import Experiment
+from collocation_sysid.runs.check import check_problem
+from collocation_sysid.statistics.trust import contact_concerns
 
 TRUTH = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 DEPTHS_M = np.linspace(-0.0005, 0.006, 14)
+THERE_AND_BACK_M = np.concatenate([DEPTHS_M[:7], DEPTHS_M[:7][::-1]])
+SMALL, FLAT = cs.Sphere(0.004, (0.03, 0.03, 0.034)), cs.Plane((0, 0, -1), (0, 0, 0.03))
 SIGMA_N = 0.002
 
 
@@ -53,13 +57,24 @@ def forces_n(seed: int) -> np.ndarray:
     return exact + SIGMA_N * np.random.default_rng(seed).normal(size=exact.shape)
 
 
+def measured_once(experiment: Experiment, seed: int = 0, **unknown) -> cs.Problem:
+    """To find E and the place of the ball."""
+    held, ball = experiment.grasps
+    read = replace(ball, wrench=replace(ball.wrench, values=forces_n(seed)))
+    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4), **unknown})
+    return cs.Problem([replace(experiment, grasps=[held, read])], known)
+
+
 def answer(experiment: Experiment, seed: int = 0, **unknown) -> cs.Run:
     """Of E and the place of the ball."""
-    held, ball = experiment.grasps
-    measured = replace(ball, wrench=replace(ball.wrench, values=forces_n(seed)))
-    seen = replace(experiment, grasps=[held, measured])
-    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4), **unknown})
-    return cs.run(cs.Problem([seen], known), seek_causes=False)
+    return cs.run(measured_once(experiment, seed, **unknown), seek_causes=False)
+
+
+def touch_of(experiment: Experiment) -> Touch:
+    """How the ball touches the block."""
+    x = cs.simulate(experiment, TRUTH).positions_m.reshape(len(experiment.t_s), -1)
+    (touch,) = touches(experiment, x, experiment.t_s)
+    return touch
 
 
 def told(run: cs.Run) -> set[str]:
@@ -105,13 +120,50 @@ def test_an_obstacle_that_is_never_touched_is_told():
 
 
 def test_a_contact_of_few_faces_is_told():
-    fine = poked(shape=cs.Sphere(0.004, (0.03, 0.03, 0.034)))
-    x = cs.simulate(fine, TRUTH).positions_m.reshape(len(DEPTHS_M), -1)
-    (touch,) = touches(fine, x)
+    fine = poked(shape=SMALL)
+    touch, wide = (touch_of(each) for each in (fine, poked()))
     assert 0 < touch.faces < 4
-    (wide,) = touches(poked(), cs.simulate(poked(), TRUTH).positions_m.reshape(len(DEPTHS_M), -1))
     assert wide.faces > touch.faces
     assert wide.gap_m < 1e-4
+    assert touch.face_mm == pytest.approx(1e3 * np.sqrt(2 / np.sqrt(3)) * 0.015)
+
+
+def test_check_compares_derivatives_within_the_gap_and_looks_at_no_grasp_of_an_obstacle():
+    findings = check_problem(measured_once(poked(shape=FLAT)))
+    assert findings.derivatives_agree
+    assert [hold.nodes for hold in findings.holds] == [25]
+    assert findings.bodies[0].nodes == 75
+
+
+@pytest.mark.parametrize(
+    ("changes", "codes"),
+    [
+        ({"shape": FLAT}, set()),
+        ({"shape": FLAT, "higher_m": 0.05, "place_sigma_m": None}, {"never"}),
+        ({}, {"coarse"}),
+        ({"shape": FLAT, "higher_m": -0.002}, {"pressed"}),
+        ({"shape": FLAT, "depths_m": THERE_AND_BACK_M}, {"lost"}),
+    ],
+)
+def test_check_says_what_contact_will_spoil_at_the_guess(changes: dict, codes: set[str]):
+    concerns = check_problem(measured_once(poked(**changes)), full=True).concerns
+    of_contact = [each for each in concerns if each.topic == "contact"]
+    assert {each.code for each in of_contact} == {f"contact/{code}" for code in codes}
+    assert all("ball" in each.sentence for each in of_contact)
+    assert all("at the guess" in each.sentence for each in of_contact)
+
+
+def test_check_says_nothing_of_contact_that_it_has_not_simulated(monkeypatch):
+    monkeypatch.setattr("collocation_sysid.runs.check.PATIENCE_S", 0.0)
+    for changes in ({"higher_m": 0.05, "place_sigma_m": None}, {"shape": SMALL}):
+        concerns = check_problem(measured_once(poked(**changes))).concerns
+        assert not any(each.topic == "contact" for each in concerns)
+
+
+def test_what_several_recordings_share_is_said_once():
+    often = [touch_of(replace(poked(shape=SMALL), name=name)) for name in ("a", "b", "c")]
+    (one,) = contact_concerns(often)
+    assert "'a' and 2 more" in one.sentence
 
 
 def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():

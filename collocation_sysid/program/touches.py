@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import Array
 from ..model.contact import Contact, contacts
 from ..recording.experiment import Experiment
+from .part import Part
 
 # Samples whose gaps are looked at together.
 AT_ONCE = 64
@@ -26,12 +27,21 @@ class Touch:
         The smallest; it touches where that is less than the width of the pressure.
     faces : float
         Most faces that touched at a time, by their quadrature points; none where it never did.
+    face_mm : float
+        Edge of those, on the average.
+    pressed : bool
+        Whether an obstacle that moves touched at the first time.
+    lost_s : float or None
+        When it was first touched no more, where it had been.
     """
 
     experiment: str
     obstacle: str
     gap_m: float
     faces: float
+    face_mm: float
+    pressed: bool
+    lost_s: float | None
 
 
 def nearest(contact: Contact, x: Array) -> Array:
@@ -64,12 +74,33 @@ def on_surface(experiment: Experiment, theta: Array, x: Array) -> tuple[Array, A
     return gaps_m, pressures_pa
 
 
-def touches(experiment: Experiment, x: Array) -> Iterator[Touch]:
-    """How the positions x (T, 3n) touch each obstacle."""
+def touched(parts: Iterable[Part]) -> Iterator[Touch]:
+    """The same of all experiments."""
+    for part in parts:
+        t_s = part.setting.dynamics.t_s[: len(part.x)]
+        yield from touches(part.segment.experiment, part.x, t_s)
+
+
+def touches(experiment: Experiment, x: Array, t_s: Array) -> Iterator[Touch]:
+    """How the positions x (T, 3n) at times (T,) touch each obstacle."""
     for contact, obstacle in zip(contacts(experiment, 1), experiment.obstacles, strict=True):
-        law, least, most = contact.contact, np.inf, 0
+        law, least, points = contact.contact, np.inf, []
+        ever = np.zeros(contact.points.count, dtype=bool)
         for first in range(0, len(x), AT_ONCE):
             gap = law.gaps(contact.points.vectors(x[first : first + AT_ONCE]))
-            least = min(least, float(gap.min()))
-            most = max(most, int((gap < law.width_m).sum(axis=1).max()))
-        yield Touch(experiment.name, obstacle.name, least, most / law.surface.a_face)
+            least, near = min(least, float(gap.min())), gap < law.width_m
+            points.append(near.sum(axis=1))
+            ever |= near.any(axis=0)
+        count = np.concatenate(points)
+        ends = np.flatnonzero((count[:-1] > 0) & (count[1:] == 0)) + 1
+        face_m2 = law.surface.area_m2[ever].sum() * law.surface.a_face / max(1, ever.sum())
+        yield Touch(
+            experiment.name,
+            obstacle.name,
+            gap_m=least,
+            faces=int(count.max()) / law.surface.a_face,
+            # Of a triangle with sides alike.
+            face_mm=1e3 * float(np.sqrt(4 / np.sqrt(3) * face_m2)),
+            pressed=bool(count[0]) and len(obstacle.poses.t_s) > 1,
+            lost_s=float(t_s[ends[0]]) if len(ends) else None,
+        )

@@ -11,7 +11,7 @@ from ..methods.solution import Solution, Status, pooled_wrench_rms
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.stability import instabilities
-from ..program.touches import touches
+from ..program.touches import touched
 from ..recording.nuisance import TIME
 from ..recording.turning import TOO_FAST
 from ..statistics.concern import Concern
@@ -72,8 +72,7 @@ def concerns(
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(instabilities(solution.collocation, solution.z))
-    for part in parts:
-        yield from contact_concerns(touches(part.segment.experiment, part.x))
+    yield from contact_concerns(touched(parts))
     for name, rollout in rollouts.items():
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
     collocation = solution.collocation

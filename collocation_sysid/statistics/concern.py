@@ -235,10 +235,16 @@ TOPICS: Mapping[str, Topic] = {
         "Look at the place, the normal and the motion of the obstacle, and at the mesh where it "
         "touches.",
         {
-            "never": "'{experiment}' never touches {obstacle}, but comes as near as {mm:.3g} mm: "
-            "its force and friction say nothing",
-            "coarse": "in '{experiment}' only {faces:.2g} faces touch {obstacle} at a time: how "
-            "wide the contact is follows from the mesh",
+            "never": "'{experiment}'{more} never touches {obstacle}{guess}, but comes as near as "
+            "{mm:.3g} mm: its force and friction say nothing",
+            "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
+            "touch {obstacle} at a time{guess}: how wide the contact is follows from the mesh; "
+            "make it finer there",
+            "pressed": "in '{experiment}'{more} {obstacle} touches already at the first "
+            "sample{guess}: where it began is not seen; let the recording begin before",
+            "lost": "in '{experiment}'{more} {obstacle} is touched no more at t = "
+            "{t_s:.4g} s{guess}: if it was, check its motion and the guess, or let window_s end "
+            "before",
         },
     ),
     "mesh": Topic(

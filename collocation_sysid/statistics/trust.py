@@ -260,16 +260,28 @@ def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
     return concerns
 
 
-def contact_concerns(found: Iterable[Touch]) -> list[Concern]:
-    """Obstacles that are never touched, or by too few faces to tell the shape of a contact."""
-    concerns: list[Concern] = []
-    for each in found:
-        data = {"experiment": each.experiment, "obstacle": each.obstacle}
-        if not each.faces:
-            concerns.append(Concern("contact/never", "doubtful", {**data, "mm": 1e3 * each.gap_m}))
-        elif each.faces < FEWEST_FACES:
-            concerns.append(Concern("contact/coarse", data={**data, "faces": each.faces}))
-    return concerns
+def contact_concerns(found: Iterable[Touch], guess: str = "") -> list[Concern]:
+    """Obstacles that are never touched, or by too few faces to tell the shape of a contact.
+
+    Where a guess was simulated, and `guess` says so, also those that are left, or touched already
+    at the first sample. What several experiments share is said once, of the worst.
+    """
+    concerns: dict[tuple[str, str], list[Concern]] = {}
+    for each in sorted(found, key=lambda touch: touch.faces):
+        data = {"experiment": each.experiment, "obstacle": each.obstacle, "guess": guess}
+        coarse = 0 < each.faces < FEWEST_FACES
+        numbers = {"faces": each.faces, "face_mm": each.face_mm}
+        for one in (
+            *concerned(not each.faces, not guess, "contact/never", mm=1e3 * each.gap_m, **data),
+            *concerned(coarse, False, "contact/coarse", **numbers, **data),
+            *concerned(bool(guess) and each.pressed, False, "contact/pressed", **data),
+            *concerned(bool(guess and each.lost_s), False, "contact/lost", t_s=each.lost_s, **data),
+        ):
+            concerns.setdefault((one.code, each.obstacle), []).append(one)
+    return [
+        replace(first, data={**first.data, "more": f" and {len(others)} more" if others else ""})
+        for first, *others in concerns.values()
+    ]
 
 
 def turn_concerns(

@@ -18,13 +18,14 @@ from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
 from ...program.stability import Instability, instabilities
+from ...program.touches import touched
 from ...statistics.concern import Concern
 from ...statistics.hypothesis import Hypothesis, ranked
 from ...statistics.modal import doubts
 from ...statistics.numerical import MOST_SUBSTEPS
 from ...statistics.plausible import oddities
 from ...statistics.scale import scale_concerns, stillness_concerns
-from ...statistics.trust import stability_concerns, turn_concerns
+from ...statistics.trust import contact_concerns, stability_concerns, turn_concerns
 from ...tree import content
 from .body import BodyFinding, ElementShape, Hold, body_finding, hold_concerns, holds_of
 from .cost import Cost, cost_concerns, cost_notes, costs, nonzeros
@@ -52,6 +53,7 @@ __all__ = [
 PATIENCE_S = 10.0
 # Agreement with fourth-order central differences that rounding allows.
 AGREEMENT = 1e-6
+GUESSED = ", at the guess"
 CHOSEN = (
     "one step a sample is counted here. Where transcription.substeps is not given, solve "
     f"takes as many as the error bars need, up to {MOST_SUBSTEPS}"
@@ -219,7 +221,9 @@ def check_problem(
         hessian_error=hessian_error,
         causes=description_causes(problem),
     )
-    concerns = _concerns(problem, findings, instabilities(simulated, z))
+    # Nothing is said of contact by a body that was only carried.
+    touching = () if start_notes else _contacts(simulated, z, whole=simulated is not first)
+    concerns = (*_concerns(problem, findings, instabilities(simulated, z)), *touching)
     notes += [*start_notes, *(each for m in findings.motions for each in motion_notes(m))]
     notes += cost_notes(findings.chosen_cost, findings.costs) if findings.chosen_cost else []
     if simulated is first:
@@ -307,6 +311,12 @@ def _concerns(
         *(c for r in findings.recordings for c in recording_concerns(r, body_of[r.experiment])),
         *(cost_concerns(chosen, findings.costs) if chosen else ()),
     )
+
+
+def _contacts(simulated: Collocation, z: Array, whole: bool) -> list[Concern]:
+    """What is touched at the guess; of first samples only whether it is already."""
+    found = contact_concerns(touched(simulated.parts(z)), GUESSED)
+    return [each for each in found if whole or each.code == "contact/pressed"]
 
 
 def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:

@@ -216,7 +216,7 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
     x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
     return BodyFinding(
         experiments,
-        nodes=len(body.nodes_m),
+        nodes=len(body.nodes.points_m),
         elements=len(body.cells),
         element=body.element.name,
         volume_m3=mesh.volume_m3,
@@ -288,8 +288,8 @@ class Hold:
 
 def holds_of(experiment: Experiment, mean_edge_m: float) -> tuple[Hold, ...]:
     """One for each grasp."""
-    points_m = experiment.body.nodes_m
-    return tuple(_hold(experiment.name, points_m, g, mean_edge_m) for g in experiment.grasps)
+    points_m = experiment.body.nodes.points_m
+    return tuple(_hold(experiment.name, points_m, g, mean_edge_m) for g in experiment.gripping)
 
 
 def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from ...arrays import Array
+from ...model.contact import contacts
 from ...problem import Problem
 from ...program.collocation import Collocation, carried_over
 from ...recording.experiment import Experiment
@@ -18,6 +19,8 @@ from ...recording.wrench import Wrench
 # depend on how many follow.
 SAMPLES, STATIC_SAMPLES = 12, 3
 STEP = 1e-5
+# Over the gap in which a pressure rises: steps that leave it say nothing of slopes within.
+OF_WIDTH = 1e-2
 # With more entries memory and wrenches are not laid out as variables: their slopes are checked.
 LAID_OUT = 5e6
 
@@ -58,14 +61,15 @@ def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
 
 def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
     """Largest relative deviations of J and H along a random direction at a disturbed start."""
-    rng, of_slopes = np.random.default_rng(0), 0.0
+    rng, of_slopes, step = np.random.default_rng(0), 0.0, _step(collocation)
     program, plain = collocation.made_explicit(), collocation
     if program.explicit:  # methods use these without memory and wrenches as variables
-        of_slopes = _slope_error(plain.objective, plain.gradient, z, rng)
+        of_slopes = _slope_error(plain.objective, plain.gradient, z, rng, step)
         if plain.remembers:
             forces = rng.normal(size=plain.constraints)
             through = partial(plain.pulled_back, multipliers=forces)
-            along = _slope_error(lambda at: forces @ plain.constraint_values(at), through, z, rng)
+            pushed = lambda at: forces @ plain.constraint_values(at)  # noqa: E731
+            along = _slope_error(pushed, through, z, rng, step)
             of_slopes = max(of_slopes, along)
         if sum(program.carried_nonzeros) > LAID_OUT:
             return of_slopes, 0.0
@@ -79,20 +83,27 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
 
     hessian = collocation.hessian(point, 1.0, multipliers)
     along = collocation.jacobian(point) @ direction
-    first = _deviation(collocation.constraint_values, along, point, direction)
-    second = _deviation(lagrangian_gradient, hessian @ direction, point, direction)
+    first = _deviation(collocation.constraint_values, along, point, direction, step)
+    second = _deviation(lagrangian_gradient, hessian @ direction, point, direction, step)
     return max(first, of_slopes), second
 
 
-def _slope_error(function, gradient, z: Array, rng: np.random.Generator) -> float:
+def _step(collocation: Collocation) -> float:
+    """As long as differences may be."""
+    touching = (t for s in collocation.segments for t in contacts(s.experiment, 1))
+    return min((STEP, *(OF_WIDTH * term.contact.width_m for term in touching)))
+
+
+def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:
     """That of a gradient along a random direction."""
     point, direction = z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=len(z))
-    return _deviation(function, gradient(point) @ direction, point, direction)
+    return _deviation(function, gradient(point) @ direction, point, direction, step)
 
 
-def _deviation(function, exact: Array, point: Array, direction: Array) -> float:
+def _deviation(function, exact: Array, point: Array, direction: Array, step: float) -> float:
     ahead, behind, far_ahead, far_behind = (
-        function(point + k * STEP * direction) for k in (1, -1, 2, -2)
+        function(point + k * step * direction) for k in (1, -1, 2, -2)
     )
-    differences = (8 * (ahead - behind) - (far_ahead - far_behind)) / (12 * STEP)
-    return float(np.abs(differences - exact).max() / np.abs(exact).max())
+    differences = (8 * (ahead - behind) - (far_ahead - far_behind)) / (12 * step)
+    largest = max(float(np.abs(exact).max()), np.finfo(float).tiny)
+    return float(np.abs(differences - exact).max()) / largest
