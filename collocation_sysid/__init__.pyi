@@ -25,9 +25,11 @@ from .problem import Problem, RolloutOptions, UncertaintyOptions
 from .program.collocation import Collocation
 from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
 from .recording import (
+    Camera,
     Capsule,
     Cuboid,
     Cylinder,
+    Depth,
     Experiment,
     Force,
     Gauge,
@@ -45,6 +47,7 @@ from .recording import (
     Sphere,
     Tendon,
     Wrench,
+    depth_image,
     place_markers,
 )
 from .runs.refine import refine
@@ -56,12 +59,14 @@ __all__ = [
     "Ball",
     "Body",
     "Box",
+    "Camera",
     "Capsule",
     "Collocation",
     "Constant",
     "Continuation",
     "Cuboid",
     "Cylinder",
+    "Depth",
     "Experiment",
     "Field",
     "Force",
@@ -111,6 +116,7 @@ __all__ = [
     "Wrench",
     "box_mesh",
     "cylinder_mesh",
+    "depth_image",
     "live",
     "place_markers",
     "refine",

@@ -63,7 +63,7 @@ class Touching:
         sides = np.roll(corners, -1, axis=1) - corners
         area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
         places, weights = RULES[faces.shape[1]]
-        shape = places if faces.shape[1] == 3 else _quadratic(places)
+        shape, _ = on_faces(places, faces.shape[1])
         count = len(weights)
         nodes = np.hstack([faces, np.broadcast_to(frame, (len(faces), 4))])
         mix = np.zeros((count, VECTORS, nodes.shape[1]))
@@ -79,7 +79,15 @@ class Touching:
         return cls(points, np.outer(area, weights).ravel(), edge_m, part, count, rows)
 
 
-def _quadratic(places: Array) -> Array:
-    """(q, 6) shape functions of a face: corners, and the middles of ab, bc and ca."""
+def on_faces(places: Array, nodes: int) -> tuple[Array, Array]:
+    """Weights (q, v) of so many nodes of a face at places (q, 3), and slopes (q, v, 3) by these.
+
+    Nodes are the corners, and of six of them the middles of ab, bc and ca.
+    """
+    unit = np.broadcast_to(np.eye(3), (len(places), 3, 3))
+    if nodes == 3:
+        return places, unit
     beside = np.roll(places, -1, axis=1)
-    return np.hstack([places * (2 * places - 1), 4 * places * beside])
+    weights = np.hstack([places * (2 * places - 1), 4 * places * beside])
+    of_sides = beside[:, :, None] * unit + places[:, :, None] * np.roll(unit, 1, axis=2)
+    return weights, np.hstack([(4 * places - 1)[:, :, None] * unit, 4 * of_sides])

@@ -256,6 +256,11 @@ def _residuals(part: Part) -> Array:
     found, slopes = [], []
     still = part.sensing.still(part.x)
     for reading, (residual, slope) in zip(part.segment.readings, still, strict=True):
+        rough = reading.roughly(part.x, part.phi)
+        if rough is not None:
+            found.append(rough)
+            slopes.append(np.zeros((len(rough), slope.shape[-1])))
+            continue
         there = reading.there(len(part.looked[len(found)]))[: len(residual)]
         found.append(residual[there])
         slopes.append(slope[there] * reading.has_offsets)

@@ -38,6 +38,10 @@ SHRINK, SMALLEST_TRUST = 0.25, 1e-10
 # shrink, is this share of the tolerance, and no equation is violated by more than this in the
 # scaling of the NLP.
 SAFETY, FEASIBLE_FORCE = 0.3, 1e-10
+# The trust region is never wider, nor where there are depth cameras.
+WIDEST, SEEING = 4.0, 0.25
+# With these, shorter steps that make nothing better are the last.
+SEEN = 1e-3
 # Steps shorter than this tell about the curvature at the answer.
 LOCAL = 0.1
 # Estimates of places may change the elements they are read in so often.
@@ -95,7 +99,10 @@ class ReducedSearch:
         self.options, self.recorder = options, recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
-        self.trust = options.trust
+        # Points that depth cameras see belong to what is near: they do not tell how a long step ends.
+        seeing = any(segment.depths for segment in collocation.segments)
+        self.widest = SEEING if seeing else WIDEST
+        self.trust = min(options.trust, self.widest)
         self.indefinite = 0
         self.lower, self.upper = collocation.bounds_p
         self.rereadings = 0
@@ -188,7 +195,7 @@ class ReducedSearch:
         """Gauss–Newton steps on one rung until they promise no more."""
         assert self.x is not None
         tolerance = self.options.tolerance
-        self.trust = self.options.trust
+        self.trust = min(self.options.trust, self.widest)
         point = self._accepted(rung, rung.evaluate(self.p, self.x, self.point))
         rejections, curvature = 0, np.zeros((len(point.p), len(point.p)))
         previous = np.inf
@@ -213,13 +220,16 @@ class ReducedSearch:
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
             trial = self._try(rung, point, step)
-            if trial is not None and self._is_better(point, step, trial):
+            better = trial is not None and self._is_better(point, step, trial)
+            if trial is not None and better and self._is_seen_better(rung, point, trial):
                 if last and length <= LOCAL:
                     curvature = self._curvature(curvature, point, trial)
                 point, rejections, previous = self._accepted(rung, trial), 0, length
                 continue
             if short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
+            if self.widest == SEEING and length <= SEEN:
+                return Status.CONVERGED  # what is seen changes by more than such a step gains
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
             self.trust = SHRINK * length
@@ -264,7 +274,7 @@ class ReducedSearch:
             return False
         length = self._length(step)
         if actual > 0.75 * predicted and length > 0.9 * self.trust:
-            self.trust = min(2.0 * self.trust, 4.0)
+            self.trust = min(2.0 * self.trust, self.widest)
         elif actual < 0.25 * predicted - noise:
             self.trust = max(0.5 * length, SMALLEST_TRUST)
         return True
@@ -317,12 +327,30 @@ class ReducedSearch:
 
     def _follow(self, rung: Horizon, point: Iterate) -> Iterate:
         """The point read where its estimates are."""
-        collocation, p = self.collocation.following(point.p)
+        counts = [segment.rows_to_follow for segment in self.collocation.segments]
+        rows = rung.first_rows(point.trajectories, counts)
+        collocation, p = self.collocation.following(point.p, rows)
         if collocation is self.collocation or self.rereadings >= REREADINGS:
             return point
         self.rereadings += 1
         self._read_in(rung, collocation, p)
         return rung.reread(p, point)
+
+    def _is_seen_better(self, rung: Horizon, point: Iterate, trial: Iterate) -> bool:
+        """Whether it is better where depth cameras look anew, too.
+
+        What points belonged to may be another part of the surface there, and points that belong to
+        nothing any more cost as much as those at the gate.
+        """
+        before = self.collocation
+        if self.widest == WIDEST or self.rereadings >= REREADINGS:
+            return True
+        unseen = before.unseen_loss
+        after = self._follow(rung, trial)
+        self.rereadings -= self.collocation is not before
+        better = after.loss + self.collocation.unseen_loss <= point.loss + unseen
+        self._read_in(rung, before, point.p)
+        return better
 
     def _accepted(self, rung: Horizon, point: Iterate) -> Iterate:
         self.point = point = self._follow(rung, point)

@@ -20,7 +20,7 @@ from ..program.stopwatch import Stopwatch
 
 def placed_at_guess(collocation: Collocation) -> Collocation:
     """The problem with unknown places started from the shape that the guess gives the body."""
-    if all(segment.experiment.markers.located.all() for segment in collocation.segments):
+    if not any(segment.rows_to_place for segment in collocation.segments):
         return collocation
     p, positions = collocation.guess_p, []
     for segment in collocation.segments:

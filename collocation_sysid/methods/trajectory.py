@@ -218,7 +218,8 @@ def _read(
     """Everything after the feasibility step."""
     response = part.sensing.looked_along(tangent.by_p, tangent.held)
     found = part.sensing.linearised(part.x, response, tangent.step)
-    pairs = [as_squares(*each, huber) for each in found]
+    both = zip(found, part.segment.readings, strict=True)
+    pairs = [as_squares(*each, reading.huber) for each, reading in both]
     residual = np.concatenate([values.ravel() for values, _ in pairs])
     slope = np.concatenate([by.reshape(values.size, by.shape[-1]) for values, by in pairs])
     report = SweepReport(

@@ -32,6 +32,8 @@ from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, held_nodes
 from ..recording.loads import Change, Force, PointMass
 from ..recording.nuisance import (
+    DEPTH_BIAS,
+    DEPTH_SCALE,
     GAUGE,
     GRASP_SHIFT,
     GRASP_TURN,
@@ -254,12 +256,12 @@ class NuisanceMap:
 
     def late_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
         """How much later than at t_s a marker was seen, at its φ."""
-        values = self._values(phi, places)
+        values = self.by_row(phi, places)
         return sum((row.clock(values[row], t_s, self) for row in values if row.clock), ca.SX(0))
 
     def read(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
         """What is read of a marker at y (3,), at its φ: first as all are seen, then as it is."""
-        values = self._values(phi, places)
+        values = self.by_row(phi, places)
         for row in sorted(values, key=lambda row: row.of == "marker"):
             y = y if row.reading is None else row.reading(y, values[row], t_s, self)
         return y
@@ -342,7 +344,7 @@ class NuisanceMap:
         return Generated(self._carried, len(self.of_grasps), 3)
 
     def _carried(self, phi: ca.SX, point: ca.SX) -> ca.SX:
-        values = self._values(phi, self.of_grasps)
+        values = self.by_row(phi, self.of_grasps)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
             point = rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
@@ -371,14 +373,14 @@ class NuisanceMap:
 
     def gravity_expression(self, phi: ca.SX) -> ca.SX:
         """Gravity (3,) in the body's frame, of the φ of `of_gravity`."""
-        values, gravity = self._values(phi, self.of_gravity), ca.DM(self.gravity_m_s2)
+        values, gravity = self.by_row(phi, self.of_gravity), ca.DM(self.gravity_m_s2)
         if TILT in values:
             gravity = self._tilted(values[TILT])
         if TURN in values:
             gravity = rotation(values[TURN]).T @ gravity
         return ca.SX(gravity)
 
-    def _values(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
+    def by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
         """By row, of φ at some places, with units."""
         sized, found = phi * self.scales[places][:, None], {}
         for at, k in enumerate(places):
@@ -424,6 +426,8 @@ def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
         return [(k, str(k + 1)) for k in range(len(experiment.gripping))]
     if of == "obstacle":
         return enumerate((each.name for each in experiment.obstacles), len(experiment.gripping))
+    if of == "depth":
+        return enumerate(depth.name for depth in experiment.depths)
     if of == "load":
         return enumerate(which for which, _ in _timed(experiment))
     if of == "sensor":
@@ -454,6 +458,8 @@ def _axes(
         assert isinstance(obstacle, Obstacle)
         if not (obstacle.shape.flat if row == OBSTACLE_TILT else len(obstacle.poses.t_s) > 1):
             return []
+    if row in (DEPTH_BIAS, DEPTH_SCALE) and experiment.depths[number].camera.matrix is None:
+        return []
     found = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
     return [each for each in found if row != ZERO or each[1] in experiment.grasps[number].zero]
 

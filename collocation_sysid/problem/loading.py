@@ -79,7 +79,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     """The files of data that a problem names, whether they are there or not."""
     names = [file.object.mesh, file.object.surface]
     for section in file.experiment:
-        names += [section.markers.file, *(reading.file for reading in section.reading)]
+        names += [section.markers.file, *(each.file for each in (*section.reading, *section.depth))]
         for grasp in section.moved:
             moved, sensed = section.file_of(grasp.displacement), section.file_of(grasp.wrench)
             names += [grasp.poses or moved, sensed]

@@ -16,6 +16,8 @@ from ..fem.body import Body
 from ..methods.scan import usual_constants
 from ..model.parameters import Parameters
 from ..recording import (
+    Camera,
+    Depth,
     Experiment,
     Gauge,
     Grasp,
@@ -33,7 +35,10 @@ from ..recording import (
 )
 from ..recording.arrays import triple
 from ..recording.clock import TIME_TOLERANCE_S
+from ..recording.depth import points_of
+from ..recording.formats.depth_files import DepthFile, read_depth
 from ..recording.formats.logs import stored_files
+from ..recording.formats.units import METRES_PER_UNIT
 from ..recording.poses import refuse_untold
 from ..recording.tables import read_gauge, within
 from ..section import stated_in
@@ -96,6 +101,7 @@ class RecordingReader:
             t_s=t_s,
             grasps=grasps,
             readings=[self._reading(k, each, t_s) for k, each in enumerate(section.reading)],
+            depths=[self._depth(k, t_s) for k in range(len(section.depth))],
             markers=self._markers(t_s, table),
             nuisance=nuisance_of(section.nuisance, self.code.row),
             **stated_in(section, Experiment, ""),
@@ -228,6 +234,47 @@ class RecordingReader:
             self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
             return Gauge(t_s=at_s[inside], values=values[inside], **told)
 
+    def _seen(self, k: int) -> tuple[DepthFile, Array]:
+        """What a depth camera saw, and when."""
+        section = self.section.depth[k]
+        file = self.folder / section.file
+        if not file.is_dir():
+            file = existing_file(self.folder, section.file, f"depth.{k}.file")
+        seen = read_depth(file, section.count_m, METRES_PER_UNIT[section.length_unit])
+        count = len(seen.images_m) or len(seen.clouds_m)
+        t_s = section.t_s if section.t_s is not None else seen.t_s
+        if t_s is None and count > 1 and not self._static:
+            message = f"{section.file} says no times of its {count} images; expected them here"
+            raise InputError(message, where=f"depth.{k}.t_s")
+        times = np.arange(float(count)) if t_s is None else np.array(t_s, dtype=float).ravel()
+        if len(times) != count:
+            message = f"found {len(times)} times for {count} images or clouds; expected as many"
+            raise InputError(message, where=f"depth.{k}.t_s")
+        return seen, times
+
+    def _depth(self, k: int, t_s: Array) -> Depth:
+        """What was seen within the experiment's time."""
+        section, where = self.section.depth[k], f"depth.{k}"
+        seen, at_s = self._seen(k)
+        known = {"matrix": seen.matrix, "pose": seen.pose}
+        known |= stated_in(section.camera, Camera, f"{where}.camera")
+        if section.camera.poses is not None:
+            file = existing_file(self.folder, section.camera.poses, f"{where}.camera.poses")
+            known["poses"] = read_poses(file)
+        with located(where=f"{where}.camera"):
+            camera = Camera(**{name: value for name, value in known.items() if value is not None})
+        with located(where=where):
+            inside = within(at_s, t_s, section.file, self._static)
+            clouds = seen.clouds_m or [
+                points_of(image, camera) if here else np.zeros((0, 3))
+                for image, here in zip(seen.images_m, inside, strict=True)
+            ]
+            clouds = [cloud for cloud, here in zip(clouds, inside, strict=True) if here]
+            told = {"name": section.name, **stated_in(section, Depth, where)}
+            depth = Depth(t_s=at_s[inside], clouds=clouds, camera=camera, **told)
+        self._note(f"{section.file}: {len(clouds)} of {len(at_s)} images are used")
+        return depth
+
     def _made(self, kind: type, word: str, k: int) -> Any:
         """What a table of a list states, on the body."""
         table, where = getattr(self.section, word)[k], f"{word}.{k}"
@@ -281,13 +328,15 @@ class RecordingReader:
         """Those of the wrench where there are no markers, else of the poses."""
         section = self.section
         sensed = [(k, grasp.wrench) for k, grasp in enumerate(section.moved) if grasp.wrench]
-        if not (sensed or section.marked or section.reading):
-            message = "nothing is measured: expected markers, the wrench of a grasp, or a reading"
+        if not (sensed or section.marked or section.reading or section.depth):
+            message = "nothing is measured: expected markers, a wrench, a reading, or depth"
             raise InputError(message, where="markers")
         there = [s for s in sensed if stored_files(self.folder / str(section.file_of(s[1])))]
         if there and not section.marked:
             k, sensor = there[0]
             return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]
+        if self._static and section.depth and max(len(each.t_s) for each in poses) < 2:
+            return np.unique(np.concatenate([self._seen(k)[1] for k in range(len(section.depth))]))
         times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
         fewest = 1 if self._static else 3
         if len(times) < fewest:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from ..checked import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
-from ..recording import Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
+from ..recording import Camera, Depth, Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
 from ..section import ByForm, Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
@@ -304,6 +304,46 @@ class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
     file: Text | None = None
 
 
+class CameraSection(section_of(Camera, "CameraSection")):
+    """A depth camera, or the frame of a scanner; what an .npz file says need not be said here.
+
+    Attributes
+    ----------
+    poses : str, optional
+        File of poses of what carries the camera; it is at rest by default.
+    """
+
+    poses: Text | None = None
+
+
+class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
+    """What a depth camera or a scanner sees of the body; nothing is labelled.
+
+    Attributes
+    ----------
+    name : str
+        For messages, error bars and pictures.
+    file : str
+        Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
+        a folder of these in the order of their names, with times.csv or t_s.
+    camera : CameraSection
+        Where it stands, and how it projects.
+    t_s : list of float, optional
+        Times, where the file does not say them; of one image that of the first sample.
+    count_m : float, optional
+        What a count of an image is, 0.001 by default.
+    length_unit : {"m", "cm", "mm", "in"}
+        Unit of clouds.
+    """
+
+    name: Annotated[str, AfterValidator(_file_name)] = "depth"
+    file: Text
+    camera: CameraSection = Field(default_factory=lambda: CameraSection.model_construct())
+    t_s: list[Finite] | None = None
+    count_m: Positive | None = None
+    length_unit: Unit = "m"
+
+
 class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection)):
     """One recording.
 
@@ -326,6 +366,8 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
         Use every n-th sample of the markers.
     reading : list of ReadingSection
         [[experiment.reading]] tables: instruments of the user's own.
+    depth : list of DepthSection
+        [[experiment.depth]] tables: depth cameras and scanners.
     nuisance : NuisanceOrNone
         What is estimated of this recording alone, as a table; or "none".
     """
@@ -339,6 +381,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     resample_hz: Positive | None = None
     every: AtLeastOne = 1
     reading: list[ReadingSection] = Field(default_factory=list)
+    depth: list[DepthSection] = Field(default_factory=list)
     nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
 
     @property

@@ -17,6 +17,7 @@ from ..arrays import Array, Index
 from ..fem.body import Body
 from ..recording.experiment import Experiment
 from ..recording.placement import Placement, Shape
+from .sighting import Sighting, sightings_of
 
 # A place leaves its element when another holds it better by this, in barycentric coordinates: so
 # it cannot swing between two. The clock leaves its sample when it is off by more than this.
@@ -54,6 +55,8 @@ class Chart:
     axes : (M, 3, k) orthonormal directions that places may move in
     samples : int
         Whole samples of the time shift.
+    sightings : tuple of Sighting
+        Where the points of depth cameras are on the surface.
     crossed : (M, 2, 3) a point and the direction of the edge that each place last left the surface
         across, NaN where it did not
     again : (M,) how often it left there before
@@ -71,6 +74,7 @@ class Chart:
     crossed: Array
     again: Index
     samples: int = 0
+    sightings: tuple[Sighting, ...] = ()
 
     @classmethod
     def of(cls, experiment: Experiment) -> Chart:
@@ -91,6 +95,7 @@ class Chart:
             np.zeros((len(points), 3, k)),
             np.full((len(points), 2, 3), np.nan),
             np.zeros(len(points), dtype=np.int64),
+            sightings=sightings_of(experiment),
         )
         return chart.about(points)
 
@@ -119,6 +124,7 @@ class Chart:
             self.body is experiment.body
             and self.on_surface == experiment.markers.on_surface
             and np.array_equal(self.sigma_m, experiment.place_sigma_m)
+            and [s.view.depth for s in self.sightings] == [*experiment.depths]
         )
 
     @cached_property

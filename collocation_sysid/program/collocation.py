@@ -202,6 +202,11 @@ class Collocation:
         """What the objective has the loss multiplied by."""
         return 1.0 / max(1, self.measurements)
 
+    @property
+    def unseen_loss(self) -> float:
+        """Loss of the points of depth cameras that belong to nothing, as if they were at the gate."""
+        return sum(depth.unseen_loss for segment in self.segments for depth in segment.depths)
+
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
         """Variables z from p = (q, φ_1, φ_2, …) and each experiment's positions (N, 3n) [m]."""
         parts = self.parts_at(p, positions) if self.carried else []
@@ -285,9 +290,13 @@ class Collocation:
 
     # Where recordings are read ----------------------------------------------------------------
 
-    def following(self, p: Array) -> tuple[Collocation, Array]:
-        """The problem read where the estimates p are, and p in it; itself if they left no chart."""
-        found = [s.following(p[s.local.places]) for s in self.segments]
+    def following(self, p: Array, positions: Sequence[Array]) -> tuple[Collocation, Array]:
+        """The problem read where the estimates p are, and p in it; itself if they left no chart.
+
+        Positions are the first rows that depth cameras need, none where there are none.
+        """
+        pairs = zip(self.segments, positions, strict=True)
+        found = [s.following(p[s.local.places], x) for s, x in pairs]
         if all(chart is s.chart for (chart, _), s in zip(found, self.segments, strict=True)):
             return self, p
         return self._read_in([chart for chart, _ in found], p, [phi for _, phi in found])
@@ -297,7 +306,7 @@ class Collocation:
 
         That is where a solve starts; p has these places.
         """
-        if all(segment.experiment.markers.located.all() for segment in self.segments):
+        if not any(segment.rows_to_place for segment in self.segments):
             return self, p
         found = [part.segment.placed(part.phi, part.x) for part in self.parts_at(p, positions)]
         return self._read_in([chart for chart, _ in found], p, [phi for _, phi in found])

@@ -45,9 +45,11 @@ class Instrument:
     vectors, own, data : int
         Numbers of vectors, of φ and of data.
     measured : int
-        Length of y, a multiple of three.
+        Length of y, a multiple of the group.
     huber : float or None
         Huber's loss: ρ(d) = d² up to this many standard deviations, linear beyond; d² without it.
+    group : int
+        How many numbers of y the loss takes together.
     """
 
     expression: Expression
@@ -56,6 +58,7 @@ class Instrument:
     data: int
     measured: int
     huber: float | None = None
+    group: int = GROUP
 
     @cached_property
     def residual(self) -> Generated:
@@ -84,9 +87,9 @@ class Instrument:
         residual, slopes = self.residual.slopes(u, data)
         weights = np.full(residual.shape, 2.0)
         if self.huber is not None:
-            groups = residual.reshape(-1, GROUP, *residual.shape[1:])
+            groups = residual.reshape(-1, self.group, *residual.shape[1:])
             lengths = np.linalg.norm(groups, axis=1)
-            weights *= np.repeat(self.huber / np.maximum(lengths, self.huber), GROUP, axis=0)
+            weights *= np.repeat(self.huber / np.maximum(lengths, self.huber), self.group, axis=0)
         return np.einsum("ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True)
 
     @property
@@ -108,7 +111,7 @@ class Instrument:
         return self._rhos(self._residual(u, data), data)
 
     def _rhos(self, residual: ca.SX, _: ca.SX) -> ca.SX:
-        groups = ca.vertsplit(residual, GROUP)
+        groups = ca.vertsplit(residual, self.group)
         return sum((self._rho(ca.sumsqr(group)) for group in groups), start=ca.SX(0))
 
     def _rho(self, square: ca.SX) -> ca.SX:
@@ -160,6 +163,23 @@ class Window(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class Pool:
+    """What of a reading statistics look at, in groups of three.
+
+    Attributes
+    ----------
+    names, sigmas : (M,)
+    components : (S, M, 3) numbers that are there
+    places_m : (3M, 3) of these on the undeformed body, where each has one
+    """
+
+    names: tuple[str, ...]
+    sigmas: Array
+    components: NDArray[np.bool_]
+    places_m: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Reading(ABC):
     """Samples (S, E) of an instrument in one experiment, E at a time, of m numbers each.
 
@@ -170,17 +190,19 @@ class Reading(ABC):
     nuisance : NuisanceMap
     huber : float or None
         See `Instrument`.
-    names : (G,) what each group of three is, G = E m / 3
+    names : (G,) what each group is, G = E m / g
     t_s : (S,)
     sigmas : (G,) standard deviations given
     measured : (S, E, m), NaN where missing
-    components : (S, G, 3) numbers that are compared
+    components : (S, G, g) numbers that are compared
     own : (E, f) positions in φ of what each reads by
     stated : str
         What states σ in a problem.
     has_offsets : bool
         Whether it is off by what nothing else tells, such as its tare: where nothing is fitted yet
         that is allowed for.
+    group : int
+        How many numbers the loss takes together, g; three, as those of a place.
     has_fixed_windows : bool
         Whether its windows do not depend on φ.
     """
@@ -195,6 +217,7 @@ class Reading(ABC):
     components: NDArray[np.bool_]
     own: Index
 
+    group: ClassVar[int] = GROUP
     stated: ClassVar[str] = "sigma_m"
     has_offsets: ClassVar[bool] = False
     has_fixed_windows: ClassVar[bool] = True
@@ -203,6 +226,15 @@ class Reading(ABC):
     def begins_s(self) -> float:
         """From when on what is looked at tells something that is compared, however φ is."""
         return float(self.t_s[self.components.any(axis=(1, 2)).argmax()])
+
+    @cached_property
+    def pool(self) -> Pool:
+        """What statistics look at: all there is, but where neighbours are taken together."""
+        return Pool(self.names, self.sigmas, self.components)
+
+    def pooled(self, values: Array) -> Array:
+        """(S, M, 3, …) of it, from residuals (S, G, g, …) or their slopes."""
+        return values
 
     @property
     def looked_sigmas(self) -> Array:
@@ -229,6 +261,10 @@ class Reading(ABC):
         """(S,) those of them that these suffice for, however φ is."""
         return np.ones(len(self.t_s), dtype=bool)
 
+    def roughly(self, x: Array, phi: Array) -> Array | None:
+        """Residuals of a first guess, where its own say little of bodies that are far off."""
+        return None
+
     # One sample -------------------------------------------------------------------------------
 
     @cached_property
@@ -253,7 +289,9 @@ class Reading(ABC):
         """That of windows of so many vectors and data."""
         if (vectors, data) not in self._instruments:
             sizes = vectors, self.own.shape[1], data, self.measured.shape[2]
-            self._instruments[vectors, data] = Instrument(self.expression, *sizes, self.huber)
+            self._instruments[vectors, data] = Instrument(
+                self.expression, *sizes, self.huber, self.group
+            )
         return self._instruments[vectors, data]
 
     @cached_property
@@ -276,7 +314,7 @@ class Reading(ABC):
 
     def _grouped(self, values: Array) -> Array:
         """(s, G, 3) from (m, s, E)."""
-        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), GROUP)
+        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), self.group)
 
     # All samples ------------------------------------------------------------------------------
 
@@ -297,7 +335,7 @@ class Reading(ABC):
     ) -> tuple[Array, Array]:
         """The same, and their slopes (s, G, 3, size) by all parameters, of which φ are the last."""
         if not len(values):
-            samples = len(self.window(phi, 0).places), len(self.names), GROUP
+            samples = len(self.window(phi, 0).places), len(self.names), self.group
             return np.zeros(samples), np.zeros((*samples, size))
         window, residual, by_u = self._read(values, phi)
         samples, each, vectors = window.places.shape
@@ -313,7 +351,7 @@ class Reading(ABC):
             _add(found, here, first + slopes.places, by_looked[:, here] @ around)
         if self.own.size:
             _add(found, np.arange(each), first + self.own, by_own)
-        shape = samples, len(self.names), GROUP
+        shape = samples, len(self.names), self.group
         return residual.reshape(shape), found.reshape(*shape, size)
 
     def _read(self, values: Array, phi: Array) -> tuple[Window, Array, Array]:
@@ -342,10 +380,10 @@ class Reading(ABC):
         return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
 
     def changes(self, values: Array, by: Array, phi: Array) -> Array:
-        """Changes (s, G, 3, c) of the residuals where what is looked at changes (n, e, 3, c)."""
+        """Changes (s, M, 3, c) of the residuals where what is looked at changes (n, e, 3, c)."""
         size = by.shape[3] + len(phi)
         slopes = Slopes.along(np.arange(by.shape[3]), by)
-        return self.linearised(values, slopes, phi, size)[1][..., : by.shape[3]]
+        return self.pooled(self.linearised(values, slopes, phi, size)[1][..., : by.shape[3]])
 
     def loss(self, values: Array, phi: Array) -> float:
         """Σ ρ."""

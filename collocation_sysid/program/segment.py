@@ -29,12 +29,14 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import TIME
 from .block_band import BandBlock, BlockBand, BlockTerm, adding_skew, skew_values
 from .charts import Chart
+from .depth import DepthReading
 from .gauge import GaugeReading, gauge_readings
 from .local_loss import LocalLoss
 from .markers import MarkerReading
 from .motion_rows import MotionRows, ahead
 from .reading import Reading
 from .sharing import Local
+from .sighting import View
 from .wrench import WrenchReading, wrench_readings
 from .wrench_channel import Grid, sensed_dofs
 
@@ -43,7 +45,7 @@ T = TypeVar("T", bound=np.generic)
 Factors = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 Weighed = tuple[AnyHistory, Array]
 
-CHARTED = ("markers", "readings", "local_loss", "_loss_scale")
+CHARTED = ("markers", "depths", "readings", "local_loss", "_loss_scale")
 
 
 @dataclass(frozen=True)
@@ -154,9 +156,19 @@ class Segment:
         return gauge_readings(self.experiment, grid.t_s, grid, self.nuisance, self.huber)
 
     @cached_property
+    def depths(self) -> tuple[DepthReading, ...]:
+        """Those of depth cameras."""
+        how = self.dynamics.t_s, self.nuisance, self.huber
+        views = (
+            View.of(self.experiment, k, self.nuisance) for k in range(len(self.chart.sightings))
+        )
+        seen = zip(self.chart.sightings, views, strict=True)
+        return tuple(DepthReading.of(replace(each, view=view), *how) for each, view in seen)
+
+    @cached_property
     def readings(self) -> tuple[Reading, ...]:
         """All that is measured, the markers first."""
-        return self.markers, *self.sensors, *self.gauges
+        return self.markers, *self.sensors, *self.gauges, *self.depths
 
     @cached_property
     def local_loss(self) -> LocalLoss:
@@ -178,16 +190,34 @@ class Segment:
         vars(other).update(kept | {"chart": chart})
         return other
 
-    def following(self, phi: Array) -> tuple[Chart, Array]:
-        """A chart where the estimates are, and φ in it; those given where they have not left."""
+    def following(self, phi: Array, x: Array) -> tuple[Chart, Array]:
+        """A chart where the estimates are, and φ in it; those given where they have not left.
+
+        Depth cameras look anew at the first rows x (rows, 3n).
+        """
         nuisance, places = self.nuisance, self.markers.place_places
         late = phi[nuisance.places(TIME)] * nuisance.scales[nuisance.places(TIME)]
         shift = float(late.sum()) / self.experiment.timestep_s
         chart, of_places = self.chart.following(np.append(phi, 0.0)[places], shift)
+        seen = [d.sighting.following(d.shapes(x, phi), phi) for d in self.depths]
+        if any(s is not d.sighting for s, d in zip(seen, self.depths, strict=True)):
+            chart = replace(chart, sightings=tuple(seen))
         return chart, self._with_places(phi, of_places)
 
     def placed(self, phi: Array, x: Array) -> tuple[Chart, Array]:
-        """The chart, and φ in it, with unknown places on the body's first rows x (rows, 3n)."""
+        """The chart, and φ in it, with unknown places on the body's first rows x (rows, 3n).
+
+        Depth cameras are aligned to the first shape that they see.
+        """
+        phi = phi.copy()
+        seen = tuple(depth.aligned(x, phi) for depth in self.depths)
+        for each in seen:
+            phi[each.view.own] = each.view.phi(each.start)[each.view.own]
+        chart, phi = self._marked(phi, x)
+        return (replace(chart, sightings=seen) if seen else chart), phi
+
+    def _marked(self, phi: Array, x: Array) -> tuple[Chart, Array]:
+        """The same of markers alone."""
         markers, rows = self.experiment.markers, self.markers.grid_rows
         if markers.located.all():
             return self.chart, phi
@@ -208,7 +238,13 @@ class Segment:
         """First rows of x that `placed` reads; none where all places are known."""
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.present[:, unknown].argmax(axis=0)
-        return 1 + int(self.markers.grid_rows[first].max()) if len(first) else 0
+        rows = [int(self.markers.grid_rows[first].max())] if len(first) else []
+        return 1 + max(rows + [depth.first_row for depth in self.depths], default=-1)
+
+    @property
+    def rows_to_follow(self) -> int:
+        """First rows of x that `following` reads."""
+        return self.grid_rows if self.depths else 0
 
     def places_m(self, phi: Array) -> Array:
         """(M, 3) places of the markers on the undeformed body."""
@@ -219,6 +255,8 @@ class Segment:
         """(k,) φ in the middle of the chart."""
         phi, late = np.zeros(self.nuisance.size), self.nuisance.places(TIME)
         phi[late] = self.chart.samples * self.experiment.timestep_s / self.nuisance.scales[late]
+        for depth in self.depths:
+            phi += depth.sighting.view.phi(depth.sighting.start)
         return self._with_places(phi, self.chart.centre)
 
     def _with_places(self, phi: Array, of_places: Array) -> Array:

@@ -18,6 +18,7 @@ from ..stated import as_given, key, stated
 from .actuator import Actuator
 from .arrays import floats, read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
+from .depth import Depth
 from .gauge import Gauge
 from .grasp import Grasp, free_motions, held_dofs
 from .loads import Change, Force, PointMass, ramp
@@ -88,6 +89,8 @@ class Experiment:
         Pressures in cavities or on patches that are held.
     readings : sequence of Gauge
         Instruments of one's own.
+    depths : sequence of Depth
+        Depth cameras and scanners.
     nuisance : Nuisance
         What else is to be estimated about this recording alone: by default what a careful
         laboratory does not know better; `Nuisance.none` for ideal data.
@@ -117,6 +120,7 @@ class Experiment:
     tendons: tuple[Tendon, ...] = key(tables("tendon", Tendon), converter=tuple, default=())
     pressures: tuple[Pressure, ...] = key(tables("pressure", Pressure), converter=tuple, default=())
     readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
+    depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
     nuisance: Nuisance = AS_IN_A_LABORATORY
 
     def __post_init__(self) -> None:
@@ -394,11 +398,25 @@ class Experiment:
                     "expected its place among them, from 0"
                 )
 
+        for depth in self.depths:
+            what = f"the depth camera '{depth.name}'"
+            if [other.name for other in self.depths].count(depth.name) > 1:
+                raise InputError(f"two depth cameras are called {depth.name!r}; expected another")
+            within(depth.times, self.t_s, what, self.static)
+            beside = np.abs(depth.times[:, None] - self.t_s).min(axis=1)
+            if self.static and beside.max() > TIME_TOLERANCE_S:
+                raise InputError(
+                    f"{what} sees at {depth.times[beside.argmax()]:g} s, where the static "
+                    "experiment has no sample; expected times among its own"
+                )
+
     def _refuse_unmeasured(self) -> None:
-        if self.readings or self.sensed:
+        if self.readings or self.depths or self.sensed:
             return
         if not self.markers.names:
-            message = "nothing is measured: there are no markers, no wrench and no reading"
+            message = (
+                "nothing is measured: there are no markers, no wrench and no reading"
+            )
             raise InputError(f"{message}; expected one of them at least")
         raise InputError("no marker sample is present; check the marker file and window_s")
 

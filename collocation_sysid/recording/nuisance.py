@@ -21,6 +21,8 @@ DEGREE = float(np.pi / 180)
 FREELY = 1e3
 # A place may move this many edges of the mesh in a step, the time of a load this many samples.
 EDGES_A_STEP = SAMPLES_A_STEP = 2.0
+# What a depth camera sees is where it was seen on the surface about so far away.
+SEEN_A_STEP_M = 0.02
 
 Of = Literal[
     "recording",
@@ -32,9 +34,10 @@ Of = Literal[
     "pressure",
     "load",
     "sensor",
+    "depth",
     "gauge",
 ]
-Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives"]
+Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth"]
 # What recordings say that share something, besides "recording" for those that do not.
 SCOPE, SCOPES = r"shared( \S+)?", '"shared", or "shared" and a word for each of several groups'
 # Units for people.
@@ -168,6 +171,15 @@ def _seen(experiment: Any) -> bool:
     return bool(experiment.markers.names)
 
 
+def _is_seen(experiment: Any) -> bool:
+    return bool(experiment.depths)
+
+
+def _viewed(experiment: Any) -> dict[str, Any]:
+    places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
+    return {"body": id(experiment.body), "pose of its cameras": places}
+
+
 def _moves(experiment: Any) -> bool:
     return not experiment.static
 
@@ -299,6 +311,31 @@ TOOL_CENTRE = NuisanceRow("tool_m", "m", None, key="tool", of="sensor", axes="x 
     beside=0.05,
     label="centre of the tool{which}, {axis}", told="its centre off by {size}",
     said="its centre about the sensor's point; in the world's frame that of the grasped nodes")
+DEPTH_TURN = NuisanceRow("depth_turn_rad", "rad", 5 * DEGREE, key="depth_pose", of="depth",
+    axes="x y z", changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, by="length",
+    label="turn of {which}, {axis}", told="a depth camera is turned by {size}",
+    said="a turn of each depth camera about the middle of the body, along its own axes",
+    same=_viewed)
+DEPTH_SHIFT = NuisanceRow("depth_shift_m", "m", 0.02, key="depth_pose", of="depth",
+    axes="x y z", changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, reach=FREELY,
+    step=lambda experiment: SEEN_A_STEP_M, by="length",
+    label="shift of {which}, {axis}", told="a depth camera is shifted by {size}",
+    said="a shift of it; where neither is given, the first image is aligned to the body first",
+    same=_viewed)
+DEPTH_BIAS = NuisanceRow("depth_bias_m", "m", 5e-3, key="depth_bias", of="depth",
+    changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, reach=FREELY,
+    step=lambda experiment: SEEN_A_STEP_M, by="worst",
+    label="bias of {which}", told="depth is off by {size}",
+    said="what is to be added to each depth of an image")
+DEPTH_SCALE = NuisanceRow("depth_scale", "1", 5e-3, key="depth_scale", of="depth",
+    changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, by="worst",
+    label="scale of {which}", told="depth is off by {size} of itself",
+    said="a factor on each depth of an image, how far from one")
+DEPTH_TIME = NuisanceRow("depth_time_s", "s", 5e-3, key="depth_time", of="depth",
+    changes=("depth",), applies=lambda experiment: _moves(experiment) and _is_seen(experiment),
+    low=-3.0, high=3.0, by="worst",
+    label="time shift of {which}", told="a depth camera is late by {size}",
+    said="how much later than its times say a depth camera saw; three deviations at most")
 # fmt: on
 
 # In the order of φ; neighbours of one component stand together.

@@ -159,7 +159,7 @@ class Shape:
         cell = int(np.argmax(depth))
         if depth[cell] >= -_INSIDE_TOLERANCE:
             return cell, 0.0
-        to_faces = np.linalg.norm(point - _nearest(point, self.triangles), axis=1)
+        to_faces = np.linalg.norm(point - nearest_on(point, self.triangles), axis=1)
         distance = float(to_faces.min())
         # Where an edge or corner is nearest, extrapolate from the element that must the least.
         nearest = self.body.mesh.surface_cells[to_faces <= distance + 1e-9 * self.mean_edge_m]
@@ -175,7 +175,7 @@ class Shape:
 
     def on_surface(self, point: Array) -> tuple[Array, Array]:
         """The nearest point of the surface, and two directions (3, 2) in its face."""
-        nearest = _nearest(point, self.triangles)
+        nearest = nearest_on(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
         sides = self.triangles[face, 1:] - self.triangles[face, 0]
         return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
@@ -210,8 +210,9 @@ class Shape:
         return best
 
 
-def _nearest(point: Array, triangles: Array) -> Array:
-    """The points of triangles (F, 3, 3), each (F, 3), that are nearest to a point (3,)."""
+def nearest_on(point: Array, triangles: Array) -> Array:
+    """The points of triangles (F, 3, 3), each (F, 3), nearest to a point (3,), or to (F, 3)."""
+    point = point[..., None, :]
     ends = np.roll(triangles, -1, axis=1)
     sides, away = ends - triangles, point - triangles
     share = np.einsum("fci,fci->fc", away, sides) / np.einsum("fci,fci->fc", sides, sides)

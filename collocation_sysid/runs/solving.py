@@ -187,7 +187,7 @@ def read_where_found(
         if not solution.status.converged:
             break
         p, positions = solution.collocation.unpack(solution.z)
-        collocation, moved = solution.collocation.following(p)
+        collocation, moved = solution.collocation.following(p, positions)
         if collocation is solution.collocation:
             break
         solution = solver(collocation, watch, collocation.pack(moved, positions))

@@ -38,6 +38,7 @@ from ..arrays import Array
 from .distributions import chi2_sf, normal_isf
 from .linearised import FitBlock, Information, LinearisedFit
 from .noise import ROUNDING
+from .spatial import spatial_errors
 
 Mask = NDArray[np.bool_]
 
@@ -206,11 +207,14 @@ class Dependence:
         Its standard deviation if the errors are independent; infinite where it cannot be told.
     shared_p : float
         Probability of correlations among channels as large as found, if they are independent.
+    space_p : float
+        The same of neighbours on the surface.
     """
 
     lag1: float
     lag1_deviation: float
     shared_p: float
+    space_p: float = 1.0
 
     @property
     def in_time(self) -> bool:
@@ -224,9 +228,14 @@ class Dependence:
         return self.shared_p < SIGNIFICANCE
 
     @property
+    def in_space(self) -> bool:
+        """Errors that are near each other on the surface are alike."""
+        return self.space_p < SIGNIFICANCE
+
+    @property
     def found(self) -> bool:
         """The errors are not independent."""
-        return self.in_time or self.among_channels
+        return self.in_time or self.among_channels or self.in_space
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,8 +265,11 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
     """Test the residuals for correlation, in time and among channels."""
     if fit.chi_squared <= ROUNDING**2 * fit.measurements:
         return Dependence(0.0, np.inf, 1.0)
+    pairs = zip(fit.blocks, information.slopes, strict=True)
+    over_space = [found for each in pairs if (found := spatial_errors(*each))]
+    space_p = min((len(over_space) * found.p for found in over_space), default=1.0)
     if all(len(block.t_s) < 2 for block in fit.blocks):  # nothing follows on anything
-        return Dependence(0.0, np.inf, _shared_p(fit))
+        return Dependence(0.0, np.inf, _shared_p(fit), space_p)
     found = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
@@ -268,6 +280,7 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
         lag1=float(np.clip(lag1_variance / variance, -1.0, 1.0)),  # corrected, it may be beyond
         lag1_deviation=float(np.sqrt(2 / expected[1, 1])),
         shared_p=_shared_p(fit),
+        space_p=space_p,
     )
 
 
@@ -329,6 +342,7 @@ def _samples(present: NDArray[np.bool_]) -> float:
 
 def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
     residual, _, present = block.channels
+    over_space = spatial_errors(block, slope)
     measured = present.any(axis=0)
     raw_variance = float(np.sum(residual**2)) / max(1, present.sum())
     if not autocovariance[0] > 0:  # the fit leaves too little to be corrected
@@ -342,6 +356,10 @@ def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> Erro
         channels, known = _among_channels(residual, present), present
     level = weight @ np.diag(channels)
     channels *= autocovariance[0] * weight.sum() / level if level > 0 else 0.0
+    if over_space is not None and len(residual) <= residual.shape[1]:
+        # Samples are too few to tell a covariance by themselves.
+        samples = np.inf, len(residual) * over_space.freedom
+        return ErrorProcess(along, over_space.covariance, len(coefficients), *samples)
     fitted = float(np.sum(slope**2))
     memory = 1 + 2 * float(np.sum(along[1:] ** 2))
     independent = _samples(present) * _effective_channels(channels)

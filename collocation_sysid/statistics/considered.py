@@ -27,6 +27,9 @@ from ..recording.nuisance import ROWS
 from .assumptions import ASSUMPTIONS, Assumption, Effect, Fitted
 from .linearised import linearised_fit
 
+# A threshold of Huber's loss that no residual reaches.
+UNWEIGHTED = 1e9
+
 
 @dataclass(frozen=True, eq=False)
 class _Changed(Columns):
@@ -89,7 +92,7 @@ def considered(
         return replace(experiment, nuisance=replace(nuisance, **more))
 
     wider = [widened(experiment) for experiment in collocation.experiments]
-    wide = replace(collocation, experiments=wider, huber=None)  # whatever their weights
+    wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
     p, positions = collocation.unpack(z)
     known = dict(zip(collocation.names, p.tolist(), strict=True))
     at = wide.pack(np.array([known.get(name, 0.0) for name in wide.names]), positions)

@@ -318,6 +318,8 @@ def correlation_notes(asked: str, errors: str, found: Dependence) -> list[str]:
     if not found.found or (errors != "autocorrelated" and asked != "independent"):
         return []
     pattern = "have parts that markers or axes share"
+    if found.in_space:
+        pattern = "are alike where they are near each other on the surface"
     if found.in_time:
         pattern = f"persist from sample to sample (autocorrelation {found.lag1:.2f})"
     if errors == "autocorrelated":

@@ -107,6 +107,8 @@ class FitBlock:
         Whether samples are equilibria, of which no frequency can be told.
     relaxed_first : bool
         Whether a memory counts as relaxed at the first sample.
+    places_m : (3M, 3), optional
+        Where channels are on the undeformed body.
     """
 
     name: str
@@ -121,6 +123,7 @@ class FitBlock:
     stated: str = "sigma_m"
     static: bool = False
     relaxed_first: bool = False
+    places_m: Array | None = None
 
     @cached_property
     def seen(self) -> Mask:
@@ -255,23 +258,25 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         relaxed = segment.body.remembers and bool(np.isinf(experiment.loaded_since_s))
         found = part.sensing.linearised(part.x, response)
         for reading, (misfit, by_own) in zip(segment.readings, found, strict=True):
-            residual, by_own = as_weights(misfit, by_own, collocation.huber)
+            residual, by_own = as_weights(misfit, by_own, reading.huber)
+            residual, misfit, by_own = map(reading.pooled, (residual, misfit, by_own))
             slope = np.zeros((*residual.shape, len(p)))
             slope[..., segment.places] = by_own
             blocks.append(
                 FitBlock(
                     name=experiment.name,
                     t_s=reading.t_s,
-                    marker_names=reading.names,
-                    present=np.asarray(reading.components.any(axis=2)),
+                    marker_names=reading.pool.names,
+                    present=np.asarray(reading.pool.components.any(axis=2)),
                     residual=residual,
                     slope=slope,
-                    sigma_m=reading.sigmas,
+                    sigma_m=reading.pool.sigmas,
                     misfit=misfit,
-                    components=reading.components,
+                    components=reading.pool.components,
                     stated=reading.stated,
                     static=experiment.static,
                     relaxed_first=relaxed,
+                    places_m=reading.pool.places_m,
                 )
             )
     prior_residual, prior_slope = collocation.prior(p)

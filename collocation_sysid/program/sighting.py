@@ -1,0 +1,468 @@
+"""Where the points that a depth camera sees lie on the surface of the body.
+
+Nothing is labelled. A point belongs to the nearest of the surface, in the shape and with the pose
+of the camera that are known so far; a `Sighting` says which for every sample. As estimates move on
+it follows, as charts of markers' places do. Between, residuals along the normals there are smooth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from ..arrays import Array, Index
+from ..fem.body import Body
+from ..fem.touching import on_faces
+from ..model.generated import Generated
+from ..model.nuisance import NuisanceMap
+from ..recording.depth import Depth
+from ..recording.experiment import Experiment
+from ..recording.nuisance import (
+    DEPTH_BIAS,
+    DEPTH_SCALE,
+    DEPTH_SHIFT,
+    DEPTH_TIME,
+    DEPTH_TURN,
+    NuisanceRow,
+    rotation,
+)
+from ..recording.placement import nearest_on
+
+OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME)
+# Triangles, by their middles, of which the nearest point is taken.
+NEARBY = 10
+# Below this cosine between normal and view a point is seen at a grazing angle; measured normals
+# may be off by as much.
+GRAZING = 0.3
+# Off an edge the way to the nearest point leaves the normal by more than this share of itself.
+BESIDE = 0.5
+# Share of the body's size that points may be off by before anything is fitted; later so many
+# times the median, where that narrows the gate by a share.
+WIDE, SPREAD, NARROWER = 0.1, 6.0, 0.8
+# What moved by less than this share of sigma is where it was.
+SAME = 0.2
+# Of an alignment: points of the surface, iterations, the share of a body's size that it may be off
+# at first, and the weight of how far points are beside those of how far they are along normals.
+# They count as so many independent ones beside the prior.
+SAMPLES, ITERATIONS, REACH, SLIDING, INDEPENDENT = 500, 25, 0.35, 0.2, 10000
+# Turns [rad] that it is begun from besides none.
+TURNED, EXACT = 0.2, 1e6
+# An alignment farther than this many deviations of its prior is of something else.
+FARTHEST = 4.0
+
+# Flat triangles that stand for a face of three nodes, or of six with those on ab, bc, ca.
+CORNERS = np.vstack([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
+FLAT = {3: np.array([[0, 1, 2]]), 6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])}
+LEFT_OUT = ("far", "turned away", "not chosen")
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """The faces of a body, each of them some flat triangles.
+
+    Attributes
+    ----------
+    nodes : (n,) of the body
+    faces : (F, 3) or (F, 6) which of these each has
+    chosen : (F,) those that may be seen
+    """
+
+    nodes: Index
+    faces: Index
+    chosen: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, body: Body, depth: Depth) -> Skin:
+        """That of a body, and what of it a camera may see."""
+        triangles = body.mesh.surface
+        chosen = np.ones(len(triangles), dtype=bool)
+        if depth.faces is not None:
+            chosen[:] = False
+            chosen[depth.faces.resolve_faces(body.mesh)] = True
+        nodes, faces = np.unique(body.nodes.on_faces(triangles), return_inverse=True)
+        return cls(nodes, faces.reshape(len(triangles), -1), chosen)
+
+    @property
+    def flat(self) -> Index:
+        """(F·k, 3) flat triangles, those of a face after each other."""
+        return self.faces[:, FLAT[self.faces.shape[1]]].reshape(-1, 3)
+
+    def at(self, triangles: Index, shares: Array) -> tuple[Index, Array]:
+        """Faces (P,), and places (P, 3) on them, of places on flat triangles (P,)."""
+        parts = FLAT[self.faces.shape[1]]
+        corners = CORNERS[parts[triangles % len(parts)]]
+        return triangles // len(parts), np.einsum("pc,pci->pi", shares, corners)
+
+    def points(self, x: Array, faces: Index, places: Array) -> tuple[Array, Array, Array]:
+        """Weights (P, v) of the nodes, points (P, 3) and outward normals of a shape x (n, 3)."""
+        weights, slopes = on_faces(places, self.faces.shape[1])
+        corners = x[self.faces[faces]]
+        along = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
+        normals = np.cross(along[:, 0], along[:, 1])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        return weights, np.einsum("pa,pai->pi", weights, corners), normals
+
+    def facing(self, x: Array, eye_m: Array | None) -> NDArray[np.bool_]:
+        """(F·k,) flat triangles that are turned to a camera; all where there is none."""
+        if eye_m is None:
+            return np.ones(len(self.flat), dtype=bool)
+        a, b, c = x[self.flat].transpose(1, 0, 2)
+        normal, way = np.cross(b - a, c - a), eye_m - (a + b + c) / 3
+        sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
+        return np.sum(normal * way, axis=1) >= GRAZING * sizes
+
+    def nearest(self, x: Array, points: Array, among: Index) -> tuple[Index, Array]:
+        """Faces (P,), and places (P, 3) on them, nearest to points (P, 3), of some triangles."""
+        corners = x[self.flat[among]]
+        near = KDTree(corners.mean(axis=1)).query(points, min(NEARBY, len(corners)))[1]
+        near = near.reshape(len(points), -1)
+        repeated = np.repeat(points, near.shape[1], axis=0)
+        feet = nearest_on(repeated, corners[near.ravel()]).reshape(*near.shape, 3)
+        best = np.linalg.norm(feet - points[:, None], axis=2).argmin(axis=1)
+        rows = np.arange(len(points))
+        triangles, feet = near[rows, best], feet[rows, best]
+        a, b, c = corners[triangles].transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        squares = np.sum(normal**2, axis=1)
+        of_b = np.sum(np.cross(feet - a, c - a) * normal, axis=1) / squares
+        of_c = np.sum(np.cross(b - a, feet - a) * normal, axis=1) / squares
+        return self.at(among[triangles], np.column_stack([1 - of_b - of_c, of_b, of_c]))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A depth camera: what it is off by, and where it stands.
+
+    Attributes
+    ----------
+    depth : Depth
+    number : int
+        Among those of the experiment.
+    nuisance : NuisanceMap
+    pivot_m : (3,) in its frame: its turn is about the middle of the body
+    """
+
+    depth: Depth
+    number: int
+    nuisance: NuisanceMap
+    pivot_m: Array
+
+    @classmethod
+    def of(cls, experiment: Experiment, number: int, nuisance: NuisanceMap) -> View:
+        """That of an experiment's camera."""
+        depth = experiment.depths[number]
+        rotations, translations = depth.camera.motion(depth.times[:1])
+        pivot_m = (experiment.body.nodes_m.mean(axis=0) - translations[0]) @ rotations[0]
+        return cls(depth, number, nuisance, pivot_m)
+
+    @cached_property
+    def own(self) -> Index:
+        """Positions in φ of what is not known of it."""
+        return self.nuisance.places(*OF_CAMERA, of=self.number)
+
+    @cached_property
+    def motion(self) -> tuple[Array, Array]:
+        """Rotations (S, 3, 3) and translations (S, 3) from its frame to the world."""
+        return self.depth.camera.motion(self.depth.times)
+
+    @cached_property
+    def rays(self) -> list[Array]:
+        """(P, 3) that points of each sample move along as their depths grow; zeros of clouds."""
+        seen, pinhole = self.depth.points_m, self.depth.camera.matrix is not None
+        return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in seen]
+
+    def corrected(self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]) -> ca.SX:
+        """Where a point is in the frame as stated, by what the camera is off by."""
+        point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(DEPTH_BIAS, 0) * ray
+        if DEPTH_TURN in values:
+            pivot = ca.DM(self.pivot_m)
+            point = rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
+        return point + values.get(DEPTH_SHIFT, 0)
+
+    @cached_property
+    def _corrected(self) -> Generated:
+        def expression(own: ca.SX, data: ca.SX) -> ca.SX:
+            values = self.nuisance.by_row(own, self.own)
+            return self.corrected(data[:3], data[3:], values)
+
+        return Generated(expression, len(self.own), 6)
+
+    def world(self, phi: Array, sample: int) -> Array:
+        """(P, 3) the points of a sample in the world, at φ (k,)."""
+        return self.corrected_at(phi, self.depth.points_m[sample], self.rays[sample], sample)
+
+    def corrected_at(self, phi: Array, points: Array, rays: Array, sample: int) -> Array:
+        """The same of some points (P, 3) of its frame, that move along rays (P, 3)."""
+        seen = self._corrected.value(phi[self.own], np.vstack([points.T, rays.T])).T
+        rotations, translations = self.motion
+        return seen @ rotations[sample].T + translations[sample]
+
+    def told(self, phi: Array) -> dict[str, float]:
+        """What φ (k,) says of it, by label."""
+        entries, values = self.nuisance.entries, phi * self.nuisance.scales
+        return {entries[k].label: float(values[k]) for k in self.own}
+
+    def phi(self, told: Mapping[str, float]) -> Array:
+        """Φ (k,) with this, zero else."""
+        values = [told.get(entry.label, 0.0) for entry in self.nuisance.entries]
+        return np.array(values) / self.nuisance.scales
+
+    def eye_m(self, sample: int) -> Array | None:
+        """(3,) where the camera is, as stated; None of a cloud."""
+        return None if self.depth.camera.matrix is None else self.motion[1][sample]
+
+    def prior(self, row: NuisanceRow) -> Array:
+        """(3,) over the deviations of its turn, or shift; so good as infinite of what is exact."""
+        places = self.nuisance.places(row, of=self.number)
+        return 1 / self.nuisance.scales[places] if len(places) else np.full(3, EXACT)
+
+    def late_s(self, phi: Array) -> float:
+        """How much later than its times say it sees."""
+        places = self.nuisance.places(DEPTH_TIME, of=self.number)
+        return float((phi * self.nuisance.scales)[places].sum())
+
+    def with_pose(self, phi: Array, turn: Array, shift_m: Array) -> Array:
+        """Φ with another turn (rotation vector) and shift, as far as these are estimated."""
+        moved, angle = phi.copy(), np.linalg.norm(turn)
+        cayley = turn * (2 * np.tan(angle / 2) / angle if angle else 1.0)
+        for row, values in ((DEPTH_TURN, cayley), (DEPTH_SHIFT, shift_m)):
+            places = self.nuisance.places(row, of=self.number)
+            moved[places] = values[: len(places)] / self.nuisance.scales[places]
+        return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Which points of the surface a camera sees, in samples (S) of as many points (E) at most.
+
+    Attributes
+    ----------
+    view : View
+    body : Body
+    skin : Skin
+    nodes, weights : (S, E, v) of the surface's nodes, in each point
+    normals : (S, E, 3) of the surface, in the world
+    points, rays : (S, E, 3) in the camera's frame
+    places_m : (S, E, 3) on the undeformed body
+    used : (S, E) points that count
+    gate_m : float
+        Farther from the surface points are of something else, for now.
+    left_out : mapping of the reason to the number of points
+    shapes_m : (S, n, 3) of the surface, and `seen_m` (S, E, 3) in the world, as they were then
+    start : mapping of the label of what is not known of the camera to its value then
+    """
+
+    view: View
+    body: Body
+    skin: Skin
+    nodes: Index
+    weights: Array
+    normals: Array
+    points: Array
+    rays: Array
+    places_m: Array
+    used: NDArray[np.bool_]
+    gate_m: float
+    left_out: Mapping[str, int]
+    shapes_m: Array
+    start: Mapping[str, float]
+
+    @classmethod
+    def of(cls, view: View, body: Body, shapes_m: Array, phi: Array, gate_m: float) -> Sighting:
+        """That in shapes (S, n, 3) of the surface."""
+        skin = Skin.of(body, view.depth)
+        seen = [_seen(view, skin, body, k, x, phi, gate_m) for k, x in enumerate(shapes_m)]
+        most = max(1, *(len(each["used"]) for each in seen))
+        arrays = {
+            name: np.stack(
+                [
+                    np.pad(s[name], [(0, most - len(s[name])), *[(0, 0)] * (s[name].ndim - 1)])
+                    for s in seen
+                ]
+            )
+            for name in seen[0]
+            if name != "reasons"
+        }
+        total = np.sum([each["reasons"] for each in seen], axis=0).tolist()
+        own = {"left_out": dict(zip(LEFT_OUT, total, strict=True)), "start": view.told(phi)}
+        return cls(view, body, skin, gate_m=gate_m, shapes_m=shapes_m, **own, **arrays)
+
+    @classmethod
+    def aligned(cls, view: View, body: Body, shapes_m: Array, phi: Array) -> Sighting:
+        """The same, with the pose of the camera aligned to these shapes first."""
+        there = np.array([len(points) > 0 for points in view.depth.points_m])
+        first = int(there.argmax())
+        skin = Skin.of(body, view.depth)
+        turn, shift_m = alignment(view, skin, shapes_m[first], first)
+        moved = view.with_pose(phi, turn, shift_m)
+        far = np.abs(moved[view.own]).max(initial=0.0) > FARTHEST
+        gate_m = max(WIDE * float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))), view.depth.gate_m)
+        phi = phi if far else moved
+        wide = cls.of(view, body, shapes_m, phi, gate_m)
+        return wide.narrowed(shapes_m, phi) or wide
+
+    def following(self, shapes_m: Array, phi: Array) -> Sighting:
+        """That in the first shapes (s, n, 3), which are known; itself where nothing has moved."""
+        known = len(shapes_m)
+        whole = np.concatenate([shapes_m, self.shapes_m[known:]])
+        limit_m = SAME * self.view.depth.sigma_m
+        still = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0) < limit_m
+        before = self.view.phi(self.start)
+        for k in range(known if still else 0):
+            way = self.view.world(phi, k) - self.view.world(before, k)
+            still = still and np.abs(way).max(initial=0.0) < limit_m
+        narrow = self.narrowed(whole, phi)
+        if still:
+            return narrow or self
+        gate_m = self.gate_m if narrow is None else narrow.gate_m
+        return Sighting.of(self.view, self.body, whole, phi, gate_m)
+
+    def missed_m(self, x: Array, phi: Array) -> Array:
+        """How far (P,) parts of a first shape x (n, 3) that face the camera are from its points."""
+        view, turned = self.view, self.skin.facing(x, self.view.eye_m(0))
+        middles = x[self.skin.flat[turned]].mean(axis=1)
+        limit_m = WIDE * float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
+        return np.minimum(KDTree(view.world(phi, 0)).query(middles)[0], limit_m)
+
+    def narrowed(self, shapes_m: Array, phi: Array) -> Sighting | None:
+        """That within a narrower gate, where points are near enough to the surface for one."""
+        gate_m = max(self._scatter_m(shapes_m, phi), self.view.depth.gate_m)
+        if gate_m > NARROWER * self.gate_m:
+            return None
+        return Sighting.of(self.view, self.body, shapes_m, phi, gate_m)
+
+    def _scatter_m(self, shapes_m: Array, phi: Array) -> float:
+        """How far points of the body may be from the surface, by how far half of them are."""
+        apart = []
+        for k, x in enumerate(shapes_m):
+            surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
+            seen = self.view.corrected_at(phi, self.points[k], self.rays[k], k)
+            apart.append(np.sum(self.normals[k] * (surface - seen), axis=1)[self.used[k]])
+        all_of_them = np.abs(np.concatenate(apart))
+        return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
+
+
+def _seen(
+    view: View, skin: Skin, body: Body, sample: int, x: Array, phi: Array, gate_m: float
+) -> dict[str, NDArray]:
+    """What one sample sees: of points within the gate, and the reasons for leaving others out."""
+    depth, cloud = view.depth, view.depth.clouds[sample]
+    world = view.world(phi, sample)
+    low, high = x.min(axis=0) - gate_m, x.max(axis=0) + gate_m
+    near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
+    rotations, translations = view.motion
+    turned = np.flatnonzero(skin.facing(x, view.eye_m(sample)))
+    near = near if len(turned) else near[:0]
+    faces, places = near, np.zeros((0, 3))
+    if len(near):
+        faces, places = skin.nearest(x, world[near], turned)
+    weights, feet, normals = skin.points(x, faces, places)
+    away = world[near] - feet
+    distance = np.linalg.norm(away, axis=1)
+    across = np.linalg.norm(away - np.sum(away * normals, axis=1)[:, None] * normals, axis=1)
+    # A point beyond an edge of what the camera sees pulls that along the way to it.
+    beyond = across > BESIDE * distance + depth.sigma_m
+    normals[beyond] = away[beyond] / distance[beyond, None]
+    alike = np.ones(len(near), dtype=bool)
+    if cloud.shape[1] == 6:
+        alike = np.sum(normals * (cloud[near, 3:] @ rotations[sample].T), axis=1) >= GRAZING
+    checks = [distance <= gate_m, alike, skin.chosen[faces]]
+    left = np.cumprod([np.ones(len(near), dtype=bool), *checks], axis=0)
+    reasons = -np.diff(left.sum(axis=1))
+    reasons[0] += len(cloud) - len(near)
+    kept = distance <= gate_m
+    rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[skin.nodes][skin.faces[faces]])
+    return {
+        "nodes": skin.faces[faces][kept],
+        "weights": weights[kept],
+        "normals": normals[kept],
+        "points": cloud[near, :3][kept],
+        "rays": view.rays[sample][near][kept],
+        "places_m": rest_m[kept],
+        "used": left[-1].astype(bool)[kept],
+        "reasons": reasons,
+    }
+
+
+def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Array]:
+    """Turn (3,) and shift (3,) of the camera that bring what it sees to a shape x (n, 3).
+
+    From where the camera is stated to be, and turned from there both ways about each axis: the best
+    of all. What is not of the body is nearest to nothing.
+    """
+    rotations, translations = view.motion
+    corners = ((x - translations[sample]) @ rotations[sample])[skin.flat]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(sides, axis=1)
+    whole = area * np.repeat(skin.chosen, len(area) // len(skin.faces))
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(area), SAMPLES, p=whole / whole.sum())
+    places = np.einsum("pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen])
+    normals = sides[chosen] / area[chosen, None]
+    tree, size = KDTree(view.depth.points_m[sample]), float(np.linalg.norm(np.ptp(x, axis=0)))
+    gates = np.geomspace(REACH * size, view.depth.gate_m, ITERATIONS)
+    starts = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
+    tried = (_aligned(view, tree, places, normals, gates, start) for start in starts)
+    _, turn, shift = min(tried, key=lambda each: each[0])
+    return turn.as_rotvec(), shift
+
+
+def _aligned(
+    view: View, tree: KDTree, places: Array, normals: Array, gates: Array, start: Array
+) -> tuple[float, Rotation, Array]:
+    """Share of parts of the surface (P, 3) that miss the cloud, turn and shift from some turn on."""
+    turn, shift, pivot = Rotation.from_rotvec(start), np.zeros(3), view.pivot_m
+    prior = np.concatenate([view.prior(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
+    missed = 1.0
+    for gate in gates:
+        # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
+        _, found = tree.query(turn.inv().apply(places - pivot - shift) + pivot)
+        moved = turn.apply(np.asarray(tree.data)[found] - pivot) + pivot + shift
+        away, turned = moved - places, np.ones(len(places), dtype=bool)
+        if view.depth.camera.matrix is not None:
+            ways = turn.apply(-pivot) + pivot + shift - places
+            turned = np.sum(normals * ways, axis=1) > GRAZING * np.linalg.norm(ways, axis=1)
+        squares = np.sum(away**2, axis=1)
+        missed = float(np.minimum(squares / gate**2, 1.0)[turned].mean()) if turned.any() else 1.0
+        weight = np.sqrt(INDEPENDENT / max(turned.sum(), 1)) * turned / gate
+        weight /= 1 + squares / (gate / 2) ** 2
+        by = np.concatenate(
+            [-_skew(moved - pivot - shift), np.tile(np.eye(3), (len(places), 1, 1))], axis=2
+        )
+        along = np.einsum("pi,pij->pj", normals, by), np.sum(normals * away, axis=1)
+        rows = [along[0] * weight[:, None], *(SLIDING * by * weight[:, None, None]).swapaxes(0, 1)]
+        right = [along[1] * weight, *(SLIDING * away * weight[:, None]).T]
+        off = prior * np.concatenate([turn.as_rotvec(), shift])
+        step = np.linalg.lstsq(
+            np.concatenate([*rows, np.diag(prior)]), -np.concatenate([*right, off])
+        )[0]
+        turn, shift = Rotation.from_rotvec(step[:3]) * turn, shift + step[3:]
+    return missed, turn, shift
+
+
+def _skew(vectors: Array) -> Array:
+    """(P, 3, 3) matrices of cross products with vectors (P, 3)."""
+    x, y, z = vectors.T
+    none = np.zeros_like(x)
+    return np.stack([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
+
+
+def sightings_of(experiment: Experiment) -> tuple[Sighting, ...]:
+    """Those of an experiment's depth cameras, on the undeformed body as its grasp carries it."""
+    if not experiment.depths:
+        return ()
+    nuisance, found = NuisanceMap.of(experiment), []
+    for number, depth in enumerate(experiment.depths):
+        view = View.of(experiment, number, nuisance)
+        nodes = Skin.of(experiment.body, depth).nodes
+        shapes_m = experiment.rigid_positions(depth.times)[:, nodes]
+        nothing = np.zeros(nuisance.size)
+        found.append(Sighting.aligned(view, experiment.body, shapes_m, nothing))
+    return tuple(found)

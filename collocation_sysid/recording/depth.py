@@ -1,0 +1,266 @@
+"""What a depth camera or a scanner sees of a body: points of its surface, nothing labelled.
+
+A point is where a camera has it, in the camera's frame: x to the right, y downwards, z along the
+optical axis. Images are turned into points as they are taken; a cloud is points already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Array
+from ..checked import Finite, Positive
+from ..errors import InputError
+from ..fem.selection import Selection
+from ..section import Vector
+from ..stated import as_given, key, stated
+from .arrays import read_only_floats
+from .clock import first_time_fault
+from .poses import PoseSequence
+from .selected import Nodes, selection
+
+Row = tuple[Finite, Finite, Finite, Finite]
+Pose = tuple[Row, Row, Row, Row]
+# A depth that differs from the next pixel's by more than this share of itself is of another thing.
+JUMP = 0.02
+# Of distortion: fixed-point iterations, of which each gains two digits for usual lenses.
+UNDISTORTING = 12
+
+
+def _poses(poses: Any) -> PoseSequence:
+    if not isinstance(poses, PoseSequence):
+        raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
+    return poses
+
+
+@stated
+class Camera:
+    """A depth camera, or the frame of a scanner.
+
+    Parameters
+    ----------
+    matrix : (3, 3) array, optional
+        Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
+        a bias and a scale of the depth are estimated, and what faces away is left out.
+    distortion : sequence of up to five numbers
+        k1, k2, p1, p2, k3 of Brown and Conrady.
+    pose : (4, 4) array
+        From the camera's frame to the world, or, with poses, to what these move (hand to eye).
+    poses : PoseSequence, optional
+        How what carries the camera moves; at rest by default.
+
+    Raises
+    ------
+    InputError
+        If the matrix is not that of a pinhole, or the pose not rigid.
+    """
+
+    matrix: Any = key(tuple[Vector, Vector, Vector] | None, converter=as_given, default=None)
+    distortion: Any = key(list[Finite], converter=as_given, default=())
+    pose: Any = key(Pose | None, converter=as_given, default=None)
+    poses: PoseSequence | None = key(converter=_poses, default=None)
+
+    def __post_init__(self) -> None:
+        pose = read_only_floats(np.eye(4) if self.pose is None else self.pose, (4, 4), "pose")
+        turn = pose[:3, :3]
+        rigid = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
+        if not rigid or not np.allclose(pose[3], [0, 0, 0, 1]):
+            raise InputError(
+                f"pose of a camera is {pose.tolist()}; expected a rigid motion "
+                "[[R, p], [0, 0, 0, 1]] from its frame to the world, in metres"
+            )
+        distortion = read_only_floats(self.distortion, (None,), "distortion of a camera")
+        if len(distortion) > 5:
+            raise InputError(
+                f"distortion has {len(distortion)} numbers; expected k1, k2, p1, p2, k3"
+            )
+        vars(self).update(pose=pose, distortion=distortion)
+        if self.matrix is not None:
+            matrix = read_only_floats(self.matrix, (3, 3), "matrix of a camera")
+            lower = matrix[[1, 2, 2, 2], [0, 0, 1, 2]]
+            if not (np.diag(matrix) > 0).all() or not np.allclose(lower, [0, 0, 0, 1]):
+                raise InputError(
+                    f"matrix of a camera is {matrix.tolist()}; expected "
+                    "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+                )
+            vars(self)["matrix"] = matrix
+
+    def motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
+        """Rotations (S, 3, 3) and translations (S, 3) [m] from its frame to the world."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        turn, at = self.pose[:3, :3], self.pose[:3, 3]
+        if self.poses is None:
+            return np.tile(turn, (len(times), 1, 1)), np.tile(at, (len(times), 1))
+        rotations, translations = self.poses.at(times)
+        return rotations @ turn, rotations @ at + translations
+
+    def rays(self, pixels: Array) -> Array:
+        """Points (P, 3) at the depth one that pixels (P, 2), u and v, are seen at."""
+        seen = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T
+        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
+        plain = seen[:, :2].copy()
+        for _ in range(UNDISTORTING if len(self.distortion) else 0):
+            x, y = plain.T
+            r2 = x**2 + y**2
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            across = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+            down = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+            plain = (seen[:, :2] - np.column_stack([across, down])) / radial[:, None]
+        return np.column_stack([plain, np.ones(len(plain))])
+
+    def pixels(self, points_m: Array) -> Array:
+        """Where (P, 2) points (P, 3) of its frame are seen, without distortion."""
+        projected = points_m @ self.matrix.T
+        return projected[:, :2] / projected[:, 2:]
+
+
+def _faces(faces: Any) -> Selection:
+    if not isinstance(faces, Selection):
+        raise InputError(f"faces of a depth camera is {faces!r}; expected a selection")
+    return faces
+
+
+@stated
+class Depth:
+    """Depth images or clouds of points of a body, one for each of its times.
+
+    Parameters
+    ----------
+    name : str
+    t_s : (S,) array
+        Times, ascending, within those of the experiment, at whatever rate.
+    clouds : sequence of (P, 3) or (P, 6) arrays
+        Points in the camera's frame, with normals of the surface behind them where these are known;
+        NaN where missing. One without points is a dropout. `Depth.of_images` makes them of images.
+    sigma_m : float
+        Standard deviation of the noise along the normal of the surface.
+    camera : Camera
+    spacing_m : float
+        Points are thinned to about this distance: neighbouring pixels are not independent.
+    gate_m : float
+        Farther from the surface a point is of something else.
+    faces : Selection, optional
+        Faces that may be seen: those with all corners there. All by default.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, time does not increase, or there is no point.
+    """
+
+    called: ClassVar[str] = "depth camera"
+
+    name: str
+    t_s: Any
+    clouds: Sequence[Any]
+    sigma_m: float = key(Positive)
+    camera: Camera = key(converter=as_given, default=Camera())
+    spacing_m: float = key(Positive, default=0.004)
+    gate_m: float = key(Positive, default=0.01)
+    faces: Selection | None = key(Nodes | None, converter=_faces, read=selection, default=None)
+
+    def __post_init__(self) -> None:
+        where = f"the depth camera '{self.name}'"
+        times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
+        if fault := first_time_fault(times):
+            raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
+        if len(times) != len(self.clouds):
+            raise InputError(
+                f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; "
+                "expected as many"
+            )
+        clouds = tuple(self._thinned(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
+        if not any(len(cloud) for cloud in clouds):
+            raise InputError(f"{where} has no point; check its file and the unit of its depth")
+        vars(self).update(t_s=times, clouds=clouds)
+
+    @classmethod
+    def of_images(
+        cls,
+        name: str,
+        images_m: ArrayLike,
+        camera: Camera,
+        sigma_m: float,
+        t_s: ArrayLike = (0.0,),
+        **options: Any,
+    ) -> Depth:
+        """Those of depth images (S, rows, columns) or (rows, columns), see `points_of`."""
+        images = np.asarray(images_m, dtype=float)
+        images = images[None] if images.ndim == 2 else images
+        clouds = [points_of(image, camera) for image in images]
+        return cls(name, t_s, clouds, sigma_m, camera, **options)
+
+    def _thinned(self, cloud: Array) -> Array:
+        """(P, 3) or (P, 6) the point nearest to the middle of each cube of a grid."""
+        if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
+            raise InputError(
+                f"a cloud of the depth camera '{self.name}' has the shape {cloud.shape}; expected "
+                "(points, 3), or (points, 6) with normals"
+            )
+        cloud = cloud[np.isfinite(cloud).all(axis=1)]
+        cubes = np.floor(cloud[:, :3] / self.spacing_m)
+        # Across the view only: noise of the depth must not choose.
+        away = np.linalg.norm((cloud[:, :3] / self.spacing_m - cubes - 0.5)[:, :2], axis=1)
+        order = np.lexsort((away, *cubes.T))
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = (np.diff(cubes[order], axis=0) != 0).any(axis=1)
+        return cloud[np.sort(order[first])]
+
+    def __repr__(self) -> str:
+        points = sum(map(len, self.clouds))
+        return f"Depth({self.name!r}: {len(self.t_s)} images of {points} points together)"
+
+    @property
+    def times(self) -> Array:
+        """(S,)."""
+        return cast(Array, self.t_s)
+
+    @property
+    def points_m(self) -> list[Array]:
+        """(P, 3) of each sample, in the camera's frame."""
+        return [cloud[:, :3] for cloud in self.clouds]
+
+
+def points_of(image_m: Array, camera: Camera) -> Array:
+    """Points (P, 3) of a depth image (rows, columns) [m]; zero and NaN are no depth.
+
+    Pixels at the edge of something, beside a jump of the depth or a pixel that has none, are left
+    out: they see two things at once.
+    """
+    if camera.matrix is None:
+        raise InputError("a depth image needs the matrix of its camera; a cloud does without")
+    depth = np.where(np.isfinite(image_m) & (image_m > 0), image_m, np.nan)
+    whole = np.isfinite(depth)
+    for axis in (0, 1):
+        for way in (1, -1):
+            whole &= np.abs(np.roll(depth, way, axis) - depth) < JUMP * np.nan_to_num(depth)
+    whole[[0, -1]] = whole[:, [0, -1]] = False
+    v, u = np.nonzero(whole)
+    return camera.rays(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
+
+
+def depth_image(camera: Camera, shape: tuple[int, int], triangles_m: Array) -> Array:
+    """A depth image (rows, columns) [m] of triangles (F, 3, 3) in the camera's frame, NaN beyond.
+
+    Of pixels that see several the nearest counts. Lenses are ideal.
+    """
+    image = np.full(shape, np.inf)
+    for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:
+        seen = camera.pixels(corners)
+        low = np.maximum(np.ceil(seen.min(axis=0)), 0).astype(int)
+        high = np.minimum(np.floor(seen.max(axis=0)), [shape[1] - 1, shape[0] - 1]).astype(int)
+        sides = (seen[1:] - seen[0]).T
+        if (high < low).any() or abs(np.linalg.det(sides)) < 1e-12:
+            continue
+        u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+        share = np.linalg.solve(sides, np.stack([u.ravel(), v.ravel()]) - seen[0][:, None])
+        share = np.vstack([1 - share.sum(axis=0), share])
+        # What is linear over a triangle in the image is one over the depth.
+        depth = np.where((share >= -1e-9).all(axis=0), 1 / (share.T @ (1 / corners[:, 2])), np.inf)
+        here = image[low[1] : high[1] + 1, low[0] : high[0] + 1]
+        np.minimum(here, depth.reshape(here.shape), out=here)
+    return np.where(np.isfinite(image), image, np.nan)

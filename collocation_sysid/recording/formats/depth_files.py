@@ -1,0 +1,200 @@
+"""Depth images and clouds of points from files, or from all files of a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Array
+from ...errors import InputError
+from ...files import reason, require_regular
+
+# What a pixel of a PNG counts where nothing else is said, as depth cameras usually do.
+USUAL_COUNT_M = 1e-3
+IMAGES, CLOUDS = (".png", ".exr"), (".ply", ".pcd", ".npy", ".xyz")
+NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFile:
+    """What a file, or a folder, says of depth.
+
+    Attributes
+    ----------
+    images_m : list of (rows, columns), of a camera; or
+    clouds_m : list of (P, 3) or (P, 6), with normals
+    t_s : (S,) or None where it says no times
+    matrix, pose : of the camera, where it says these
+    """
+
+    images_m: list[Array]
+    clouds_m: list[Array]
+    t_s: Array | None = None
+    matrix: Array | None = None
+    pose: Array | None = None
+
+
+def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
+    """Read a file, or all files of a folder in the order of their names.
+
+    Parameters
+    ----------
+    count_m : float, optional
+        What an integer of an image counts; as the file says, or a millimetre, by default.
+    length_m : float
+        The unit of clouds.
+
+    Raises
+    ------
+    InputError
+        If it is none of these, is damaged, or a package is missing that reads it.
+    """
+    if path.is_dir():
+        return _folder(path, count_m, length_m)
+    require_regular(path)
+    kind = path.suffix.lower()
+    if kind not in _READERS:
+        known = ", ".join(_READERS)
+        raise InputError(f"is a {kind or 'file without an ending'}; expected one of {known}", path)
+    try:
+        found = _READERS[kind](path)
+    except InputError as error:
+        raise error.located(path) from error
+    except (Exception, SystemExit) as error:
+        raise InputError(f"cannot be read ({reason(error)}); expected {kind}", path) from error
+    if isinstance(found, DepthFile):
+        return found
+    if kind in CLOUDS:
+        return DepthFile([], [_cloud(found, path, length_m)])
+    return DepthFile([_in_metres(found, count_m, path)], [])
+
+
+def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
+    files = sorted(each for each in path.iterdir() if each.suffix.lower() in (*IMAGES, *CLOUDS))
+    if not files:
+        raise InputError(f"has no {', '.join((*IMAGES, *CLOUDS))}; expected images or clouds", path)
+    if len(kinds := {each.suffix.lower() for each in files}) > 1:
+        raise InputError(f"has {', '.join(sorted(kinds))} together; expected one kind", path)
+    parts = [read_depth(each, count_m, length_m) for each in files]
+    times = path / "times.csv"
+    t_s = None
+    if times.is_file():
+        t_s = np.loadtxt(times, delimiter=",", skiprows=1, usecols=0, ndmin=1)
+        if len(t_s) != len(files):
+            raise InputError(f"has {len(t_s)} times for {len(files)} files", times)
+    images = [image for part in parts for image in part.images_m]
+    return DepthFile(images, [cloud for part in parts for cloud in part.clouds_m], t_s)
+
+
+def _in_metres(image: Array, count_m: float | None, path: Path) -> Array:
+    if image.ndim != 2:
+        raise InputError(f"has the shape {image.shape}; expected one channel of depths", path)
+    if image.dtype.kind in "iu":
+        return image * (USUAL_COUNT_M if count_m is None else count_m)
+    return image.astype(float)
+
+
+def _cloud(points: Array, path: Path, length_m: float) -> Array:
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1] not in (3, 6):
+        raise InputError(
+            f"has the shape {points.shape}; expected x, y, z of each point, and nx, ny, nz behind "
+            "them where normals are known",
+            path,
+        )
+    return np.hstack([length_m * points[:, :3], points[:, 3:]])
+
+
+def _npz(path: Path) -> DepthFile:
+    with np.load(path) as held:
+        arrays = {name: held[name] for name in held.files}
+    names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
+    if len(names) != 1:
+        raise InputError(
+            f"has {', '.join(arrays) or 'nothing'}; expected one of depth_m, depth_counts with "
+            "count_m, and points_m; beside it t_s, camera_matrix, camera_pose"
+        )
+    values = arrays[names[0]]
+    if names[0] == "depth_counts":
+        values = values * float(arrays.get("count_m", USUAL_COUNT_M))
+    samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
+    clouded = names[0] == "points_m"
+    known = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
+    return DepthFile([] if clouded else samples, samples if clouded else [], *known)
+
+
+def _png(path: Path) -> Array:
+    image = import_module("PIL.Image").open(path)
+    if image.mode not in ("I;16", "I;16B", "I"):
+        raise InputError(f"has the mode {image.mode}; expected depths of 16 bits in one channel")
+    return np.asarray(image).astype(np.int64)
+
+
+def _exr(path: Path) -> Array:
+    try:
+        made = import_module("OpenEXR").File(str(path))
+    except ImportError as missing:
+        raise InputError(
+            "needs the package OpenEXR, which is not installed: pip install "
+            "'collocation-sysid[exr]', or convert it to .npz"
+        ) from missing
+    channels: Mapping[str, Any] = made.channels()
+    names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [*channels]
+    return np.asarray(channels[names[0]].pixels, dtype=float)
+
+
+def _ply(path: Path) -> Array:
+    mesh = import_module("meshio").read(path)
+    points = np.asarray(mesh.points, dtype=float)
+    return _with_normals(points, mesh.point_data)
+
+
+def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
+    for names in NORMALS:
+        if set(names) <= set(columns):
+            return np.column_stack([points, *(columns[name] for name in names)])
+    return points
+
+
+def _pcd(path: Path) -> Array:
+    raw, head = path.read_bytes(), dict[str, list[str]]()
+    begins = 0
+    while "DATA" not in head:
+        ends = raw.find(b"\n", begins)
+        if ends < 0:
+            raise InputError("has no line DATA; expected a PCD file")
+        words = raw[begins:ends].decode("ascii", "replace").split()
+        head |= {words[0]: words[1:]} if words and words[0] != "#" else {}
+        begins = ends + 1
+    kinds = zip(head["TYPE"], head["SIZE"], strict=True)
+    counts = head.get("COUNT", ["1"] * len(head["FIELDS"]))
+    fields = zip(head["FIELDS"], kinds, counts, strict=True)
+    form = np.dtype([(f, f"<{t.lower()}{s}", (int(c),)) for f, (t, s), c in fields])
+    if head["DATA"] == ["binary"]:
+        rows = np.frombuffer(raw, form, int(head["POINTS"][0]), begins)
+        columns = {name: rows[name][:, 0] for name in rows.dtype.names or ()}
+    elif head["DATA"] == ["ascii"]:
+        numbers = np.loadtxt(raw[begins:].decode("ascii").splitlines(), ndmin=2)
+        columns = dict(zip(head["FIELDS"], numbers.T, strict=True))
+    else:
+        raise InputError(
+            f"has DATA {' '.join(head['DATA'])}; expected ascii or binary: convert it, for example "
+            "by pcl_convert_pcd_ascii_binary"
+        )
+    return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
+
+
+_READERS: dict[str, Callable[[Path], Array | DepthFile]] = {
+    ".npz": _npz,
+    ".png": _png,
+    ".exr": _exr,
+    ".ply": _ply,
+    ".pcd": _pcd,
+    ".npy": lambda path: np.load(path),
+    ".xyz": lambda path: np.loadtxt(path, ndmin=2),
+}
