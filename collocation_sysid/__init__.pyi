@@ -25,11 +25,11 @@ from .problem import Problem, RolloutOptions, UncertaintyOptions
 from .program.collocation import Collocation
 from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
 from .recording import (
-    Camera,
     Capsule,
     Cuboid,
     Cylinder,
     Depth,
+    DepthCamera,
     Experiment,
     Force,
     Gauge,
@@ -59,7 +59,6 @@ __all__ = [
     "Ball",
     "Body",
     "Box",
-    "Camera",
     "Capsule",
     "Collocation",
     "Constant",
@@ -67,6 +66,7 @@ __all__ = [
     "Cuboid",
     "Cylinder",
     "Depth",
+    "DepthCamera",
     "Experiment",
     "Field",
     "Force",

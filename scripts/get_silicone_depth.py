@@ -2,8 +2,8 @@
 
 They are public data (GPL-3) of Arnavaz, Kragballe Nielsen, Kry, Macklin and Erleben 2023,
 "Differentiable Depth for Real2Sim Calibration of Soft Body Simulations", Computer Graphics Forum
-42(1): repository diku-dk/DiffCal, commit 5f810dcf577e208b0225ee6bdfd91ad854df2bc8. The folder has, of
-each image, NAME.npz (depth_counts, count_m) and NAME.json (camera and object). Written are the
+42(1): repository diku-dk/DiffCal, commit 5f810dcf577e208b0225ee6bdfd91ad854df2bc8. The folder has,
+of each image, NAME.npz (depth_counts, count_m) and NAME.json (camera and object). Written are the
 images with their cameras in the frame of the hanging bars, and a mesh of the bar.
 """
 

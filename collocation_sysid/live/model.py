@@ -368,6 +368,8 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("a force that carries something from step to step", "none")
     if experiment.actuators:
         raise refused("tensions and pressures, which frames do not bring,", "none")
+    if experiment.depths:
+        raise refused("depth cameras, which frames do not bring,", "none")
     if experiment.obstacles:
         raise refused("obstacles, which frames do not bring,", "none")
     if experiment.nuisance.sensor_lag_s and any(grasp.wrench for grasp in experiment.grasps):

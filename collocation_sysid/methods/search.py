@@ -42,6 +42,9 @@ SAFETY, FEASIBLE_FORCE = 0.3, 1e-10
 WIDEST, SEEING = 4.0, 0.25
 # With these, shorter steps that make nothing better are the last.
 SEEN = 1e-3
+# A step may lose so few of the points that were seen, and points may be so much farther off by what
+# looking anew changes.
+STILL_SEEN, AS_NEAR = 0.97, 1.01
 # Steps shorter than this tell about the curvature at the answer.
 LOCAL = 0.1
 # Estimates of places may change the elements they are read in so often.
@@ -99,13 +102,13 @@ class ReducedSearch:
         self.options, self.recorder = options, recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
-        # Points that depth cameras see belong to what is near: they do not tell how a long step ends.
+        # Points that depth cameras see belong to what is near: they tell of no long step.
         seeing = any(segment.depths for segment in collocation.segments)
         self.widest = SEEING if seeing else WIDEST
         self.trust = min(options.trust, self.widest)
         self.indefinite = 0
         self.lower, self.upper = collocation.bounds_p
-        self.rereadings = 0
+        self.rereadings, self.most_seen = 0, 0
         self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
         # Kept by the workers, see `trajectory.positions`.
@@ -339,18 +342,20 @@ class ReducedSearch:
     def _is_seen_better(self, rung: Horizon, point: Iterate, trial: Iterate) -> bool:
         """Whether it is better where depth cameras look anew, too.
 
-        What points belonged to may be another part of the surface there, and points that belong to
-        nothing any more cost as much as those at the gate.
+        What points belonged to may be another part of the surface there, or nothing any more.
         """
         before = self.collocation
-        if self.widest == WIDEST or self.rereadings >= REREADINGS:
+        if self.widest == WIDEST:
             return True
-        unseen = before.unseen_loss
+        if self.rereadings >= REREADINGS:
+            return False
+        self.most_seen = max(self.most_seen, before.measurements)
         after = self._follow(rung, trial)
         self.rereadings -= self.collocation is not before
-        better = after.loss + self.collocation.unseen_loss <= point.loss + unseen
+        seen = self.collocation.measurements
+        each, before_each = after.loss / max(1, seen), point.loss / max(1, before.measurements)
         self._read_in(rung, before, point.p)
-        return better
+        return seen >= STILL_SEEN * self.most_seen and each <= AS_NEAR * before_each
 
     def _accepted(self, rung: Horizon, point: Iterate) -> Iterate:
         self.point = point = self._follow(rung, point)

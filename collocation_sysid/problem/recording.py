@@ -16,8 +16,8 @@ from ..fem.body import Body
 from ..methods.scan import usual_constants
 from ..model.parameters import Parameters
 from ..recording import (
-    Camera,
     Depth,
+    DepthCamera,
     Experiment,
     Gauge,
     Grasp,
@@ -257,12 +257,14 @@ class RecordingReader:
         section, where = self.section.depth[k], f"depth.{k}"
         seen, at_s = self._seen(k)
         known = {"matrix": seen.matrix, "pose": seen.pose}
-        known |= stated_in(section.camera, Camera, f"{where}.camera")
+        known |= stated_in(section.camera, DepthCamera, f"{where}.camera")
         if section.camera.poses is not None:
             file = existing_file(self.folder, section.camera.poses, f"{where}.camera.poses")
             known["poses"] = read_poses(file)
         with located(where=f"{where}.camera"):
-            camera = Camera(**{name: value for name, value in known.items() if value is not None})
+            camera = DepthCamera(
+                **{name: value for name, value in known.items() if value is not None}
+            )
         with located(where=where):
             inside = within(at_s, t_s, section.file, self._static)
             clouds = seen.clouds_m or [

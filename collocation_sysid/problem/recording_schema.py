@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from ..checked import AtLeastOne, Boundless, Finite, NotNegative, Positive, Text
-from ..recording import Camera, Depth, Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
+from ..recording import Depth, DepthCamera, Experiment, Gauge, Grasp, Markers, Obstacle, Wrench
 from ..section import ByForm, Section, Unit, Vector, given_keys, section_of
 from .nuisance_schema import NuisanceOrNone, NuisanceSection
 
@@ -304,7 +304,7 @@ class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
     file: Text | None = None
 
 
-class CameraSection(section_of(Camera, "CameraSection")):
+class DepthCameraSection(section_of(DepthCamera, "DepthCameraSection")):
     """A depth camera, or the frame of a scanner; what an .npz file says need not be said here.
 
     Attributes
@@ -326,7 +326,7 @@ class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
     file : str
         Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
         a folder of these in the order of their names, with times.csv or t_s.
-    camera : CameraSection
+    camera : DepthCameraSection
         Where it stands, and how it projects.
     t_s : list of float, optional
         Times, where the file does not say them; of one image that of the first sample.
@@ -338,7 +338,7 @@ class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
 
     name: Annotated[str, AfterValidator(_file_name)] = "depth"
     file: Text
-    camera: CameraSection = Field(default_factory=lambda: CameraSection.model_construct())
+    camera: DepthCameraSection = Field(default_factory=lambda: DepthCameraSection.model_construct())
     t_s: list[Finite] | None = None
     count_m: Positive | None = None
     length_unit: Unit = "m"

@@ -202,11 +202,6 @@ class Collocation:
         """What the objective has the loss multiplied by."""
         return 1.0 / max(1, self.measurements)
 
-    @property
-    def unseen_loss(self) -> float:
-        """Loss of the points of depth cameras that belong to nothing, as if they were at the gate."""
-        return sum(depth.unseen_loss for segment in self.segments for depth in segment.depths)
-
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
         """Variables z from p = (q, φ_1, φ_2, …) and each experiment's positions (N, 3n) [m]."""
         parts = self.parts_at(p, positions) if self.carried else []
@@ -290,12 +285,13 @@ class Collocation:
 
     # Where recordings are read ----------------------------------------------------------------
 
-    def following(self, p: Array, positions: Sequence[Array]) -> tuple[Collocation, Array]:
+    def following(self, p: Array, positions: Sequence[Array] = ()) -> tuple[Collocation, Array]:
         """The problem read where the estimates p are, and p in it; itself if they left no chart.
 
         Positions are the first rows that depth cameras need, none where there are none.
         """
-        pairs = zip(self.segments, positions, strict=True)
+        rows = positions or [np.zeros((0, segment.dofs)) for segment in self.segments]
+        pairs = zip(self.segments, rows, strict=True)
         found = [s.following(p[s.local.places], x) for s, x in pairs]
         if all(chart is s.chart for (chart, _), s in zip(found, self.segments, strict=True)):
             return self, p

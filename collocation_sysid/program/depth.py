@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -25,7 +24,7 @@ from ..recording.nuisance import DEPTH_TIME
 from ..recording.placement import Placement
 from .channel import Points
 from .charts import Chart
-from .reading import GROUP, Pool, Reading, Window, lagrange_weights
+from .reading import GROUP, Pooled, Reading, Window, lagrange_weights
 from .sighting import Sighting
 
 # Times around a sample.
@@ -115,13 +114,6 @@ class DepthReading(Reading):
         return Window(self._window.places[:samples], self._window.data[:, :samples])
 
     @property
-    def unseen_loss(self) -> float:
-        """Loss of the points that belong to nothing, as if they were at the gate."""
-        depth, limit = self.sighting.view.depth, cast(float, self.huber)
-        points = sum(map(len, depth.clouds)) - int(self.sighting.used.sum())
-        return points * (2 * limit * max(depth.gate_m / depth.sigma_m, limit) - limit**2)
-
-    @property
     def first_row(self) -> int:
         """The last time of the channel that its first sample is read from."""
         return int(self._times[0, -1])
@@ -192,7 +184,7 @@ class DepthReading(Reading):
         )
 
     @cached_property
-    def pool(self) -> Pool:
+    def pool(self) -> Pooled:
         """Patches, three together."""
         means, counts = self._pooling
         name, seen = self.sighting.view.depth.name, self.sighting
@@ -200,7 +192,7 @@ class DepthReading(Reading):
         of_points = seen.places_m.reshape(-1, 3)
         sums = (means @ of_points).reshape(*counts.shape, 3) * np.sqrt(counts)[..., None]
         places = sums.sum(axis=0) / np.maximum(counts.sum(axis=0), 1)[:, None]
-        return Pool(
+        return Pooled(
             tuple(f"{name} {k + 1}" for k in range(count)),
             np.full(count, seen.view.depth.sigma_m),
             (counts > 0).reshape(len(counts), count, GROUP),

@@ -163,7 +163,7 @@ class Window(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class Pooled:
     """What of a reading statistics look at, in groups of three.
 
     Attributes
@@ -228,9 +228,9 @@ class Reading(ABC):
         return float(self.t_s[self.components.any(axis=(1, 2)).argmax()])
 
     @cached_property
-    def pool(self) -> Pool:
+    def pool(self) -> Pooled:
         """What statistics look at: all there is, but where neighbours are taken together."""
-        return Pool(self.names, self.sigmas, self.components)
+        return Pooled(self.names, self.sigmas, self.components)
 
     def pooled(self, values: Array) -> Array:
         """(S, M, 3, …) of it, from residuals (S, G, g, …) or their slopes."""

@@ -38,6 +38,8 @@ from ..recording.placement import nearest_on
 OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME)
 # Triangles, by their middles, of which the nearest point is taken.
 NEARBY = 10
+# Steps to it on a curved face.
+SETTLING = 3
 # Below this cosine between normal and view a point is seen at a grazing angle; measured normals
 # may be off by as much.
 GRAZING = 0.3
@@ -45,7 +47,7 @@ GRAZING = 0.3
 BESIDE = 0.5
 # Share of the body's size that points may be off by before anything is fitted; later so many
 # times the median, where that narrows the gate by a share.
-WIDE, SPREAD, NARROWER = 0.1, 6.0, 0.8
+WIDE, SPREAD, NARROWER = 0.25, 6.0, 0.8
 # What moved by less than this share of sigma is where it was.
 SAME = 0.2
 # Of an alignment: points of the surface, iterations, the share of a body's size that it may be off
@@ -102,12 +104,29 @@ class Skin:
 
     def points(self, x: Array, faces: Index, places: Array) -> tuple[Array, Array, Array]:
         """Weights (P, v) of the nodes, points (P, 3) and outward normals of a shape x (n, 3)."""
+        weights, points, along = self._along(x, faces, places)
+        normals = np.cross(along[:, 0], along[:, 1])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        return weights, points, normals
+
+    def _along(self, x: Array, faces: Index, places: Array) -> tuple[Array, Array, Array]:
+        """Weights, points, and slopes (P, 2, 3) of these along the faces."""
         weights, slopes = on_faces(places, self.faces.shape[1])
         corners = x[self.faces[faces]]
         along = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
-        normals = np.cross(along[:, 0], along[:, 1])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-        return weights, np.einsum("pa,pai->pi", weights, corners), normals
+        return weights, np.einsum("pa,pai->pi", weights, corners), along
+
+    def triangles(self, x: Array, parts: int = 4) -> Array:
+        """(F·parts², 3, 3) of a shape x (n, 3), faces divided along each side into so many."""
+        i, j = np.indices((parts, parts)).reshape(2, -1)
+        up, down = i + j < parts, i + j < parts - 1
+        upward = np.stack([[i, j], [i + 1, j], [i, j + 1]])[..., up]
+        downward = np.stack([[i + 1, j], [i + 1, j + 1], [i, j + 1]])[..., down]
+        of_b, of_c = np.concatenate([upward, downward], axis=2).transpose(1, 2, 0) / parts
+        places = np.stack([1 - of_b - of_c, of_b, of_c], axis=-1).reshape(-1, 3)
+        faces = np.repeat(np.arange(len(self.faces)), len(places))
+        points = self.points(x, faces, np.tile(places, (len(self.faces), 1)))[1]
+        return points.reshape(-1, 3, 3)
 
     def facing(self, x: Array, eye_m: Array | None) -> NDArray[np.bool_]:
         """(F·k,) flat triangles that are turned to a camera; all where there is none."""
@@ -133,7 +152,16 @@ class Skin:
         squares = np.sum(normal**2, axis=1)
         of_b = np.sum(np.cross(feet - a, c - a) * normal, axis=1) / squares
         of_c = np.sum(np.cross(b - a, feet - a) * normal, axis=1) / squares
-        return self.at(among[triangles], np.column_stack([1 - of_b - of_c, of_b, of_c]))
+        faces, places = self.at(among[triangles], np.column_stack([1 - of_b - of_c, of_b, of_c]))
+        for _ in range(SETTLING if self.faces.shape[1] > 3 else 0):
+            # Faces are curved: what is nearest on the flat triangle is beside what is on them.
+            _, feet, along = self._along(x, faces, places)
+            way = np.einsum("pki,pi->pk", along, points - feet)
+            squares = np.einsum("pki,pli->pkl", along, along)
+            step = np.linalg.solve(squares, way[..., None])[..., 0]
+            places = np.clip(places + np.column_stack([step, -step.sum(axis=1)]), 0.0, 1.0)
+            places /= places.sum(axis=1, keepdims=True)
+        return faces, places
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,7 +385,7 @@ def _seen(
     world = view.world(phi, sample)
     low, high = x.min(axis=0) - gate_m, x.max(axis=0) + gate_m
     near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
-    rotations, translations = view.motion
+    rotations, _ = view.motion
     turned = np.flatnonzero(skin.facing(x, view.eye_m(sample)))
     near = near if len(turned) else near[:0]
     faces, places = near, np.zeros((0, 3))
@@ -417,7 +445,7 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
 def _aligned(
     view: View, tree: KDTree, places: Array, normals: Array, gates: Array, start: Array
 ) -> tuple[float, Rotation, Array]:
-    """Share of parts of the surface (P, 3) that miss the cloud, turn and shift from some turn on."""
+    """How much of the surface at (P, 3) misses the cloud, turn and shift, from some turn on."""
     turn, shift, pivot = Rotation.from_rotvec(start), np.zeros(3), view.pivot_m
     prior = np.concatenate([view.prior(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
     missed = 1.0

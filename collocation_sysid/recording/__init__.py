@@ -2,8 +2,8 @@
 
 from .alignment import align as align
 from .clock import sample_interval_s as sample_interval_s
-from .depth import Camera as Camera
 from .depth import Depth as Depth
+from .depth import DepthCamera as DepthCamera
 from .depth import depth_image as depth_image
 from .experiment import Experiment as Experiment
 from .gauge import Gauge as Gauge

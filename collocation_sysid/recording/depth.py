@@ -38,7 +38,7 @@ def _poses(poses: Any) -> PoseSequence:
 
 
 @stated
-class Camera:
+class DepthCamera:
     """A depth camera, or the frame of a scanner.
 
     Parameters
@@ -138,7 +138,7 @@ class Depth:
         NaN where missing. One without points is a dropout. `Depth.of_images` makes them of images.
     sigma_m : float
         Standard deviation of the noise along the normal of the surface.
-    camera : Camera
+    camera : DepthCamera
     spacing_m : float
         Points are thinned to about this distance: neighbouring pixels are not independent.
     gate_m : float
@@ -158,7 +158,7 @@ class Depth:
     t_s: Any
     clouds: Sequence[Any]
     sigma_m: float = key(Positive)
-    camera: Camera = key(converter=as_given, default=Camera())
+    camera: DepthCamera = key(converter=as_given, default=DepthCamera())
     spacing_m: float = key(Positive, default=0.004)
     gate_m: float = key(Positive, default=0.01)
     faces: Selection | None = key(Nodes | None, converter=_faces, read=selection, default=None)
@@ -183,7 +183,7 @@ class Depth:
         cls,
         name: str,
         images_m: ArrayLike,
-        camera: Camera,
+        camera: DepthCamera,
         sigma_m: float,
         t_s: ArrayLike = (0.0,),
         **options: Any,
@@ -225,7 +225,7 @@ class Depth:
         return [cloud[:, :3] for cloud in self.clouds]
 
 
-def points_of(image_m: Array, camera: Camera) -> Array:
+def points_of(image_m: Array, camera: DepthCamera) -> Array:
     """Points (P, 3) of a depth image (rows, columns) [m]; zero and NaN are no depth.
 
     Pixels at the edge of something, beside a jump of the depth or a pixel that has none, are left
@@ -243,7 +243,7 @@ def points_of(image_m: Array, camera: Camera) -> Array:
     return camera.rays(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
 
 
-def depth_image(camera: Camera, shape: tuple[int, int], triangles_m: Array) -> Array:
+def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array) -> Array:
     """A depth image (rows, columns) [m] of triangles (F, 3, 3) in the camera's frame, NaN beyond.
 
     Of pixels that see several the nearest counts. Lenses are ideal.

@@ -414,9 +414,7 @@ class Experiment:
         if self.readings or self.depths or self.sensed:
             return
         if not self.markers.names:
-            message = (
-                "nothing is measured: there are no markers, no wrench and no reading"
-            )
+            message = "nothing is measured: there are no markers, no wrench and no reading"
             raise InputError(f"{message}; expected one of them at least")
         raise InputError("no marker sample is present; check the marker file and window_s")
 

@@ -1,0 +1,252 @@
+"""Depth images and clouds of points: what is read, how it is fitted, and how sure that is."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+import collocation_sysid as cs
+from collocation_sysid.errors import InputError
+from collocation_sysid.program.sighting import Skin
+from collocation_sysid.recording.depth import points_of
+from collocation_sysid.recording.formats.depth_files import read_depth
+from collocation_sysid.statistics.uncertainty import covariance
+
+TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
+MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
+MIDDLE_M, BIAS_M, NOISE_M = np.array([0.06, 0.015, -0.01]), 0.002, 1.5e-4
+
+
+def looking(eye_m: np.ndarray, at_m: np.ndarray = MIDDLE_M) -> np.ndarray:
+    """The pose of a camera that looks from one point at another, upright."""
+    ahead = (at_m - eye_m) / np.linalg.norm(at_m - eye_m)
+    right = np.cross(ahead, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([right, np.cross(ahead, right), ahead, eye_m])
+    return pose
+
+
+POSE = looking(np.array([0.06, -0.3, 0.15]))
+
+
+@cache
+def bar() -> cs.Body:
+    return cs.Body(
+        cs.box_mesh((0.12, 0.03, 0.02), (4, 1, 1)), density_kg_m3=1070.0, element="tet10"
+    )
+
+
+def hanging(depths: tuple[cs.Depth, ...], **changes) -> cs.Experiment:
+    """The bar held at one end, sagging."""
+    held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
+    kept = cs.Nuisance.none(
+        depth_turn_rad=0.09, depth_shift_m=0.02, depth_bias_m=0.005, depth_scale=0.005
+    )
+    return cs.Experiment(
+        bar(), [0.0], [held], kind="static", depths=depths, **{"nuisance": kept} | changes
+    )
+
+
+@cache
+def image_m() -> np.ndarray:
+    """What a camera at POSE sees of the bar, without noise."""
+    cloud = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
+    x = cs.simulate(hanging((cloud,)), TRUTH).positions_m[0]
+    skin, camera = Skin.of(bar(), cloud), cs.DepthCamera(MATRIX, pose=POSE)
+    seen = (skin.triangles(x[skin.nodes]) - POSE[:3, 3]) @ POSE[:3, :3]
+    return cs.depth_image(camera, SHAPE, seen)
+
+
+def noisy(rng: np.random.Generator) -> np.ndarray:
+    """The same with a bias, and noise that is alike over three pixels."""
+    noise = gaussian_filter(rng.normal(size=SHAPE), 1.2)
+    return image_m() + BIAS_M + NOISE_M * noise / noise.std()
+
+
+def moved(turn_rad: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
+    """A pose that is stated wrong by a turn about the middle of the bar, and a shift."""
+    off = np.eye(4)
+    off[:3, :3] = Rotation.from_rotvec(turn_rad).as_matrix()
+    off[:3, 3] = MIDDLE_M - off[:3, :3] @ MIDDLE_M + shift_m
+    return off @ POSE
+
+
+def fitted(image: np.ndarray, pose: np.ndarray, guess: float = 2e5, **options) -> cs.Solution:
+    camera = cs.DepthCamera(MATRIX, pose=pose)
+    depth = cs.Depth.of_images("front", image, camera, NOISE_M, spacing_m=0.004, **options)
+    unknown = {**TRUTH, "young_pa": cs.Unknown(guess)}
+    return cs.solve(cs.Problem([hanging((depth,))], cs.Parameters.of(unknown)))
+
+
+def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
+    axis, way = np.array([0.1, 0.8, -0.6]), np.array([0.5, 0.6, 0.6])
+    pose = moved(np.radians(10) * axis / np.linalg.norm(axis), 0.02 * way / np.linalg.norm(way))
+    solution = fitted(noisy(rng), pose)
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
+    (part,) = solution.collocation.parts(solution.z)
+    (reading,) = part.segment.depths
+    apart = reading.apart_m(part.looked[-1], part.phi)
+    assert np.sqrt(np.nanmean(apart**2)) < 2e-4
+    bars = covariance(solution.collocation, solution.z).estimates["young_pa"]
+    low, high = bars.ci95
+    assert low < TRUTH["young_pa"] < high < 1.2 * low
+
+
+def test_what_is_beside_the_body_is_left_out_and_counted(rng):
+    image = noisy(rng)
+    image[:20] = 0.34  # a wall above the bar, nearer than it
+    solution = fitted(image, POSE)
+    (sighting,) = solution.collocation.segments[0].chart.sightings
+    assert sighting.left_out["far"] > 20
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
+
+
+@pytest.mark.long
+def test_an_interior_point_method_finds_the_same(rng):
+    image = noisy(rng)
+    reduced = fitted(image, POSE)
+    unknown = {**TRUTH, "young_pa": cs.Unknown(1.05 * reduced.parameters["young_pa"])}
+    seen = reduced.collocation.experiments
+    other = cs.solve(cs.Problem(seen, cs.Parameters.of(unknown), method="interior-point"))
+    assert other.status.converged
+    assert abs(other.parameters["young_pa"] / reduced.parameters["young_pa"] - 1) < 5e-3
+
+
+def test_pixels_at_edges_and_without_depth_are_left_out():
+    image = np.full((8, 10), 0.5)
+    image[:, 5:] = 0.6
+    image[3, 2] = 0.0
+    points = points_of(image, cs.DepthCamera([[100, 0, 5], [0, 100, 4], [0, 0, 1]]))
+    # Rows 1 to 6, columns 1 to 8, without both beside the jump, nor the hole and its neighbours.
+    assert len(points) == 6 * 6 - 5
+    assert set(points[:, 2]) == {0.5, 0.6}
+
+
+def test_a_lens_bends_the_rays_as_its_distortion_says():
+    camera = cs.DepthCamera(MATRIX, distortion=[0.1, -0.02, 1e-3, 2e-3])
+    x, y, _ = camera.rays(np.array([[20.0, 100.0]]))[0]
+    r2 = x * x + y * y
+    radial = 1 + 0.1 * r2 - 0.02 * r2 * r2
+    u = x * radial + 2 * 1e-3 * x * y + 2e-3 * (r2 + 2 * x * x)
+    v = y * radial + 1e-3 * (r2 + 2 * y * y) + 2 * 2e-3 * x * y
+    np.testing.assert_allclose([300 * u + 80, 300 * v + 60], [20, 100], atol=1e-6)
+
+
+def written(folder: Path) -> dict[str, Path]:
+    """One cloud of three points with normals, and an image, in all formats."""
+    points, normals = np.arange(9.0).reshape(3, 3), np.tile([0.0, 0, 1], (3, 1))
+    files = {kind: folder / f"cloud.{kind}" for kind in ("npy", "xyz", "ply", "pcd", "npz", "png")}
+    np.save(files["npy"], np.hstack([points, normals]))
+    np.savetxt(files["xyz"], points)
+    columns = {f"n{axis}": normals[:, k] for k, axis in enumerate("xyz")}
+    meshio.write(files["ply"], meshio.Mesh(points, [("triangle", [[0, 1, 2]])], columns))
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 3\nDATA binary\n"
+    files["pcd"].write_bytes(head.encode() + points.astype("<f4").tobytes())
+    np.savez(files["npz"], depth_counts=np.full((4, 5), 500), count_m=1e-3)
+    Image.fromarray(np.full((4, 5), 500, dtype=np.uint16)).save(files["png"])
+    return files
+
+
+def test_clouds_and_images_are_read_from_every_format(tmp_path):
+    for kind, file in written(tmp_path).items():
+        read = read_depth(file, None, 1.0)
+        if kind in ("npz", "png"):
+            np.testing.assert_allclose(read.images_m, np.full((1, 4, 5), 0.5))
+        else:
+            (cloud,) = read.clouds_m
+            assert cloud.shape == (3, 6 if kind in ("npy", "ply") else 3)
+            np.testing.assert_allclose(cloud[:, :3].ravel(), np.arange(9))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("flat.npy", "expected x, y, z"),
+        ("colour.png", "16 bits"),
+        ("packed.pcd", "ascii or binary"),
+        ("image.tif", "expected one of"),
+        ("two.npz", "expected one of depth_m"),
+        ("image.exr", "OpenEXR"),
+    ],
+)
+def test_files_that_cannot_be_read_are_refused_with_a_remedy(tmp_path, name, said):
+    file = tmp_path / name
+    if name == "flat.npy":
+        np.save(file, np.zeros((3, 2)))
+    elif name == "colour.png":
+        Image.new("RGB", (4, 4)).save(file)
+    elif name == "two.npz":
+        np.savez(file, other=np.zeros(3))
+    else:
+        file.write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n")
+    with pytest.raises(InputError, match=said):
+        read_depth(file, None, 1.0)
+
+
+def test_a_problem_file_states_depth(tmp_path):
+    bar().mesh.write(tmp_path / "bar.vtu")
+    np.savez(tmp_path / "front.npz", depth_m=image_m(), camera_matrix=MATRIX, camera_pose=POSE)
+    text = """
+    [object]
+    mesh = "bar.vtu"
+    element = "tet10"
+    density_kg_m3 = 1070.0
+    [parameters]
+    young_pa = { guess = 1e5 }
+    poisson = 0.45
+    gamma_r_s = 1e-3
+    gamma_m_1_s = 0.1
+    [[experiment]]
+    name = "hanging"
+    kind = "static"
+    [experiment.grasp]
+    nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
+    [[experiment.depth]]
+    file = "front.npz"
+    sigma_m = 0.0002
+    spacing_m = 0.005
+    [experiment.nuisance]
+    depth_pose = { prior_m = 0.01 }
+    """
+    file = tmp_path / "problem.toml"
+    file.write_text(text)
+    (experiment,) = cs.Problem.read(file).experiments
+    (depth,) = experiment.depths
+    np.testing.assert_allclose(depth.camera.pose, POSE)
+    assert 100 < len(depth.points_m[0]) < 400
+    assert experiment.nuisance.depth_shift_m == 0.01
+    assert experiment.nuisance.depth_turn_rad is None
+    file.write_text(text.replace("front.npz", "back.npz"))
+    with pytest.raises(InputError, match="does not exist"):
+        cs.Problem.read(file)
+    camera = "camera = { matrix = [[1, 0, 0], [0, 1, 0], [0, 1, 1]] }"
+    file.write_text(text.replace("spacing_m = 0.005", camera))
+    with pytest.raises(InputError, match="pixels"):
+        cs.Problem.read(file)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    """Of twins with noise alike over three pixels and a bias; see scripts/study_depth.py."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+    from study_depth import held
+
+    assert 0.9 <= np.mean([held(seed) for seed in range(40)]) <= 1.0
+
+
+def test_a_dropout_is_a_cloud_without_points():
+    seen = points_of(image_m(), cs.DepthCamera(MATRIX))
+    depth = cs.Depth("front", [0.0, 1.0], [seen, seen[:0]], 1e-3)
+    assert [len(points) > 0 for points in depth.points_m] == [True, False]
+    with pytest.raises(InputError, match="no point"):
+        replace(depth, clouds=[seen[:0], seen[:0]])
