@@ -187,6 +187,24 @@ def instruments(scheme: str = "midpoint", huber: float | None = None) -> Colloca
     return program(replace(made, readings=blunt), scheme=scheme, huber=huber)
 
 
+def watched(**changes) -> Collocation:
+    """Seen by a camera between its samples, of which nothing is known exactly, beside markers."""
+    cube = hung_cube(6, (1, 1, 2))
+    cube = cs.with_markers(cube, cube.markers.positions_m)
+    pose = np.array([[1, 0, 0, 0.05], [0, 0, 1, -0.4], [0, -1, 0, 0.05], [0, 0, 0, 1.0]])
+    camera = cs.DepthCamera([[100, 0, 0], [0, 100, 0], [0, 0, 1]], pose=pose)
+    places = np.random.default_rng(0).uniform([-0.04, -0.04, 0.395], [0.04, 0.04, 0.405], (9, 3))
+    seen = cs.Depth("front", cube.t_s[1:5] + 0.003, [places] * 4, 0.05, camera, gate_m=0.1)
+    unknown = Nuisance.none(
+        depth_turn_rad=0.1,
+        depth_shift_m=0.02,
+        depth_bias_m=0.01,
+        depth_scale=0.01,
+        depth_time_s=0.01,
+    )
+    return program(replace(cube, depths=[seen], nuisance=unknown), **changes)
+
+
 def clamp(**changes) -> Collocation:
     """A user's load cell in the hand, beside a sensor and markers."""
     cube = wristed_cube(6, ALL_UNKNOWN, frame="grasp")
@@ -278,6 +296,7 @@ PROGRAMS: dict[str, Make] = {
         )
         for scheme, start, rows, steps in LAYOUTS
     },
+    "depth camera": watched,
     "engineering moduli": lambda: program(swung(), parameters=ENGINEERING),
     "some fixed": lambda: program(swung(), parameters=POISSON_FIXED),
     "all fixed": lambda: program(swung(), parameters=ALL_FIXED),
