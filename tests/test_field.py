@@ -309,6 +309,11 @@ def test_a_file_states_fields_of_the_body_and_of_a_region(tiny: Path):
     assert read.lengths_m == {"gamma_r_s": 0.1, "core.young_pa": 0.1}
     free = [item.name for item in read.parameters.free if "field" in item.name]
     assert free == ["field_1", "field_2", "field_3", "core.field_1", "core.field_2"]
+    known = cs.Problem.read(tiny / "problem.toml", [*stated, "parameters.field_2.guess=0.4"])
+    shares = [item for item in known.parameters.free if item.name.startswith("field_")]
+    assert sorted((share.guess, share.prior) for share in shares) == [(0.0, (0.0, 1.0))] * 2 + [
+        (0.4, (0.0, 1.0))
+    ]
     wrong = "object.region.core.field.parameter=E"
     with pytest.raises(cs.InputError, match=r"object.region 'core': parameter of a field is 'E'"):
         cs.Problem.read(tiny / "problem.toml", [*stated, *inside, wrong])

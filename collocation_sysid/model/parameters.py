@@ -211,7 +211,7 @@ def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
             None if given.guess is None else float(given.guess),
             low if given.lower is None else float(given.lower),
             high if given.upper is None else float(given.upper),
-            prior=given.prior,
+            prior=(0.0, 1.0) if given.prior is None and is_mode(name) else given.prior,
             scale=scale,
             unit=float(typical) if scale == "linear" else 1.0,
         )
@@ -261,8 +261,7 @@ class Parameters:
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
         """With the shares of the shapes of fields, of which no word was said."""
         names = dict.fromkeys(name for body in bodies for name in body.mode_names)
-        prior = Unknown(0.0, prior=(0.0, 1.0))
-        further = (parameter(name, prior) for name in names if name not in self.names)
+        further = (parameter(name, Unknown(0.0)) for name in names if name not in self.names)
         return Parameters((*self.items, *further))
 
     def fixed_at(self, values: Mapping[str, float]) -> Parameters:

@@ -13,6 +13,7 @@ import numpy as np
 import tomli_w
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from ...fem.constants import is_mode
 from ...problem.schema import ProblemFile, completed
 from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
 from ...result.animation import film
@@ -168,6 +169,8 @@ def _content(design: Design, folder: Path) -> dict[str, Any]:
     new["name"] = next(name for name in free if name not in taken)
     described["experiment"] = [*(tables if design.added else []), _designed(new)]
     for item in recording.problem.parameters.free:
+        if is_mode(item.name):
+            continue
         stated = described["parameters"].get(item.name)
         guess = {"guess": design.after.values[item.name]}
         described["parameters"][item.name] = (stated if isinstance(stated, dict) else {}) | guess

@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from ...arrays import Array
 from ...errors import InputError, require_among
+from ...fem.constants import is_mode
 from ...model.parameters import Parameters, ThetaMap
 from ...problem import Problem
 from ...program.collocation import Collocation
@@ -143,15 +144,16 @@ class Errors:
         units = 1 / np.sqrt(np.diag(information) + prior)
         scaled = units[:, None] * (information + np.diag(prior)) * units
         covariance = units[:, None] * np.linalg.inv(scaled) * units
-        values = {
-            item.name: item.value(float(c)) for item, c in zip(parameters.free, q, strict=True)
-        }
-        slopes = dict(zip(values, np.diag(sizes), strict=True))
+        values, slopes = dict[str, float](), dict[str, Array]()
+        for item, c, slope in zip(parameters.free, q, np.diag(sizes), strict=True):
+            if not is_mode(item.name):
+                values[item.name], slopes[item.name] = item.value(float(c)), slope
+        told = len(values)
         derived = Derived.of([constants], q)
         moving = {name: by_q for name, by_q in derived.by_q.items() if by_q.any()}
         values |= {name: derived.values[name] for name in moving}
         slopes |= {name: by_q / derived.values[name] for name, by_q in moving.items()}
-        return cls(covariance, values, slopes, len(parameters.free))
+        return cls(covariance, values, slopes, told)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
         """(k, nq) of those names, of the estimated parameters where there are none."""
