@@ -53,7 +53,7 @@ def prepared(divisions: int, steps: int, friction: float | None) -> dict[str, Ca
     dynamics = Dynamics.of(experiment, SCHEME).with_theta(experiment.body.theta(TRUTH))
     x = march(experiment, dynamics)
     (part,) = collocation.parts_at(collocation.guess_p, [x])
-    for term in contacts(experiment, len(x)):
+    for term in contacts(experiment):
         area_m2, nothing = term.contact.surface.area_m2, np.zeros((0, len(x), term.points.count))
         gap_m = term.contact.distance.value(term.points.vectors(x), nothing)[0]
         touched = (gap_m < term.contact.width_m) @ area_m2 / area_m2.sum()

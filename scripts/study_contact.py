@@ -93,7 +93,7 @@ def pressed(
         nuisance=cs.Nuisance.none(),
     )
     seen = cs.simulate(experiment, LAW)
-    (term,) = contacts(experiment, 1)
+    (term,) = contacts(experiment)
     x = seen.positions_m.reshape(1, -1)
     place = term.points.vectors(x)[:, 0]
     gap_m = term.contact.distance.value(place[:, None], np.zeros((0, 1, place.shape[1])))[0, 0]

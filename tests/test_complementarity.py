@@ -117,13 +117,13 @@ def test_nothing_is_entered_and_pressure_times_gap_is_small(name: str):
     experiment, answer = answered(name)
     (hard,) = answer.positions_m
     hard = hard.reshape(len(hard), -1)
-    (term,) = contacts(experiment, len(hard))
+    (term,) = contacts(experiment)
     gaps = term.contact.gaps(term.points.vectors(hard))
     assert gaps.min() >= -1e-9
     relaxed = experiment.with_obstacles(
         [replace(each, relaxed=RELAXED[-1]) for each in experiment.obstacles]
     )
-    (term,) = contacts(relaxed, len(hard))
+    (term,) = contacts(relaxed)
     product_m2 = term.pressing(hard)[0] * gaps
     assert product_m2.max() <= 1.000001 * RELAXED[-1] * term.contact.width_m**2
     assert np.any(term.pressing(hard) > 0.01 * term.contact.width_m)

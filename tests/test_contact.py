@@ -135,7 +135,7 @@ def cubed_m2(gap, width_m: float):
 @pytest.mark.parametrize("which", [0, 1])
 def test_a_contact_force_is_the_slope_of_its_energy(which):
     experiment, states = pushed()
-    term = contacts(experiment, 1)[which]
+    term = contacts(experiment)[which]
     force, x = term.force(states)[0], states.xi[0]
     assert energy_j(term, x) > 0
     ways = np.random.default_rng(1).normal(size=(6, len(x)))
@@ -150,7 +150,7 @@ def test_a_contact_force_is_the_slope_of_its_energy(which):
 def test_what_a_body_is_given_its_obstacle_loses(friction):
     experiment, states = pushed(friction)
     places = states.xi.reshape(-1, 3)
-    for term in contacts(experiment, 1):
+    for term in contacts(experiment):
         force = term.force(states).reshape(-1, 3)
         assert np.abs(force).max() > 1e-4
         np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12)
@@ -160,7 +160,7 @@ def test_what_a_body_is_given_its_obstacle_loses(friction):
 def test_friction_dissipates_and_stays_within_its_cone():
     experiment, states = pushed(0.4)
     smooth, _ = pushed()
-    rubbing, pressing = contacts(experiment, 1)[0], contacts(smooth, 1)[0]
+    rubbing, pressing = contacts(experiment)[0], contacts(smooth)[0]
     along = (rubbing.force(states) - pressing.force(states))[0]
     assert along @ states.nu[0] < 0
     own = slice(3 * len(experiment.body.nodes.points_m))
@@ -175,7 +175,7 @@ def test_a_sensor_of_an_obstacle_reads_the_sum_of_its_contact_forces():
     seen = simulate(experiment, TRUTH, "backward-euler")
     x = seen.positions_m.reshape(len(seen.t_s), -1)
     nu = np.diff(x, axis=0, prepend=x[:1]) / experiment.timestep_s
-    terms = contacts(experiment, len(x))
+    terms = contacts(experiment)
     own = slice(len(experiment.body.nodes.points_m))
     for term, read in zip(terms, seen.wrenches[1:], strict=True):
         force = term.force(States(x, nu, as_theta(TRUTH))).reshape(len(x), -1, 3)[:, own]
@@ -296,7 +296,7 @@ def test_stiffer_contact_tends_to_what_may_not_enter_at_all():
         still = {"kind": "static", "gravity_m_s2": (0.0, 0.0, 0.0), "nuisance": IDEAL}
         return Experiment(body, t_s, [held, obstacle], **still)
 
-    points = contacts(pressed(1.0, 1e-4), 1)[0].points
+    points = contacts(pressed(1.0, 1e-4))[0].points
     own = len(body.nodes_m)
     free = np.setdiff1d(np.arange(3 * own), held.dofs)
     elastic = {name: TRUTH[name] for name in ("lambda_pa", "mu_pa")}
@@ -360,7 +360,7 @@ def laid(
 
 def energies_j(experiment: Experiment, positions_m: np.ndarray, scheme: str) -> np.ndarray:
     """All of it at each step: of motion, of height, of the body and of the contact."""
-    body, law = experiment.body, contacts(experiment, 1)[0]
+    body, law = experiment.body, contacts(experiment)[0]
     own, mass, step_s = len(body.nodes.points_m), body.node_mass, experiment.timestep_s
     elastic = {name: SPONGE[name] for name in ("lambda_pa", "mu_pa")}
     young_pa = 3e3 * (3 * 2e3 + 2 * 3e3) / (2e3 + 3e3)
@@ -414,7 +414,7 @@ def test_a_block_on_a_tilted_plane_slides_beyond_its_angle_of_friction(degrees, 
     gained = (speed[-1] - speed[-41]) / (40 * experiment.timestep_s)
     if np.tan(tilt) < friction:
         share = np.tan(tilt) / friction
-        slip = contacts(experiment, 1)[0].contact.slip
+        slip = contacts(experiment)[0].contact.slip
         assert gained == pytest.approx(0.0, abs=1e-6)
         assert speed[-1] == pytest.approx(slip * share / np.sqrt(1 - share**2), rel=1e-4)
     else:

@@ -8,11 +8,10 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from problems_small import TRUTH, as_theta, measured, pressed_cube
+from problems_small import TRUTH, as_theta, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.live.model import Model
 from collocation_sysid.model.contact import contacts
 from collocation_sysid.model.force_term import States
 from collocation_sysid.program.touches import on_surface
@@ -132,12 +131,6 @@ def test_a_body_keeps_its_nodes_and_mass_and_its_obstacles_come_last():
     assert replace(cube, name="again").body is cube.body
 
 
-def test_live_refuses_obstacles():
-    problem = cs.Problem([measured(pressed_cube(4))], cs.Parameters.of(TRUTH))
-    with pytest.raises(InputError, match="obstacles, which frames do not bring"):
-        Model.of(problem)
-
-
 SOLIDS = {
     "plane": cs.Plane((0.0, 0.6, 0.8), (0.01, 0.02, 0.03)),
     "sphere": cs.Sphere(0.02, (0.01, 0.0, 0.05)),
@@ -177,7 +170,7 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is():
     motion = cs.simulate(cube, TRUTH, "bdf2")
     x = motion.positions_m.reshape(len(motion.t_s), -1)
     touched = gaps_m, pressures_pa = on_surface(cube, theta, x)
-    (term,) = contacts(cube, len(x))
+    (term,) = contacts(cube)
     force = term.force(States(x, np.zeros_like(x), theta)).reshape(len(x), -1, 3)
     own, surface = cube.body.mesh.points_m, cube.body.mesh.surface
     areas_m2 = np.linalg.norm(

@@ -370,8 +370,8 @@ def _only_experiment(problem: Problem) -> Experiment:
         raise refused("tensions and pressures, which frames do not bring,", "none")
     if experiment.depths:
         raise refused("depth cameras, which frames do not bring,", "none")
-    if experiment.obstacles:
-        raise refused("obstacles, which frames do not bring,", "none")
+    if experiment.obstacles and experiment.nuisance.obstacle_time_s:
+        raise refused("an obstacle whose delay is estimated", "one whose clock is known")
     if experiment.nuisance.sensor_lag_s and any(grasp.wrench for grasp in experiment.grasps):
         raise refused("a sensor with a low-pass (sensor_lag)", "one without")
     own = (generated(each.force, each.points.dofs) for each in experiment.body.placed_forces)

@@ -71,7 +71,7 @@ def hardened(first: Solution, solve: Solve) -> Solution:
 def within_reach(experiment: Experiment, x: Array) -> list[Obstacle]:
     """Obstacles that touch no faces but those that came near in a motion x (T, 3n)."""
     found, mesh = [], experiment.body.mesh
-    for contact, obstacle in zip(contacts(experiment, 1), experiment.obstacles, strict=True):
+    for contact, obstacle in zip(contacts(experiment), experiment.obstacles, strict=True):
         surface = contact.contact.surface
         faces = mesh.surface[surface.faces]
         gaps = nearest(contact, x).reshape(-1, surface.a_face).min(axis=1)

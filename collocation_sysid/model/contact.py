@@ -22,7 +22,7 @@ An impact rings, and may gain energy, under the midpoint rule; BDF2 and backward
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Self
 
@@ -191,19 +191,17 @@ class ContactLaw:
 
 @dataclass(frozen=True, eq=False)
 class Contact(Pointwise):
-    """What one obstacle does to a body at T times.
+    """What one obstacle does to a body, at any times.
 
     Attributes
     ----------
     contact : ContactLaw
-    times : int
     share : float
     brought : Brought, optional
         Of a program that has b as variables: these; they follow from the gap by default.
     """
 
     contact: ContactLaw
-    times: int
     share: float = 1.0
     brought: Brought | None = None
     weighed: Array | None = None
@@ -245,8 +243,8 @@ class Contact(Pointwise):
         return self
 
     def rows(self, rows: slice) -> Self:
-        """The same at some of the times."""
-        return replace(self, times=len(range(self.times)[rows]))
+        """It is the same at all times."""
+        return self
 
     def towards(self, other: Self, share: float) -> Self:
         """Obstacles move with their frames, as grasps do."""
@@ -279,18 +277,17 @@ class Contact(Pointwise):
 
     def data(self, chosen: Index | None) -> Array:
         """Of the law."""
-        data = self.contact.data[:, slice(None) if chosen is None else chosen]
-        return np.broadcast_to(data[:, None], (2, self.times, data.shape[1]))
+        return self.contact.data[:, None, slice(None) if chosen is None else chosen]
 
 
 def _no_data(y: Array) -> Array:
     return np.zeros((0, *y.shape[1:]))
 
 
-def contacts(experiment: Experiment, times: int) -> tuple[Contact, ...]:
-    """Those of an experiment's obstacles at so many times."""
+def contacts(experiment: Experiment) -> tuple[Contact, ...]:
+    """Those of an experiment's obstacles."""
     laws = (contact_law(experiment.body, o, experiment.static) for o in experiment.obstacles)
-    return tuple(Contact(law, times) for law in laws)
+    return tuple(Contact(law) for law in laws)
 
 
 @lru_cache(maxsize=32)

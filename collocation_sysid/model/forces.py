@@ -63,7 +63,7 @@ class Forces:
             Potential(actuator.measure, actuator.amplitude(times)[:, None])
             for actuator in experiment.actuators
         )
-        touching = contacts(experiment, len(times))
+        touching = contacts(experiment)
         further = (*potentials, *touching, *point_forces(experiment.body, times))
         unknown = np.full(len(experiment.body.constants), np.nan)
         still = experiment.static

@@ -6,6 +6,7 @@ obstacle's frame is at U_t X, and off by what is not known of the obstacle, to f
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -80,7 +81,18 @@ class Grasping:
         places[:, ~self._gripped], by_own[..., ~self._gripped] = self._points[:, ~self._gripped], 0
         slopes = np.zeros((3, len(self.nuisance.moving), places.shape[1]))
         slopes[:, self._columns] = by_own
-        return places.T[self._node], np.moveaxis(slopes, 2, 0)[self._node]
+        places, slopes = places.T[self._node], np.moveaxis(slopes, 2, 0)[self._node]
+        for along, obstacle, row, axis, place in self._of_obstacles:
+            if row != OBSTACLE_TIME:
+                column = np.flatnonzero(self.nuisance.moving == place)[0]
+                frame_m = self.experiment.body.nodes_m[obstacle.nodes]
+                moved = np.broadcast_to(obstacle.direction, frame_m.shape)
+                if row == OBSTACLE_TILT:
+                    moved = np.cross(obstacle.across[axis], frame_m - obstacle.shape.middle_m)
+                off = self.nuisance.scales[place] * np.repeat(moved, 3, axis=0)
+                slopes[along, :, column] = off
+                places[along] += phi[place] * off
+        return places, slopes
 
     def curvature(self, phi: Array, weights: Array) -> Array:
         """Σ weights[t, g] ∂²goal/∂φ² (m, m), for weights (N, g) that are zero while free."""
@@ -104,7 +116,7 @@ class Grasping:
 
     @cached_property
     def _zeros(self) -> Array:
-        """(N, g, m) by how much goals move with the zeros of displacements, and of obstacles."""
+        """(N, g, m) by how much goals move with zeros of displacements and delays of obstacles."""
         found = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.moving)))
         for number, grasp in enumerate(self.experiment.gripping):
             rows = np.flatnonzero(grasp.holds(self.t_s))
@@ -112,27 +124,25 @@ class Grasping:
                 along = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
                 column = np.flatnonzero(self.nuisance.moving == place)
                 found[np.ix_(rows, along, column)] = self.nuisance.scales[place]
+        beside_s = 0.5e-3 * self.experiment.timestep_s
+        for along, obstacle, row, _, place in self._of_obstacles:
+            if row == OBSTACLE_TIME:
+                places_m = self.experiment.body.nodes_m[obstacle.nodes]
+                after, before = (
+                    obstacle.poses.carry(places_m, self.t_s + s) for s in (beside_s, -beside_s)
+                )
+                rate = (before - after).reshape(len(self.t_s), -1) / (2 * beside_s)
+                column = np.flatnonzero(self.nuisance.moving == place)
+                found[:, along, column] = self.nuisance.scales[place] * rate
+        return found
+
+    @property
+    def _of_obstacles(self) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
+        """What is not known of obstacles: dofs, row, axis, and position in φ."""
         for number, obstacle in enumerate(self.experiment.obstacles, len(self.experiment.gripping)):
             along = np.searchsorted(self.dofs, obstacle.dofs)
             for row, axis, place in self.nuisance.of_obstacle(number):
-                column = np.flatnonzero(self.nuisance.moving == place)
-                change = self.nuisance.scales[place] * self._off(obstacle, row, axis)
-                found[:, along, column] = change.reshape(len(self.t_s), -1)
-        return found
-
-    def _off(self, obstacle: Obstacle, row: NuisanceRow, axis: int) -> Array:
-        """(N, 4, 3) by how much a frame moves with something that is not known of it."""
-        places_m = self.experiment.body.nodes_m[obstacle.nodes]
-        if row == OBSTACLE_TIME:
-            beside_s = 0.5e-3 * self.experiment.timestep_s
-            after, before = (
-                obstacle.poses.carry(places_m, self.t_s + s) for s in (beside_s, -beside_s)
-            )
-            return (before - after) / (2 * beside_s)
-        moved = np.broadcast_to(obstacle.direction, places_m.shape)
-        if row == OBSTACLE_TILT:
-            moved = np.cross(obstacle.across[axis], places_m - obstacle.shape.middle_m)
-        return np.einsum("tij,kj->tki", obstacle.poses.at(self.t_s)[0], moved)
+                yield along, obstacle, row, axis, place
 
     @cached_property
     def _gripped(self) -> NDArray[np.bool_]:

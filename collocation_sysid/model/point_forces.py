@@ -87,7 +87,7 @@ class Pointwise(ForceTerm):
 
     @abstractmethod
     def data(self, chosen: Index | None) -> Array:
-        """(D, T, i) of the law."""
+        """(D, T, i) of the law, or (D, 1, i)."""
 
     @property
     def couplings(self) -> SymmetricPattern:  # type: ignore[override]
@@ -116,7 +116,8 @@ class Pointwise(ForceTerm):
             before = self.brought.before[..., slice(None) if chosen is None else chosen]
         u = np.concatenate([y, *moving, steady, before])
         ends = len(y), len(y) * (2 if self.by_velocity else 1), len(u) - len(before)
-        return _At(chosen, u, self.data(chosen), *ends)
+        data = self.data(chosen)
+        return _At(chosen, u, np.broadcast_to(data, (len(data), *y.shape[1:])), *ends)
 
     def force(self, states: States) -> Array:
         """(T, 3n) [N]."""

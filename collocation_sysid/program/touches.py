@@ -59,7 +59,7 @@ def on_surface(experiment: Experiment, theta: Array, x: Array) -> tuple[Array, A
     """
     shape = len(x), len(experiment.body.mesh.surface)
     gaps_m, pressures_pa = np.full(shape, np.nan), np.zeros(shape)
-    for contact in contacts(experiment, 1):
+    for contact in contacts(experiment):
         law = contact.contact
         for first in range(0, len(x), AT_ONCE):
             rows, by_face = (
@@ -83,7 +83,7 @@ def touched(parts: Iterable[Part]) -> Iterator[Touch]:
 
 def touches(experiment: Experiment, x: Array, t_s: Array) -> Iterator[Touch]:
     """How the positions x (T, 3n) at times (T,) touch each obstacle."""
-    for contact, obstacle in zip(contacts(experiment, 1), experiment.obstacles, strict=True):
+    for contact, obstacle in zip(contacts(experiment), experiment.obstacles, strict=True):
         law, least, points = contact.contact, np.inf, []
         ever = np.zeros(contact.points.count, dtype=bool)
         for first in range(0, len(x), AT_ONCE):

@@ -90,7 +90,7 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
 
 def _step(collocation: Collocation) -> float:
     """As long as differences may be."""
-    touching = (t for s in collocation.segments for t in contacts(s.experiment, 1))
+    touching = (t for s in collocation.segments for t in contacts(s.experiment))
     return min((STEP, *(OF_WIDTH * term.contact.width_m for term in touching)))
 
 
