@@ -202,6 +202,8 @@ def test_evidence_is_that_of_a_normal_marginal_likelihood(rng):
         total = slopes @ prior @ slopes.T + noise**2 * np.eye(30)
         return -float(data @ np.linalg.solve(total, data) + np.linalg.slogdet(total)[1]) / 2
 
+    beyond = replace(field, covariance=2 * np.eye(6))  # the model misses by more than noise
+    assert beyond.likelier(factor=3.0) == 0.0
     for length_m, factor in ((None, 3.0), (0.02, 1.0), (0.1, 0.5)):
         other = modes if length_m is None else modes.at(length_m)
         turn = factor * np.linalg.lstsq(modes.shapes, other.shapes, rcond=None)[0]

@@ -36,6 +36,8 @@ from .uncertainty import Uncertainty
 TOLD = 0.5
 # Another amplitude, or length, is worth a word where it is likelier by this factor's logarithm.
 LIKELIER = 3.0
+# Of error bars' variance over the prior's: more is not told by data and prior.
+WIDER = 1.1
 AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
@@ -102,9 +104,18 @@ class FieldEstimate:
         alone = vectors * (1 / values - 1) @ vectors.T
         return alone, vectors @ ((vectors.T @ self.shares) / values)
 
+    @cached_property
+    def _beyond_prior(self) -> bool:
+        """Whether the model misses by so much more than noise that bars are wider than the prior.
+
+        The answer then weighs data and prior by other errors than these, and tells no evidence.
+        """
+        known = self.covariance
+        return not np.isfinite(known).all() or np.linalg.eigvalsh(known)[-1] > WIDER
+
     def likelier(self, length_m: float | None = None, factor: float = 1.0) -> float:
         """Ln Z(D) − ln Z(I) with another length, or with the amplitude times a factor."""
-        if not np.isfinite(self.covariance).all() or length_m == self.modes.length_m:
+        if self._beyond_prior or length_m == self.modes.length_m:
             return 0.0
         size = len(self.shares)
         prior = factor**2 * np.eye(size)
