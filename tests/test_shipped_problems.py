@@ -235,7 +235,7 @@ def test_one_silicone_and_one_friction_press_to_a_third_of_the_height():
     largest_n = np.abs(alone.collocation.segments[0].experiment.obstacles[0].wrench.values).max()
     assert pooled_wrench_rms(alone)[0] < 0.002 * largest_n
     assert 6.8e4 < 6 * alone.parameters["c10_pa"] < 7.9e4
-    assert 0.15 < alone.parameters["platen_friction"] < 0.6
+    assert 0.1 < alone.parameters["platen_friction"] < 0.35
 
 
 @pytest.mark.slow

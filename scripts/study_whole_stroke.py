@@ -1,0 +1,89 @@
+"""The whole stroke of problems/phantom_compression: each specimen alone, and what else E hangs on.
+
+    python scripts/study_whole_stroke.py [--only specimens assumed meshes]
+
+Specimens are A1 to A5 with Yeoh's law. Of A1 alone then other compressibilities, contacts and
+frictions, and other meshes. Get the data by scripts/get_phantom_compression.py. Each line takes
+half a minute of processor time, the fine mesh several.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from make_phantom_mesh import SECTIONS_MM, turned
+
+from collocation_sysid import Problem, run
+from collocation_sysid.errors import InputError, SimulationError
+from collocation_sysid.methods.solution import pooled_wrench_rms
+from collocation_sysid.runs.result import FoundValue
+
+FILE = Path(__file__).parents[1] / "problems" / "phantom_compression" / "whole_stroke.toml"
+PLATEN = "experiment.A1.obstacle.platen"
+ASSUMED = {
+    "as shipped": (),
+    "half the bulk modulus": ("parameters.kappa_pa.fixed=2e6",),
+    "2.5 times the bulk modulus": ("parameters.kappa_pa.fixed=1e7",),
+    "a tenth of κ": (f"{PLATEN}.stiffness_pa_m=1e10",),
+    "five times the slip": (f"{PLATEN}.slip=1e-4",),
+    "no friction": ("parameters.platen_friction={ fixed = 0.0 }",),
+    "hardly any slip": ("parameters.platen_friction={ fixed = 1.0 }",),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", choices=("specimens", "assumed", "meshes"))
+    only = parser.parse_args().only or ("specimens", "assumed", "meshes")
+    print("| | E kPa | 95 % | whole | μ | 95 % | whole | misfit N | % of the largest load |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, specimen, changes in _variants(only, Path(folder)):
+            print(_line(name, specimen, changes), flush=True)
+
+
+def _variants(only: Sequence[str], folder: Path) -> Iterator[tuple[str, str, Sequence[str]]]:
+    if "specimens" in only:
+        for k in range(1, 6):
+            yield f"A{k}", f"A{k}", ()
+    if "assumed" in only:
+        for name, changes in ASSUMED.items():
+            yield name, "A1", changes
+    if "meshes" in only:
+        for name, section in SECTIONS_MM.items():
+            turned(*section).write(folder / f"{name}.vtu")
+            yield f"{name} mesh", "A1", (f"object.mesh={folder / name}.vtu",)
+
+
+def _line(name: str, specimen: str, changes: Sequence[str]) -> str:
+    problem = Problem.read(FILE, list(changes))
+    (alone,) = (each for each in problem.experiments if each.name == specimen)
+    try:
+        found = run(replace(problem, experiments=[alone]), seek_causes=False)
+    except (InputError, SimulationError) as error:
+        return f"| {name} | {error} | | | | | | | |"
+    (wrench,) = (each.wrench for each in alone.obstacles if each.wrench is not None)
+    largest_n, missed_n = np.nanmax(np.abs(wrench.values)), pooled_wrench_rms(found.solution)[0]
+    assert missed_n is not None
+    young = _told(found.estimates["young_pa"], 1e-3, "{:.1f}")
+    friction = _told(found.estimates["platen_friction"], 1.0, "{:.2f}")
+    misfit = f"{4 * missed_n:.2f} | {100 * missed_n / largest_n:.2f}"
+    return f"| {name} | {young} | {friction} | {misfit} |"
+
+
+def _told(estimate: FoundValue, factor: float, form: str) -> str:
+    """A value and its two intervals."""
+    cells = [form.format(factor * estimate.value)]
+    for interval in (estimate.ci95, estimate.whole95):
+        ends = (form.format(factor * end) for end in interval or ())
+        cells.append(" to ".join(ends) or "—")
+    return " | ".join(cells)
+
+
+if __name__ == "__main__":
+    main()
