@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from collocation_sysid.model.contact import contacts
 from collocation_sysid.model.force_term import States
 from collocation_sysid.program.touches import on_surface
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
+from collocation_sysid.result.page import write_page
 from collocation_sysid.result.pictures.shapes import contact_shapes
 from collocation_sysid.result.replay import Replay
 
@@ -163,7 +166,7 @@ def test_pictures_have_outlines_where_obstacles_are_and_keep_them():
     assert Replay.of(replace(cube, grasps=cube.gripping)).obstacles_m is None
 
 
-def test_pictures_show_where_something_presses_and_how_far_the_rest_is():
+def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path: Path):
     both, theta = pressed_cube(4), as_theta(TRUTH)
     held, _, plate = both.grasps
     cube = replace(both, grasps=[held, plate])
@@ -185,6 +188,10 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is():
     kept = Replay.from_arrays(cube.name, seen.arrays())
     assert set(contact_shapes(kept)) == {"pressure", "gap"}
     assert contact_shapes(Replay.of(cube)) == {}
+    page = write_page(kept, tmp_path / "page.html").read_text()
+    (packed,) = re.findall('"outlines": "([^"]*)"', page)
+    drawn = np.frombuffer(base64.b64decode(packed), dtype="<f4").reshape(seen.obstacles_m.shape)
+    np.testing.assert_allclose(drawn, seen.obstacles_m, rtol=1e-6)
 
 
 def test_recordings_with_other_obstacles_are_of_one_body():
