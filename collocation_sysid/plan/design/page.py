@@ -40,7 +40,7 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
 
 
 def _table(design: Design) -> Table:
-    heads = ("", "value", "error before", "error after", "over the draws", "smaller by")
+    heads = ("", "value", "error before", "error after", "over the draws", "times smaller")
     before, after, rows = design.before, design.after, []
     for name, relative in after.relative.items():
         earlier = before.relative[name] if before is not None else np.nan
@@ -68,11 +68,11 @@ def _meaning(design: Design) -> str:
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
     if design.added:
-        return f"before: the recordings there are; {after} besides them"
+        return f"before: the recordings so far; {after} added to them"
     if design.before is None:
         return after
     shipped = f"{design.recording.template.duration_s:.4g} s"
-    return f"before: the problem's own motion of {shipped}; {after}, alone"
+    return f"before: the problem's own motion of {shipped}; {after} by itself"
 
 
 def pictures(design: Design) -> dict[str, Figure]:
