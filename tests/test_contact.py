@@ -16,8 +16,10 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.force_term import States
 from collocation_sysid.program.simulation import simulate
+from collocation_sysid.program.touches import rubbings
 from collocation_sysid.recording import (
     Capsule,
     Cuboid,
@@ -423,6 +425,18 @@ def test_a_block_on_a_tilted_plane_slides_beyond_its_angle_of_friction(degrees, 
     across, normal = np.linalg.norm(seen.wrenches[0][:, :2], axis=1), seen.wrenches[0][:, 2]
     known = np.isfinite(normal)
     assert (across[known] <= friction * normal[known] + 1e-9).all()
+    dynamics = Dynamics.of(experiment, scheme).with_theta(experiment.body.theta(RUBBER))
+    x = seen.positions_m.reshape(len(seen.t_s), -1)
+    (rubbed,) = rubbings(experiment, dynamics, x).values()
+    path_m = speed.sum() * experiment.timestep_s
+    braked_j = friction * mass.sum() * G_M_S2 * np.cos(tilt) * path_m
+    assert rubbed.used <= 1
+    if np.tan(tilt) < friction:
+        assert rubbed.slipping < 0.05
+        assert rubbed.dissipated_j < 2e-3 * mass.sum() * G_M_S2 * EDGE_M
+    else:
+        assert rubbed.slipping > 0.95
+        assert rubbed.dissipated_j == pytest.approx(braked_j, rel=0.02)
 
 
 def test_a_dragged_block_sticks_then_slips_and_the_other_way_again():

@@ -10,9 +10,12 @@ import pytest
 from problems_small import GUESS, measured, pressed_cube
 
 import collocation_sysid as cs
+from collocation_sysid.display import plain_text
 from collocation_sysid.program.touches import Touch, touches
 from collocation_sysid.recording import Experiment
+from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
+from collocation_sysid.runs.result import Result
 from collocation_sysid.statistics.trust import contact_concerns
 
 TRUTH = {"young_pa": 2e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
@@ -164,6 +167,19 @@ def test_what_several_recordings_share_is_said_once():
     often = [touch_of(replace(poked(shape=SMALL), name=name)) for name in ("a", "b", "c")]
     (one,) = contact_concerns(often)
     assert "'a' and 2 more" in one.sentence
+
+
+def test_what_friction_did_is_told_in_a_line_and_kept_in_the_result(tmp_path):
+    run = answer(poked(friction=0.3, place_sigma_m=None))
+    said = " ".join(
+        plain_text(summary(run.result, run.save(tmp_path / "run", frames=False))).split()
+    )
+    assert said.count("friction of ball in 'poke': at most") == 1
+    (rubbed,) = run.result.fit.experiments["poke"].friction.values()
+    assert 0 < rubbed.used <= 1
+    assert 0 < rubbed.slipping < 1
+    assert rubbed.dissipated_j > 0
+    assert Result.read(tmp_path / "run").fit == run.result.fit
 
 
 def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():

@@ -43,6 +43,8 @@ from .point_forces import Brought, Pointwise
 # κ in E over an edge of the mesh, δ in edges; ε in edges a second, or a sample: by up to that much
 # a body creeps that lies where it is held by friction.
 STIFFNESS, WIDTH, SLIP = 100.0, 0.002, (0.01, 1e-4)
+# Many ε fast the friction is 95 % of its limit, and more: it slips.
+FAST = 3.0
 # Evaluations are of so many points at a time, or a multiple: that few sizes are compiled.
 AT_A_TIME = 16
 # Widths that b of relaxed contact has at most, also where a gap is not positive.
@@ -165,28 +167,51 @@ class ContactLaw:
 
     def force(self, u: ca.SX, data: ca.SX, pressing: ca.SX | None = None) -> ca.SX:
         """(12,) on the ways to the point and to the ends of the frame, at b as it is or given."""
-        size = 3 * VECTORS
-        y, constants = u[:size], u[u.numel() - len(self.columns) :]
-        place, axes = self.seen(y)
+        place, axes, slope, normal_n = self._normal(u, data, pressing)
+        # What turns the frame is as the point is seen along its axes.
+        push = normal_n * slope
+        force = ca.vertcat(axes @ push, ca.vec(u[:3] @ push.T) / self._size_m)
+        if not self.obstacle.rubs:
+            return force
+        _, rub, _ = self._rub(u, place, axes @ slope, normal_n)
+        return force + ca.vertcat(rub, -ca.vec(rub @ (place / self._size_m).T))
+
+    def _normal(
+        self, u: ca.SX, data: ca.SX, pressing: ca.SX | None
+    ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """The point in the obstacle's frame, its axes, the gap's slope there and N."""
+        place, axes = self.seen(u[: 3 * VECTORS])
         here = ca.SX.sym("place", 3)
         gap, slope = self.gap(here), ca.gradient(self.gap(here), here)
         gap, slope = ca.substitute([gap, slope], [here], [place])
         near = self.near(gap, data[1]) if pressing is None else pressing
-        normal_n = data[0] * self.stiffness(constants) * near
-        # What turns the frame is as the point is seen along its axes.
-        push = normal_n * slope
-        force = ca.vertcat(axes @ push, ca.vec(y[:3] @ push.T) / self._size_m)
-        if not self.obstacle.rubs:
-            return force
-        against, *ends = ca.vertsplit(u[size : 2 * size], 3)
-        shares = place / self._size_m
-        against -= ca.horzcat(*ends) @ shares
-        normal = axes @ slope
-        normal /= ca.norm_2(normal)
+        return place, axes, slope, data[0] * self.stiffness(self._constants(u)) * near
+
+    def _constants(self, u: ca.SX) -> ca.SX:
+        return u[u.numel() - len(self.columns) :]
+
+    def _rub(
+        self, u: ca.SX, place: ca.SX, slope: ca.SX, normal_n: ca.SX
+    ) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """What friction may be, what it is (3,), and the velocity along the obstacle (3,)."""
+        against, *ends = ca.vertsplit(u[3 * VECTORS : 6 * VECTORS], 3)
+        against -= ca.horzcat(*ends) @ (place / self._size_m)
+        normal = slope / ca.norm_2(slope)
         along = against - normal * ca.dot(normal, against)
-        speed = ca.sqrt(ca.sumsqr(along) + self.slip**2)
-        rub = -self.friction(constants) * normal_n / speed * along
-        return force + ca.vertcat(rub, -ca.vec(rub @ shares.T))
+        limit_n = self.friction(self._constants(u)) * normal_n
+        return limit_n, -limit_n / ca.sqrt(ca.sumsqr(along) + self.slip**2) * along, along
+
+    @cached_property
+    def rubbing(self) -> Generated:
+        """What friction may be, that of what slips, what it is (3,), and its power; (y, ẏ, c)."""
+
+        def told(u: ca.SX, data: ca.SX) -> ca.SX:
+            place, axes, slope, normal_n = self._normal(u, data, None)
+            limit_n, rub, along = self._rub(u, place, axes @ slope, normal_n)
+            slips = ca.sumsqr(along) > (FAST * self.slip) ** 2
+            return ca.vertcat(limit_n, limit_n * slips, rub, -ca.dot(rub, along))
+
+        return Generated(told, self.generated.inputs, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,6 +257,11 @@ class Contact(Pointwise):
         gaps = self.contact.gaps(self.points.vectors(xi))
         data = np.broadcast_to(self.contact.data[:, None], (2, *gaps.shape))
         return self.contact.pressing.value(gaps[None], data)
+
+    def rubbing(self, states: States) -> Array:
+        """(6, T) sums over its points of what friction does, see the law's."""
+        here = self._at(states)
+        return self.contact.rubbing.value(here.u, here.data).sum(axis=2)
 
     @property
     def by_velocity(self) -> bool:

@@ -9,9 +9,13 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.contact import Contact, contacts
+from ..model.dynamics import Dynamics
+from ..model.force_term import States
 from ..recording.experiment import Experiment
 from .part import Part
 
+# Of the largest normal force.
+GRAZE = 0.01
 # Samples whose gaps are looked at together.
 AT_ONCE = 64
 
@@ -72,6 +76,45 @@ def on_surface(experiment: Experiment, theta: Array, x: Array) -> tuple[Array, A
             pressing = contact.pressing(x[rows])[0].reshape(by_face).mean(axis=2)
             pressures_pa[here] += law.stiffness_at(theta) * pressing
     return gaps_m, pressures_pa
+
+
+@dataclass(frozen=True)
+class Rubbing:
+    """What friction with an obstacle did in a motion.
+
+    Attributes
+    ----------
+    used : float
+        Its largest force over what it may be, of all points together.
+    slipping : float
+        Share of the time that points slip, by what friction may be there.
+    dissipated_j : float
+    """
+
+    used: float
+    slipping: float
+    dissipated_j: float
+
+
+def rubbings(experiment: Experiment, dynamics: Dynamics, x: Array) -> dict[str, Rubbing]:
+    """By its name what each obstacle with friction did along positions x (T, 3n)."""
+    xi, nu = dynamics.evaluation_states(x)
+    told = {}
+    for contact in contacts(experiment, 1):
+        if not contact.by_velocity:
+            continue
+        rows = (States(a[None], v[None], dynamics.theta) for a, v in zip(xi, nu, strict=True))
+        sums = np.concatenate([contact.rubbing(row) for row in rows], axis=1)
+        limit_n, slipping_n, *rub_n, power_w = sums
+        # Of a mere graze nothing is said.
+        firm = limit_n > GRAZE * limit_n.max(initial=0.0)
+        used = np.linalg.norm(rub_n, axis=0)[firm] / limit_n[firm]
+        told[contact.contact.obstacle.name] = Rubbing(
+            used=float(used.max(initial=0.0)),
+            slipping=float(slipping_n.sum() / max(limit_n.sum(), np.finfo(float).tiny)),
+            dissipated_j=float(power_w.sum() * dynamics.step_s),
+        )
+    return told
 
 
 def touched(parts: Iterable[Part]) -> Iterator[Touch]:

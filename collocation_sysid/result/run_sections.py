@@ -255,6 +255,11 @@ def _fit(result: Result) -> Section:
         for reading, rms in (each.reading_rms or {}).items():
             sigma = short((each.reading_sigma or {})[reading])
             lines.append(f"{reading} of '{name}': {short(rms)} RMS (sigma {sigma})")
+        for obstacle, rubbed in (each.friction or {}).items():
+            lines.append(
+                f"friction of {obstacle} in '{name}': at most {rubbed.used:.0%} of its limit, "
+                f"slips {rubbed.slipping:.0%} of the time, takes {short(rubbed.dissipated_j)} J"
+            )
     lines += [_simulated(name, each) for name, each in result.rollout.experiments.items()]
     lines.append(
         f"{result.iterations} iterations in {timing.total:.1f} s "

@@ -13,6 +13,7 @@ from ..fem.constants import is_mode, symbol_of, unit_of
 from ..fem.field import FieldShapes
 from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
+from ..program.touches import Rubbing
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import NumericalError
@@ -159,6 +160,7 @@ class FittedExperiment:
         What was estimated of this recording alone, in words.
     wrench_sigma_n, wrench_sigma_nm, reading_sigma
         What is stated of the noise.
+    friction : by obstacle, of those that rub
     """
 
     rms_m: float
@@ -172,6 +174,7 @@ class FittedExperiment:
     wrench_sigma_n: float | None = optional()
     wrench_sigma_nm: float | None = optional()
     reading_sigma: Mapping[str, float] | None = optional()
+    friction: Mapping[str, Rubbing] | None = optional()
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from ..methods.solution import pooled_wrench_rms, reading_rms
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import Part
+from ..program.touches import rubbings
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, in_unit_for_people
 from ..statistics.fields import FieldEstimate
@@ -192,6 +193,7 @@ def _fit(answer: Answer) -> FoundFit:
             reading_rms(experiment, solution.readings[name]) or None,
             *(root_mean(each[np.isfinite(each)]) or None for each in both),
             reading_sigma={gauge.name: gauge.sigma for gauge in experiment.readings} or None,
+            friction=rubbings(experiment, part.setting.dynamics, part.x) or None,
         )
     pooled = pooled_wrench_rms(solution)
     return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled)
