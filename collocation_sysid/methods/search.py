@@ -108,7 +108,7 @@ class ReducedSearch:
         self.trust = min(options.trust, self.widest)
         self.indefinite = 0
         self.lower, self.upper = collocation.bounds_p
-        self.rereadings, self.most_seen = 0, 0
+        self.rereadings, self.most_seen, self.placed = 0, 0, True
         self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
         # Kept by the workers, see `trajectory.positions`.
@@ -316,10 +316,12 @@ class ReducedSearch:
 
     def _place(self, rung: Horizon, first: bool) -> None:
         """Start unknown places where the first samples lie on what was simulated first."""
-        if first and self.x is not None:
+        if (first or not self.placed) and self.x is not None:
             counts = [segment.rows_to_place for segment in self.collocation.segments]
             if any(counts):
                 rows = rung.first_rows(self.x, counts)
+                seeing = self.widest == SEEING  # what is seen later is not there yet
+                self.placed = not seeing or [*map(len, rows)] == counts
                 self._read_in(rung, *self.collocation.placed(self.p, rows))
 
     def _read_in(self, rung: Horizon, collocation: Collocation, p: Array) -> None:

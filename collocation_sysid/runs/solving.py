@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
@@ -134,9 +137,23 @@ def _solved(
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
-    if scan is None:
-        return solution
-    return replace(solution, scan=scan, notes=(scan.sentence, *solution.notes))
+    notes = (*([] if scan is None else [scan.sentence]), *solution.notes, *_seen(solution))
+    return replace(solution, scan=scan or solution.scan, notes=notes)
+
+
+def _seen(solution: Solution) -> Iterator[str]:
+    """How near the surface is to what depth cameras saw, and what of that was left out."""
+    for part in solution.collocation.parts(solution.z):
+        readings = len(part.segment.readings) - len(part.segment.depths)
+        for reading, looked in zip(part.segment.depths, part.looked[readings:], strict=True):
+            apart_m, seen = reading.apart_m(looked, part.phi), reading.sighting
+            said = ", ".join(f"{count} {why}" for why, count in seen.left_out.items() if count)
+            yield (
+                f"experiment '{part.segment.experiment.name}': {seen.used.sum()} points of "
+                f"'{seen.view.depth.name}' are off by {1e3 * np.sqrt(np.nanmean(apart_m**2)):.3g} "
+                f"mm (RMS; half of them by less than {1e3 * np.nanmedian(np.abs(apart_m)):.3g}); "
+                f"left out: {said or 'none'}"
+            )
 
 
 def shared(solver: Method, workers: Workers | None) -> Method:
