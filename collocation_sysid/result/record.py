@@ -114,8 +114,20 @@ def replays(finished: Answer) -> list[Replay]:
             read = _sensed(finished, experiment), _own_readings(finished, experiment)
             own = places_m, *read, _touched(finished, experiment, shown[0])
             replay = Replay.of(experiment, fit, rolled_out, natural, *own)
-            seen.append(replace(replay, fields=_in_cells(finished, experiment.body)))
+            of_cells, of_cameras = _in_cells(finished, experiment.body), _seen(finished, experiment)
+            seen.append(replace(replay, fields=of_cells, seen=of_cameras))
     return seen
+
+
+def _seen(finished: Answer, experiment: Experiment) -> dict[str, Array]:
+    """What depth cameras see, see `Replay.seen`; nothing of what was not fitted."""
+    found = {}
+    for part in finished.solution.collocation.parts(finished.solution.z):
+        readings = len(part.segment.readings) - len(part.segment.depths)
+        if part.segment.experiment.name == experiment.name:
+            for reading, looked in zip(part.segment.depths, part.looked[readings:], strict=True):
+                found[reading.sighting.view.depth.name] = reading.drawn(part.x, looked, part.phi)
+    return found
 
 
 def _touched(

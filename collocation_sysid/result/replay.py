@@ -26,7 +26,7 @@ from ..runs.result import Result
 
 ARRAYS_FILE = "trajectory.npz"
 # What stands before the number of a wrench, and the names of readings of one's own and of fields.
-WRENCH, READING, FIELD = "wrench_", "reading_", "field_"
+WRENCH, READING, FIELD, SEEN = "wrench_", "reading_", "field_", "seen_"
 # Of the body, and so the same for all experiments of a run.
 OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes,
@@ -95,6 +95,9 @@ class Replay:
     fields : mapping of name to (E, 4)
         Constants that differ from place to place: value, the ends of its interval, and its
         deviation over the prior's, NaN where another region is.
+    seen : mapping of name to (k, 3)
+        Of each depth camera's first image: u, v and how far behind the surface [m] of points; and
+        u, v of outlines of faces as fitted, each ended by a row of NaN.
     gaps_m, pressures_pa : (T, F) of the surface as fitted, or simulated, where there are obstacles
     """
 
@@ -125,6 +128,7 @@ class Replay:
     gaps_m: Array | None = None
     pressures_pa: Array | None = None
     fields: Mapping[str, Array] = field(default_factory=dict)
+    seen: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -201,6 +205,7 @@ class Replay:
         stored |= {f"{WRENCH}{k}": values for k, values in enumerate(self.wrenches, start=1)}
         stored |= {f"{READING}{name}": values for name, values in self.readings.items()}
         stored |= {f"{FIELD}{name}": values for name, values in self.fields.items()}
+        stored |= {f"{SEEN}{name}": values for name, values in self.seen.items()}
         there = {key: value for key, value in stored.items() if value is not None}
         return {key if key in OF_BODY else prefix + key: value for key, value in there.items()}
 
@@ -225,6 +230,8 @@ class Replay:
         stored["readings"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
         said = f"{prefix}{FIELD}"
         stored["fields"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
+        said = f"{prefix}{SEEN}"
+        stored["seen"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)
         stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
@@ -290,6 +297,9 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
     for name, said in arrays["fields"].items():
         if said.dtype.kind != "f" or said.shape != (len(arrays["tetrahedra"]), 4):
             raise ValueError(f"{FIELD}{name} is {said.dtype} of shape {said.shape}")
+    for name, said in arrays["seen"].items():
+        if said.dtype.kind != "f" or said.ndim != 2 or said.shape[1] != 3:
+            raise ValueError(f"{SEEN}{name} is {said.dtype} of shape {said.shape}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
             raise ValueError(f"{key} names nodes that are not there")

@@ -15,6 +15,7 @@ from ...runs.result import Result
 from ..replay import Replay, read_run, reading_run
 from ..style import RESOLUTION_DPI
 from .confidence import Confidence, budget_picture, confidence_ellipses, correlation_matrix
+from .depth import depth_picture
 from .field import field_picture
 from .mesh import elements_picture, mesh_picture
 from .over_time import error_over_time, readings_picture, tracks
@@ -74,6 +75,8 @@ def _of_experiment(replay: Replay) -> dict[str, Figure]:
         count = said.shape[1] // 3
         names = [f"{name} {k + 1}" for k in range(count)] if count > 1 else [name]
         pictures[f"reading_{replay.name}_{name}"] = readings_picture(said, names)
+    for name, seen in replay.seen.items():
+        pictures[f"depth_{replay.name}_{name}"] = depth_picture(seen)
     if replay.has_shapes:
         pictures[f"shapes_{replay.name}"] = shapes(replay)
         coloured = contact_shapes(replay).items()
