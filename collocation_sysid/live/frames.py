@@ -286,8 +286,10 @@ class FrameReader:
         if len(cells) != len(self._columns):
             raise InputError(f"{len(cells)} cells; expected {len(self._columns)}")
         by_name = dict(zip(self._columns, map(_cell, cells), strict=True))
-        poses = [self._pose_of(by_name, number) for number in self.grasps]
-        pose = None if any(one is None for one in poses) else as_pose(_alone(poses), self.grasps)
+        poses = [[by_name[name] for name in self._pose_columns(k)] for k in self.grasps]
+        each = [(values[:3], values[3:]) for values in poses]
+        seen = not np.isnan(poses).any()
+        pose = as_pose(each[0] if len(each) == 1 else each, self.grasps) if seen else None
         tracks = [[by_name.get(f"{m}_{a}", np.nan) for a in ("x", "y", "z")] for m in self.names]
         t_s, told = as_time(by_name["t_s"]), list[Told]()
         for number, columns in enumerate(self._told_columns, 1):
@@ -295,10 +297,6 @@ class FrameReader:
             if np.isfinite(values).any():
                 told.append((number, t_s, values))
         return Frame(t_s, pose, as_tracks(tracks, self.names), told=tuple(told))
-
-    def _pose_of(self, by_name: Mapping[str, float], number: int) -> Pose | None:
-        values = [by_name[name] for name in self._pose_columns(number)]
-        return None if np.isnan(values).any() else (values[:3], values[3:])
 
     def _pose_columns(self, number: int) -> list[str]:
         before = "" if len(self.grasps) == 1 else f"{number}."
@@ -325,10 +323,6 @@ class FrameReader:
                 f"a column {reprlib.repr(unknown[0])}; expected {', '.join(sorted(known))}"
             )
         return columns
-
-
-def _alone(poses: list[Pose]) -> Pose:
-    return poses[0] if len(poses) == 1 else poses
 
 
 def _parsed(text: str) -> Mapping[str, Any]:

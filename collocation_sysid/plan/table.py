@@ -198,6 +198,7 @@ def _summary(method: str, rows: Sequence[Row]) -> Row:
     low, high = wilson_interval(successes, len(done))
     errors = [f"error_{name}" for name in parameters_in(rows, "error_")]
     medians = [name for name, column in COLUMNS.items() if column.summed_up]
+    known = {n: [row[n] for row in done if row[n] is not None] for n in (*errors, *medians)}
     return {
         "method": method,
         "runs": len(done),
@@ -206,13 +207,8 @@ def _summary(method: str, rows: Sequence[Row]) -> Row:
         "success_rate": successes / len(done) if done else None,
         "success_low": low,
         "success_high": high,
-        **{name: _median(done, name) for name in (*errors, *medians)},
+        **{name: float(np.median(each)) if each else None for name, each in known.items()},
     }
-
-
-def _median(rows: Sequence[Row], name: str) -> float | None:
-    values = [row[name] for row in rows if row[name] is not None]
-    return float(np.median(values)) if values else None
 
 
 def best_run(rows: Sequence[Row]) -> Row | None:
