@@ -100,7 +100,7 @@ def rubbings(experiment: Experiment, dynamics: Dynamics, x: Array) -> dict[str, 
     """By its name what each obstacle with friction did along positions x (T, 3n)."""
     xi, nu = dynamics.evaluation_states(x)
     told = {}
-    for contact in contacts(experiment, 1):
+    for contact in contacts(experiment):
         if not contact.by_velocity:
             continue
         rows = (States(a[None], v[None], dynamics.theta) for a, v in zip(xi, nu, strict=True))
