@@ -19,6 +19,7 @@ from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
 from collocation_sysid.pipeline import Run
 from collocation_sysid.program.wrench import without_sensors
 from collocation_sysid.recording import Nuisance
+from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
@@ -230,6 +231,7 @@ def test_an_eighth_of_a_cylinder_stands_for_the_whole_and_its_friction_resists(t
 @pytest.mark.slow
 def test_one_silicone_and_one_friction_press_to_a_third_of_the_height():
     problem = measured("phantom_compression", "PHANTOM_DATA", "whole_stroke.toml")
+    assert check_problem(problem).derivatives_agree
     alone = solve(replace(problem, experiments=problem.experiments[:1]))
     assert alone.status.converged
     largest_n = np.abs(alone.collocation.segments[0].experiment.obstacles[0].wrench.values).max()

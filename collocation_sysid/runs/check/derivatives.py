@@ -20,7 +20,7 @@ from ...recording.wrench import Wrench
 SAMPLES, STATIC_SAMPLES = 12, 3
 STEP = 1e-5
 # Over the gap in which a pressure rises: steps that leave it say nothing of slopes within.
-OF_WIDTH = 1e-2
+OF_WIDTH = 1e-3
 # With more entries memory and wrenches are not laid out as variables: their slopes are checked.
 LAID_OUT = 5e6
 
