@@ -56,6 +56,8 @@ SAME = 0.2
 SAMPLES, ITERATIONS, REACH, SLIDING, INDEPENDENT = 500, 25, 0.35, 0.2, 10000
 # Turns [rad] that it is begun from besides none.
 TURNED, EXACT = 0.2, 1e6
+# More points of a cloud only make it slower.
+ENOUGH = 4000
 # An alignment farther than this many deviations of its prior is of something else.
 FARTHEST = 4.0
 
@@ -434,7 +436,8 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
     chosen = rng.choice(len(area), SAMPLES, p=whole / whole.sum())
     places = np.einsum("pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen])
     normals = sides[chosen] / area[chosen, None]
-    tree, size = KDTree(view.depth.points_m[sample]), float(np.linalg.norm(np.ptp(x, axis=0)))
+    cloud, size = view.depth.points_m[sample], float(np.linalg.norm(np.ptp(x, axis=0)))
+    tree = KDTree(cloud[:: 1 + len(cloud) // ENOUGH])
     gates = np.geomspace(REACH * size, view.depth.gate_m, ITERATIONS)
     starts = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
     tried = (_aligned(view, tree, places, normals, gates, start) for start in starts)
