@@ -114,8 +114,16 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert held >= 17
 
 
-def test_an_obstacle_far_from_where_it_is_stated_is_told():
-    assert "nuisance/far" in told(answer(poked(2.5e-3)))
+@pytest.mark.parametrize(
+    ("off_m", "prior_m", "verdict"), [(2.5e-3, 5e-4, "check"), (1e-3, 1e-4, "doubtful")]
+)
+def test_an_obstacle_far_from_where_it_is_stated_is_told(
+    off_m: float, prior_m: float, verdict: str
+):
+    run = answer(poked(off_m, prior_m))
+    assert "nuisance/far" in told(run)
+    assert run.trust is not None
+    assert run.trust.verdict == verdict
 
 
 def test_an_obstacle_that_is_never_touched_is_told():
