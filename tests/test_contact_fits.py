@@ -126,6 +126,36 @@ def test_an_obstacle_far_from_where_it_is_stated_is_told(
     assert run.trust.verdict == verdict
 
 
+FORGOTTEN = {
+    "lid": cs.Obstacle(
+        shape=cs.Plane((0, 0, -1), (0, 0, 0.029)),
+        faces=cs.Box((-1, -1, 0.0299), (0.016, 1, 1)),
+        name="lid",
+    ),
+    "wall": cs.Obstacle(shape=cs.Plane((1, 0, 0), (0.003, 0, 0)), name="wall"),
+}
+
+
+@pytest.mark.parametrize("fault", ["friction", *FORGOTTEN])
+def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
+    stated = poked()
+    others = [FORGOTTEN[fault]] if fault in FORGOTTEN else []
+    actual = poked(friction=0.0 if others else 0.5)
+    actual = replace(actual, grasps=[*actual.grasps, *others])
+    exact_n = cs.simulate(actual, TRUTH).wrenches[0][:, :3]
+    read_n = exact_n + SIGMA_N * np.random.default_rng(0).normal(size=exact_n.shape)
+    held, ball = stated.grasps
+    measured = replace(ball, wrench=replace(ball.wrench, values=read_n))
+    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4)})
+    problem = cs.Problem([replace(stated, grasps=[held, measured])], known)
+    run = cs.run(problem, seek_causes=False)
+    low, high = run.result.parameters["young_pa"].ci95
+    assert low < TRUTH["young_pa"] < high
+    assert run.trust is not None
+    assert run.trust.verdict == "doubtful"
+    assert "noise/larger" in told(run)
+
+
 def test_an_obstacle_that_is_never_touched_is_told():
     assert "contact/never" in told(answer(poked(0.05, place_sigma_m=None)))
 
