@@ -126,6 +126,18 @@ def test_an_obstacle_far_from_where_it_is_stated_is_told(
     assert run.trust.verdict == verdict
 
 
+@pytest.mark.parametrize("factor", [30.0, 1 / 30.0])
+def test_a_compressed_block_is_found_from_thirty_times_its_stiffness_and_a_thirtieth(factor: float):
+    pressed = poked(shape=FLAT)
+    held, plate = pressed.grasps
+    exact_n = cs.simulate(pressed, TRUTH).wrenches[0][:, :3]
+    measured = replace(plate, wrench=replace(plate.wrench, values=exact_n))
+    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(factor * TRUTH["young_pa"])})
+    solution = cs.solve(cs.Problem([replace(pressed, grasps=[held, measured])], known))
+    assert solution.status.converged
+    assert solution.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=1e-4)
+
+
 FORGOTTEN = {
     "lid": cs.Obstacle(
         shape=cs.Plane((0, 0, -1), (0, 0, 0.029)),
