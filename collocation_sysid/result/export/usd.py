@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -198,7 +199,7 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         If Newton is not installed.
     """
     try:
-        import newton
+        newton: Any = import_module("newton")
     except ImportError as error:
         raise InputError("install Newton to verify the export: pip install newton") from error
 
