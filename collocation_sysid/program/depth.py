@@ -202,7 +202,7 @@ class DepthReading(Reading):
     def pooled(self, values: Array) -> Array:
         """(S, M, 3, …): sums over patches whose variance is that of a point."""
         means, counts = self._pooling
-        flat = means @ values.reshape(means.shape[1], -1)
+        flat = means @ values.reshape(values.shape[0] * values.shape[1] * values.shape[2], -1)
         return flat.reshape(len(counts), -1, GROUP, *values.shape[3:])
 
     # In pictures ------------------------------------------------------------------------------

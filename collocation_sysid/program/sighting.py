@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -310,7 +311,7 @@ class Sighting:
         skin = Skin.of(body, view.depth)
         seen = [_seen(view, skin, body, k, x, phi, gate_m) for k, x in enumerate(shapes_m)]
         most = max(1, *(len(each["used"]) for each in seen))
-        arrays = {
+        arrays: dict[str, Any] = {
             name: np.stack(
                 [
                     np.pad(s[name], [(0, most - len(s[name])), *[(0, 0)] * (s[name].ndim - 1)])
@@ -321,8 +322,9 @@ class Sighting:
             if name != "reasons"
         }
         total = np.sum([each["reasons"] for each in seen], axis=0).tolist()
-        own = {"left_out": dict(zip(LEFT_OUT, total, strict=True)), "start": view.told(phi)}
-        return cls(view, body, skin, gate_m=gate_m, shapes_m=shapes_m, **own, **arrays)
+        own: dict[str, Any] = {"left_out": dict(zip(LEFT_OUT, total, strict=True))}
+        own |= {"start": view.told(phi), "gate_m": gate_m, "shapes_m": shapes_m}
+        return cls(view, body, skin, **own, **arrays)
 
     @classmethod
     def aligned(cls, view: View, body: Body, shapes_m: Array, phi: Array) -> Sighting:
