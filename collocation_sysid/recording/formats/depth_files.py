@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Array, Index
+from ...arrays import Array
 from ...errors import InputError
 from ...files import reason, require_regular
 
@@ -128,7 +128,7 @@ def _npz(path: Path) -> DepthFile:
     return DepthFile([] if clouded else samples, samples if clouded else [], *known)
 
 
-def _png(path: Path) -> Index:
+def _png(path: Path) -> Any:
     image = import_module("PIL.Image").open(path)
     if image.mode not in ("I;16", "I;16B", "I"):
         raise InputError(f"has the mode {image.mode}; expected depths of 16 bits in one channel")
@@ -189,7 +189,7 @@ def _pcd(path: Path) -> Array:
     return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
 
 
-_READERS: dict[str, Callable[[Path], Array | Index | DepthFile]] = {
+_READERS: dict[str, Callable[[Path], Array | DepthFile]] = {
     ".npz": _npz,
     ".png": _png,
     ".exr": _exr,
