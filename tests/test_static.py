@@ -483,7 +483,7 @@ def test_a_run_without_markers_speaks_of_forces(tmp_path):
         (
             "wrench =",
             "# wrench =",
-            "nothing is measured: expected markers, the wrench of a grasp, or a reading",
+            "nothing is measured: expected markers, a wrench, a reading, or depth",
         ),
         ('axes = "x"', 'axes = "xz"', "held by the grasps 1 and 3 at the same time along z"),
         ('axes = "x"', 'axes = "w"', "grasp.2.axes"),
