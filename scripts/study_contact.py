@@ -212,7 +212,7 @@ if __name__ == "__main__":
         sys.argv.remove("poked")
     for name in sys.argv[1:]:
         law = {"sphere": sphere, "cylinder": cylinder}[name]
-        for cells in (1.5, 3.0) if name == "sphere" else (2.0, 4.0, 8.0):
+        for cells in (1.5, 3.0, 4.2) if name == "sphere" else (2.0, 4.0, 8.0):
             print(name, cells, law(cells), flush=True)
         if name == "cylinder":
             for kappa, delta in ((10, 0.02), (30, 0.002), (100, 0.02), (300, 0.002), (1000, 2e-4)):
