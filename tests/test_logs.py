@@ -126,6 +126,9 @@ def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said
     poses = read_poses(f"{address}#deg")
     turned = Rotation.from_quat(poses.quaternions_xyzw).as_rotvec(degrees=True)[:, 2]
     np.testing.assert_allclose(turned, np.array(degrees["turn"]) + 0.01, atol=1e-5)
+    alone = dataset(tmp_path / "one", degrees, episodes=1)
+    with pytest.raises(InputError, match="unit of its joints; expected #rad or #deg"):
+        read_poses(f"{alone}#observation.state#arm.urdf#base>upper")
     with pytest.raises(InputError, match="has 2 episodes; expected one, as in pick#observation"):
         read_gauge(f"{folder}#observation.state")
 

@@ -15,16 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..recording.formats.columns import FORCES, TORQUES
 from ..recording.formats.text import written_number
 from ..recording.gauge import Gauge
+from ..recording.pose_files import POSE_COLUMNS
 from ..recording.poses import first_matrix_fault, first_pose_fault
+from ..recording.tables import WRENCH_COLUMNS
 from ..recording.wrench import Wrench
 
 Pose = Any
 
-WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
-POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _KEYS = ("t_s", "pose", "markers", "wrench", "readings")
 _POSE_KEYS = ("position_m", "quaternion_xyzw")
 _SAMPLE_KEYS = ("t_s", "values")
@@ -300,7 +299,7 @@ class FrameReader:
 
     def _pose_columns(self, number: int) -> list[str]:
         before = "" if len(self.grasps) == 1 else f"{number}."
-        return [before + name for name in POSE_COLUMNS]
+        return [before + name for name in POSE_COLUMNS[1:]]
 
     @property
     def _told_columns(self) -> list[Sequence[str]]:

@@ -103,8 +103,8 @@ class ReducedSearch:
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
         # Points that depth cameras see belong to what is near: they tell of no long step.
-        seeing = any(segment.depths for segment in collocation.segments)
-        self.widest = SEEING if seeing else WIDEST
+        self.seeing = any(segment.depths for segment in collocation.segments)
+        self.widest = SEEING if self.seeing else WIDEST
         self.trust = min(options.trust, self.widest)
         self.indefinite = 0
         self.lower, self.upper = collocation.bounds_p
@@ -231,7 +231,7 @@ class ReducedSearch:
                 continue
             if short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
-            if self.widest == SEEING and length <= SEEN:
+            if self.seeing and length <= SEEN:
                 return Status.CONVERGED  # what is seen changes by more than such a step gains
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
@@ -320,8 +320,8 @@ class ReducedSearch:
             counts = [segment.rows_to_place for segment in self.collocation.segments]
             if any(counts):
                 rows = rung.first_rows(self.x, counts)
-                seeing = self.widest == SEEING  # what is seen later is not there yet
-                self.placed = not seeing or [*map(len, rows)] == counts
+                # What cameras see later is not there yet.
+                self.placed = not self.seeing or [*map(len, rows)] == counts
                 self._read_in(rung, *self.collocation.placed(self.p, rows))
 
     def _read_in(self, rung: Horizon, collocation: Collocation, p: Array) -> None:
@@ -347,7 +347,7 @@ class ReducedSearch:
         What points belonged to may be another part of the surface there, or nothing any more.
         """
         before = self.collocation
-        if self.widest == WIDEST:
+        if not self.seeing:
             return True
         if self.rereadings >= REREADINGS:
             return False

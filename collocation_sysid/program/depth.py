@@ -24,7 +24,7 @@ from ..recording.nuisance import DEPTH_TIME
 from ..recording.placement import Placement
 from .channel import Points
 from .charts import Chart
-from .reading import GROUP, Pooled, Reading, Window, lagrange_weights
+from .reading import GROUP, Pooled, Reading, Window, lagrange_weights, times_around
 from .sighting import Sighting
 
 # Times around a sample.
@@ -88,9 +88,7 @@ class DepthReading(Reading):
         if not (off or len(clock)) or len(self.at_s) < 2:
             return nearest[:, None]
         used = min(NEIGHBOURS, len(self.at_s))
-        beside = np.searchsorted(self.at_s, self.t_s + TIME_TOLERANCE_S, side="right") - 1
-        first = np.clip(beside - (used - 1) // 2, 0, len(self.at_s) - used)
-        return first[:, None] + np.arange(used)
+        return times_around(self.at_s, self.t_s + TIME_TOLERANCE_S, used)
 
     @cached_property
     def _window(self) -> Window:

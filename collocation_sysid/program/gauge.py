@@ -23,7 +23,7 @@ from ..recording.nuisance import GAUGE
 from ..recording.placement import place_markers
 from .channel import Motion, Points
 from .charts import Chart
-from .reading import GROUP, Channel, Reading, Window, lagrange_weights
+from .reading import GROUP, Channel, Reading, Window, lagrange_weights, times_around
 from .wrench_channel import GraspWrench, Grid
 
 # Times around a sample; of equilibria, which have no velocities, the two beside it.
@@ -87,9 +87,7 @@ class GaugeReading(Reading):
     @cached_property
     def _window(self) -> Window:
         used = min(STATIC_NEIGHBOURS if self.static else NEIGHBOURS, len(self.at_s))
-        beside = np.searchsorted(self.at_s, self.t_s + TIME_TOLERANCE_S, side="right") - 1
-        first = np.clip(beside - (used - 1) // 2, 0, len(self.at_s) - used)
-        times = first[:, None] + np.arange(used)
+        times = times_around(self.at_s, self.t_s + TIME_TOLERANCE_S, used)
         each = np.arange(self.channel.each)
         places = (times[..., None] * self.channel.each + each).reshape(len(times), 1, -1)
         data = np.column_stack([self.at_s[times] - self.t_s[:, None], self.t_s])

@@ -483,6 +483,13 @@ def _product(slopes: sp.csr_array, blocks: Array) -> Entries:
     return Entries(rows, columns, np.asarray(found.data, dtype=np.float64))
 
 
+def times_around(known_s: Array, at_s: Array, count: int) -> Index:
+    """(S, count) which of some times (n,) in turn are around others (S,), as evenly as they can."""
+    beside = np.searchsorted(known_s, at_s, side="right") - 1
+    first = np.clip(beside - (count - 1) // 2, 0, len(known_s) - count)
+    return first[:, None] + np.arange(count)
+
+
 def lagrange_weights(at: T, places: Sequence[T]) -> list[Any]:
     """Weights of samples at some places, numbers or expressions, for the value between them."""
     return [

@@ -22,7 +22,7 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import SENSOR_TIME, TARE
 from ..recording.wrench import Wrench
 from .channel import Forced, Motion
-from .reading import Reading, Window, lagrange_weights
+from .reading import Reading, Window, lagrange_weights, times_around
 from .wrench_channel import GraspWrench, Grid
 
 # Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
@@ -89,9 +89,7 @@ class WrenchReading(Reading):
         """Of all samples: the grid times around each, and how much later than it they are."""
         here, used = self.channel.phi_places(SENSOR_TIME), self._used(known)
         t_s, shift_s = self.channel.t_s[:known], (phi[here] * self.nuisance.scales[here]).sum()
-        late = np.searchsorted(t_s, self.t_s + shift_s, side="right")
-        first = np.clip(late - 1 - (used - 1) // 2, 0, known - used)
-        times = first[:, None] + np.arange(used)
+        times = times_around(t_s, self.t_s + shift_s, used)
         data = self.channel.t_s[times] - self.t_s[:, None]
         return Window(_both(times), data.T[..., None])
 

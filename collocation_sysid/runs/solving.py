@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -79,22 +79,22 @@ def solve(
             "--scheduler",
         )
     with workers_of(scheduler) as workers:
-        return _likeliest(problem, solver, watch, start, workers)
+        return _likeliest(
+            problem, start, partial(_solved, solver=solver, watch=watch, workers=workers)
+        )
 
 
 def _likeliest(
     problem: Problem,
-    solver: Method,
-    watch: Watch | None,
     start: str | Path | Earlier | None,
-    workers: Workers | None,
+    solved: Callable[[Problem, str | Path | Earlier | None], Solution],
 ) -> Solution:
     """Solve with the likeliest of the lengths that fields have to choose from.
 
     An answer tells, to first order, which of them that is, see `statistics.fields`; with that it is
     solved again from there, until it is the likeliest by its own answer or one that was tried.
     """
-    solution, tried = _solved(problem, solver, watch, start, workers), [problem.lengths_m]
+    solution, tried = solved(problem, start), [problem.lengths_m]
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     if all(len(field.field.lengths_m) == 1 for field in fields):
         return solution
@@ -105,15 +105,15 @@ def _likeliest(
             break
         tried.append(best)
         problem = problem.with_lengths(best)
-        solution = _solved(problem, solver, watch, Earlier.of(solution), workers)
+        solution = solved(problem, Earlier.of(solution))
     return solution
 
 
 def _solved(
     problem: Problem,
+    start: str | Path | Earlier | None,
     solver: Method,
     watch: Watch | None,
-    start: str | Path | Earlier | None,
     workers: Workers | None,
 ) -> Solution:
     earlier = Earlier.read(start) if isinstance(start, (str, Path)) else start

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...errors import InputError
+from ...errors import InputError, located
 from ...files import reason, require_regular
+from .text import decode, read_bytes, read_grid, times_of
 
 # What a pixel of a PNG counts where nothing else is said, as depth cameras usually do.
 USUAL_COUNT_M = 1e-3
@@ -84,7 +85,8 @@ def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
     times = path / "times.csv"
     t_s = None
     if times.is_file():
-        t_s = np.loadtxt(times, delimiter=",", skiprows=1, usecols=0, ndmin=1)
+        with located(times):
+            t_s = times_of(read_grid(decode(read_bytes(times))), 0)
         if len(t_s) != len(files):
             raise InputError(f"has {len(t_s)} times for {len(files)} files", times)
     images = [image for part in parts for image in part.images_m]

@@ -102,10 +102,13 @@ class Log(Protocol):
     topics : dict of name to (type, number of messages)
     start_ns : int
         When the first message was recorded; times of today in seconds are not exact as floats.
+    unit : str or None
+        Of the positions of joints, of `UNITS`, where all such logs have the same.
     """
 
     topics: dict[str, tuple[str, int]]
     start_ns: int
+    unit: str | None
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Yield when each was recorded [ns], and the message; its fields are attributes."""
@@ -113,8 +116,8 @@ class Log(Protocol):
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Log]:
-    """A log, by its content.
+def opened(path: Path, episode: int | None = None) -> Iterator[Log]:
+    """A log, by its content; of a dataset an episode.
 
     Raises
     ------
@@ -122,7 +125,7 @@ def opened(path: Path) -> Iterator[Log]:
         If it is none, is damaged, or a package that reads it is missing.
     """
     if (path / "meta" / "info.json").is_file():
-        log: Any = partial(Dataset, path)
+        log: Any = partial(_Dataset, path, episode)
     elif path.is_file() and path.suffix == ".mcap":
         log = partial(_Mcap, path)
     elif path.suffix in (".bag", ".db3") or (path / "metadata.yaml").is_file():
@@ -170,6 +173,8 @@ def require_packages(*modules: str) -> None:
 class _Bag:
     """A ROS bag, through rosbags."""
 
+    unit: str | None = "rad"
+
     def __init__(self, path: Path) -> None:
         require_packages("rosbags")
         from rosbags.highlevel import AnyReader
@@ -198,6 +203,8 @@ class _Bag:
 
 class _Mcap:
     """An MCAP file with messages of ROS 2, protobuf or JSON."""
+
+    unit: str | None = "rad"
 
     def __init__(self, path: Path) -> None:
         require_packages("mcap", "mcap_ros2", "mcap_protobuf")
@@ -242,7 +249,7 @@ class _Json:
 
 
 @dataclass
-class Dataset:
+class _Dataset:
     """A LeRobot dataset: the topics are its features, the messages the frames of an episode.
 
     Attributes
@@ -255,6 +262,7 @@ class Dataset:
     episode: int | None = None
     topics: dict[str, tuple[str, int]] = field(default_factory=dict)
     start_ns: int = 0
+    unit: str | None = None  # what a robot's makers chose
     names: dict[str, list[str]] = field(default_factory=dict)
 
     def __enter__(self) -> Log:
@@ -271,7 +279,6 @@ class Dataset:
     def __exit__(self, *_: object) -> None: ...
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield times and positions by name."""
         from pyarrow import dataset
 
         if self.episode is None and self._episodes > 1:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, hint_at
-from .logs import Address, Dataset, Log, opened, require_packages, require_topic
+from .logs import Address, Log, opened, require_packages, require_topic
 
 AXES = ("x", "y", "z")
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -76,9 +76,7 @@ def listed_topics(path: str | Path) -> list[LogTopic]:
     InputError
         If it is none, is damaged, or a package that reads it is missing.
     """
-    with opened(Path(path)) as log:
-        if isinstance(log, Dataset):
-            log.episode = 0
+    with opened(Path(path), episode=0) as log:
         return [_told(log, Path(path), name) for name in log.topics]
 
 
@@ -91,10 +89,8 @@ def table(address: Address) -> bytes:
         If the topic is not there, holds nothing that is known here, or it takes frames or a robot's
         description to read it.
     """
-    with opened(address.log) as log:
+    with opened(address.log, address.episode) as log:
         require_topic(log, address.topic)
-        if isinstance(log, Dataset):
-            log.episode = address.episode
         messages = list(log.messages(address.topic))
         if not messages:
             raise InputError(f"the topic {address.topic} has no messages")
@@ -103,6 +99,7 @@ def table(address: Address) -> bytes:
             more = list(log.messages(static)) if static in log.topics else []
             return _written(POSE, *_chained(messages, more, address, log.start_ns))
         times, rows = _rows(messages, log.start_ns)
+        unit = address.unit or log.unit
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
         raise InputError(
@@ -111,7 +108,7 @@ def table(address: Address) -> bytes:
         )
     values = np.array([[row.get(name, np.nan) for name in columns] for row in rows])
     if address.robot is not None:
-        return _written(POSE, times, _of_joints(columns, values, address))
+        return _written(POSE, times, _of_joints(columns, values, address, unit))
     return _written(columns, times, values)
 
 
@@ -349,7 +346,7 @@ def _path(edges: Mapping[tuple[str, str], Any], parent: str, child: str) -> list
     return path
 
 
-def _of_joints(columns: list[str], values: Array, address: Address) -> Array:
+def _of_joints(columns: list[str], values: Array, address: Address, unit: str | None) -> Array:
     """Poses of a robot's link by the positions of its joints, in radians and metres."""
     require_packages("pytransform3d")
     from pytransform3d.transformations import pq_from_transform
@@ -371,7 +368,8 @@ def _of_joints(columns: list[str], values: Array, address: Address) -> Array:
                 f"there is no link {frame!r}; it has {', '.join(links)}{hint_at(frame, links)}",
                 address.robot,
             )
-    degrees = _in_degrees(address)
+    if unit is None:
+        raise InputError("does not tell the unit of its joints; expected #rad or #deg behind it")
     limits = {name: robot.get_joint_limits(name) for name in columns if _has_joint(robot, name)}
     if not limits:
         joints = ", ".join(columns)
@@ -380,18 +378,11 @@ def _of_joints(columns: list[str], values: Array, address: Address) -> Array:
     for row, position in enumerate(values):
         for name, value in zip(columns, position, strict=True):
             if name in limits:
-                angle = np.radians(value) if degrees else value
+                angle = np.radians(value) if unit == "deg" else value
                 _refuse_beyond(name, angle, limits[name], address)
                 robot.set_joint(name, angle)
         poses[row] = pq_from_transform(robot.get_transform(child, parent))[[0, 1, 2, 4, 5, 6, 3]]
     return poses
-
-
-def _in_degrees(address: Address) -> bool:
-    """Joints of ROS are in radians; a dataset's in what its robot's makers chose."""
-    if address.unit is None and address.episode is not None:
-        raise InputError("does not tell the unit of its joints; expected #rad or #deg behind it")
-    return address.unit == "deg"
 
 
 def _has_joint(robot: Any, name: str) -> bool:

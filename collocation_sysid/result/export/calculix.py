@@ -5,16 +5,14 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError
-from ...program.rest import rest_state
 from .identified import Identified, IdentifiedRegion
-from .target import Comparison, Exported, Holds, heading
+from .target import Comparison, Exported, Holds, heading, longest, moved_at_rest
 
 DECK = "body.inp"
 LONGEST_S = 600.0
@@ -139,17 +137,11 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
             "no displacements written"
         ]
         raise InputError(f"CalculiX failed: {said[0].strip()}", folder / DECK)
-    # What the deck leaves out is left out on both sides.
-    alone = replace(body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf)
-    ours = rest_state(alone, body.theta).reshape(-1, 3) - body.nodes_m
-    sag_m, apart_m = _longest(ours), _longest(theirs - ours)
+    ours = moved_at_rest(body)
+    sag_m, apart_m = longest(ours), longest(theirs - ours)
     share = f" ({apart_m / sag_m:.2%} of it)" if sag_m else ""
     remark = f"no node is further than {apart_m:.3g} m apart{share}"
-    return [Comparison("largest displacement at rest", _longest(theirs), sag_m, "m", remark)]
-
-
-def _longest(way_m: Array) -> float:
-    return float(np.linalg.norm(way_m, axis=1).max())
+    return [Comparison("largest displacement at rest", longest(theirs), sag_m, "m", remark)]
 
 
 def _last_displacements(file: Path, count: int) -> Array | None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ...arrays import Array, Index
 from ...fem.refinement import split_in_eight
+from ...program.rest import rest_state
 from .identified import Identified
 
 LINEAR_ONLY = (
@@ -157,6 +158,17 @@ def _never_held(body: Identified) -> Iterator[str]:
         yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.holds(times).all() for grasp in e.grasps):
         yield "grasps that begin or end to hold within the recording stay as they begin"
+
+
+def moved_at_rest(body: Identified) -> Array:
+    """(n, 3) how far our equilibrium moves the nodes, without what exports leave out."""
+    alone = replace(body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf)
+    return rest_state(alone, body.theta).reshape(-1, 3) - body.nodes_m
+
+
+def longest(way_m: Array) -> float:
+    """How far what moves farthest moves, of (n, 3)."""
+    return float(np.linalg.norm(way_m, axis=1).max())
 
 
 def linear_cells(body: Identified) -> list[Index]:

@@ -7,7 +7,6 @@ Poisson's ratio, density and masses, and no damping, which stands in attributes 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,10 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from ...arrays import Array, Index
 from ...errors import InputError
-from ...program.rest import rest_state
 from ...recording import Grasp
 from .identified import Identified, IdentifiedRegion
-from .target import Comparison, Exported, Holds, heading, linear_cells
+from .target import Comparison, Exported, Holds, heading, linear_cells, longest, moved_at_rest
 
 STAGE = "body.usda"
 OWN = "collocationSysid"
@@ -219,7 +217,5 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         before, after = after, before
         before.particle_qd.assign(BRAKE * before.particle_qd.numpy())
     theirs = before.particle_q.numpy().astype(float) - body.nodes_m
-    alone = replace(body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf)
-    ours = rest_state(alone, body.theta).reshape(-1, 3) - body.nodes_m
-    sagged, sag = (float(np.linalg.norm(way, axis=1).max()) for way in (theirs, ours))
-    return [Comparison("largest displacement at rest", sagged, sag, "m")]
+    sag_m = longest(moved_at_rest(body))
+    return [Comparison("largest displacement at rest", longest(theirs), sag_m, "m")]
