@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.program.sighting import Skin
+from collocation_sysid.model.nuisance import NuisanceMap
+from collocation_sysid.program.sighting import Sighting, Skin, View
 from collocation_sysid.recording.depth import points_of
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.result.pictures.depth import depth_picture
@@ -58,13 +59,21 @@ def hanging(depths: tuple[cs.Depth, ...], **changes) -> cs.Experiment:
     )
 
 
+NOTHING = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
+
+
+@cache
+def hanging_m() -> np.ndarray:
+    """The surface of the bar, sagging."""
+    x = cs.simulate(hanging((NOTHING,)), TRUTH).positions_m[0]
+    return x[Skin.of(bar(), NOTHING).nodes]
+
+
 @cache
 def image_m() -> np.ndarray:
     """What a camera at POSE sees of the bar, without noise."""
-    cloud = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
-    x = cs.simulate(hanging((cloud,)), TRUTH).positions_m[0]
-    skin, camera = Skin.of(bar(), cloud), cs.DepthCamera(MATRIX, pose=POSE)
-    seen = (skin.triangles(x[skin.nodes]) - POSE[:3, 3]) @ POSE[:3, :3]
+    skin, camera = Skin.of(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE)
+    seen = (skin.triangles(hanging_m()) - POSE[:3, 3]) @ POSE[:3, :3]
     return cs.depth_image(camera, SHAPE, seen)
 
 
@@ -101,6 +110,24 @@ def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     bars = covariance(solution.collocation, solution.z).estimates["young_pa"]
     low, high = bars.ci95
     assert low < TRUTH["young_pa"] < high < 1.2 * low
+
+
+@pytest.mark.parametrize(
+    ("axis", "way"),
+    [((0.61, -0.71, 0.36), (-0.54, 0.48, -0.7)), ((0.83, 0.31, 0.46), (-0.09, 0.53, -0.84))],
+)
+def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(axis, way, rng):
+    """Not to where it is said to be: 20 mm and 10 degrees off, it would not see the bar's top."""
+    camera = cs.DepthCamera(
+        MATRIX, pose=moved(np.radians(10) * np.array(axis), 0.02 * np.array(way))
+    )
+    depth = cs.Depth.of_images("front", noisy(rng), camera, NOISE_M, spacing_m=0.004)
+    experiment = hanging((depth,))
+    nuisance = NuisanceMap.of(experiment)
+    view, nothing = View.of(experiment, 0, nuisance), np.zeros(nuisance.size)
+    sighting = Sighting.aligned(view, bar(), hanging_m()[None], nothing)
+    assert sighting.gate_m == depth.gate_m
+    assert sighting.used.sum() > 0.95 * len(depth.points_m[0])
 
 
 def test_what_is_beside_the_body_is_left_out_and_counted(rng):

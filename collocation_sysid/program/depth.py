@@ -221,7 +221,7 @@ class DepthReading(Reading):
         # Where the camera has what is at places of the world: the inverse of what it is off by.
         basis = np.vstack([np.zeros(3), np.eye(3)])
         images = view.corrected_at(phi, basis, np.zeros((4, 3)), 0)
-        faces = seen.skin.flat[seen.skin.facing(shape, view.eye_m(0))]
+        faces = seen.skin.flat[seen.skin.facing(shape, view.eye_m(phi, 0))]
         corners = np.linalg.solve((images[1:] - images[0]).T, (shape - images[0]).T).T[faces]
         camera = view.depth.camera
         flat = (lambda p: p[:, :2]) if camera.matrix is None else camera.pixels

@@ -245,9 +245,11 @@ class View:
         values = [told.get(entry.label, 0.0) for entry in self.nuisance.entries]
         return np.array(values) / self.nuisance.scales
 
-    def eye_m(self, sample: int) -> Array | None:
-        """(3,) where the camera is, as stated; None of a cloud."""
-        return None if self.depth.camera.matrix is None else self.motion[1][sample]
+    def eye_m(self, phi: Array, sample: int) -> Array | None:
+        """(3,) where the camera is, at φ (k,); None of a cloud."""
+        if self.depth.camera.matrix is None:
+            return None
+        return self.corrected_at(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)[0]
 
     def prior(self, row: NuisanceRow) -> Array:
         """(3,) over the deviations of its turn, or shift; so good as infinite of what is exact."""
@@ -358,7 +360,7 @@ class Sighting:
 
     def missed_m(self, x: Array, phi: Array) -> Array:
         """How far (P,) parts of a first shape x (n, 3) that face the camera are from its points."""
-        view, turned = self.view, self.skin.facing(x, self.view.eye_m(0))
+        view, turned = self.view, self.skin.facing(x, self.view.eye_m(phi, 0))
         middles = x[self.skin.flat[turned]].mean(axis=1)
         limit_m = WIDE * float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
         return np.minimum(KDTree(view.world(phi, 0)).query(middles)[0], limit_m)
@@ -390,7 +392,7 @@ def _seen(
     low, high = x.min(axis=0) - gate_m, x.max(axis=0) + gate_m
     near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
     rotations, _ = view.motion
-    turned = np.flatnonzero(skin.facing(x, view.eye_m(sample)))
+    turned = np.flatnonzero(skin.facing(x, view.eye_m(phi, sample)))
     near = near if len(turned) else near[:0]
     faces, places = near, np.zeros((0, 3))
     if len(near):
