@@ -20,7 +20,6 @@ from collocation_sysid.model.nuisance import NuisanceMap
 from collocation_sysid.program.sighting import Sighting, Skin, View
 from collocation_sysid.recording.depth import points_of
 from collocation_sysid.recording.formats.depth_files import read_depth
-from collocation_sysid.result.pictures.depth import depth_picture
 from collocation_sysid.statistics.uncertainty import covariance
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
@@ -270,20 +269,6 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     from study_depth import held
 
     assert 0.9 <= np.mean([held(seed) for seed in range(40)]) <= 1.0
-
-
-def test_a_run_draws_what_the_camera_saw_over_the_surface(rng):
-    solution = fitted(noisy(rng), POSE)
-    (part,) = solution.collocation.parts(solution.z)
-    (reading,) = part.segment.depths
-    seen = reading.drawn(part.x, part.looked[-1], part.phi)
-    there = np.isfinite(seen[:, 2])
-    assert np.sqrt(np.mean(seen[there, 2] ** 2)) < 2e-4
-    # What is seen lies within what is drawn of the surface, but for a pixel.
-    low, high = np.nanmin(seen[~there, :2], axis=0), np.nanmax(seen[~there, :2], axis=0)
-    assert (seen[there, :2] > low - 1).all()
-    assert (seen[there, :2] < high + 1).all()
-    assert len(depth_picture(seen).axes) == 2
 
 
 def test_a_dropout_is_a_cloud_without_points():

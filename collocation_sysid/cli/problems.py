@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -18,6 +19,9 @@ from ..runs.check import check_problem, glance
 from ..tree import as_json
 from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors, show
 from .options import OfProblem, Out, Told, command
+
+if TYPE_CHECKING:
+    from ..problem import Problem
 
 commands = typer.Typer()
 
@@ -144,15 +148,19 @@ class Check(OfProblem, Told):
     ----------
     full : bool
         Simulate whole recordings, however long that takes.
+    out : DIR
+        Where pictures of what depth cameras see are written; runs/<problem>_check by default.
     """
 
     full: bool = False
+    out: Path | None = None
 
 
 @command(
     commands,
     "check problem.toml",
     "check problem.toml --full",
+    "check problem.toml --out pictures",
     "check problem.toml --set transcription.scheme=backward-euler",
 )
 def check(options: Check) -> None:
@@ -160,6 +168,8 @@ def check(options: Check) -> None:
 
     Bodies, recordings and grasps are shown at once. Derivatives, costs and the simulation at the
     guess follow, of the first samples only where whole recordings take more than ten seconds.
+
+    Of each depth camera a picture shows the first image and the undeformed body over it.
     """
     from ..result.check_sections import closer_table, glance_table
     from ..result.progress import Progress
@@ -167,6 +177,7 @@ def check(options: Check) -> None:
     problem = options.read()
     if not options.as_json:
         show(glance_table(glance(problem)))
+        _overlay(problem, options.out or Path("runs") / f"{run_name(options.problem)}_check")
     with Progress(errors, quiet=options.quiet) as progress:
         findings = check_problem(problem, progress.say, options.full)
     if options.as_json:
@@ -175,3 +186,15 @@ def check(options: Check) -> None:
         show(closer_table(findings))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
+
+
+def _overlay(problem: Problem, folder: Path) -> None:
+    """Draw what depth cameras see, and the body."""
+    if not any(experiment.depths for experiment in problem.experiments):
+        return
+    from ..result.seen import save_overlays
+
+    require_possible(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in save_overlays(problem.experiments, folder):
+        typer.echo(f"depth over the undeformed body: {file}")

@@ -210,26 +210,6 @@ class DepthReading(Reading):
         apart = self.predicted(values, phi)[..., 0]
         return np.where(self.sighting.used[: len(apart)], apart, np.nan)
 
-    def drawn(self, x: Array, looked: Array, phi: Array) -> Array:
-        """(k, 3) of the first image: u, v and how far points are behind the surface [m]; then u, v
-        of the outlines of faces that are turned to the camera, each ended by a row of NaN.
-
-        Of a cloud u and v are x and y of its own frame.
-        """
-        seen, view, used = self.sighting, self.sighting.view, self.sighting.used[0]
-        shape = self.shapes(x, phi)[0]
-        # Where the camera has what is at places of the world: the inverse of what it is off by.
-        basis = np.vstack([np.zeros(3), np.eye(3)])
-        images = view.corrected_at(phi, basis, np.zeros((4, 3)), 0)
-        faces = seen.skin.flat[seen.skin.facing(shape, view.eye_m(phi, 0))]
-        corners = np.linalg.solve((images[1:] - images[0]).T, (shape - images[0]).T).T[faces]
-        camera = view.depth.camera
-        flat = (lambda p: p[:, :2]) if camera.matrix is None else camera.pixels
-        closed = flat(corners[:, [0, 1, 2, 0]].reshape(-1, 3)).reshape(-1, 4, 2)
-        outlines = np.pad(closed, ((0, 0), (0, 1), (0, 1)), constant_values=np.nan).reshape(-1, 3)
-        apart = self.apart_m(looked, phi)[0][used]
-        return np.vstack([np.column_stack([flat(seen.points[0][used]), apart]), outlines])
-
     def shapes(self, x: Array, phi: Array) -> Array:
         """(s, n, 3) of the surface at the samples that the first rows x (rows, 3n) suffice for."""
         late, known = self.sighting.view.late_s(phi), int((self._times[:, -1] < len(x)).sum())

@@ -13,6 +13,7 @@ from ..fem.body import Linearisation
 from ..model.histories import AnyHistory
 from ..model.setting import Setting
 from .channel import Motion
+from .depth import DepthReading
 from .segment import Segment
 from .sensing import Sensing
 
@@ -76,6 +77,12 @@ class Part:
             self.given[k] if k in self.given else reading.channel.values(self.motion, self.phi)
             for k, reading in enumerate(self.segment.readings)
         ]
+
+    @property
+    def sights(self) -> list[tuple[DepthReading, Array]]:
+        """What depth cameras see, and of each what it looks at."""
+        depths = self.segment.depths
+        return [*zip(depths, self.looked[len(self.looked) - len(depths) :], strict=True)]
 
     @property
     def loss(self) -> float:

@@ -235,6 +235,12 @@ class View:
         rotations, translations = self.motion
         return seen @ rotations[sample].T + translations[sample]
 
+    def own_m(self, phi: Array, points_m: Array, sample: int) -> Array:
+        """(P, 3) points (P, 3) of the world in its frame: what `world` says of it, but for bias."""
+        basis = np.vstack([np.zeros(3), np.eye(3)])
+        corner, *along = self.corrected_at(phi, basis, np.zeros((4, 3)), sample)
+        return np.linalg.solve((along - corner).T, (points_m - corner).T).T
+
     def told(self, phi: Array) -> dict[str, float]:
         """What φ (k,) says of it, by label."""
         entries, values = self.nuisance.entries, phi * self.nuisance.scales
@@ -331,8 +337,7 @@ class Sighting:
     @classmethod
     def aligned(cls, view: View, body: Body, shapes_m: Array, phi: Array) -> Sighting:
         """The same, with the pose of the camera aligned to these shapes first."""
-        there = np.array([len(points) > 0 for points in view.depth.points_m])
-        first = int(there.argmax())
+        first = view.depth.first
         skin = Skin.of(body, view.depth)
         turn, shift_m = alignment(view, skin, shapes_m[first], first)
         moved = view.with_pose(phi, turn, shift_m)

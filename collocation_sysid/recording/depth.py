@@ -224,6 +224,11 @@ class Depth:
         """(P, 3) of each sample, in the camera's frame."""
         return [cloud[:, :3] for cloud in self.clouds]
 
+    @property
+    def first(self) -> int:
+        """The first sample that has points."""
+        return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
+
 
 def points_of(image_m: Array, camera: DepthCamera) -> Array:
     """Points (P, 3) of a depth image (rows, columns) [m]; zero and NaN are no depth.

@@ -322,6 +322,12 @@ class Experiment:
             places[:, obstacle.nodes] = obstacle.carry(self.body.nodes_m, np.atleast_1d(t_s))
         return places
 
+    @property
+    def up(self) -> Array:
+        """(3,) unit vector against gravity; z where there is none."""
+        pull = np.linalg.norm(self.gravity_m_s2)
+        return -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
+
     def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))

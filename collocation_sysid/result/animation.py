@@ -181,7 +181,8 @@ class Film:
         outer, outlines_m = outer[there], replay.obstacles_m
         camera = Camera.facing(outer, replay.up)
         beside = with_outlines(outer, None if outlines_m is None else outlines_m[there])
-        everything = np.vstack([beside.reshape(-1, 3), replay.measured_m.reshape(-1, 3)])
+        seen_m = [rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.seen.values()]
+        everything = np.vstack([beside.reshape(-1, 3), replay.measured_m.reshape(-1, 3), *seen_m])
         width = WIDTH_MM / len(told)
         aspect = width_over_height(camera, everything)
         height = float(np.clip((width - 8) / aspect, LOWEST_MM, TALLEST_MM))
@@ -204,7 +205,11 @@ class Film:
     def _surround(self, axes: Axes, camera: Camera, mm_per_m: float, total: float) -> None:
         draw_directions(axes, camera, (7.0, 4.0))
         draw_scale(axes, mm_per_m, (WIDTH_MM * 0.17, 4.0))
-        draw_key(axes, key("grasped", "measured", "behind the body"), (WIDTH_MM * 0.42, 5.5))
+        named = ["grasped", "measured", "behind the body"]
+        if self.replay.seen:
+            markers = named[1:] if len(self.replay.marker_names) else []
+            named = ["grasped", *markers, "seen in depth"]
+        draw_key(axes, key(*named), (WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5))
 
     def show(self, t: int) -> None:
         """Show sample `t`."""
@@ -212,7 +217,7 @@ class Film:
         measured = replay.measured_m[t]
         for name, positions, markers, drawn, title in self.panels:
             outlines_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
-            drawn.show(positions[t], replay.held[t], measured, outlines_m=outlines_m)
+            drawn.show(positions[t], replay.held[t], measured, None, outlines_m, replay.seen_m(t))
             distances = np.linalg.norm(markers[t] - measured, axis=1)
             present = distances[np.isfinite(distances)]
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"

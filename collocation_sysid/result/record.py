@@ -121,13 +121,16 @@ def replays(finished: Answer) -> list[Replay]:
 
 def _seen(finished: Answer, experiment: Experiment) -> dict[str, Array]:
     """What depth cameras see, see `Replay.seen`; nothing of what was not fitted."""
-    found = {}
-    for part in finished.solution.collocation.parts(finished.solution.z):
-        readings = len(part.segment.readings) - len(part.segment.depths)
-        if part.segment.experiment.name == experiment.name:
-            for reading, looked in zip(part.segment.depths, part.looked[readings:], strict=True):
-                found[reading.sighting.view.depth.name] = reading.drawn(part.x, looked, part.phi)
-    return found
+    if not experiment.depths:
+        return {}
+    from .seen import seen_as_fitted  # which needs matplotlib
+
+    return {
+        reading.sighting.view.depth.name: seen_as_fitted(part, reading, looked)
+        for part in finished.solution.collocation.parts(finished.solution.z)
+        if part.segment.experiment.name == experiment.name
+        for reading, looked in part.sights
+    }
 
 
 def _touched(

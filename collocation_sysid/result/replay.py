@@ -21,6 +21,7 @@ from ..errors import InputError
 from ..fem.constants import bare, symbol_of
 from ..fem.elements import EDGES
 from ..files import RESULT_FILE, damage_refused, require_own
+from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.experiment import Experiment
 from ..runs.result import Result
 
@@ -95,9 +96,10 @@ class Replay:
     fields : mapping of name to (E, 4)
         Constants that differ from place to place: value, the ends of its interval, and its
         deviation over the prior's, NaN where another region is.
-    seen : mapping of name to (k, 3)
-        Of each depth camera's first image: u, v and how far behind the surface [m] of points; and
-        u, v of outlines of faces as fitted, each ended by a row of NaN.
+    seen : mapping of name to (k, 8)
+        Of each depth camera points: when they were seen [s], u, v and depth [m] in the image, how
+        far behind the surface [m], NaN of those that do not count, and where in the world [m]. Of
+        some samples then when, u and v of outlines of faces, each ended by NaN, and NaN else.
     gaps_m, pressures_pa : (T, F) of the surface as fitted, or simulated, where there are obstacles
     """
 
@@ -153,7 +155,6 @@ class Replay:
         fitted, rolled_out = (
             each and (each[0][:, : len(nodes_m)], each[1]) for each in (fitted, rolled_out)
         )
-        pull = np.linalg.norm(experiment.gravity_m_s2)
         return cls(
             experiment.name,
             experiment.t_s,
@@ -164,7 +165,7 @@ class Replay:
             nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
             np.asarray(experiment.held(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
-            -experiment.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0]),
+            experiment.up,
             markers.names,
             given_m if places_m is None else places_m,
             np.where(markers.located[:, None], given_m, np.nan),
@@ -184,6 +185,18 @@ class Replay:
     def shapes_m(self) -> Array | None:
         """(T, n, 3) positions to show where there is room for one: fitted, else simulated."""
         return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
+
+    def seen_m(self, t: int) -> Array:
+        """(P, 3) points that depth cameras saw about sample `t`: as they do often, or as it is."""
+        found = [np.zeros((0, 3))]
+        for rows in self.seen.values():
+            points = rows[np.isfinite(rows[:, 4])]
+            times = np.unique(points[:, 0])
+            steps_s = [float(np.median(np.diff(x))) for x in (times, self.t_s) if len(x) > 1]
+            apart_s = np.abs(times - self.t_s[t])
+            if apart_s.min(initial=np.inf) <= max(steps_s, default=0.0) / 2 + TIME_TOLERANCE_S:
+                found.append(points[points[:, 0] == times[apart_s.argmin()], 5:])
+        return np.concatenate(found)
 
     @property
     def has_shapes(self) -> bool:
@@ -298,7 +311,7 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         if said.dtype.kind != "f" or said.shape != (len(arrays["tetrahedra"]), 4):
             raise ValueError(f"{FIELD}{name} is {said.dtype} of shape {said.shape}")
     for name, said in arrays["seen"].items():
-        if said.dtype.kind != "f" or said.ndim != 2 or said.shape[1] != 3:
+        if said.dtype.kind != "f" or said.ndim != 2 or said.shape[1] != 8:
             raise ValueError(f"{SEEN}{name} is {said.dtype} of shape {said.shape}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:

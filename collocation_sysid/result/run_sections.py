@@ -48,7 +48,8 @@ SHOWN_DIAGNOSES = 2
 SHOWN_BUDGETS, SHOWN_SOURCES, LITTLE = 3, 3, 0.01
 
 CAPTIONS = {
-    "depth": "What a depth camera saw and the fitted surface; colours: mm behind the surface.",
+    "depth": "What a depth camera saw under outlines of the fitted surface, of up to four samples, "
+    "and how far behind the surface points are; grey ones do not count.",
     "shapes": "The body at times of the recording; orange: measured markers.",
     "field": "What differs from place to place, between the ends of its 95 % interval; below, cut "
     "open. Pale is what the data do not tell: it is as the prior has it.",

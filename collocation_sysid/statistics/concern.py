@@ -112,6 +112,10 @@ TOPICS: Mapping[str, Topic] = {
             "wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
             "wrench-clock": "it was measured about {by_ms:.2g} ms {when} than its times say: its "
             "clock is not that of the poses",
+            "camera": "only {percent:.0f} % of the surface have points within {within_mm:.3g} mm: "
+            "check camera.pose, that it is of a frame with x to the right, y down, z forward, and "
+            "the unit of the depth; look at the picture that check draws",
+            "camera/likely": "hardly any points are near the body, but they are if {mistakes}",
             "wrench-tare": "it seems zeroed with the body in hand: zero it before, or widen "
             "nuisance.tare",
         },

@@ -1,34 +1,86 @@
-"""What a depth camera saw over the fitted surface, and how far they are apart."""
+"""What a depth camera saw over the surface of the body, and how far they are apart."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from ...arrays import Array
-from ..style import PAGE_MM
+from ..style import BLACK, PAGE_MM, SMALL_PT
 
-MM_PER_INCH, HIGH = 25.4, 0.6
+MM_PER_INCH = 25.4
+# No panel is wider than this share of the page; titles are so high, and panels between these.
+WIDEST, TITLES, HIGH = 0.6, 0.4, (0.3, 1.0)
+# Points cover about this share of where they lie.
+COVERED = 0.3
 # The scale ends where this share of the points does.
 SHOWN = 95
+# Outlines are shown so far beyond the points, in sizes of what these cover.
+BEYOND = 0.5
 
 
 def depth_picture(seen: Array) -> Figure:
-    """Draw points over outlines of the surface, coloured by how far behind it they are.
+    """Draw an image and the outlines of the surface over it, and below it how far they are apart.
+
+    Of several samples those that have outlines are shown. Without a fit there is nothing below.
 
     Parameters
     ----------
-    seen : (k, 3) see `Replay.seen`
+    seen : (k, 8) see `Replay.seen`
     """
-    points, lines = seen[np.isfinite(seen[:, 2])], seen[~np.isfinite(seen[:, 2])]
-    width = PAGE_MM / MM_PER_INCH
-    figure = Figure(figsize=(width, HIGH * width), layout="constrained")
-    axes = figure.add_subplot()
-    axes.plot(*lines[:, :2].T, color="0.6", linewidth=0.5, zorder=1)
-    apart_mm = 1e3 * points[:, 2]
-    end = max(1e-3, float(np.percentile(np.abs(apart_mm), SHOWN)) if len(apart_mm) else 1.0)
-    drawn = axes.scatter(*points[:, :2].T, c=apart_mm, cmap="RdBu", vmin=-end, vmax=end, s=5)
-    figure.colorbar(drawn, ax=axes, label="behind the surface [mm]", shrink=0.8)
-    axes.set(aspect="equal", xlabel="u", ylabel="v")
-    axes.invert_yaxis()
+    times = np.unique(seen[np.isnan(seen[:, 3]), 0])
+    points = seen[np.isfinite(seen[:, 3])]
+    fitted = bool(np.isfinite(points[:, 4]).any())
+    inch = PAGE_MM / MM_PER_INCH
+    across = min(1 / max(1, len(times)), WIDEST)
+    width, height = np.ptp(points[:, 1:3], axis=0)
+    panel = across * inch * float(np.clip(height / max(width, 1e-12), *HIGH)) + TITLES
+    size = (max(WIDEST, across * len(times)) * inch, panel * (1 + fitted))
+    figure = Figure(figsize=size, layout="constrained")
+    dot = COVERED * (72 * across * inch) ** 2 * HIGH[0] / max(1, len(points) / max(1, len(times)))
+    axes = figure.subplots(1 + fitted, max(1, len(times)), squeeze=False)
+    end = 1.0
+    if fitted:
+        end = max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SHOWN)))
+    near, far = np.percentile(points[:, 3], [1, 99])
+    for column, t_s in zip(axes.T, times, strict=False):
+        here = points[points[:, 0] == t_s]
+        lines = seen[(seen[:, 0] == t_s) & np.isnan(seen[:, 3]), 1:3]
+        looks = {"cmap": "viridis", "vmin": near, "vmax": far, "s": dot}
+        image = _panel(column[0], here[:, 1:3], here[:, 3], lines, BLACK, looks)
+        title = f"t = {t_s:.4g} s" if len(times) > 1 else ""
+        column[0].set_title(title, fontsize=SMALL_PT)
+        if fitted:
+            used = here[np.isfinite(here[:, 4])]
+            left = here[~np.isfinite(here[:, 4])]
+            column[1].plot(*left[:, 1:3].T, ".", ms=1.5, color="0.7")
+            looks = {"cmap": "RdBu", "vmin": -end, "vmax": end, "s": dot}
+            apart = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", looks)
+            rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
+            column[1].set_title(f"{rms:.2g} mm RMS of {len(used):,} points", fontsize=SMALL_PT)
+    figure.colorbar(image, ax=axes[0], label="depth [m]", shrink=0.8)
+    if fitted:
+        figure.colorbar(apart, ax=axes[1], label="behind the surface [mm]", shrink=0.8)
     return figure
+
+
+def _panel(
+    axes: Axes, places: Array, values: Array, lines: Array, colour: str, looks: dict[str, Any]
+) -> PathCollection:
+    """Points and outlines; what of these is far from all points is cut off."""
+    drawn = axes.scatter(*places.T, c=values, linewidths=0, zorder=1, **looks)
+    axes.plot(*lines.T, color=colour, linewidth=0.4, zorder=2)
+    low, high = places.min(axis=0), places.max(axis=0)
+    room = BEYOND * (high - low).max()
+    both = np.vstack([places, lines[np.isfinite(lines).all(axis=1)]])
+    low, high = np.maximum(both.min(axis=0), low - room), np.minimum(both.max(axis=0), high + room)
+    margin = 0.03 * (high - low).max()
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin))
+    axes.set(aspect="equal", xlabel="u", ylabel="v")
+    if not ((lines >= low) & (lines <= high)).all(axis=1).any():
+        axes.text(0.5, 0.02, "the body is not in view", transform=axes.transAxes, ha="center")
+    return drawn

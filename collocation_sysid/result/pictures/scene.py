@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array
-from ..style import BLACK, SMALL_PT, VERMILION, Picture
+from ..style import BLACK, BLUE, SMALL_PT, VERMILION, Picture
 from .camera import Camera, Triangles
 
 EDGE = "#5A6B7B"
@@ -25,6 +25,9 @@ SKINS = ("#B4D0EA", "#F0D3A0", "#B9DDC2", "#E2C3D9", "#D9D9A8", "#C9C3E6")
 # Of more triangles than this one would see nothing but edges.
 EDGED = 6000
 _DOT = {"ls": "", "marker": "o", "ms": 3.2, "mec": VERMILION, "mew": 0.7}
+_SEEN = {"ls": "", "marker": ".", "ms": 1.6, "mec": "none", "mfc": BLUE}
+# More points of depth cameras only take longer to draw.
+MOST_SEEN = 1000
 _SQUARE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none"}
 
 
@@ -122,6 +125,7 @@ class Drawn:
         axes.add_collection(self.skin, autolim=False)
         self.grasped = axes.add_line(Line2D([], [], zorder=3, **_SQUARE))
         self.outlines = axes.add_line(Line2D([], [], zorder=0.5, lw=0.6, color=BLACK))
+        self.seen = axes.add_line(Line2D([], [], zorder=3.5, **_SEEN))
         self.rings = axes.add_line(Line2D([], [], mfc="none", zorder=4, **_DOT))
         self.dots = axes.add_line(Line2D([], [], mfc=VERMILION, zorder=5, **_DOT))
 
@@ -132,10 +136,12 @@ class Drawn:
         markers_m: Array,
         skins: Array | None = None,
         outlines_m: Array | None = None,
+        seen_m: Array | None = None,
     ) -> None:
         """Show nodes (n, 3), those of them that are grasped, markers (M, 3), and outlines (o, 3).
 
-        Markers that the body hides are rings; grasped nodes turned away are left out. Triangles
+        Markers that the body hides are rings; grasped nodes turned away are left out, and so are
+        points (P, 3) that depth cameras saw, where the body hides them. Triangles
         have the colours `skins` (F, 3), by default those of their parts.
         """
         camera = self.view.camera
@@ -151,6 +157,11 @@ class Drawn:
         self.grasped.set_data(*self.view.places(positions_m[outer[held[outer]]]).T)
         if outlines_m is not None:
             self.outlines.set_data(*self.view.places(outlines_m).T)
+        if seen_m is not None:
+            few_m = seen_m[:: 1 + len(seen_m) // MOST_SEEN]
+            self.seen.set_data(
+                *self.view.places(few_m[~camera.hidden(few_m, positions_m, self.surface)]).T
+            )
         hidden = camera.hidden(markers_m, positions_m, self.surface)
         self.rings.set_data(*self.view.places(markers_m[hidden]).T)
         self.dots.set_data(*self.view.places(markers_m[~hidden]).T)
@@ -188,10 +199,11 @@ def draw_directions(
 
 
 def key(*entries: str) -> list[Line2D]:
-    """Legend handles of "grasped", "markers", "measured" and "behind the body", or of parts."""
+    """Legend handles of "grasped", "markers", "measured", "behind the body", "seen in depth"."""
     styles = {
         "grasped": {**_SQUARE, "ms": 3.0},
         "behind the body": {**_DOT, "mfc": "none"},
+        "seen in depth": {**_SEEN, "ms": 4.0},
     }
     return [
         Line2D([], [], label=name, **styles.get(name, {**_DOT, "mfc": VERMILION}))

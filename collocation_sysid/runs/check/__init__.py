@@ -19,6 +19,7 @@ from ...problem import Problem
 from ...program.collocation import Collocation
 from ...program.stability import Instability, instabilities
 from ...program.touches import touched
+from ...statistics.cameras import camera_mistakes
 from ...statistics.concern import Concern
 from ...statistics.hypothesis import Hypothesis, ranked
 from ...statistics.modal import doubts
@@ -347,4 +348,5 @@ def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:
     constants = usual_constants(problem.parameters)
     odd = (oddity for body in problem.bodies for oddity in oddities(body))
     doubtful = (cause for e in problem.experiments for cause in doubts(e, constants, problem.huber))
-    return (*odd, *ranked(doubtful))
+    blind = (cause for e in problem.experiments for cause in camera_mistakes(e))
+    return (*odd, *ranked((*blind, *doubtful)))

@@ -106,6 +106,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
         (
             *(["the wrench"] if any(g.wrench is not None for g in experiment.grasps) else []),
             *(gauge.name for gauge in experiment.readings),
+            *(f"{sum(map(len, d.clouds)):,} points of '{d.name}'" for d in experiment.depths),
         ),
     )
 

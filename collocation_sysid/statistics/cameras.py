@@ -1,0 +1,147 @@
+"""Depth cameras that see hardly anything of the body: what is likely wrong with their description.
+
+Where points may belong to the body, its surface as grasps carry it has points nearby. Where hardly
+any of it has, the usual mistakes are undone, one and then two at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ..arrays import Array
+from ..program.sighting import ENOUGH, WIDE, Skin
+from ..recording.depth import Depth
+from ..recording.experiment import Experiment
+from .hypothesis import Hypothesis
+
+# Of the surface, how much has points nearby where it is hardly seen, and where it is.
+HARDLY, WELL = 0.1, 0.5
+# The axes of a camera in frames of other conventions: right, down and ahead in columns.
+FRAMES = {
+    "x to the right, y up, z backwards": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "x to the left, y up, z forward": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
+    "x forward, y to the left, z up": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
+}
+MILLI = 1e-3
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """How a camera is described.
+
+    Attributes
+    ----------
+    carrier, pose : (4, 4) motions of what carries it, and of its frame on that
+    factor : float
+        Of the points that it sees.
+    """
+
+    carrier: Array
+    pose: Array
+    factor: float = 1.0
+
+
+def _scaled(seeing: Seeing, by: float) -> Seeing:
+    pose = seeing.pose.copy()
+    pose[:3, 3] *= by
+    return replace(seeing, pose=pose)
+
+
+def _turned(seeing: Seeing, turn: list[list[int]]) -> Seeing:
+    pose = seeing.pose.copy()
+    pose[:3, :3] = pose[:3, :3] @ np.array(turn, dtype=float)
+    return replace(seeing, pose=pose)
+
+
+# What may be wrong, and how it is undone; likelier ones first.
+MISTAKES: dict[str, Callable[[Seeing], Seeing]] = {
+    "camera.pose is inverted (it maps the camera's frame to the world)": lambda s: replace(
+        s, pose=np.linalg.inv(s.pose)
+    ),
+    "camera.poses are inverted": lambda s: replace(s, carrier=np.linalg.inv(s.carrier)),
+    **{
+        f"camera.pose is of a frame with {axes} (expected x to the right, y down, z forward)": (
+            partial(_turned, turn=turn)
+        )
+        for axes, turn in FRAMES.items()
+    },
+    "its points are in mm (see count_m and length_unit)": lambda s: replace(s, factor=MILLI),
+    "its points are too small by 1000 (see count_m and length_unit)": lambda s: replace(
+        s, factor=1 / MILLI
+    ),
+    "camera.pose is in mm (expected m)": partial(_scaled, by=MILLI),
+}
+
+
+def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
+    """That depth cameras are described wrongly which see hardly anything of the body."""
+    for depth in experiment.depths:
+        view = _OneCamera(experiment, depth)
+        here = view.share(view.stated)
+        if here >= HARDLY:
+            continue
+        data = {"percent": 100 * here, "within_mm": 1e3 * view.within_m}
+        of, code = f"'{depth.name}' of '{experiment.name}'", "camera"
+        strength = 1 / max(here, MILLI)
+        if mistakes := view.likeliest():
+            data, code = {"mistakes": list(mistakes)}, "camera/likely"
+        yield Hypothesis(code, of, data, strength=strength)
+
+
+class _OneCamera:
+    """How much of the body a camera sees with another description.
+
+    Attributes
+    ----------
+    stated : Seeing
+    within_m : float
+        So near to the undeformed body points may be of it.
+    """
+
+    stated: Seeing
+    within_m: float
+
+    def __init__(self, experiment: Experiment, depth: Depth) -> None:
+        at_s, camera = depth.times[[depth.first]], depth.camera
+        self.skin, self.pinhole = Skin.of(experiment.body, depth), camera.matrix is not None
+        self.shape_m = experiment.rigid_positions(at_s)[0, self.skin.nodes]
+        points_m = depth.points_m[depth.first]
+        self.tree = KDTree(points_m[:: 1 + len(points_m) // ENOUGH])
+        carrier = np.eye(4)
+        if camera.poses is not None:
+            rotations, translations = camera.poses.at(at_s)
+            carrier[:3, :3], carrier[:3, 3] = rotations[0], translations[0]
+        self.stated = Seeing(carrier, camera.pose)
+        self.within_m = WIDE * float(np.linalg.norm(np.ptp(self.shape_m, axis=0)))
+
+    def share(self, seeing: Seeing) -> float:
+        """Of the surface that is turned to the camera what has points nearby."""
+        motion = seeing.carrier @ seeing.pose
+        turn, eye_m = motion[:3, :3], motion[:3, 3]
+        turned = self.skin.facing(self.shape_m, eye_m if self.pinhole else None)
+        if not turned.any():
+            return 0.0
+        middles_m = self.shape_m[self.skin.flat[turned]].mean(axis=1)
+        own = (middles_m - eye_m) @ turn / seeing.factor
+        nearest, _ = self.tree.query(own, distance_upper_bound=self.within_m / seeing.factor)
+        return float(np.isfinite(nearest).mean())
+
+    def likeliest(self) -> tuple[str, ...]:
+        """One mistake without which it sees the body, or else two; those by which it does best."""
+        for count in (1, 2):
+            shares = {}
+            for names in combinations(MISTAKES, count):
+                seeing = self.stated
+                for name in names:
+                    seeing = MISTAKES[name](seeing)
+                shares[names] = self.share(seeing)
+            best = max(shares, key=lambda names: shares[names])
+            if shares[best] >= WELL:
+                return best
+        return ()

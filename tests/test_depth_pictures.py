@@ -1,0 +1,199 @@
+"""What is drawn of depth cameras, before a fit and after, and who is told to see nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problem_files import run_command
+from test_depth import (
+    MATRIX,
+    NOISE_M,
+    POSE,
+    SHAPE,
+    bar,
+    fitted,
+    hanging,
+    image_m,
+    moved,
+    noisy,
+)
+
+import collocation_sysid as cs
+from collocation_sysid.program.sighting import Skin
+from collocation_sysid.recording.depth import points_of
+from collocation_sysid.result.animation import Film
+from collocation_sysid.result.pictures.depth import depth_picture
+from collocation_sysid.result.replay import Replay
+from collocation_sysid.result.seen import seen_as_fitted, seen_before
+from collocation_sysid.statistics.cameras import camera_mistakes
+
+UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
+IN_MM = POSE * np.array([[1, 1, 1, 1000]] * 3 + [[1, 1, 1, 1]])
+
+
+def seeing(pose: np.ndarray, factor: float = 1.0) -> cs.Experiment:
+    """The bar, seen by a camera that is described by this pose and a factor of its depth."""
+    camera = cs.DepthCamera(MATRIX, pose=pose)
+    return hanging((cs.Depth.of_images("front", factor * image_m(), camera, NOISE_M),))
+
+
+@pytest.mark.parametrize(
+    ("pose", "factor", "said"),
+    [
+        (INVERTED, 1.0, ["inverted"]),
+        (POSE @ UPWARD, 1.0, ["y up, z backwards"]),
+        (np.linalg.inv(POSE @ UPWARD), 1.0, ["inverted", "y up, z backwards"]),
+        (POSE, 1000.0, ["points are in mm"]),
+        (IN_MM, 1.0, ["pose is in mm"]),
+        (IN_MM, 1000.0, ["points are in mm", "pose is in mm"]),
+    ],
+)
+def test_a_camera_that_sees_nothing_of_the_body_is_told_why(pose, factor, said):
+    (mistake,) = camera_mistakes(seeing(pose, factor))
+    assert mistake.cause == "camera"
+    assert all(word in mistake.sentence for word in said)
+    assert len(mistake.data["mistakes"]) == len(said)
+
+
+def test_a_camera_that_is_somewhere_else_is_told_to_see_nothing():
+    elsewhere = moved(np.zeros(3), np.array([0.0, 0.0, 0.7]))
+    (mistake,) = camera_mistakes(seeing(elsewhere))
+    assert "only 0 % of the surface" in mistake.sentence
+
+
+def test_a_camera_that_is_20_mm_and_10_degrees_off_is_none_that_sees_nothing():
+    off = moved(np.radians(10) * np.array([0, 0.6, 0.8]), np.array([0.02, 0, 0]))
+    assert not [*camera_mistakes(seeing(off))]
+
+
+def test_outlines_before_a_fit_are_where_the_stated_camera_sees_the_body():
+    (rows,) = seen_before(seeing(POSE)).values()
+    points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
+    assert np.isnan(points[:, 4]).all()
+    # The undeformed bar is drawn by hand.
+    skin = Skin.of(bar(), seeing(POSE).depths[0])
+    own = (skin.triangles(bar().nodes_m[skin.nodes], 1) - POSE[:3, 3]) @ POSE[:3, :3]
+    silhouette = np.argwhere(np.isfinite(cs.depth_image(cs.DepthCamera(MATRIX), SHAPE, own)))
+    low, high = np.nanmin(lines[:, 1:3], axis=0), np.nanmax(lines[:, 1:3], axis=0)
+    np.testing.assert_allclose(low[::-1], silhouette.min(axis=0), atol=1.5)
+    np.testing.assert_allclose(high[::-1], silhouette.max(axis=0), atol=1.5)
+    assert len(depth_picture(rows).axes) == 2
+
+
+def test_what_is_not_in_view_is_said_in_the_picture():
+    (rows,) = seen_before(seeing(INVERTED)).values()
+    said = [text.get_text() for text in depth_picture(rows).axes[0].texts]
+    assert said == ["the body is not in view"]
+
+
+def test_a_cloud_is_drawn_with_the_body_from_its_broad_side():
+    cloud = points_of(image_m(), cs.DepthCamera(MATRIX)) @ POSE[:3, :3].T + POSE[:3, 3]
+    (rows,) = seen_before(hanging((cs.Depth("scan", [0.0], [cloud], 1e-3),))).values()
+    points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
+    wide, high = np.nanmax(lines[:, 1:3], axis=0) - np.nanmin(lines[:, 1:3], axis=0)
+    assert 100 < wide < 135
+    assert 20 < high < 60
+    # It hangs below the undeformed one, downwards in the picture.
+    assert points[:, 2].max() > np.nanmax(lines[:, 2]) + 20
+
+
+PROBLEM = """
+[object]
+mesh = "bar.vtu"
+element = "tet10"
+density_kg_m3 = 1070.0
+[parameters]
+young_pa = { guess = 1.5e5 }
+poisson = 0.45
+gamma_r_s = 1e-3
+gamma_m_1_s = 0.1
+[[experiment]]
+name = "hanging"
+kind = "static"
+[experiment.grasp]
+nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
+[[experiment.depth]]
+name = "front"
+file = "front.npz"
+sigma_m = 0.0002
+"""
+
+
+def stated(folder: Path, pose: np.ndarray) -> Path:
+    bar().mesh.write(folder / "bar.vtu")
+    np.savez(folder / "front.npz", depth_m=image_m(), camera_matrix=MATRIX, camera_pose=pose)
+    (folder / "problem.toml").write_text(PROBLEM)
+    return folder / "problem.toml"
+
+
+def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
+    file = stated(tmp_path, INVERTED)
+    checked = run_command("check", str(file), "--out", str(tmp_path / "seen"))
+    assert checked.code == 1
+    assert (tmp_path / "seen" / "depth_hanging_front.png").stat().st_size > 5000
+    assert "depth_hanging_front.png" in checked.out
+    assert "inverted" in " ".join(checked.out.split())
+    assert "points of 'front'" in checked.out
+
+
+@pytest.fixture(scope="module")
+def found():
+    return fitted(noisy(np.random.default_rng(3)), POSE)
+
+
+def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(found):
+    (part,) = found.collocation.parts(found.z)
+    ((reading, looked),) = part.sights
+    rows = seen_as_fitted(part, reading, looked)
+    points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
+    used = np.isfinite(points[:, 4])
+    assert used.sum() == reading.sighting.used.sum()
+    assert np.sqrt(np.mean(points[used, 4] ** 2)) < 2e-4
+    # What is seen lies within what is drawn of the surface, but for a pixel.
+    low, high = np.nanmin(lines[:, 1:3], axis=0), np.nanmax(lines[:, 1:3], axis=0)
+    assert (points[used, 1:3] > low - 1).all()
+    assert (points[used, 1:3] < high + 1).all()
+    # Where points are in the world they are on the surface, to what they are apart.
+    skin, x = reading.sighting.skin, reading.shapes(part.x, part.phi)[0]
+    _, places = skin.nearest(x, points[used, 5:], np.arange(len(skin.flat)))
+    faces, _ = skin.nearest(x, points[used, 5:], np.arange(len(skin.flat)))
+    _, feet, _ = skin.points(x, faces, places)
+    away = np.linalg.norm(points[used, 5:] - feet, axis=1)
+    assert np.median(np.abs(away - np.abs(points[used, 4]))) < 1e-6
+    titles = [axes.get_title() for axes in depth_picture(rows).axes]
+    assert any("mm RMS of" in title for title in titles)
+
+
+def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found):
+    (part,) = found.collocation.parts(found.z)
+    ((reading, looked),) = part.sights
+    rows = seen_as_fitted(part, reading, looked)
+    experiment = part.segment.experiment
+    x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)
+    replay = Replay.of(experiment, (x[:1], np.zeros((1, 0, 3))))
+    # As if the camera had seen it twice, before and after a dropout.
+    later = rows + np.eye(8)[0] * 0.2
+    replay = replace(
+        replay,
+        t_s=np.array([0.0, 0.1, 0.2]),
+        held=np.repeat(replay.held, 3, axis=0),
+        measured_m=np.zeros((3, 0, 3)),
+        positions_m=x,
+        markers_m=np.zeros((3, 0, 3)),
+        seen={"front": np.vstack([rows, later])},
+    )
+    assert [len(replay.seen_m(t)) for t in range(3)] == [reading.sighting.used.sum()] * 3
+    sparse = replace(replay, seen={"front": rows})
+    assert [len(sparse.seen_m(t)) > 0 for t in range(3)] == [True, False, False]
+    film = Film(sparse)
+    ((_, _, _, drawn, _),) = film.panels
+    film.show(0)
+    u, _ = drawn.seen.get_data()
+    assert 0 < len(u) <= reading.sighting.used.sum()
+    shown = drawn.view.places(sparse.seen_m(0))
+    assert np.isin(np.round(u, 6), np.round(shown[:, 0], 6)).all()
+    film.show(2)
+    assert len(drawn.seen.get_data()[0]) == 0
