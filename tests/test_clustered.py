@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import pickle
+import platform
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,10 +32,12 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods import workers
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
+from collocation_sysid.methods.start import marched
 from collocation_sysid.methods.workers import OnCluster, workers_of
 from collocation_sysid.program.collocation import Collocation
 
 distributed = pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
 
 
 @pytest.fixture
@@ -118,21 +125,78 @@ def test_what_a_lost_worker_had_is_done_again(there):
     with workers_of(there.scheduler_address) as found:
         solution = ReducedSpace()(collocation, watch, workers=found)
     assert len(there.scheduler.workers) == 1
-    assert_alike(solution, ReducedSpace()(collocation))
+    *notes, said = solution.notes
+    assert said == "1 of 2 workers were lost on the way: what they had was done again on others"
+    assert_alike(replace(solution, notes=tuple(notes)), ReducedSpace()(collocation))
 
 
-def test_a_cluster_without_workers_left_is_named(there, monkeypatch):
+def assert_best_is_kept(solution: cs.Solution, why: str) -> None:
+    """The answer is the last line of the history, simulated here."""
+    assert solution.status is Status.CLUSTER_LOST
+    assert solution.message == f"{Status.CLUSTER_LOST.sentence} {why}"
+    assert solution.parameters == solution.history[-1].parameters
+    collocation, z = solution.collocation, solution.z
+    alike, failure = marched(collocation, collocation.unpack(z)[0])
+    assert failure is None
+    for part, x in zip(collocation.parts(z), alike, strict=True):
+        np.testing.assert_allclose(part.x, x, atol=1e-9)
+
+
+def test_without_workers_left_the_best_is_kept(there, monkeypatch):
     monkeypatch.setattr(workers, "LOOK_EVERY_S", 0.2)
 
     def watch(line: Iteration) -> None:
-        for number in (0, 1):
-            lose(there, number)
+        if line.number == 3:
+            for number in (0, 1):
+                lose(there, number)
 
-    with (
-        workers_of(there.scheduler_address) as found,
-        pytest.raises(InputError, match=r"--scheduler: the cluster was lost \(no worker is left\)"),
-    ):
-        ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
+    with workers_of(there.scheduler_address) as found:
+        solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
+    assert_best_is_kept(solution, "No worker is left.")
+
+
+def test_without_a_scheduler_left_the_best_is_kept(there, monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
+
+    def watch(line: Iteration) -> None:
+        if line.number == 3:
+            there.sync(there.scheduler.close)
+
+    with workers_of(there.scheduler_address) as found:
+        solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
+    with dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
+        there.close()  # which looks for the scheduler
+    assert_best_is_kept(solution, "Its scheduler answers no more.")
+
+
+FAULTS = """
+import resource, threading
+import numpy as np
+from collocation_sysid.methods import workers
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(100):
+        np.ones(2**17)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+def compared():
+    print(faults(), workers._done(lambda: faults() and faults()))
+
+thread = threading.Thread(target=compared)
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_workers_keep_the_memory_of_arrays_that_come_and_go():
+    """A nanny's processes give it back: each array of 1 MB then is 256 pages to be had anew."""
+    environment = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}
+    said = subprocess.check_output([sys.executable, "-c", FAULTS], env=environment, text=True)
+    before, after = map(int, said.split())
+    assert before > 100 * 250
+    assert after < 100
 
 
 def test_an_interrupted_solve_keeps_its_best(there):
@@ -148,6 +212,58 @@ def test_an_interrupted_solve_keeps_its_best(there):
     assert solution.status is Status.INTERRUPTED
     assert solution.parameters == lines[-1].parameters
     assert np.isfinite(solution.z).all()
+
+
+@pytest.fixture
+def apart(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen]]]:
+    """The address of a scheduler, and its process before those of its two workers."""
+    file, command = tmp_path / "scheduler.json", [sys.executable, "-m"]
+    options = ["--scheduler-file", str(file), "--no-dashboard"]
+    one = ["--nthreads", "1", "--no-nanny", "--local-directory", str(tmp_path)]
+    commands = [
+        [*command, "distributed.cli.dask_scheduler", "--port", "0", *options],
+        *[[*command, "distributed.cli.dask_worker", *one, *options]] * 2,
+    ]
+    processes = [subprocess.Popen(each, stderr=subprocess.DEVNULL) for each in commands]
+    try:
+        with distributed.Client(scheduler_file=str(file), set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+            address = client.scheduler.address
+        yield address, processes
+    finally:
+        for each in processes:
+            each.kill()
+            each.wait()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("ended", "status", "said"),
+    [
+        (slice(1, 2), Status.CONVERGED, "1 of 2 workers were lost on the way"),
+        (slice(1, 3), Status.CLUSTER_LOST, "No worker is left."),
+        (slice(0, 1), Status.CLUSTER_LOST, "Its scheduler answers no more."),
+    ],
+    ids=["a worker", "all workers", "the scheduler"],
+)
+def test_killed_processes_cost_no_answer(apart, monkeypatch, ended, status, said):
+    monkeypatch.setattr(workers, "LOOK_EVERY_S", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 2.0)
+    address, processes = apart
+
+    def watch(line: Iteration) -> None:
+        if line.number == 3:
+            for each in processes[ended]:
+                each.kill()
+
+    problem = cs.Problem(several()[:3], GUESS, method=ReducedSpace())
+    run = cs.run(problem, watch=watch, scheduler=address, seek_causes=False)
+    assert run.solution.status is status
+    assert said in " ".join([run.solution.message, *run.solution.notes])
+    known = cs.run(problem, seek_causes=False).solution
+    line = known.history[len(run.solution.history) - 1]
+    for name, value in run.solution.parameters.items():
+        assert value == pytest.approx(line.parameters[name], rel=1e-8)
 
 
 def test_workers_of_another_version_are_refused():

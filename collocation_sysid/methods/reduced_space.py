@@ -32,10 +32,10 @@ from ..program.collocation import Collocation
 from ..program.lapack import one_blas_thread
 from ..program.sweep import Sweep
 from .curvature import require_second_derivatives
-from .recorder import Recorder
+from .recorder import Ended, Recorder
 from .search import ReducedSearch, SearchOptions
 from .solution import Solution, Status, Watch
-from .start import completed
+from .start import completed, marched
 from .trajectory import positions
 from .workers import Here, Workers
 
@@ -74,7 +74,12 @@ class ReducedSpace(SearchOptions):
         search = ReducedSearch(self, recorder, start, workers)
         status, message = recorder.search(search.run)
         collocation = recorder.collocation
-        found = search.x and workers.fetch(workers.each(positions, search.x))
+        try:
+            found = search.x and workers.fetch(workers.each(positions, search.x))
+            recorder.notes += workers.notes()
+        except Ended as lost:
+            status, message = lost.status, lost.message
+            found, _ = marched(collocation, search.p)
         z = completed(collocation, search.p, found)
         rows = [segment.grid_rows for segment in collocation.segments]
         reached = found is not None and [len(x) for x in found] == rows

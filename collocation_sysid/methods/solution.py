@@ -33,6 +33,7 @@ class Status(Enum):
     DIVERGED = "diverged"
     NUMERICAL_FAILURE = "numerical-failure"
     INTERRUPTED = "interrupted"
+    CLUSTER_LOST = "cluster-lost"
     REFUSED = "refused"
     NOT_SIMULABLE = "not-simulable"
 
@@ -61,6 +62,8 @@ _SENTENCES = {
     Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
     "guess or linear solver may help.",
     Status.INTERRUPTED: "Interrupted; this is the best iterate so far.",
+    Status.CLUSTER_LOST: "The cluster was lost; this is the best iterate so far, simulated here, "
+    "from which --start goes on.",
     Status.NOT_SIMULABLE: "The body cannot be simulated at the guess; start from stiffer or less "
     "damped parameters or without a guess, or use interior-point, which needs no simulation.",
     Status.REFUSED: "The solver refused the problem or one of its options.",

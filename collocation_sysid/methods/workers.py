@@ -6,10 +6,12 @@ worker, until it is fetched. Should a worker be lost, dask does again on another
 
 from __future__ import annotations
 
+import ctypes
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
+from functools import cache
 from importlib.metadata import version
 from typing import Any, Protocol, TypeVar
 from weakref import WeakKeyDictionary
@@ -22,10 +24,14 @@ from ..program.charts import Chart
 from ..program.collocation import Collocation
 from ..program.segment import Segment
 from ..recording.experiment import Experiment
+from .recorder import Ended
+from .solution import Status
 
 T = TypeVar("T")
 # How often it is looked whether there are workers at all.
 LOOK_EVERY_S = 10
+# glibc's M_TRIM_THRESHOLD and M_MMAP_THRESHOLD, and the most that it raises them to by itself.
+KEPT_BYTES = {-1: 64 * 2**20, -3: 32 * 2**20}
 
 
 class Workers(Protocol):
@@ -41,6 +47,10 @@ class Workers(Protocol):
 
     def fetch(self, kept: Sequence[Any]) -> list[Any]:
         """What is kept; raises what it raised."""
+        ...
+
+    def notes(self) -> list[str]:
+        """What the user should know of them."""
         ...
 
 
@@ -62,6 +72,10 @@ class Here:
         """See `Workers`."""
         return list(kept)
 
+    def notes(self) -> list[str]:
+        """See `Workers`."""
+        return []
+
 
 class OnCluster:
     """Workers of a dask cluster, each experiment on one of them.
@@ -80,51 +94,74 @@ class OnCluster:
         self.client = client
         self._sent: WeakKeyDictionary[object, Any] = WeakKeyDictionary()
         self._homes: list[str] = []
-        _require_package(client)
+        self._first = _require_package(client)
 
     def hold(self, collocation: Collocation) -> list[Any]:
         """See `Workers`; bodies and experiments are sent once."""
         segments = collocation.segments
-        known = all(segment.experiment in self._sent for segment in segments)
-        if not known or len(self._homes) != len(segments):
-            costs = [segment.variables for segment in segments]
-            self._homes = _shared_out(costs, self.client.nthreads())
-        return [self._segment(s, home) for s, home in zip(segments, self._homes, strict=True)]
+        with self._unless_lost():
+            known = all(segment.experiment in self._sent for segment in segments)
+            if not known or len(self._homes) != len(segments):
+                costs = [segment.variables for segment in segments]
+                self._homes = _shared_out(costs, self.client.nthreads())
+            return [self._segment(s, home) for s, home in zip(segments, self._homes, strict=True)]
 
     def each(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
         """See `Workers`."""
         rows = zip(self._homes, *columns, strict=True)
-        return [self._submit(home, run, *row) for home, *row in rows]
+        with self._unless_lost():
+            return [self._submit(home, run, *row) for home, *row in rows]
 
     def fetch(self, kept: Sequence[Any]) -> list[Any]:
         """See `Workers`.
 
         Raises
         ------
-        InputError
-            If all workers are gone, or an experiment ends those that it is given to.
+        Ended
+            If the scheduler or all workers are gone, or an experiment ends those that it is
+            given to.
         """
-        dask = distributed()
-        lost = dask.scheduler.KilledWorker, dask.client.FutureCancelledError, OSError
-        try:
-            return [self._result(future, dask.TimeoutError) for future in kept]
-        except lost as error:
-            said = f"the cluster was lost ({type(error).__name__}: {error})"
-            raise _refusal(said) from error
+        with self._unless_lost():
+            return [self._result(future) for future in kept]
 
-    def _result(self, future: Any, late: type[Exception]) -> Any:
+    def notes(self) -> list[str]:
+        """See `Workers`."""
+        with self._unless_lost():
+            gone = self._first - self.client.nthreads().keys()
+        said = f"{len(gone)} of {len(self._first)} workers were lost on the way: "
+        return [f"{said}what they had was done again on others"] if gone else []
+
+    def _result(self, future: Any) -> Any:
         while True:
             try:
                 return future.result(timeout=LOOK_EVERY_S)
-            except late:
-                if not self.client.nthreads():
-                    raise _refusal("the cluster was lost (no worker is left)") from None
+            except distributed().TimeoutError:
+                _require_some(self.client.nthreads())
+
+    @contextmanager
+    def _unless_lost(self) -> Iterator[None]:
+        """End the search where the cluster is gone."""
+        dask = distributed()
+        killed, cut = dask.scheduler.KilledWorker, (dask.client.CancelledError, OSError)
+        try:
+            yield
+        except (Exception, dask.client.CancelledError) as error:
+            if self.client.status != "running":
+                why = "Its scheduler answers no more"
+            elif isinstance(error, killed):
+                why = "A recording ended every worker that it was given to: mind their memory"
+            elif isinstance(error, cut):
+                why = " ".join(str(error).split()) or type(error).__name__
+            else:
+                raise
+            sentence = f"{Status.CLUSTER_LOST.sentence} {why.rstrip('.')}."
+            raise Ended(Status.CLUSTER_LOST, sentence) from error
 
     def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
         # By the name of the function dask knows how long such tasks take.
         key = f"{run.__name__}-{secrets.token_hex(16)}"
         return self.client.submit(
-            alone, run, *arguments, key=key, workers=[home], allow_other_workers=True
+            _done, run, *arguments, key=key, workers=[home], allow_other_workers=True
         )
 
     def _segment(self, segment: Segment, home: str) -> Any:
@@ -167,9 +204,8 @@ def workers_of(scheduler: str | None) -> Iterator[OnCluster | None]:
 
 def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
     """The worker of each experiment: the costliest first, each to the thread with least to do."""
+    _require_some(threads)
     slots = [(address, k) for address, count in threads.items() for k in range(count)]
-    if not slots:
-        raise _refusal("the scheduler has no workers")
     loads, homes = dict.fromkeys(slots, 0), [""] * len(costs)
     for number in sorted(range(len(costs)), key=lambda k: -costs[k]):
         slot = min(loads, key=lambda slot: (loads[slot], slot[1]))
@@ -178,21 +214,27 @@ def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
     return homes
 
 
-def _require_package(client: Any) -> None:
-    """Refuse workers without this version."""
+def _require_package(client: Any) -> set[str]:
+    """The workers; those without this version are refused."""
     ours = version("collocation-sysid")
-    found = client.run(_version, on_error="return")
-    if not found:
+    versions = client.run(_version, on_error="return")
+    if not versions:
         raise _refusal("the scheduler has no workers; start some, as with dask worker ADDRESS")
-    for address, theirs in found.items():
+    for address, theirs in versions.items():
         if theirs != ours:
             raise _refusal(
                 f"found {theirs!r} on the worker {address}; expected collocation-sysid {ours}"
             )
+    return set(versions)
 
 
 def _refusal(message: str) -> InputError:
     return InputError(message, None, "--scheduler")
+
+
+def _require_some(threads: dict[str, int]) -> None:
+    if not threads:
+        raise OSError("No worker is left")
 
 
 # On the workers -----------------------------------------------------------------------------------
@@ -200,6 +242,24 @@ def _refusal(message: str) -> InputError:
 
 def _version() -> str:
     return version("collocation-sysid")
+
+
+def _done(run: Callable[..., T], *arguments: Any) -> T:
+    """``run(*arguments)`` on a worker's thread."""
+    _keep_freed()
+    return alone(run, *arguments)
+
+
+@cache
+def _keep_freed() -> None:
+    """Let this process keep the memory of arrays that come and go.
+
+    dask's nannies set MALLOC_TRIM_THRESHOLD_, by which glibc gives every freed array back to the
+    system, and never learns not to: a sweep then waits for its pages to come again.
+    """
+    if mallopt := getattr(ctypes.pythonapi, "mallopt", None):  # glibc's only
+        for option, size in KEPT_BYTES.items():
+            mallopt(option, size)
 
 
 def _itself(thing: T) -> T:
