@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import runpy
 import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import casadi as ca
 import numpy as np
 import pytest
 from problem_files import run_command, write_problem
@@ -36,6 +38,7 @@ from collocation_sysid.recording import (
 )
 from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
 from collocation_sysid.result.export.identified import alone
+from collocation_sysid.result.export.solids import Facets
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
@@ -490,7 +493,7 @@ def laid_block(shape: Solid) -> Identified:
     motion = simulate(fallen, values, "bdf2", substeps=4).positions_m
     still = alone(fallen)
     theta, shapes = still.body.theta(values), motion[:, : len(block.nodes_m)]
-    return Identified("b", "good", (), {}, still.body, theta, still, shapes, fallen.obstacles)
+    return Identified("b", "good", (), {}, still.body, theta, still, shapes, fallen)
 
 
 LAID_ON = {
@@ -526,7 +529,9 @@ def test_all_solids_are_geoms_and_what_a_geom_lacks_is_said(tmp_path):
         Capsule(0.005, ends),
     ]
     others = [replace(body.obstacles[0], shape=s, name=f"it {k}") for k, s in enumerate(solids)]
-    several = replace(body, obstacles=(*body.obstacles, *others))
+    assert body.touching is not None
+    touching = body.touching.with_obstacles((*body.obstacles, *others))
+    several = replace(body, touching=touching)
     model = exported(several, "mujoco", tmp_path)
     geoms = ElementTree.parse(model / "body.xml").findall(".//geom")
     assert [geom.get("type") for geom in geoms] == ["plane", "sphere", "cylinder", "capsule"]
@@ -536,10 +541,134 @@ def test_all_solids_are_geoms_and_what_a_geom_lacks_is_said(tmp_path):
     said = " ".join(told["not_expressed"])
     assert "it 1: its edges are not rounded" in said
     assert "table" not in said
-    for other in ("calculix", "febio", "newton"):
-        folder = exported(several, other, tmp_path)
-        left_out = json.loads((folder / "identified.json").read_text())["not_expressed"]
-        assert any("what it may touch is not exported: table, it 0" in each for each in left_out)
+
+
+SOLIDS = {
+    "plane": Plane(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 0.0401])),
+    "sphere": Sphere(0.02, np.array([0.02, 0.02, 0.0601])),
+    "box": Cuboid(np.array([(0.01, 0.01, 0.0401), (0.03, 0.03, 0.06)]), 0.004),
+    "cylinder": Cylinder(0.008, np.array([(0.02, 0.02, 0.0401), (0.02, 0.02, 0.06)]), 0.002),
+    "capsule": Capsule(0.0099, np.array([(0.02, -0.01, 0.05), (0.02, 0.05, 0.05)])),
+}
+
+
+def pressed_block(
+    *shapes: Solid, friction: float = 0.0, material: str = "st-venant-kirchhoff"
+) -> Identified:
+    """A block held below into which something comes 3 mm, as if a run had identified it."""
+    block = Body(box_mesh((0.04, 0.04, 0.04), (2, 2, 2)), material, 300.0)
+    t_s = np.arange(3.0)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 2, 3] = [-0.0015, -0.003, -0.003]
+    pressing = [
+        Obstacle(shape=shape, name=f"it {k}", friction=friction, poses=poses)  # pyright: ignore
+        for k, shape in enumerate(shapes)
+    ]
+    grasps = [Grasp(nodes_where(block, 2, 0.0), PoseSequence.fixed()), *pressing]
+    seen = vertex_markers(block, np.array([0]), t_s)
+    whole = Experiment(block, t_s, grasps, seen, nuisance=IDEAL, kind="static")
+    still = alone(whole)
+    values = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    theta = still.body.theta(values)
+    return Identified("b", "good", (), {}, still.body, theta, still, None, whole)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_facets_lie_on_the_surface_of_their_solid_and_look_out_of_it(name):
+    solid, about_m = SOLIDS[name], np.array([0.02, 0.02, 0.02])
+    facets = Facets.of(solid, about_m, 0.1, depth_m=2e-5)
+    gap = ca.Function("gap", [place := ca.SX.sym("p", 3)], [solid.gap(place)])
+    corners = facets.points_m[facets.triangles]
+    middles = corners.mean(axis=1)
+    gaps = np.array(gap(np.vstack([corners.reshape(-1, 3), middles]).T))
+    assert np.abs(gaps).max() < 3e-4 * (name != "plane") + 1e-9
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outside = middles + 1e-3 * normals / np.linalg.norm(normals, axis=1)[:, None]
+    assert np.array(gap(outside.T)).min() > 5e-4
+    assert float(np.array(gap(facets.points_m[-1])).squeeze()) < -1e-3
+    seen = facets.towards(about_m[None])
+    assert 0 < len(seen.triangles) <= len(facets.triangles)
+    if name in ("box", "cylinder"):  # not those on top
+        assert seen.points_m[seen.triangles][..., 2].max() < 0.06
+
+
+@needs_ccx
+def test_calculix_is_pressed_with_the_same_force(tmp_path):
+    body = pressed_block(SOLIDS["plane"], friction=0.2)
+    moved, force = verify_export(body, "calculix", exported(body, "calculix", tmp_path))
+    assert moved.ours > 2.5e-3
+    assert force.ours > 0.5
+    assert abs(moved.relative) < 5e-3
+    assert abs(force.relative) < 5e-3
+
+
+def test_febio_gets_what_is_touched_as_rigid_facets(tmp_path):
+    body = pressed_block(SOLIDS["sphere"], SOLIDS["plane"], friction=0.2)
+    model = in_febio(body, tmp_path)
+    ids = [node.get("id") for node in model.iterfind("Mesh/Nodes/node")]
+    assert ids == [str(k) for k in range(1, len(ids) + 1)]
+    places = numbers_in(
+        " ".join(n.text or "" for n in model.iterfind("Mesh/Nodes/node")).replace(",", " ")
+    )
+    places = places.reshape(-1, 3)
+    for k, pair in enumerate(model.iterfind("Mesh/SurfacePair")):
+        surfaces = {each.get("name"): each for each in model.iterfind("Mesh/Surface")}
+        wall = surfaces[pair.findtext("secondary", "")]
+        corners = places[[indices_in(each.text) for each in wall]]
+        assert corners[..., 2].min() > 0.04 - 5e-5  # it is further out by half of the width
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert (normals[:, 2] < 0).any()
+        cells = [
+            numbers
+            for each in model.iterfind("Mesh/Elements")
+            if each.get("name") == f"cells_wall_{k}"
+            for numbers in each
+        ]
+        tetrahedra = places[[indices_in(each.text) for each in cells]]
+        assert (np.linalg.det(tetrahedra[:, 1:] - tetrahedra[:, :1]) > 0).all()
+        contact = model.findall("Contact/contact")[k]
+        assert contact.get("surface_pair") == pair.get("name")
+        assert float(contact.findtext("fric_coeff", "")) == 0.2
+        assert float(contact.findtext("penalty", "")) > 1e7
+    down = model.findall("Rigid/rigid_bc[dof='z']/value")
+    assert [float(each.text or "") for each in down] == pytest.approx([-0.0014] * 2, abs=5e-5)
+
+
+def test_sofa_gets_planes_and_balls_and_says_what_else_there_is(tmp_path):
+    body = pressed_block(*SOLIDS.values(), friction=0.2)
+    scene = ElementTree.parse(exported(body, "sofa", tmp_path) / "body.scn")
+    plane, ball = scene.find(".//PlaneForceField"), scene.find(".//SphereForceField")
+    assert plane is not None
+    assert ball is not None
+    np.testing.assert_allclose(numbers_in(plane.get("normal")), (0, 0, -1), atol=1e-12)
+    assert float(plane.get("d", "")) == pytest.approx(-0.0386)
+    np.testing.assert_allclose(numbers_in(ball.get("center")), (0.02, 0.02, 0.0586))
+    told = json.loads((tmp_path / "sofa" / "identified.json").read_text())["not_expressed"]
+    for said in ("it 0: nothing rubs on it", "it 2: what the body may touch", "it 4: what"):
+        assert any(said in each for each in told)
+
+
+def test_usd_gets_solids_their_motion_and_friction(tmp_path):
+    body = pressed_block(*SOLIDS.values(), friction=0.2)
+    stage = stage_of(exported(body, "usd", tmp_path))
+    from pxr import UsdGeom, UsdPhysics, UsdShade
+
+    for k, name in enumerate(SOLIDS, start=1):
+        solid = stage.GetPrimAtPath(f"/World/Obstacle_{k}/Shape")
+        assert solid.GetTypeName() == {"box": "Cube"}.get(name, name.title())
+        assert solid.HasAPI(UsdPhysics.CollisionAPI)
+        material, _ = UsdShade.MaterialBindingAPI(solid).ComputeBoundMaterial("physics")
+        assert UsdPhysics.MaterialAPI(material).GetDynamicFrictionAttr().Get() == pytest.approx(0.2)
+        # USD's matrices act on rows; the last row is where its middle is.
+        at = [UsdGeom.Xformable(solid).ComputeLocalToWorldTransform(t) for t in (0.0, 1.0)]
+        assert at[1][3][2] - at[0][3][2] == pytest.approx(-0.0015)
+    box = np.array(
+        UsdGeom.Xformable(stage.GetPrimAtPath("/World/Obstacle_3/Shape")).GetLocalTransformation()
+    )
+    np.testing.assert_allclose(np.abs(box[:3, :3]), np.diag([0.01, 0.01, 0.00995]), atol=1e-9)
+    capsule = UsdGeom.Capsule(stage.GetPrimAtPath("/World/Obstacle_5/Shape"))
+    assert capsule.GetHeightAttr().Get() == pytest.approx(0.06)
+    assert capsule.GetRadiusAttr().Get() == pytest.approx(0.0099)
 
 
 @needs_mujoco
@@ -557,3 +686,19 @@ def test_newton_opens_the_stage_and_sags_alike_with_the_same_energy(tmp_path):
     (sag,) = verify_export(body, "usd", exported(body, "usd", tmp_path))
     assert sag.ours > 0.1 * BAR_M[0]  # not small
     assert abs(sag.relative) < 1e-3
+
+
+@pytest.mark.long
+def test_newton_is_pressed_alike_from_the_stage_and_has_all_solids(tmp_path):
+    newton = pytest.importorskip("newton")
+    pytest.importorskip("newton_usd_schemas")
+    body = pressed_block(SOLIDS["plane"], material="stable-neo-hookean")
+    (moved,) = verify_export(body, "usd", exported(body, "usd", tmp_path))
+    assert moved.ours > 1e-3
+    assert abs(moved.relative) < 0.02
+    folder = exported(pressed_block(*SOLIDS.values(), friction=0.2), "newton", tmp_path)
+    build = runpy.run_path(str(folder / "body.py"))
+    model = build["model"]("cpu")
+    kinds = [newton.GeoType(kind).name.lower() for kind in model.shape_type.numpy()]
+    assert kinds == list(SOLIDS)
+    np.testing.assert_allclose(model.shape_material_mu.numpy(), 0.2)

@@ -1,10 +1,14 @@
-"""CalculiX: an input deck of the body at rest in its grasp, under gravity."""
+"""CalculiX: an input deck of the body at rest in its grasp, under gravity, on what it touches.
+
+Of a static recording it has a step for each sample.
+"""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +16,13 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from .identified import Identified, IdentifiedRegion
-from .target import Comparison, Exported, Holds, heading, longest, moved_at_rest
+from .solids import Wall, walls
+from .target import Comparison, Exported, Holds, at_rest, heading, longest
 
 DECK = "body.inp"
 LONGEST_S = 600.0
+# Corners of a tetrahedron's sides as numbered there.
+SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
 # Of U = Σ (J − 1)^2i / D_i beyond the first: a zero is taken for a very stiff term.
 NO_TERM = 1e20
 # C_i of Arruda and Boyce's series.
@@ -25,7 +32,8 @@ _CHAINS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 def export(body: Identified) -> Exported:
     """The deck of one static step, as large as the loads are."""
-    limits = HOLDS.lost(body)
+    static = body.experiment.static
+    limits = replace(HOLDS, motion=static, drives=static).lost(body)
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
     for k, region in enumerate(body.regions):
@@ -47,14 +55,56 @@ def export(body: Identified) -> Exported:
         mesh += f"*ELEMENT,TYPE={kind},ELSET=E{k}\n" + "".join(f"{line}\n" for line in lines)
     mesh += "".join(f"*ELSET,ELSET=BODY\nE{k}\n" for k in range(len(body.regions)))
     head = heading(body, limits, "** ")
-    return Exported({DECK: f"{head}{mesh}{materials}{_step(body, linear)}"}, tuple(limits))
+    touched, steps = walls(body), ""
+    for t_s in _times_s(body):
+        steps += _step(body, touched, t_s, linear)
+    return Exported({DECK: f"{head}{mesh}{materials}{_walls(body, touched)}{steps}"}, tuple(limits))
 
 
-def _step(body: Identified, linear: bool) -> str:
-    """Grasped nodes where they are held, gravity, and what else pulls."""
-    held = np.argwhere(body.held)
-    moved = body.moved_m
-    boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(float(moved[n, a]))}\n" for n, a in held)
+def _times_s(body: Identified) -> Array:
+    """Of each step."""
+    return body.experiment.t_s[: None if body.experiment.static else 1]
+
+
+def _walls(body: Identified, touched: Sequence[Wall]) -> str:
+    """What is touched: a tetrahedron under each facet, none of whose nodes is free."""
+    deck, node, cell = "", len(body.nodes_m), len(body.body.cells)
+    tetrahedra, numbers = body.body.mesh.tetrahedra, np.arange(len(body.body.cells)) + 1
+    faces = {
+        tuple(sorted(corners)): f"{number},S{side}"
+        for side, places in enumerate(SIDES, start=1)
+        for corners, number in zip(tetrahedra[:, places].tolist(), numbers, strict=True)
+    }
+    for k, wall in enumerate(touched):
+        points = wall.points_m(body.start_s) + wall.back_m
+        deck += f"*NODE,NSET=W{k}\n"
+        deck += "".join(f"{node + i},{_fields(*p)}\n" for i, p in enumerate(points, start=1))
+        deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
+        for i, (a, b, c) in enumerate(wall.facets.triangles + node + 1, start=1):
+            deck += f"{cell + i},{a},{c},{b},{node + len(points)}\n"
+        node, cell = node + len(points), cell + len(wall.facets.triangles)
+        touching = body.body.mesh.surface[wall.faces].tolist()
+        sides = "".join(f"{faces[tuple(sorted(face))]}\n" for face in touching)
+        stick = f"*FRICTION\n{_fields(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)}\n"
+        deck += (
+            f"*SOLID SECTION,ELSET=W{k},MATERIAL=WALL\n*SURFACE,NAME=W{k}\nW{k},S1\n"
+            f"*SURFACE,NAME=B{k}\n{sides}"
+            f"*SURFACE INTERACTION,NAME=W{k}\n*SURFACE BEHAVIOR,PRESSURE-OVERCLOSURE=LINEAR\n"
+            f"{_fields(wall.stiffness_pa_m)}\n{stick if wall.obstacle.rubs else ''}"
+            f"*CONTACT PAIR,INTERACTION=W{k},TYPE=SURFACE TO SURFACE\nB{k},W{k}\n"
+        )
+    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_fields(body.regions[0].young_pa, 0.3)}\n"
+    return f"{material}*DENSITY\n1.\n{deck}" if touched else ""
+
+
+def _step(body: Identified, touched: Sequence[Wall], t_s: float, linear: bool) -> str:
+    """Grasped nodes and obstacles where they are then, gravity, and what else pulls."""
+    moved = [body.experiment.grasped([t_s])[1][0] - body.nodes_m]
+    moved += [w.points_m(t_s) - w.points_m(body.start_s) - w.back_m for w in touched]
+    rows = np.concatenate(moved)
+    held = np.argwhere(np.isfinite(rows))
+    boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(float(rows[n, a]))}\n" for n, a in held)
+    prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n" for k in range(len(touched)))
     pulled = np.argwhere(body.loads_n)
     loads = "".join(f"{n + 1},{a + 1},{_fields(float(body.loads_n[n, a]))}\n" for n, a in pulled)
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
@@ -64,7 +114,7 @@ def _step(body: Identified, linear: bool) -> str:
         f"*STEP,INC=1000{'' if linear else ',NLGEOM'}\n*STATIC\n{'1.,1.' if linear else '0.1,1.'}\n"
         + (f"*BOUNDARY\n{boundary}" if boundary else "")
         + (f"*CLOAD\n{loads}" if loads else "")
-        + f"{weight}*NODE PRINT,NSET=ALL\nU\n*NODE FILE\nU\n*EL FILE\nS\n*END STEP\n"
+        + f"{weight}*NODE PRINT,NSET=ALL\nU\n{prints}*NODE FILE\nU\n*EL FILE\nS\n*END STEP\n"
     )
 
 
@@ -131,28 +181,38 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         )
     except subprocess.TimeoutExpired:
         raise InputError(f"CalculiX took more than {LONGEST_S:g} s", folder / DECK) from None
-    theirs = _last_displacements(folder / "body.dat", len(body.nodes_m))
+    times = _times_s(body)
+    theirs, pushed = _last_printed(folder / "body.dat", len(body.nodes_m), len(times))
     if theirs is None:
         said = [x for x in ended.stdout.splitlines() if "ERROR" in x] or [
             "no displacements written"
         ]
         raise InputError(f"CalculiX failed: {said[0].strip()}", folder / DECK)
-    ours = moved_at_rest(body)
+    (*_, ours), (*_, forces) = at_rest(body, len(times))
     sag_m, apart_m = longest(ours), longest(theirs - ours)
     share = f" ({apart_m / sag_m:.2%} of it)" if sag_m else ""
     remark = f"no node is further than {apart_m:.3g} m apart{share}"
-    return [Comparison("largest displacement at rest", longest(theirs), sag_m, "m", remark)]
+    what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
+    told = [Comparison(f"largest displacement {what}", longest(theirs), sag_m, "m", remark)]
+    for each, push, force in zip(body.obstacles, pushed, forces, strict=True):
+        size_n, own_n = float(np.linalg.norm(push)), float(np.linalg.norm(force))
+        told.append(Comparison(f"force of {each.name} {what}", size_n, own_n, "N"))
+    return told
 
 
-def _last_displacements(file: Path, count: int) -> Array | None:
-    """(n, 3) of the last increment; None where it did not get to the end."""
+def _last_printed(file: Path, count: int, steps: int) -> tuple[Array | None, Array]:
+    """(n, 3) displacements and (o, 3) forces at the end; None where it did not get there."""
     if not file.is_file():
-        return None
-    table, complete = np.full((count, 3), np.nan), False
+        return None, np.zeros((0, 3))
+    table, forces, time = np.full((count, 3), np.nan), [], 0.0
     for line in file.read_text().splitlines():
         words = line.split()
         if "time" in words:
-            complete = float(words[-1]) >= 1.0 - 1e-9
+            if float(words[-1]) > time:
+                time, forces = float(words[-1]), []
+        elif len(words) == 3:
+            forces.append([float(word) for word in words])
         elif len(words) == 4 and words[0].isdigit():
             table[int(words[0]) - 1] = [float(word) for word in words[1:]]
-    return table if complete and np.isfinite(table).all() else None
+    done = time >= steps * (1.0 - 1e-6) and np.isfinite(table).all()
+    return table if done else None, np.array(forces).reshape(-1, 3)

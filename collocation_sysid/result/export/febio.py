@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from ...arrays import Index
 from .identified import Identified, IdentifiedRegion
+from .solids import Wall, walls
 from .target import Exported, Holds, heading, numbers
 
 MODEL = "body.feb"
@@ -39,7 +43,14 @@ def export(body: Identified) -> Exported:
         "<Control><analysis>STATIC</analysis><time_steps>10</time_steps>"
         "<step_size>0.1</step_size></Control>\n"
     )
-    xml += f"<Material>\n{materials}</Material>\n{_mesh(body)}{_boundary(body)}"
+    touched = walls(body)
+    for wall in range(len(touched)):
+        materials += (
+            f'<material id="{len(body.regions) + wall + 1}" name="wall_{wall}" type="rigid body">'
+            "<density>1</density></material>\n"
+        )
+    xml += f"<Material>\n{materials}</Material>\n{_mesh(body, touched)}{_boundary(body)}"
+    xml += _touching(touched)
     # A body load pushes against the vector that it is given.
     against = numbers(-body.experiment.gravity_m_s2, ",")
     xml += (
@@ -85,11 +96,12 @@ def _law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, fl
     return HOLDS.materials.get(region.material, "neo-Hookean"), moduli, False
 
 
-def _mesh(body: Identified) -> str:
+def _mesh(body: Identified, touched: Sequence[Wall]) -> str:
+    solids, facets = _walls(body, touched)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):
         xml += f'<node id="{k}">{numbers(point, ",")}</node>\n'
-    xml += "</Nodes>\n"
+    xml += f"</Nodes>\n{solids}"
     for region in body.regions:
         kind = "tet10" if body.quadratic else "tet4"
         xml += f'<Elements type="{kind}" name="cells_{region.name}">\n'
@@ -100,9 +112,10 @@ def _mesh(body: Identified) -> str:
         if held.any():
             nodes = ",".join(map(str, np.flatnonzero(held) + 1))
             xml += f'<NodeSet name="held_{axis}">{nodes}</NodeSet>\n'
+    xml += facets
     domains = "".join(
-        f'<SolidDomain name="cells_{region.name}" mat="{region.name}"/>\n'
-        for region in body.regions
+        f'<SolidDomain name="cells_{name}" mat="{name}"/>\n'
+        for name in [r.name for r in body.regions] + [f"wall_{k}" for k in range(len(touched))]
     )
     maps = ""
     for axis, held, way in zip("xyz", body.held.T, body.moved_m.T, strict=True):
@@ -128,3 +141,58 @@ def _boundary(body: Identified) -> str:
         elif held.any():
             conditions += f'<bc {where} type="zero displacement"><{axis}_dof>1</{axis}_dof></bc>\n'
     return f"<Boundary>\n{conditions}</Boundary>\n"
+
+
+def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
+    """Nodes and cells of what is touched, a tetrahedron under each facet; surfaces that touch."""
+    solids, facets = "", ""
+    node, cell, corners = len(body.nodes_m), len(body.body.cells), body.body.mesh.surface
+    for k, wall in enumerate(touched):
+        points = wall.points_m(body.start_s) + wall.back_m
+        nodes = "".join(
+            f'<node id="{i}">{numbers(point, ",")}</node>\n'
+            for i, point in enumerate(points, node + 1)
+        )
+        triangles = wall.facets.triangles + node + 1
+        inner = np.full((len(triangles), 1), node + len(points))
+        cells = np.hstack([triangles[:, [0, 2, 1]], inner])
+        solids += f'<Nodes name="nodes_wall_{k}">\n{nodes}</Nodes>\n'
+        solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{_rows("elem", cells, cell)}'
+        solids += "</Elements>\n"
+        touching = body.body.nodes.on_faces(corners[wall.faces]) + 1
+        for name, sides in (("body", touching), ("wall", triangles)):
+            rows = _rows(f"tri{sides.shape[1]}", sides)
+            facets += f'<Surface name="{name}_side_{k}">\n{rows}</Surface>\n'
+        facets += (
+            f'<SurfacePair name="pair_{k}"><primary>body_side_{k}</primary>'
+            f"<secondary>wall_side_{k}</secondary></SurfacePair>\n"
+        )
+        node, cell = node + len(points), cell + len(triangles)
+    return solids, facets
+
+
+def _rows(tag: str, rows: Index, after: int = 0) -> str:
+    return "".join(
+        f'<{tag} id="{k}">{",".join(map(str, row))}</{tag}>\n'
+        for k, row in enumerate(rows.tolist(), after + 1)
+    )
+
+
+def _touching(touched: Sequence[Wall]) -> str:
+    """What is touched comes from where it does not touch, and pushes in proportion to the depth."""
+    driven, contacts = "", ""
+    for k, wall in enumerate(touched):
+        fixed = "".join(f"<{dof}_dof>1</{dof}_dof>" for dof in ("Ru", "Rv", "Rw"))
+        driven += f'<rigid_bc type="rigid_fixed"><rb>wall_{k}</rb>{fixed}</rigid_bc>\n'
+        for axis, way in zip("xyz", -wall.back_m, strict=True):
+            driven += (
+                f'<rigid_bc type="rigid_displacement"><rb>wall_{k}</rb><dof>{axis}</dof>'
+                f'<value lc="1">{float(way)!r}</value><relative>0</relative></rigid_bc>\n'
+            )
+        contacts += (
+            f'<contact type="sliding-elastic" name="touch_{k}" surface_pair="pair_{k}">'
+            f"<laugon>PENALTY</laugon><penalty>{wall.stiffness_pa_m!r}</penalty>"
+            "<auto_penalty>0</auto_penalty><symmetric_stiffness>0</symmetric_stiffness>"
+            f"<fric_coeff>{float(wall.obstacle.friction)!r}</fric_coeff></contact>\n"
+        )
+    return f"<Rigid>\n{driven}</Rigid>\n<Contact>\n{contacts}</Contact>\n" if touched else ""

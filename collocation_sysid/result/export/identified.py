@@ -107,8 +107,8 @@ class Identified:
     experiment : Experiment
         With gravity and grasps as they were found.
     rolled_out_m : (T, n, 3) our prediction at the samples, or None
-    obstacles : tuple of Obstacle
-        What it may touch, where it was found to be; frictions are numbers.
+    touching : Experiment, optional
+        The same with what the body may touch, where that was found to be; frictions are numbers.
     """
 
     title: str
@@ -119,7 +119,7 @@ class Identified:
     theta: Array
     experiment: Experiment
     rolled_out_m: Array | None
-    obstacles: tuple[Obstacle, ...] = ()
+    touching: Experiment | None = None
 
     @classmethod
     def read(
@@ -172,6 +172,7 @@ class Identified:
             replace(o, friction=values[o.friction]) if isinstance(o.friction, str) else o
             for o in corrected.obstacles
         )
+        touching = corrected.with_obstacles(touched) if touched else None
         if touched:
             with located(folder):
                 corrected = alone(corrected)
@@ -186,8 +187,13 @@ class Identified:
             body.theta(values),
             corrected,
             rolled_out_m,
-            touched,
+            touching,
         )
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """What it may touch."""
+        return () if self.touching is None else self.touching.obstacles
 
     @property
     def start_s(self) -> float:

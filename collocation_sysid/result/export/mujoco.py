@@ -17,9 +17,9 @@ from ...arrays import Array
 from ...errors import InputError
 from ...model.forces import Forces
 from ...program.modes import natural_modes
-from ...recording import Capsule, Cuboid, Cylinder, Grasp, Plane, Solid, Sphere
-from ...recording.solids import name_of
+from ...recording import Grasp, Solid
 from .identified import Identified
+from .solids import Primitive, grown
 from .target import Comparison, Exported, Holds, heading, linear_cells, numbers
 
 MODEL = "body.xml"
@@ -41,7 +41,8 @@ HOLDS = Holds(
     "damping by mass, γ_m = {gamma_m_1_s:.4g} 1/s, is not known, and MuJoCo refuses dampers on the "
     "nodes of a flex",
     motion=True,
-    obstacles=True,
+    roundings=False,
+    faces=False,
 )
 
 
@@ -67,7 +68,6 @@ def export(body: Identified) -> Exported:
             "set position and velocity of the free joints at every step, as --verify does"
         )
     step_s = _step_s(body)
-    limits += _lost_of_obstacles(body)
     x = heading(body, limits, "<!-- ", " -->")
     x += f"<mujoco model={quoteattr(body.title or 'body')}>\n"
     gravity = numbers(body.experiment.gravity_m_s2)
@@ -105,56 +105,22 @@ def _obstacles(body: Identified, step_s: float) -> str:
     lines, skin = "", SKIN * _edge_m(body)
     for k, each in enumerate(body.obstacles):
         position, turn = _pose(each, body.start_s)
-        rubs = float(each.friction)
+        rubs, geom = float(each.friction), _geom(grown(each.shape, -skin))
         lines += (
             f'<body name="obstacle{k}" mocap="true" pos="{numbers(position)}" '
-            f'quat="{numbers(turn)}"><geom name={quoteattr(each.name)} {_geom(each.shape, skin)} '
+            f'quat="{numbers(turn)}"><geom name={quoteattr(each.name)} {geom} '
             f'priority="1" condim="{3 if rubs else 1}" friction="{rubs!r} 0 0" '
             f'solref="{2 * step_s!r} 1"/></body>\n'
         )
     return lines
 
 
-def _geom(solid: Solid, skin: float) -> str:
-    """Type, place and size of a geom that is so much smaller."""
-    if isinstance(solid, Plane):
-        turn = Rotation.align_vectors(solid.normal[None], np.array([[0.0, 0.0, 1.0]]))[0]
-        place = solid.point_m - skin * solid.normal
-        at = f'pos="{numbers(place)}" quat="{numbers(np.roll(turn.as_quat(), 1))}"'
-        return f'type="plane" size="0 0 1" {at}'
-    if isinstance(solid, Sphere):
-        return (
-            f'type="sphere" size="{_less(solid.radius_m, skin)!r}" pos="{numbers(solid.centre_m)}"'
-        )
-    if isinstance(solid, Cuboid):
-        half = [_less(each, skin) for each in np.diff(solid.corners_m, axis=0)[0] / 2]
-        return f'type="box" size="{numbers(half)}" pos="{numbers(solid.middle_m)}"'
-    assert isinstance(solid, (Cylinder, Capsule))
-    middle, size = solid.ends_m.mean(axis=0), _less(solid.radius_m, skin)
-    half = float(np.linalg.norm(np.diff(solid.ends_m, axis=0))) / 2
-    share = _less(half, skin) / half if isinstance(solid, Cylinder) else 1.0
-    ends = middle + share * (solid.ends_m - middle)
-    return f'type="{name_of(solid)[:-2]}" size="{size!r}" fromto="{numbers(ends)}"'
-
-
-def _less(length_m: float, by_m: float) -> float:
-    """So much less, but not less than half."""
-    return max(float(length_m) - by_m, float(length_m) / 2)
-
-
-def _lost_of_obstacles(body: Identified) -> list[str]:
-    """What of them it does not hold."""
-    said = []
-    for each in body.obstacles:
-        if getattr(each.shape, "rounding_m", 0.0):
-            said.append(f"{each.name}: its edges are not rounded")
-        if each.faces is not None:
-            said.append(f"{each.name}: all of the body may touch it")
-        if len(each.poses.t_s) > 1:
-            said.append(
-                f"{each.name} is where it is at the first sample; its poses have the motion"
-            )
-    return said
+def _geom(solid: Solid) -> str:
+    """Type, place and size."""
+    shape = Primitive.of(solid)
+    turn = numbers(shape.turn.as_quat(scalar_first=True))
+    size = numbers(shape.size_m) if len(shape.size_m) else "0 0 1"
+    return f'type="{shape.kind}" size="{size}" pos="{numbers(shape.place_m)}" quat="{turn}"'
 
 
 def _welds(body: Identified, step_s: float) -> str:

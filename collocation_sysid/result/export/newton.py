@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 
+from ...recording import Obstacle
 from ...tree import content
 from .identified import Identified
+from .solids import Primitive, walls
 from .target import Exported, Holds, heading, linear_cells
 
 MODULE = "body.py"
@@ -17,7 +20,17 @@ HOLDS = Holds(
     "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
     "damping γ_r becomes a viscosity, γ_r μ / 2 in Pa s, of shape alone: changes of volume are "
     "damped less",
+    roundings=False,
+    faces=False,
 )
+# Of a shape there; planes without end.
+SIZES = {
+    "plane": ("width", "length"),
+    "sphere": ("radius",),
+    "box": ("hx", "hy", "hz"),
+    "cylinder": ("radius", "half_height"),
+    "capsule": ("radius", "half_height"),
+}
 _BUILD = '''
 import json
 from pathlib import Path
@@ -43,17 +56,36 @@ def add_to(builder):
         k_mu=np.array(body["k_mu"]),
         k_lambda=np.array(body["k_lambda"]),
         k_damp=np.array(body["k_damp"]),
+        particle_radius=body["contact_m"],
     )
     for k, (mass, held) in enumerate(zip(body["node_mass_kg"], body["held"])):
         builder.particle_mass[first + k] = 0.0 if held else mass
 
 
+def add_obstacles_to(builder):
+    """Add what it may touch to a newton.ModelBuilder."""
+    for each in body["obstacles"]:
+        config = newton.ModelBuilder.ShapeConfig(
+            ke=body["contact_n_m"], kd=0.0, mu=each["friction"]
+        )
+        add = getattr(builder, "add_shape_" + each["kind"])
+        place = wp.transform(each["place_m"], each["quaternion_xyzw"])
+        still = {} if each["kind"] == "plane" else {"body": -1}
+        add(xform=place, cfg=config, label=each["name"], **each["size"], **still)
+
+
 def model(device=None):
-    """A model of the body alone, for newton.solvers.SolverVBD."""
+    """A model of the body and what it may touch, for newton.solvers.SolverVBD."""
     builder = newton.ModelBuilder(gravity=tuple(body["gravity_m_s2"]))
     add_to(builder)
+    add_obstacles_to(builder)
     builder.color()
-    return builder.finalize(device=device)
+    made = builder.finalize(device=device)
+    if body["obstacles"]:
+        # Newton takes the mean of the body's and the obstacle's.
+        made.soft_contact_ke, made.soft_contact_kd = body["contact_n_m"], 0.0
+        made.soft_contact_mu = body["obstacles"][0]["friction"]
+    return made
 '''
 
 
@@ -86,8 +118,28 @@ def export(body: Identified) -> Exported:
         "held": body.grasped,
         "gravity_m_s2": body.experiment.gravity_m_s2,
     }
+    touched = walls(body)
+    numbers |= {
+        "contact_m": max((wall.width_m for wall in touched), default=0.0) / 2,
+        "contact_n_m": max((wall.node_n_m for wall in touched), default=0.0),
+        "obstacles": [_obstacle(each, body.start_s) for each in body.obstacles],
+    }
     files = {
         MODULE: heading(body, limits, "# ") + _BUILD,
         NUMBERS: json.dumps(content(numbers)) + "\n",
     }
     return Exported(files, tuple(limits))
+
+
+def _obstacle(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
+    shape = Primitive.of(obstacle.shape)
+    place_m, turn = shape.placed(obstacle, t_s)
+    sizes = shape.size_m if len(shape.size_m) else np.zeros(2)
+    return {
+        "name": obstacle.name,
+        "kind": shape.kind,
+        "size": dict(zip(SIZES[shape.kind], sizes.tolist(), strict=True)),
+        "place_m": place_m,
+        "quaternion_xyzw": turn.as_quat(),
+        "friction": float(obstacle.friction),
+    }

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...errors import InputError
 from .identified import Identified, IdentifiedRegion
+from .solids import Primitive, walls
 from .target import Exported, Holds, heading, numbers
 
 SCENE = "body.scn"
@@ -13,6 +14,7 @@ PLUGINS = (
     "Constraint.Projective",
     "LinearSolver.Direct",
     "Mass",
+    "MechanicalLoad",
     "ODESolver.Backward",
     "SolidMechanics.FEM.Elastic",
     "SolidMechanics.FEM.HyperElastic",
@@ -34,6 +36,9 @@ HOLDS = Holds(
     "brakes that a stretched body turns",
     mass_damping="",
     damping="rayleigh",
+    shapes=("plane", "sphere"),
+    faces=False,
+    friction=False,
     tried=False,
 )
 
@@ -71,9 +76,26 @@ def export(body: Identified) -> Exported:
     x += f'<TetrahedronSetTopologyContainer position="{numbers(body.nodes_m)}" '
     x += f'tetrahedra="{cells}"/>\n<TetrahedronSetGeometryAlgorithms template="Vec3d"/>\n'
     x += '<MechanicalObject template="Vec3d"/>\n'
-    x += f'<DiagonalMass vertexMass="{mass}"/>\n{force}\n'
+    x += f'<DiagonalMass vertexMass="{mass}"/>\n{force}\n{_obstacles(body)}'
     x += f'<FixedProjectiveConstraint indices="{held}"/>\n</Node>\n</Node>\n'
     return Exported({SCENE: x}, tuple(limits))
+
+
+def _obstacles(body: Identified) -> str:
+    """Penalties on nodes, in proportion to their depth."""
+    lines = ""
+    for wall in walls(body):
+        shape = Primitive.of(wall.obstacle.shape)
+        place_m, turn = shape.placed(wall.obstacle, body.start_s)
+        stiff = f'stiffness="{wall.node_n_m!r}" damping="0"'
+        if shape.kind == "plane":
+            normal = turn.as_matrix()[:, 2]
+            level = float(normal @ place_m)
+            lines += f'<PlaneForceField normal="{numbers(normal)}" d="{level!r}" {stiff}/>\n'
+        elif shape.kind == "sphere":
+            ball = f'center="{numbers(place_m)}" radius="{float(shape.size_m[0])!r}"'
+            lines += f"<SphereForceField {ball} {stiff}/>\n"
+    return lines
 
 
 def _law(region: IdentifiedRegion) -> str:

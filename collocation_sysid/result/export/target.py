@@ -10,8 +10,11 @@ import numpy as np
 
 from ...arrays import Array, Index
 from ...fem.refinement import split_in_eight
+from ...model.forces import Forces
 from ...program.rest import rest_state
+from ...program.simulation import simulate
 from .identified import Identified
+from .solids import Primitive
 
 LINEAR_ONLY = (
     "quadratic tetrahedra are split into eight linear ones on the same nodes: too stiff in bending "
@@ -95,13 +98,15 @@ class Holds:
         `mass_damping` have; what these say where a body has them, empty where they are held.
     damping : str
         The law of its own, of which nothing is said.
-    memory, motion, quadratic : bool
-        Branches of memory; grasps that move; elements with nodes on their edges, which are split
-        where they are not held.
+    memory, motion, drives, quadratic : bool
+        Branches of memory; grasps that move, and what is touched; elements with nodes on their
+        edges, which are split where they are not held.
     forces : str
         What is said where forces act on nodes, empty where they are held.
-    obstacles : bool
-        What the body may touch.
+    shapes : tuple of str
+        Of what the body may touch.
+    roundings, faces, friction : bool
+        Of that: edges that are round; that some faces alone touch it; that it rubs.
     tried : bool
         Whether the simulator itself has ever read such files.
     """
@@ -113,17 +118,19 @@ class Holds:
     damping: str = ""
     memory: bool = False
     motion: bool = False
+    drives: bool = False
     forces: str = "forces on nodes are left out"
     quadratic: bool = False
-    obstacles: bool = False
+    shapes: tuple[str, ...] = ("plane", "sphere", "box", "cylinder", "capsule")
+    roundings: bool = True
+    faces: bool = True
+    friction: bool = True
     tried: bool = True
 
     def lost(self, body: Identified) -> list[str]:
         """What it does not hold of a body, and what was done instead."""
         said = [*_never_held(body)]
-        if body.obstacles and not self.obstacles:
-            names = ", ".join(each.name for each in body.obstacles)
-            said.append(f"what it may touch is not exported: {names}")
+        said += self._lost_of_obstacles(body)
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             told = [
@@ -146,6 +153,20 @@ class Holds:
             said.append(self.forces)
         return said if self.tried else [*said, UNTRIED]
 
+    def _lost_of_obstacles(self, body: Identified) -> Iterator[str]:
+        for each in body.obstacles:
+            if (kind := Primitive.of(each.shape).kind) not in self.shapes:
+                yield f"{each.name}: what the body may touch is not exported if it is a {kind}"
+                continue
+            if getattr(each.shape, "rounding_m", 0.0) and not self.roundings:
+                yield f"{each.name}: its edges are not rounded"
+            if each.faces is not None and not self.faces:
+                yield f"{each.name}: all of the body may touch it"
+            if each.friction and not self.friction:
+                yield f"{each.name}: nothing rubs on it"
+            if len(each.poses.t_s) > 1 and not self.drives:
+                yield f"{each.name} is where it is at the first sample; its poses have the motion"
+
 
 def _never_held(body: Identified) -> Iterator[str]:
     """What no target of ours takes."""
@@ -160,10 +181,27 @@ def _never_held(body: Identified) -> Iterator[str]:
         yield "grasps that begin or end to hold within the recording stay as they begin"
 
 
-def moved_at_rest(body: Identified) -> Array:
-    """(n, 3) how far our equilibrium moves the nodes, without what exports leave out."""
-    alone = replace(body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf)
-    return rest_state(alone, body.theta).reshape(-1, 3) - body.nodes_m
+def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
+    """Our equilibria at so many samples, without what exports leave out.
+
+    Returns
+    -------
+    (T, n, 3) how far they move the nodes, and (T, o, 3) the forces of obstacles on the body
+    """
+    whole = replace(
+        body.touching or body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf
+    )
+    if samples > 1:
+        states = simulate(whole, body.theta).positions_m[:samples].reshape(samples, -1)
+    else:
+        states = rest_state(whole, body.theta)[None]
+    # In statics what slides is the way since the sample before.
+    ways = np.diff(states, axis=0, prepend=states[:1])
+    forces = Forces.of(whole, whole.t_s[:samples], body.theta).total(states, ways)
+    on_nodes = forces.reshape(samples, -1, 3)
+    on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]
+    moved_m = states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m
+    return moved_m, np.stack(on_body, axis=1) if on_body else np.zeros((samples, 0, 3))
 
 
 def longest(way_m: Array) -> float:

@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from ...arrays import Array, Index
 from ...errors import InputError
-from ...recording import Grasp
+from ...recording import Grasp, Obstacle
 from .identified import Identified, IdentifiedRegion
-from .target import Comparison, Exported, Holds, heading, linear_cells, longest, moved_at_rest
+from .solids import Primitive, walls
+from .target import Comparison, Exported, Holds, at_rest, heading, linear_cells, longest
 
 STAGE = "body.usda"
 OWN = "collocationSysid"
@@ -33,6 +34,9 @@ HOLDS = Holds(
     "damping γ_r is no part of the schemas: it stands as an attribute of our own",
     "γ_m = {gamma_m_1_s:.4g} 1/s is no part of the schemas: it stands as an attribute of our own",
     motion=True,
+    drives=True,
+    roundings=False,
+    faces=False,
 )
 SINGLE = "numbers are single precision"
 REGIONS = (
@@ -73,6 +77,8 @@ def export(body: Identified) -> Exported:
     _mesh(pxr, stage, body, placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
         _gripper(pxr, stage, k, grasp, body, placed_m)
+    for k, obstacle in enumerate(body.obstacles, start=1):
+        _obstacle(pxr, stage, f"/World/Obstacle_{k}", obstacle, body)
     return Exported({STAGE: stage.GetRootLayer().ExportToString()}, tuple(limits))
 
 
@@ -159,15 +165,8 @@ def _gripper(
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
     pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
-    t_s = body.experiment.t_s
-    matrices, positions_m = grasp.poses.at(t_s)
-    wxyz = Rotation.from_matrix(matrices).as_quat(scalar_first=True)
-    place = gripper.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
-    turn = gripper.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble)
-    for k, time in enumerate([pxr.Usd.TimeCode.Default(), *t_s.tolist()]):
-        row = max(k - 1, 0)
-        place.Set(pxr.Gf.Vec3d(*positions_m[row].tolist()), time)
-        turn.Set(pxr.Gf.Quatd(*wxyz[row].tolist()), time)
+    matrices, positions_m = grasp.poses.at(body.experiment.t_s)
+    _put(pxr, gripper, positions_m, Rotation.from_matrix(matrices), body.experiment.t_s)
     held = np.intersect1d(grasp.nodes, np.flatnonzero(body.grasped))
     prim, types = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment"), pxr.Sdf.ValueTypeNames
     for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
@@ -180,6 +179,49 @@ def _gripper(
         ("coords1", types.Vector3fArray, local_m.astype(np.float32)),
     ):
         prim.CreateAttribute(f"physics:{name}", kind, False).Set(values)
+
+
+def _put(pxr: Any, prim: Any, places_m: Array, turns: Rotation, t_s: Array) -> None:
+    """Where something is (T, 3), and turned how; at the first of the times by default."""
+    wxyz = turns.as_quat(scalar_first=True)
+    place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
+    turn = prim.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble)
+    for k, time in enumerate([pxr.Usd.TimeCode.Default(), *t_s.tolist()]):
+        row = max(k - 1, 0)
+        place.Set(pxr.Gf.Vec3d(*places_m[row].tolist()), time)
+        turn.Set(pxr.Gf.Quatd(*wxyz[row].tolist()), time)
+
+
+def _obstacle(pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: Identified) -> None:
+    """What is touched, kinematic where it moves, with its friction."""
+    shape, t_s, frame = Primitive.of(obstacle.shape), body.experiment.t_s, path
+    if len(obstacle.poses.t_s) > 1:
+        moving = pxr.UsdGeom.Xform.Define(stage, path)
+        pxr.UsdPhysics.RigidBodyAPI.Apply(moving.GetPrim()).CreateKinematicEnabledAttr(True)
+        matrices, places_m = obstacle.poses.at(t_s)
+        _put(pxr, moving, places_m, Rotation.from_matrix(matrices), t_s)
+        place_m, turn, frame = shape.place_m, shape.turn, f"{path}/Shape"
+    else:
+        place_m, turn = shape.placed(obstacle, body.start_s)
+    kinds = {"box": "Cube"}
+    solid = getattr(pxr.UsdGeom, kinds.get(shape.kind, shape.kind.title())).Define(stage, frame)
+    _put(pxr, solid, place_m[None], Rotation.concatenate([turn]), t_s[:0])
+    if shape.kind == "box":
+        solid.CreateSizeAttr(2.0)
+        solid.AddScaleOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*shape.size_m))
+    elif shape.kind != "plane":
+        solid.CreateRadiusAttr(float(shape.size_m[0]))
+    if shape.kind in ("plane", "cylinder", "capsule"):
+        solid.CreateAxisAttr("Z")
+    if shape.kind in ("cylinder", "capsule"):
+        solid.CreateHeightAttr(2 * float(shape.size_m[1]))
+    pxr.UsdPhysics.CollisionAPI.Apply(solid.GetPrim())
+    solid.GetPrim().SetDisplayName(obstacle.name)
+    material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{path.rpartition('/')[2]}")
+    rubbing = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    for attribute in (rubbing.CreateStaticFrictionAttr, rubbing.CreateDynamicFrictionAttr):
+        attribute(float(obstacle.friction))
+    _bind(pxr, solid.GetPrim(), material)
 
 
 def _named(name: str) -> str:
@@ -201,7 +243,9 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     except ImportError as error:
         raise InputError("install Newton to verify the export: pip install newton") from error
 
-    builder = newton.ModelBuilder()
+    builder, touched = newton.ModelBuilder(), walls(body)
+    if touched:
+        builder.default_particle_radius = max(wall.width_m for wall in touched) / 2
     # Its rigid bodies would be simulated too; what they hold stands still instead.
     builder.add_usd(str(folder / STAGE), ignore_paths=["/World/Gripper_.*"])
     held = np.flatnonzero(body.grasped)
@@ -209,13 +253,22 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         builder.particle_mass[k] = 0.0
     builder.color()
     model = builder.finalize(device="cpu")
-    solver = newton.solvers.SolverVBD(model, iterations=ITERATIONS)
+    if touched:
+        model.soft_contact_ke = max(wall.node_n_m for wall in touched)
+        model.soft_contact_mu = touched[0].obstacle.friction
+        model.shape_material_ke.fill_(model.soft_contact_ke)
+    pipeline = newton.CollisionPipeline(model)
+    # What is touched stands still, and is nothing to solve for.
+    solver = newton.solvers.SolverVBD(
+        model, iterations=ITERATIONS, integrate_with_external_rigid_solver=True
+    )
     before: Any = model.state()
-    after, control = model.state(), model.control()
+    after, control, contacts = model.state(), model.control(), pipeline.contacts()
     for _ in range(STEPS):
-        solver.step(before, after, control, None, STEP_S)
+        pipeline.collide(before, contacts)
+        solver.step(before, after, control, contacts, STEP_S)
         before, after = after, before
         before.particle_qd.assign(BRAKE * before.particle_qd.numpy())
     theirs = before.particle_q.numpy().astype(float) - body.nodes_m
-    sag_m = longest(moved_at_rest(body))
+    sag_m = longest(at_rest(body)[0][0])
     return [Comparison("largest displacement at rest", longest(theirs), sag_m, "m")]
