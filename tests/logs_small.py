@@ -130,6 +130,41 @@ class Messages:
         ]
         return t_s, "/markers", name, self.made(name, self.header(t_s, "world"), 0, items)
 
+    def image(self, t_s: float, encoding: str, pixels: np.ndarray, topic: str) -> Message:
+        name, fill = "sensor_msgs/msg/Image", 4  # bytes at the end of each row
+        rows = pixels.view("u1").reshape(len(pixels), -1)
+        data = np.pad(rows, ((0, 0), (0, fill))).ravel()
+        sizes = *pixels.shape, encoding, 0, rows.shape[1] + fill
+        return t_s, topic, name, self.made(name, self.header(t_s, "camera"), *sizes, data)
+
+    def packed(self, t_s: float, form: str, data: bytes, topic: str) -> Message:
+        name = "sensor_msgs/msg/CompressedImage"
+        content = np.frombuffer(data, "u1")
+        return t_s, topic, name, self.made(name, self.header(t_s, "camera"), form, content)
+
+    def camera(self, t_s: float, matrix: Any, distortion: Any, projection: Any) -> Message:
+        name = "sensor_msgs/msg/CameraInfo"
+        numbers = (np.asarray(each, dtype=float).ravel() for each in (distortion, matrix))
+        whole = np.asarray(projection, dtype=float).ravel()
+        area = self.made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+        told = "plumb_bob", *numbers, np.eye(3).ravel(), whole, 0, 0, area
+        info = self.made(name, self.header(t_s, "camera"), 120, 160, *told)
+        return t_s, "/camera/camera_info", name, info
+
+    def cloud(self, t_s: float, columns: dict[str, np.ndarray], topic: str) -> Message:
+        name, count = "sensor_msgs/msg/PointCloud2", len(next(iter(columns.values())))
+        form = np.dtype([(each, "<f4") for each in (*columns, "rgb")])
+        rows = np.zeros(count, form)
+        for each, values in columns.items():
+            rows[each] = values
+        fields = [
+            self.made("sensor_msgs/msg/PointField", each, 4 * k, 7, 1)
+            for k, each in enumerate(form.names or ())
+        ]
+        data, size = np.frombuffer(rows.tobytes(), "u1"), form.itemsize
+        told = 1, count, fields, False, size, size * count, data, True
+        return t_s, topic, name, self.made(name, self.header(t_s, "camera"), *told)
+
     def pressure(self, t_s: float, value_pa: float) -> Message:
         name = "sensor_msgs/msg/FluidPressure"
         return t_s, "/chamber", name, self.made(name, self.header(t_s, ""), value_pa, 0.0)

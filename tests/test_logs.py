@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from logs_small import KINDS, START_S, URDF, Messages, bag, dataset, json_mcap, recorded
+from PIL import Image
 from problem_files import run_command, write_problem
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +21,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.live.frames import FrameReader
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, read_poses, read_wrench
+from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.recording.formats.logs import stored_files
 from collocation_sysid.recording.formats.topics import listed_topics
 from collocation_sysid.recording.tables import read_gauge, read_pressure
@@ -166,6 +168,104 @@ def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
     assert topics["/wrench"]["rate_hz"] == pytest.approx(50, rel=1e-3)
     assert topics["/wrench"]["messages"] == len(T_S)
     assert "trial#/tf#base>tool" in run_command("topics", log).out
+
+
+RAYS = {
+    "matrix": [[100, 0, 3], [0, 101, 2], [0, 0, 1]],
+    "distortion": [0.1, -0.02, 1e-3, 2e-3, 0.003],
+    "projection": [[90, 0, 3, 0], [0, 91, 2, 0], [0, 0, 1, 0]],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_depth_images_of_a_topic_come_with_their_camera_and_times(
+    tmp_path: Path, kind: str
+) -> None:
+    of = Messages(kind)
+    counts = np.arange(400, 435, dtype="<u2").reshape(5, 7)
+    Image.fromarray(counts.astype(np.uint16)).save(tmp_path / "counts.png")
+    squeezed = (tmp_path / "counts.png").read_bytes()
+    raw, rectified = "/camera/depth/image_raw", "/camera/depth/image_rect_raw"
+    messages = [of.camera(0.0, **RAYS)]
+    for t in (0.1, 0.2):
+        metres = (counts * np.float32(1e-3) + np.float32(t)).astype("<f4")
+        messages += [
+            of.image(t, "16UC1", counts, raw),
+            of.image(t, "32FC1", metres, rectified),
+            of.packed(t, "16UC1; compressedDepth png", bytes(12) + squeezed, f"{raw}/packed"),
+        ]
+    log = bag(tmp_path / "trial", messages, kind)
+    seen = read_depth(Path(f"{log}#{raw}"), None, 1.0)
+    np.testing.assert_allclose(seen.t_s, (0.1, 0.2), atol=1e-9)
+    np.testing.assert_allclose(seen.images_m, [counts * 1e-3] * 2)
+    np.testing.assert_array_equal(seen.matrix, RAYS["matrix"])
+    np.testing.assert_array_equal(seen.distortion, RAYS["distortion"])
+    straight = read_depth(Path(f"{log}#{rectified}"), None, 1.0)
+    np.testing.assert_allclose(straight.images_m[1], counts * 1e-3 + 0.2, rtol=1e-6)
+    np.testing.assert_array_equal(straight.matrix, np.array(RAYS["projection"])[:, :3])
+    assert straight.distortion is not None
+    assert not len(straight.distortion)
+    packed = read_depth(Path(f"{log}#{raw}/packed"), 2e-3, 1.0)
+    np.testing.assert_allclose(packed.images_m[0], counts * 2e-3)
+    np.testing.assert_array_equal(packed.matrix, RAYS["matrix"])
+    topics = {each.name: each for each in listed_topics(log)}
+    assert topics[raw].serves == "depth images, 7 x 5: [[experiment.depth]]"
+    assert topics[raw].write == (f"{log.name}#{raw}",)
+    assert topics["/camera/camera_info"].serves == (
+        "the camera's matrix, for the depth images beside it"
+    )
+
+
+def test_clouds_of_a_topic_are_read_with_their_normals(tmp_path: Path) -> None:
+    of, points = Messages(), np.arange(12.0).reshape(4, 3)
+    columns = dict(zip("xyz", points.T, strict=True))
+    turned = {f"normal_{axis}": np.full(4, float(axis == "z")) for axis in "xyz"}
+    messages = [
+        of.cloud(0.0, columns, "/plain"),
+        of.cloud(0.0, columns | turned, "/turned"),
+        of.pressure(0.0, 1.0),
+    ]
+    log = bag(tmp_path / "trial", messages)
+    (plain,) = read_depth(Path(f"{log}#/plain"), None, 1e-3).clouds_m
+    np.testing.assert_allclose(plain, 1e-3 * points)
+    (normal,) = read_depth(Path(f"{log}#/turned"), None, 1.0).clouds_m
+    np.testing.assert_allclose(normal, np.hstack([points, np.tile([0.0, 0, 1], (4, 1))]))
+    with pytest.raises(InputError, match=r"/chamber has neither depth images \(16UC1"):
+        read_depth(Path(f"{log}#/chamber"), None, 1.0)
+    with pytest.raises(InputError, match="holds clouds of points; expected one of numbers"):
+        read_poses(Path(f"{log}#/plain"))
+
+
+def test_a_problem_states_depth_by_the_topic_of_a_log(tmp_path: Path) -> None:
+    file = write_problem(tmp_path, {"swing": 12})
+    of, flat = Messages(), np.full((120, 160), 400, dtype="<u2")
+    square = [[100, 0, 80], [0, 100, 60], [0, 0, 1]]
+    messages = [of.camera(0.0, square, np.zeros(5), np.zeros((3, 4)))]
+    messages += [of.image(t, "16UC1", flat, "/camera/depth") for t in (0.0, 0.02, 0.04, 9.0)]
+    bag(tmp_path / "trial", messages)
+    stated = '[[experiment.depth]]\nfile = "trial#/camera/depth"\nsigma_m = 0.001\n'
+    file.write_text(f"{file.read_text()}\n{stated}")
+    (depth,) = Problem.read(file).experiments[0].depths
+    np.testing.assert_allclose(depth.t_s, (0.0, 0.02, 0.04), atol=1e-9)
+    np.testing.assert_array_equal(depth.camera.matrix, square)
+    np.testing.assert_allclose(depth.points_m[0][:, 2], 0.4)
+    camera = "camera = { matrix = [[50, 0, 80], [0, 50, 60], [0, 0, 1]] }\n"
+    file.write_text(f"{file.read_text()}{camera}")
+    (depth,) = Problem.read(file).experiments[0].depths
+    assert depth.camera.matrix[0, 0] == 50
+
+
+def test_a_lens_that_is_not_known_and_images_cut_short_are_refused(tmp_path: Path) -> None:
+    of, pixels = Messages(), np.full((4, 4), 400, dtype="<u2")
+    lens = dict(RAYS, distortion=np.ones(8))
+    t, topic, name, image = of.image(0.0, "16UC1", pixels, "/camera/image_raw")
+    short = replace(image, data=image.data[:-3])
+    messages = [of.camera(0.0, **lens), (t, topic, name, image), (t, "/short", name, short)]
+    log = bag(tmp_path / "trial", messages)
+    with pytest.raises(InputError, match="plumb_bob with 8 numbers; expected plumb_bob with five"):
+        read_depth(Path(f"{log}#{topic}"), None, 1.0)
+    with pytest.raises(InputError, match="45 bytes in a message; expected 4 rows of 4 times 2"):
+        _ = read_depth(Path(f"{log}#/short"), None, 1.0).images_m[0]
 
 
 @pytest.mark.parametrize(

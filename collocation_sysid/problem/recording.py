@@ -256,7 +256,8 @@ class RecordingReader:
         """What was seen within the experiment's time."""
         section, where = self.section.depth[k], f"depth.{k}"
         seen, at_s = self._seen(k)
-        known: dict[str, Any] = {"matrix": seen.matrix, "pose": seen.pose}
+        names = ("matrix", "pose", "distortion")
+        known: dict[str, Any] = {name: getattr(seen, name) for name in names}
         known |= stated_in(section.camera, DepthCamera, f"{where}.camera")
         if section.camera.poses is not None:
             file = existing_file(self.folder, section.camera.poses, f"{where}.camera.poses")

@@ -305,7 +305,7 @@ class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
 
 
 class DepthCameraSection(section_of(DepthCamera, "DepthCameraSection")):
-    """A depth camera, or the frame of a scanner; what an .npz file says need not be said here.
+    """A depth camera, or the frame of a scanner; what an .npz or a log says need not be said.
 
     Attributes
     ----------
@@ -325,7 +325,8 @@ class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
         For messages, error bars and pictures.
     file : str
         Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
-        a folder of these in the order of their names, with times.csv or t_s.
+        a folder of these in the order of their names, with times.csv or t_s; or a topic of a log,
+        ``run.mcap#/camera/depth/image_rect_raw``.
     camera : DepthCameraSection
         Where it stands, and how it projects.
     t_s : list of float, optional

@@ -1,11 +1,11 @@
-"""Depth images and clouds of points from files, or from all files of a folder."""
+"""Depth images and clouds of points from files, all files of a folder, or a topic of a log."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,16 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError, located
 from ...files import reason, require_regular
+from .depth_messages import ENCODINGS, camera_of, columns_of, depth_in, image_of, is_camera, png
+from .logs import Address, Log, opened, require_topic
 from .text import decode, read_bytes, read_grid, times_of
+from .topics import time_s
 
 # What a pixel of a PNG counts where nothing else is said, as depth cameras usually do.
 USUAL_COUNT_M = 1e-3
 IMAGES, CLOUDS = (".png", ".exr"), (".ply", ".pcd", ".npy", ".xyz")
+# The topic beside those of a camera's images that says how it projects.
+CAMERA = "camera_info"
 NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 
 
@@ -27,21 +32,36 @@ class DepthFile:
 
     Attributes
     ----------
-    images_m : list of (rows, columns), of a camera; or
+    images_m : sequence of (rows, columns), of a camera; or
     clouds_m : list of (P, 3) or (P, 6), with normals
     t_s : (S,) or None where it says no times
-    matrix, pose : of the camera, where it says these
+    matrix, pose, distortion : of the camera, where it says these
     """
 
-    images_m: list[Array]
+    images_m: Sequence[Array]
     clouds_m: list[Array]
     t_s: Array | None = None
     matrix: Array | None = None
     pose: Array | None = None
+    distortion: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Messages(Sequence[Array]):
+    """Images of messages, each made when it is asked for: many do not fit into the memory."""
+
+    messages: Sequence[Any]
+    count_m: float | None
+
+    def __len__(self) -> int:
+        return len(self.messages)
+
+    def __getitem__(self, place: Any) -> Any:
+        return _in_metres(image_of(self.messages[place]), self.count_m)
 
 
 def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
-    """Read a file, or all files of a folder in the order of their names.
+    """Read a file, a topic of a log, or all files of a folder in the order of their names.
 
     Parameters
     ----------
@@ -55,6 +75,9 @@ def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
     InputError
         If it is none of these, is damaged, or a package is missing that reads it.
     """
+    if (address := Address.of(path)) is not None:
+        with located(path):
+            return _topic(address, count_m, length_m)
     if path.is_dir():
         return _folder(path, count_m, length_m)
     require_regular(path)
@@ -72,7 +95,43 @@ def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
         return found
     if kind in CLOUDS:
         return DepthFile([], [_cloud(found, path, length_m)])
-    return DepthFile([_in_metres(found, count_m, path)], [])
+    with located(path):
+        return DepthFile([_in_metres(found, count_m)], [])
+
+
+def _topic(address: Address, count_m: float | None, length_m: float) -> DepthFile:
+    """Messages in the order of their times, and the camera that the log has beside them."""
+    with opened(address.log, address.episode) as log:
+        require_topic(log, address.topic)
+        timed = {
+            time_s(each, at_ns, log.start_ns): each for at_ns, each in log.messages(address.topic)
+        }
+        camera = _camera_beside(log, address.topic)
+    t_s = np.array(sorted(timed))
+    messages = [timed[t] for t in t_s]
+    if not messages or not (held := depth_in(messages[0])):
+        raise InputError(
+            f"the topic {address.topic} has neither depth images ({', '.join(ENCODINGS)}, "
+            "compressedDepth) nor clouds of points"
+        )
+    if "images" not in held:
+        clouds = [_cloud(_of_columns(columns_of(each)), address.log, length_m) for each in messages]
+        return DepthFile([], clouds, t_s)
+    return DepthFile(_Messages(messages, count_m), [], t_s, *camera)
+
+
+def _camera_beside(log: Log, topic: str) -> tuple[Array | None, None, Array | None]:
+    """Matrix, no pose, and distortion, of the first camera_info in a topic's namespace."""
+    above = [str(each) for each in PurePosixPath(topic).parents]
+    names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
+    if (name := next((each for each in names if each in log.topics), None)) is None:
+        return None, None, None
+    message = next((each for _, each in log.messages(name)), None)
+    if not is_camera(message):
+        return None, None, None
+    with located(where=name):
+        matrix, distortion = camera_of(message, "rect" in topic)
+    return matrix, None, distortion
 
 
 def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
@@ -93,9 +152,9 @@ def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
     return DepthFile(images, [cloud for part in parts for cloud in part.clouds_m], t_s)
 
 
-def _in_metres(image: Array, count_m: float | None, path: Path) -> Array:
+def _in_metres(image: Array, count_m: float | None) -> Array:
     if image.ndim != 2:
-        raise InputError(f"has the shape {image.shape}; expected one channel of depths", path)
+        raise InputError(f"has the shape {image.shape}; expected one channel of depths")
     if image.dtype.kind in "iu":
         return image * (USUAL_COUNT_M if count_m is None else count_m)
     return image.astype(float)
@@ -130,13 +189,6 @@ def _npz(path: Path) -> DepthFile:
     return DepthFile([] if clouded else samples, samples if clouded else [], *known)
 
 
-def _png(path: Path) -> Any:
-    image = import_module("PIL.Image").open(path)
-    if image.mode not in ("I;16", "I;16B", "I"):
-        raise InputError(f"has the mode {image.mode}; expected depths of 16 bits in one channel")
-    return np.asarray(image).astype(np.int64)
-
-
 def _exr(path: Path) -> Array:
     try:
         made = import_module("OpenEXR").File(str(path))
@@ -154,6 +206,10 @@ def _ply(path: Path) -> Array:
     mesh = import_module("meshio").read(path)
     points = np.asarray(mesh.points, dtype=float)
     return _with_normals(points, mesh.point_data)
+
+
+def _of_columns(columns: Mapping[str, Array]) -> Array:
+    return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
 
 
 def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
@@ -188,12 +244,12 @@ def _pcd(path: Path) -> Array:
             f"has DATA {' '.join(head['DATA'])}; expected ascii or binary: convert it, for example "
             "by pcl_convert_pcd_ascii_binary"
         )
-    return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
+    return _of_columns(columns)
 
 
 _READERS: dict[str, Callable[[Path], Array | DepthFile]] = {
     ".npz": _npz,
-    ".png": _png,
+    ".png": png,
     ".exr": _exr,
     ".ply": _ply,
     ".pcd": _pcd,

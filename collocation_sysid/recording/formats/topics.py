@@ -18,6 +18,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, hint_at
+from .depth_messages import depth_in, is_camera
 from .logs import Address, Log, opened, require_packages, require_topic
 
 AXES = ("x", "y", "z")
@@ -94,6 +95,8 @@ def table(address: Address) -> bytes:
         messages = list(log.messages(address.topic))
         if not messages:
             raise InputError(f"the topic {address.topic} has no messages")
+        if held := depth_in(messages[0][1]):
+            raise InputError(f"the topic {address.topic} holds {held}; expected one of numbers")
         if _is_transforms(messages[0][1]):
             static = address.topic + "_static"
             more = list(log.messages(static)) if static in log.topics else []
@@ -122,6 +125,10 @@ def _told(log: Log, path: Path, name: str) -> LogTopic:
         edges = _edges(log.messages(name), log.start_ns)
         serves = "poses of one frame in another: " + ", ".join(f"{p}>{c}" for p, c in edges)
         write = [f"{write[0]}#{parent}>{child}" for parent, child in edges]
+    elif first and (held := depth_in(first[0][1])):
+        serves = f"{held}: [[experiment.depth]]"
+    elif first and is_camera(first[0][1]):
+        serves, write = "the camera's matrix, for the depth images beside it", []
     elif first:
         _, rows = _rows(first, log.start_ns)
         serves = _served(set().union(*rows), first[0][1])
@@ -149,12 +156,12 @@ def _served(columns: set[str], message: Any) -> str:
 
 def _rows(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Row]]:
     """Rows in the order of their times; of several at a time the first."""
-    t_s = np.array([_time_s(message, at_ns, start_ns) for at_ns, message in messages])
+    t_s = np.array([time_s(message, at_ns, start_ns) for at_ns, message in messages])
     _, first = np.unique(t_s, return_index=True)
     return t_s[first], [_row(messages[k][1]) for k in first]
 
 
-def _time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
+def time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
     """When a message was measured; when it was recorded where it does not say."""
     first = next(iter(_items(message)), None)
     stamps = (_at(message, "header.stamp"), _at(message, "timestamp"), _at(first, "header.stamp"))
@@ -266,7 +273,7 @@ def _edges(
         for each in _at(message, "transforms") or [message]:
             pose = _pose(each)
             if (edge := _child(each)) is not None and pose is not None:
-                edges.setdefault(edge, {})[_time_s(each, at_ns, start_ns)] = pose
+                edges.setdefault(edge, {})[time_s(each, at_ns, start_ns)] = pose
     return edges
 
 
