@@ -1,6 +1,8 @@
 """What is kept compiled is executed: nothing that others could have written is used."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -91,3 +93,61 @@ def test_folder_of_another_user_is_refused(folder, monkeypatch):
     monkeypatch.setattr(os, "getuid", lambda: 12345)
     with pytest.warns(RuntimeWarning, match="belongs to another user"):
         assert jit.load("key") is None
+
+
+APART = """
+import ctypes, mmap, sys
+
+from llvmlite import ir
+
+from collocation_sysid.fem.kernels.jit import DOUBLE, DOUBLES, CompiledFunction, NativeCode, address
+import numpy as np
+
+library = ctypes.CDLL(None)
+library.mmap.restype = ctypes.c_void_p
+library.mmap.argtypes = ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long
+library.munmap.argtypes = ctypes.c_void_p, ctypes.c_size_t
+
+
+def taken(size):
+    return library.mmap(None, size, 0, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, -1, 0)
+
+
+def scaled_often():
+    module = ir.Module()
+    run = ir.Function(module, ir.FunctionType(ir.VoidType(), [DOUBLES]), "run")
+    builder = ir.IRBuilder(run.append_basic_block())
+    value = builder.load(run.args[0])
+    for _ in range(1000):
+        value = builder.fmul(value, DOUBLE(1.0001))
+    builder.store(value, run.args[0])
+    builder.ret_void()
+    return module
+
+
+blocks = [taken(3 << 30) for _ in range(100)]
+for size in [mmap.PAGESIZE << k for k in range(14, 0, -1)]:
+    while taken(size) > min(blocks):
+        pass
+for block in blocks:
+    library.munmap(block, mmap.PAGESIZE)
+code = NativeCode("run", "scaled", (ctypes.c_void_p,), scaled_often, quickly=True)
+value = np.ones(1)
+for each in [CompiledFunction(code) for _ in range(4)]:
+    each(address(value))
+print(value[0])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it maps memory as Linux does")
+def test_code_and_its_constants_may_be_mapped_far_apart(tmp_path):
+    """As in a process with much else mapped, where a page is free here and another there."""
+    done = subprocess.run(
+        [sys.executable, "-c", APART],
+        env=os.environ | {"COLLOCATION_SYSID_CACHE": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == pytest.approx(1.0001**4000)

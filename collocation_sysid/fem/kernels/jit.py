@@ -79,8 +79,10 @@ def _target_machine(quickly: bool) -> llvm.TargetMachine:
         cpu=llvm.get_host_cpu_name(),
         features=llvm.get_host_cpu_features().flatten(),
         opt=0 if quickly else 3,
-        reloc="pic",
-        codemodel="small",
+        # Sections are mapped wherever there is room, and code reaches its constants by whole
+        # addresses. By 32 bits it does not if they are 2 GB apart: LLVM then ends the process.
+        reloc="static",
+        codemodel="jitdefault",
         jit=True,
     )
 
