@@ -29,7 +29,7 @@ from .statistics.considered import assumed
 from .statistics.diagnostics import diagnose
 from .statistics.linearised import LinearisedFit, linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
-from .statistics.pose_noise import pose_noise_draws
+from .statistics.pose_noise import with_pose_noise
 from .statistics.probes import Answered, Probe, probes
 from .statistics.profile import Profile, profile_of
 from .statistics.trust import turn_concerns
@@ -175,17 +175,15 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     try:
         fit = linearised_fit(solution.collocation, solution.z)
         say("finding what noise of the poses does")
-        extra, noises = pose_noise_draws(solution.collocation, solution.z)
+        fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
     except SimulationError as error:
         return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",)), None
-    answer = Run(problem, solution, rollouts, None, diagnose(fit, extra))
+    answer = Run(problem, solution, rollouts, None, diagnose(fit))
     if not solution.collocation.nq:
         return answer, fit
-    options = problem.uncertainty
+    parameters = solution.collocation.parameters
     try:
-        uncertainty = uncertainty_of(
-            fit, solution.collocation.parameters, solution.q, options.noise, options.errors, extra
-        )
+        uncertainty = uncertainty_of(fit, parameters, solution.q, problem.uncertainty)
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
@@ -206,10 +204,8 @@ def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
     """Refits of parts of the data, and with assumptions freed."""
     say("refitting parts of the data, and with assumptions freed")
     solution, options = answer.solution, answer.problem.uncertainty
-    collocation, z = solution.collocation, solution.z
-    extra, known = pose_noise_draws(collocation, z)[0], options.assumptions.deviations
-    how = options.noise, options.errors, extra
-    return probes(Answered(collocation, z, fit, *how, answer.estimates, answer.budget, known))
+    at, known = (solution.collocation, solution.z, fit), options.assumptions.deviations
+    return probes(Answered(*at, options, answer.estimates, answer.budget, known))
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:

@@ -37,8 +37,7 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import (
-    ErrorsOption,
-    NoiseOption,
+    ErrorModel,
     Uncertainty,
     uncertainty_of,
 )
@@ -49,13 +48,12 @@ SCHEME, LAYERS, STEPS = "midpoint", 5, 60
 OFFSET_M, SHIFT_S, PHI = 0.002, 0.003, 0.85
 QUANTITIES = (*TRUTH, "young_pa", "poisson")
 COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν", "own")
-# Noise and errors as `uncertainty_of` takes them.
-KINDS: tuple[tuple[NoiseOption, ErrorsOption], ...] = (
-    ("given", "auto"),
-    ("estimated", "auto"),
-    ("given", "independent"),
-    ("estimated", "independent"),
-    ("auto", "auto"),
+KINDS = (
+    ErrorModel("given"),
+    ErrorModel("estimated"),
+    ErrorModel("given", "independent"),
+    ErrorModel("estimated", "independent"),
+    ErrorModel(),
 )
 ACCEPTED = (0.91, 0.98)
 
@@ -132,7 +130,7 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     collocation = solution.collocation
     q = solution.z[: collocation.nq]
     fit = linearised_fit(collocation, solution.z)
-    found = [uncertainty_of(fit, collocation.parameters, q, *kind) for kind in KINDS]
+    found = [uncertainty_of(fit, collocation.parameters, q, kind) for kind in KINDS]
     wrong = collocation.parameters_of(solution.z)[collocation.nq :] - phi
     return Outcome(
         solution.status.converged,
@@ -240,11 +238,11 @@ def header(sigma_m: float, twins: int) -> str:
 def coverage_table(by_case: list[list[Outcome]]) -> str:
     """Percent of the intervals that hold the truth."""
     lines = [_line("held [%]", COLUMNS) + "  correlated"]
-    for k, (noise, errors) in enumerate(KINDS):
+    for k, kind in enumerate(KINDS):
         for case, outcomes in zip(CASES, by_case, strict=True):
             share = shares(outcomes, k)
             chosen = np.mean([outcome.correlated[k] for outcome in outcomes])
-            name = f"{case.name}: {noise}, {errors}"
+            name = f"{case.name}: {kind.noise}, {kind.errors}"
             lines.append(_line(name, [_marked(s) for s in share]) + f"{100 * chosen:10.0f} %")
     lines.append("")
     for case, outcomes in zip(CASES, by_case, strict=True):
@@ -272,12 +270,12 @@ def shares(outcomes: list[Outcome], kind: int) -> Array:
 def score_table(by_case: list[list[Outcome]]) -> str:
     """Mean and standard deviation of the scores."""
     lines = [_line("scores", COLUMNS[:4], 14)]
-    for k, (noise, errors) in enumerate(KINDS):
+    for k, kind in enumerate(KINDS):
         for case, outcomes in zip(CASES, by_case, strict=True):
             rows = np.array([outcome.scores[k] for outcome in outcomes])
             mean, deviation = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
             cells = [f"{m:+.2f} ± {d:.2f}" for m, d in zip(mean, deviation, strict=True)]
-            lines.append(_line(f"{case.name}: {noise}, {errors}", cells, 14))
+            lines.append(_line(f"{case.name}: {kind.noise}, {kind.errors}", cells, 14))
     return "\n".join(lines)
 
 

@@ -31,7 +31,7 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import ErrorModel, covariance
 
 Array = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ def predicted(sigma_m: float) -> tuple[float, ...]:
     collocation = noisy(sigma_m, None, truth)
     _, x = reference(sigma_m)
     z = collocation.pack(np.log(truth), [x])
-    variances = covariance(collocation, z, errors="independent").covariance.diagonal()
+    variances = covariance(collocation, z, ErrorModel(errors="independent")).covariance.diagonal()
     return tuple(np.sqrt(variances).tolist())
 
 

@@ -14,6 +14,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_coverage import CASES, KINDS, Outcome, run
 
+from collocation_sysid.statistics.uncertainty import ErrorModel
+
 pytestmark = pytest.mark.long
 
 TWINS, MANY = 2, 15  # of each case; two cases have the same noise
@@ -21,8 +23,9 @@ SIGMA_M = 1e-3
 # What chance leaves out in one of a thousand tests.
 RARE = 1e-3
 NOISES = {"white": CASES[:2], "autoregressive": CASES[2:]}
-AUTO = KINDS.index(("auto", "auto"))
-ROBUST, TEXTBOOK = KINDS.index(("estimated", "auto")), KINDS.index(("estimated", "independent"))
+AUTO = KINDS.index(ErrorModel())
+ROBUST = KINDS.index(ErrorModel("estimated"))
+TEXTBOOK = KINDS.index(ErrorModel("estimated", "independent"))
 
 
 @cache

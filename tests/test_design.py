@@ -35,7 +35,7 @@ from collocation_sysid.program.marching import march
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Grasp, PoseSequence
 from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import ErrorModel, covariance
 
 AT = GUESS.with_guess(TRUTH)
 LIMITS = Limits.model_validate(
@@ -251,7 +251,7 @@ def errors_at(collocation, z) -> Errors:
 
 def test_error_bars_are_those_that_a_run_reports():
     collocation, z = at_answer([hung_cube(8)])
-    run = covariance(collocation, z, "given", "independent")
+    run = covariance(collocation, z, ErrorModel("given", "independent"))
     found = errors_at(collocation, z)
     known = {n: e for n, e in {**run.estimates, **run.derived}.items() if e.std_error is not None}
     assert {"lambda_pa", "mu_pa", "young_pa", "poisson"} <= known.keys()

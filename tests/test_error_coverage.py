@@ -13,7 +13,7 @@ from scipy.stats import binom, kstest
 
 from collocation_sysid.statistics.autocorrelation import dependence, error_processes
 from collocation_sysid.statistics.linearised import LinearisedFit, information
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_of
 
 DRAWS = 60
 PROBLEMS = {
@@ -41,7 +41,7 @@ def held(uncertainty: Uncertainty, wrong: np.ndarray) -> np.ndarray:
 
 def coverage(of: Problem, phi: float, shared: float = 0.0, count: int = DRAWS, **options) -> float:
     hits = [
-        held(uncertainty_of(fit, PARAMETERS, wrong[:4], **options), wrong)
+        held(uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(**options)), wrong)
         for fit, wrong in draws(of, phi, shared, count)
     ]
     return float(np.mean(hits))
@@ -83,7 +83,7 @@ def test_textbook_intervals_fail_where_errors_persist():
 def test_intervals_rarely_change_for_white_errors():
     of = PROBLEMS["one marker, 40 samples"]
     chosen = [
-        uncertainty_of(fit, PARAMETERS, wrong[:4], noise="estimated").errors
+        uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(noise="estimated")).errors
         for fit, wrong in draws(of, 0.0)
     ]
     assert np.mean([errors == "autocorrelated" for errors in chosen]) < 0.06  # 1 % of two tests
@@ -148,7 +148,7 @@ def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_par
     fit, wrong = sample()
     full, k = plain_information(fit), fit.shared
     schur = full[:k, :k] - full[:k, k:] @ np.linalg.solve(full[k:, k:], full[k:, :k])
-    found = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
+    found = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     scale = np.sqrt(np.diag(found.covariance))
     np.testing.assert_allclose(
         found.covariance / np.outer(scale, scale),
@@ -162,7 +162,7 @@ def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_par
 
 def test_local_parameters_have_standard_deviations():
     fit, wrong = sample()
-    found = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
+    found = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert tuple(found.nuisance) == fit.names[4:]
     expected = np.sqrt(np.diag(np.linalg.inv(plain_information(fit))))[4:]
     np.testing.assert_allclose(list(found.nuisance.values()), expected, rtol=1e-6)
@@ -173,7 +173,7 @@ def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free
     fit, wrong = sample()
     at_bound = replace(fit, at_bound=np.arange(len(fit.names)) == bounded)
     found, free = (
-        uncertainty_of(each, PARAMETERS, wrong[:4], errors="independent")
+        uncertainty_of(each, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
         for each in (at_bound, fit)
     )
     shown = np.arange(4) != bounded
@@ -201,7 +201,7 @@ def test_errors_that_persist_are_told_once():
     assert found.errors == "autocorrelated"
     (note,) = [note for note in found.notes if "persist" in note]
     assert "0.8" in note or "0.9" in note
-    forced = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
+    forced = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert forced.errors == "independent"
     assert any("too small" in note for note in forced.notes)
 
@@ -218,8 +218,8 @@ def test_persistent_errors_far_below_the_sigma_given_change_nothing():
 
 def test_error_bars_never_fall_below_those_of_the_sigma_given():
     fit, wrong = sample(phi=0.9)
-    given = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="autocorrelated")
-    independent = uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
+    given = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="autocorrelated"))
+    independent = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert (np.diag(given.covariance) >= 0.999999 * np.diag(independent.covariance)).all()
 
 
@@ -232,7 +232,7 @@ def test_error_bars_follow_the_units_of_the_residuals():
     )
     for errors in ("independent", "autocorrelated"):
         before, after = (
-            uncertainty_of(f, PARAMETERS, wrong[:4], "estimated", errors).covariance
+            uncertainty_of(f, PARAMETERS, wrong[:4], ErrorModel("estimated", errors)).covariance
             for f in (replace(fit, prior_slope=0 * fit.prior_slope),
                       replace(scaled, prior_slope=0 * fit.prior_slope))
         )  # fmt: skip
@@ -242,5 +242,5 @@ def test_error_bars_follow_the_units_of_the_residuals():
 def test_a_record_of_two_samples_is_no_error():
     fit, wrong = sample(samples=(2, 3), markers=2, offsets=False)
     for errors in ("auto", "independent", "autocorrelated"):
-        found = uncertainty_of(fit, PARAMETERS, wrong[:4], errors=errors)
+        found = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors=errors))
         assert np.isfinite(found.degrees_of_freedom)

@@ -15,7 +15,7 @@ from scipy.stats import binom, kstest
 
 from collocation_sysid.statistics.linearised import information
 from collocation_sysid.statistics.noise import noise_level
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -122,7 +122,7 @@ def test_a_common_variance_would_not_do_where_markers_differ():
     held = {"auto": [], "estimated": []}
     for fit, wrong in draws(split, (3.0, 0.5), 200):
         for noise, hits in held.items():
-            each = uncertainty_of(fit, PARAMETERS, wrong[:4], noise)  # type: ignore[arg-type]
+            each = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(noise))  # type: ignore[arg-type]
             half = each.quantiles * np.sqrt(np.diag(each.covariance))
             hits.append((np.abs(wrong[:4]) < half)[0])
     assert np.mean(held["estimated"]) < 0.9 < np.mean(held["auto"])
@@ -138,12 +138,12 @@ def test_what_is_expected_besides_is_no_noise():
     fit, wrong = of.fit([errors], np.zeros(len(of.names)))
     factored = information(fit)
     assert noise_level(fit, factored).kind == "by-marker"
-    known = noise_level(fit, factored, [extra])
+    known = noise_level(fit.disturbed([extra]), factored)
     assert known.kind == "given"
     assert known.pooled == pytest.approx(1.0, abs=1.0)  # a deviation of 0.32
     without, widened = (
-        uncertainty_of(fit, PARAMETERS, wrong[:4], "given", "independent", more).covariance
-        for more in (None, [extra])
+        uncertainty_of(each, PARAMETERS, wrong[:4], ErrorModel("given", "independent")).covariance
+        for each in (fit, fit.disturbed([extra]))
     )
     assert (np.diag(widened) > 1.5 * np.diag(without)).any()
     rows = fit.blocks[0].slope.reshape(-1, len(of.names))
@@ -164,8 +164,9 @@ def test_error_bars_for_correlated_errors_hold_what_is_expected_besides(noise):
     steps = rng.normal(size=(201, 64, 3))
     samples[:, :, 1] = 1.3 * sum(steps[:, k : k + 60] for k in range(5))
     fit, wrong = of.fit([samples[0] + rng.normal(size=samples[0].shape)], np.zeros(len(of.names)))
+    fit = fit.disturbed([samples[1:]])
     correlated, independent = (
-        np.diag(uncertainty_of(fit, PARAMETERS, wrong[:4], noise, errors, [samples[1:]]).covariance)
+        np.diag(uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(noise, errors)).covariance)
         for errors in ("autocorrelated", "independent")
     )
     assert (correlated > 0.999999 * independent).all()
@@ -176,7 +177,7 @@ def test_error_bars_for_correlated_errors_hold_what_is_expected_besides(noise):
 
 def notes(deviations: tuple[float, ...], **options) -> tuple[str, ...]:
     fit, wrong = next(draws(PROBLEMS["three markers"], deviations, 1))
-    return uncertainty_of(fit, PARAMETERS, wrong[:4], **options).notes
+    return uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(**options)).notes
 
 
 def test_a_wrong_sigma_is_told_with_how_much():

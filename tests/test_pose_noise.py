@@ -13,7 +13,8 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Grasp, Nuisance, PoseSequence
 from collocation_sysid.recording.poses import Interpolation
-from collocation_sysid.statistics.pose_noise import pose_noise_draws, roughness
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.pose_noise import roughness, with_pose_noise
 
 # So small that all is linear, and markers as exact, so that it counts.
 SIGMA_M, SIGMA_RAD = 1e-7, 1e-6
@@ -62,7 +63,8 @@ def test_draws_are_how_readings_follow_poses(nuisance, interpolation, scheme):
     phi = 0.5 * np.random.default_rng(1).normal(size=segment.nuisance.size)
     before, positions = reading(of, poses, phi)
     z = of.pack(np.concatenate([GUESS.with_guess(TRUTH).guess_q, phi]), [positions])
-    (draws,), (noise,) = pose_noise_draws(of, z, seed=0)
+    fit, (noise,) = with_pose_noise(linearised_fit(of, z), of, z, seed=0)
+    draws = fit.blocks[0].disturbances
     assert (noise.sigma_m, noise.sigma_rad, noise.judged) == (SIGMA_M, SIGMA_RAD, False)
     assert draws is not None
     white = np.random.default_rng(0).normal(size=(2, len(poses.t_s), 3 * len(draws)))
@@ -114,4 +116,5 @@ def test_noise_that_hardly_moves_a_marker_costs_nothing():
     coarse = replace(of, experiments=(coarse,))
     _, positions = reading(of, experiment.grasps[0].poses, np.zeros(0))
     z = coarse.pack(GUESS.with_guess(TRUTH).guess_q, [positions])
-    assert pose_noise_draws(coarse, z) == ([None], ())
+    fit, noises = with_pose_noise(linearised_fit(coarse, z), coarse, z)
+    assert (fit.blocks[0].disturbances, noises) == (None, ())

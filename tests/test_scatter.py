@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2, t
 from collocation_sysid.statistics.linearised import LinearisedFit
 from collocation_sysid.statistics.scatter import Scatter, single_fits
 from collocation_sysid.statistics.trust import fit_concerns
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_of
 
 MADE = problem((80, 80, 80, 80), 3, offsets=False)
 RECORDINGS = len(MADE.slopes)
@@ -33,7 +33,7 @@ def fitted(seed: int, spread: float = 0.0) -> tuple[LinearisedFit, np.ndarray]:
 
 def judged(seed: int, spread: float = 0.0) -> Uncertainty:
     fit, wrong = fitted(seed, spread)
-    return uncertainty_of(fit, PARAMETERS, wrong[:4], errors="independent")
+    return uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
 
 
 def scatter(found: Uncertainty) -> Scatter:
@@ -46,7 +46,7 @@ def test_a_step_from_the_joint_answer_is_the_fit_to_one_recording():
     rng = np.random.default_rng(3)
     local = rng.normal(size=len(MADE.names)) / np.maximum(MADE.prior_slope, 1e-300)
     truth = np.where(MADE.prior_slope > 0, local, 0.0)
-    for k, ((_, alone, step), slope) in enumerate(zip(single_fits(fit), MADE.slopes, strict=True)):
+    for k, ((alone, step), slope) in enumerate(zip(single_fits(fit), MADE.slopes, strict=True)):
         errors = rng.normal(size=slope.shape[:3])
         rng.normal()
         columns = [0, 1, 2, 3, 4 + k]

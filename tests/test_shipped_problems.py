@@ -20,7 +20,7 @@ from collocation_sysid.pipeline import Run
 from collocation_sysid.program.wrench import without_sensors
 from collocation_sysid.recording import Nuisance
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, covariance
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # A folder with the C3D files of scripts/get_srl_beam.py.
@@ -284,7 +284,7 @@ def noisy_fit(huber: bool, offsets: bool) -> Solution:
 def attainable() -> Uncertainty:
     """Error bars of the fit with both remedies for white noise of the sigma_m given."""
     solution = noisy_fit(huber=True, offsets=True)
-    return covariance(solution.collocation, solution.z, errors="independent")
+    return covariance(solution.collocation, solution.z, ErrorModel(errors="independent"))
 
 
 def standard_errors_off(solution: Solution) -> np.ndarray:

@@ -26,7 +26,7 @@ from collocation_sysid.program.segment import Segment
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.linearised import marker_sensitivities, sensitivities
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import ErrorModel, covariance
 
 AT_TRUTH = GUESS.with_guess(TRUTH)
 NAMES = tuple(TRUTH)
@@ -172,7 +172,7 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
         columns.append((ahead - behind) / (2 * step))
     matrix = np.stack(columns, axis=1)
     expected = np.linalg.inv(matrix.T @ matrix)
-    found = covariance(collocation, z, noise="given", errors="independent").covariance
+    found = covariance(collocation, z, ErrorModel("given", "independent")).covariance
     deviations = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(deviations, deviations),
                                expected / np.outer(deviations, deviations), atol=1e-4)  # fmt: skip
@@ -233,7 +233,7 @@ def test_noise_is_estimated_from_the_residuals():
     for sigma_m in (1e-4, 1e-2):  # what is claimed; the noise has 1 mm
         collocation, z = simulated([with_sigma(noisy(experiment, 1e-3, seed=1), sigma_m)])
         truth, z_truth = simulated([with_sigma(experiment, 1e-3)])
-        estimated = covariance(collocation, z, noise="estimated")
+        estimated = covariance(collocation, z, ErrorModel("estimated"))
         ratio = estimated.covariance / covariance(truth, z_truth).covariance
         np.testing.assert_allclose(ratio, ratio[0, 0])
         assert ratio[0, 0] == pytest.approx(1.0, abs=0.2)
@@ -244,7 +244,7 @@ def test_residuals_larger_than_sigma_are_pointed_out():
     collocation, z = simulated([experiment])
     (note,) = covariance(collocation, z).notes
     assert "times as large as sigma_m" in note
-    assert covariance(collocation, z, noise="estimated").notes == ()
+    assert covariance(collocation, z, ErrorModel("estimated")).notes == ()
 
 
 def test_noise_needs_more_measurements_than_parameters():
@@ -253,22 +253,24 @@ def test_noise_needs_more_measurements_than_parameters():
     tracks[2, 0] = experiment.markers.positions_m[2, 0]
     collocation, z = simulated([with_markers(experiment, tracks)])
     with pytest.raises(InputError, match="3 measurements of 4 parameters"):
-        covariance(collocation, z, noise="estimated")
+        covariance(collocation, z, ErrorModel("estimated"))
 
 
 def test_unknown_noise_is_refused():
     collocation, z = simulated([hung_cube(3)])
-    with pytest.raises(InputError, match="given, estimated"):
-        covariance(collocation, z, noise="guessed")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="auto, independent, autocorrelated"):
-        covariance(collocation, z, errors="normal")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="'given' or 'estimated'"):
+        covariance(collocation, z, ErrorModel(noise="guessed"))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="'independent' or 'autocorrelated'"):
+        covariance(collocation, z, ErrorModel(errors="normal"))  # type: ignore[arg-type]
 
 
 def test_a_prior_adds_its_information():
     prior = changed(AT_TRUTH, mu_pa={"prior": (300.0, 1e-3)})
     experiment = measured(hung_cube())
     without, with_prior = (
-        covariance(*simulated([experiment], parameters), errors="independent").covariance
+        covariance(
+            *simulated([experiment], parameters), ErrorModel(errors="independent")
+        ).covariance
         for parameters in (AT_TRUTH, prior)
     )
     difference = np.linalg.inv(with_prior) - np.linalg.inv(without)

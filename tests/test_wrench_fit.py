@@ -26,7 +26,7 @@ from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors, shortened
 from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import covariance, uncertainty_of
+from collocation_sysid.statistics.uncertainty import ErrorModel, covariance, uncertainty_of
 
 NOISE_M = 1e-3
 UNKNOWN = {item.name: cs.Unknown(item.guess, item.lower, item.upper) for item in GUESS.items}
@@ -81,7 +81,7 @@ def test_error_bars_are_those_of_the_slopes():
     assert sensor.measurements == int(collocation.segments[0].sensors[0].present.sum())
     rows = [b.slope.reshape(-1, 4)[b.seen.ravel()] for b in (markers, sensor)]
     of_both = np.linalg.inv(sum(r.T @ r for r in rows))
-    found = covariance(collocation, solution.z, noise="given", errors="independent")
+    found = covariance(collocation, solution.z, ErrorModel(noise="given", errors="independent"))
     np.testing.assert_allclose(found.covariance, of_both, rtol=1e-6)
     assert {"hung cube/force", "hung cube/torque"} <= set(found.level.names)
 

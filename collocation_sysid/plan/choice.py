@@ -395,7 +395,7 @@ def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[st
     """What the variance of each estimate is made of, but for noise of the poses, step and mesh."""
     options, parameters = problem.uncertainty, solution.collocation.parameters
     try:
-        known = uncertainty_of(fit, parameters, solution.q, options.noise, options.errors)
+        known = uncertainty_of(fit, parameters, solution.q, options)
         changes = assumed(solution.collocation, solution.z, options.assumptions.deviations)
     except (InputError, SimulationError):
         return {}  # without error bars there is none

@@ -8,7 +8,7 @@ from typing import Literal
 
 from ..checked import Options, Positive, Text
 from ..statistics.assumptions import Assumptions
-from ..statistics.uncertainty import ErrorsOption, NoiseOption
+from ..statistics.uncertainty import ErrorModel
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,11 @@ class RolloutOptions(Options):
 
 
 @dataclass(frozen=True)
-class UncertaintyOptions(Options):
+class UncertaintyOptions(ErrorModel):
     """How the error bars are found.
 
     Attributes
     ----------
-    noise : {"auto", "given", "estimated"}
-        Trust sigma_m, or scale it by the residuals; auto where they ask for it.
-    errors : {"auto", "independent", "autocorrelated"}
-        What to assume of the errors; auto tests the residuals.
     profile : tuple of str
         List of the parameters whose profile likelihood is wanted.
     numerical : bool
@@ -44,8 +40,6 @@ class UncertaintyOptions(Options):
         How far off what is assumed may be.
     """
 
-    noise: NoiseOption = "auto"
-    errors: ErrorsOption = "auto"
     profile: tuple[Text, ...] = ()
     numerical: bool = False
     assumptions: Assumptions = field(default_factory=Assumptions)

@@ -23,7 +23,7 @@ from ..arrays import Array
 from .concern import Concern
 from .distributions import beta_sf, chi2_isf, normal_isf
 from .linearised import FitBlock, LinearisedFit, Mask, information
-from .noise import Extra, NoiseLevel, noise_level
+from .noise import NoiseLevel, noise_level
 
 SIGNIFICANCE = 0.01
 # A pattern with this share of the residuals' power is worth naming.
@@ -85,16 +85,9 @@ class MarkerDiagnosis:
     sentence: str
 
 
-def diagnose(fit: LinearisedFit, extra: Extra | None = None) -> tuple[MarkerDiagnosis, ...]:
-    """Diagnose every marker that was seen, experiment by experiment.
-
-    Parameters
-    ----------
-    fit : LinearisedFit
-    extra : sequence of (K, T, M, 3), optional
-        Variance that each residual has besides its noise, in units of σ², by experiment.
-    """
-    level = noise_level(fit, information(fit), extra)
+def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
+    """Diagnose every marker that was seen, experiment by experiment."""
+    level = noise_level(fit, information(fit))
     alone = {outlier.series: outlier for outlier in reversed(set_apart(fit)[1])}
     return tuple(
         _diagnose(block, marker, fit.shared, _estimated(fit, block), level, alone)

@@ -109,6 +109,8 @@ class FitBlock:
         Whether a memory counts as relaxed at the first sample.
     places_m : (3M, 3), optional
         Where channels are on the undeformed body.
+    disturbances : (K, T, M, 3), optional
+        Samples of what the residuals have besides their noise, in units of σ.
     """
 
     name: str
@@ -124,6 +126,7 @@ class FitBlock:
     static: bool = False
     relaxed_first: bool = False
     places_m: Array | None = None
+    disturbances: Array | None = None
 
     @cached_property
     def seen(self) -> Mask:
@@ -226,6 +229,11 @@ class LinearisedFit:
     def measurements(self) -> int:
         """Scalar measurements that are present."""
         return sum(block.measurements for block in self.blocks)
+
+    def disturbed(self, samples: Iterable[Array | None]) -> LinearisedFit:
+        """The same with what is known of each block's residuals besides their noise."""
+        pairs = zip(self.blocks, samples, strict=True)
+        return replace(self, blocks=tuple(replace(b, disturbances=each) for b, each in pairs))
 
     def after(self, step: Array) -> LinearisedFit:
         """The same after a step (p,) of all parameters, to first order."""

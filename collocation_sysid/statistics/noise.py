@@ -24,8 +24,6 @@ from .distributions import chi2_cdf, chi2_sf
 from .linearised import FitBlock, Information, LinearisedFit
 
 Noise = Literal["given", "estimated", "by-marker"]
-# (K, T, M, 3) of each block: samples of what adds to the residuals, in units of σ; or None.
-Extra = Sequence[Array | None]
 
 # Residuals this small, in units of σ, are rounding.
 ROUNDING = 1e-6
@@ -125,9 +123,7 @@ class NoiseLevel:
         return total, np.maximum(freedom, 1.0)
 
 
-def noise_level(
-    fit: LinearisedFit, information: Information, extra: Extra | None = None
-) -> NoiseLevel:
+def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
     """Compare the residuals with the σ given.
 
     Parameters
@@ -135,8 +131,6 @@ def noise_level(
     fit : LinearisedFit
     information : Information
         Of the fit.
-    extra : sequence of (K, T, M, 3), optional
-        Samples of what the residuals have besides their noise, in units of σ, by block.
     """
     names, squares, counts, shares = [], [], [], []
     for block, slope in zip(fit.blocks, information.slopes, strict=True):
@@ -147,7 +141,7 @@ def noise_level(
             squares.append(float(np.sum(block.residual[:, m] ** 2)) / shortened(block))
             counts.append(int(block.seen[:, m].sum()))
             shares.append(rows.T @ rows)
-    of_score, besides = _besides(fit, information, extra)
+    of_score, besides = _besides(fit, information)
     level = _level(
         tuple(names),
         np.array(squares),
@@ -162,11 +156,12 @@ def noise_level(
     return replace(level, stated=min(stated, key="sigma_m".__ne__, default="sigma_m"))
 
 
-def drawn(fit: LinearisedFit, extra: Extra) -> list[Array]:
+def drawn(fit: LinearisedFit) -> list[Array]:
     """Samples (K, T, M, 3) of every block, zero where it has none and where samples are missing."""
-    count = next((len(each) for each in extra if each is not None), 1)
+    of_blocks = [block.disturbances for block in fit.blocks]
+    count = next((len(each) for each in of_blocks if each is not None), 0)
     found = []
-    for block, each in zip(fit.blocks, extra, strict=True):
+    for block, each in zip(fit.blocks, of_blocks, strict=True):
         samples = np.zeros((count, *block.residual.shape)) if each is None else each
         found.append(samples[:count] * block.seen)
     return found
@@ -181,14 +176,12 @@ def projected(information: Information, errors: Sequence[Array]) -> tuple[Array,
     return scores, [each.reshape(given.shape) for each, given in zip(left, errors, strict=True)]
 
 
-def _besides(
-    fit: LinearisedFit, information: Information, extra: Extra | None
-) -> tuple[Array, Array]:
-    """Covariance (r, r) of the score, and (G, K) sums of squares of each marker, of the extra."""
+def _besides(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
+    """Covariance (r, r) of the score, and (G, K) sums of squares of each marker."""
     seen = [block.present.any(axis=0) for block in fit.blocks]
-    if extra is None or all(each is None for each in extra):
+    if not len((samples := drawn(fit))[0]):
         return np.zeros_like(information.prior), np.zeros((int(np.concatenate(seen).sum()), 1))
-    scores, left = projected(information, drawn(fit, extra))
+    scores, left = projected(information, samples)
     present = [block.seen for block in fit.blocks]
     sums = [
         np.sum((each * there) ** 2, axis=(1, 3))[:, used].T

@@ -23,6 +23,7 @@ from ..program.sweep import Columns, Sweep
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
 from .considered import followed
+from .linearised import LinearisedFit
 
 # Samples of D η, and the fewest and the memory where bodies are large.
 DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8
@@ -81,14 +82,14 @@ def roughness(poses: PoseSequence) -> tuple[float, float]:
 
 
 @one_blas_thread()
-def pose_noise_draws(
-    collocation: Collocation, z: Array, seed: int = 0
-) -> tuple[list[Array | None], tuple[PoseNoise, ...]]:
-    """Samples of how noise of the poses changes the residuals, and what noise that is.
+def with_pose_noise(
+    fit: LinearisedFit, collocation: Collocation, z: Array, seed: int = 0
+) -> tuple[LinearisedFit, tuple[PoseNoise, ...]]:
+    """A fit with samples of how noise of the poses changes its residuals, and what noise that is.
 
     Returns
     -------
-    draws : list by block, see `LinearisedFit`, of (K, T, M, 3) in standard deviations, or None
+    fit : LinearisedFit
     noises : tuple of PoseNoise, those that matter
     """
     draws: list[Array | None] = []
@@ -103,7 +104,7 @@ def pose_noise_draws(
         draws += found
         if found[0] is not None:
             noises += [noise for noise in here if noise.sigma_m or noise.sigma_rad]
-    return draws, tuple(noises)
+    return fit.disturbed(draws), tuple(noises)
 
 
 def _noise(name: str, grasp: Grasp) -> PoseNoise:

@@ -25,9 +25,8 @@ from .considered import Changes, assumed
 from .distributions import normal_isf
 from .estimates import Estimate
 from .linearised import Derived, FitBlock, LinearisedFit, best_step, least_squares, linearised_fit
-from .noise import Extra
 from .scatter import TELLING, part_fit, recordings_of, single_fits
-from .uncertainty import ErrorsOption, NoiseOption, Uncertainty, uncertainty_of
+from .uncertainty import ErrorModel, Uncertainty, uncertainty_of
 
 # Into so many windows of time the data are cut.
 WINDOWS = ("first third", "middle third", "last third")
@@ -96,8 +95,7 @@ class Answered:
     collocation : Collocation
     z : (variables,)
     fit : LinearisedFit
-    noise, errors, extra
-        See `uncertainty_of`.
+    errors : ErrorModel
     estimates : mapping of name to Estimate
     budget : mapping of name to BudgetLine
     deviations : mapping of all assumptions and nuisance parameters to their deviations
@@ -106,20 +104,17 @@ class Answered:
     collocation: Collocation
     z: Array
     fit: LinearisedFit
-    noise: NoiseOption
-    errors: ErrorsOption
-    extra: Extra | None
+    errors: ErrorModel
     estimates: Mapping[str, Estimate]
     budget: Mapping[str, BudgetLine]
     deviations: Mapping[str, float | None]
 
-    def found(self, fit: LinearisedFit, p: Array, extra: Extra | None) -> Uncertainty:
+    def found(self, fit: LinearisedFit, p: Array) -> Uncertainty:
         """Estimates and error bars of another fit at p."""
         q = p[: fit.shared]
         constants = (segment.constants for segment in self.collocation.segments)
         fit = replace(fit, derived=Derived.of(constants, q))
-        own = self.collocation.parameters, q, self.noise, self.errors, extra
-        return uncertainty_of(fit, *own)
+        return uncertainty_of(fit, self.collocation.parameters, q, self.errors)
 
     def moves(self, found: Uncertainty) -> dict[str, Move]:
         """How far estimates went that a refit tells."""
@@ -160,11 +155,8 @@ def _windows(at: Answered) -> Iterator[Probe]:
     for k, name in enumerate(WINDOWS):
         cuts = [_third(block, k) for block in at.fit.blocks]
         blocks = [_cut(block, cut) for block, cut in zip(at.fit.blocks, cuts, strict=True)]
-        extra = at.extra and [
-            each if each is None else each[:, cut] for each, cut in zip(at.extra, cuts, strict=True)
-        ]
-        alone, step = part_fit(at.fit, blocks, np.arange(len(at.fit.names)))
-        yield from _part(at, "window", name, (alone, step), extra)
+        alone = part_fit(at.fit, blocks, np.arange(len(at.fit.names)))
+        yield from _part(at, "window", name, *alone)
 
 
 def _third(block: FitBlock, k: int) -> slice:
@@ -176,29 +168,24 @@ def _cut(block: FitBlock, cut: slice) -> FitBlock:
     """The same of some samples."""
     own = ("t_s", "present", "residual", "slope", "misfit", "components")
     there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
-    return replace(block, **there)
+    shaken = block.disturbances
+    return replace(block, **there, disturbances=None if shaken is None else shaken[:, cut])
 
 
 def _recordings(at: Answered) -> Iterator[Probe]:
     if len(recordings_of(at.fit)) < 2:
         return
-    for numbers, alone, step in single_fits(at.fit):
-        extra = at.extra and [at.extra[k] for k in numbers]
-        yield from _part(at, "recording", alone.blocks[0].name, (alone, step), extra)
+    for alone, step in single_fits(at.fit):
+        yield from _part(at, "recording", alone.blocks[0].name, alone, step)
 
 
 def _part(
-    at: Answered,
-    kind: Kind,
-    name: str,
-    refit: tuple[LinearisedFit, Array],
-    extra: Extra | None,
+    at: Answered, kind: Kind, name: str, alone: LinearisedFit, step: Array
 ) -> Iterator[Probe]:
     """What a part of the data says alone, of what it tells at all."""
-    alone, step = refit
     if alone.measurements <= len(alone.names):
         return
-    found = at.found(alone, at.p[: alone.shared] + step[: alone.shared], extra)
+    found = at.found(alone, at.p[: alone.shared] + step[: alone.shared])
     left = least_squares(alone)
     falls = left.loss(-step) - left.loss(np.zeros(len(step)))
     yield Probe(kind, name, falls, at.moves(found))
@@ -255,7 +242,7 @@ def _of_freedom(at: Answered, name: str, wide: LinearisedFit, p: Array) -> Probe
     """The best of a fit with one more freedom, linearised at p."""
     first, step = len(at.fit.names), best_step(wide)
     after, own = wide.after(step), step[first:]
-    found = at.found(after, p + step[:first], at.extra)
+    found = at.found(after, p + step[:first])
     before, left = least_squares(at.fit), least_squares(after)
     falls = before.loss(np.zeros(first)) - left.loss(np.zeros(len(step)))
     worst, unit = int(np.argmax(np.abs(own))), at.deviations[_row(name)] or 1.0
@@ -280,7 +267,8 @@ def _released(at: Answered, probe: Probe, limit: float) -> Probe:
             break
         z = collocation.pack(p, near)
         changes = assumed(collocation, z, alone)
-        wide = with_freedom(linearised_fit(collocation, z), changes, probe.name)
+        there = linearised_fit(collocation, z).disturbed(b.disturbances for b in at.fit.blocks)
+        wide = with_freedom(there, changes, probe.name)
         probe = _of_freedom(at, probe.name, wide, p)
         if np.abs(step[: wide.shared]).max(initial=0.0) < SETTLED:
             break

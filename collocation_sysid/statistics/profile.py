@@ -19,8 +19,9 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.parameters import Parameter
 from .distributions import chi2_isf
-from .linearised import LinearisedFit
-from .uncertainty import Uncertainty, uncertainty_of
+from .estimates import relative_slopes
+from .linearised import LinearisedFit, least_squares
+from .uncertainty import Uncertainty
 
 SolveFixed = Callable[[str, float], float]
 
@@ -213,7 +214,7 @@ def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
 
 def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
     """Variance of the estimate over what the σ given would make it."""
-    parameters, q = solution.collocation.parameters, solution.q
-    given = uncertainty_of(fit, parameters, q, "given", "independent").covariance[k, k]
-    scale = float(uncertainty.covariance[k, k] / given)
+    size = relative_slopes(solution.collocation.parameters, solution.q)[k]
+    given = size * least_squares(fit).errors[k]
+    scale = float(uncertainty.covariance[k, k] / given**2)
     return scale if np.isfinite(scale) else 1.0

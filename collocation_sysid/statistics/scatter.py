@@ -100,7 +100,7 @@ def recordings_of(fit: LinearisedFit) -> dict[str, list[int]]:
     return found
 
 
-def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, Array]]:
+def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
     """The fit to each recording alone, and its parameters less the joint ones.
 
     The numbers are those of its blocks.
@@ -109,8 +109,7 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[list[int], LinearisedFit, 
         # What recordings share they have to find alone, too.
         mine = [other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared :]]
         columns = np.r_[np.arange(fit.shared), fit.shared + np.flatnonzero(mine)]
-        alone, step = part_fit(fit, [fit.blocks[k] for k in numbers], columns)
-        yield numbers, alone, step
+        yield part_fit(fit, [fit.blocks[k] for k in numbers], columns)
 
 
 def part_fit(

@@ -19,12 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..checked import Options
 from ..errors import InputError
 from ..fem.constants import constant_named, is_damping
 from ..model.parameters import Parameters
@@ -47,13 +48,11 @@ from .estimates import (
     user_estimates,
 )
 from .linearised import Information, LinearisedFit, information, least_squares, linearised_fit
-from .noise import Extra, Noise, NoiseLevel, drawn, noise_level, projected
-from .pose_noise import pose_noise_draws
+from .noise import Noise, NoiseLevel, drawn, noise_level, projected
+from .pose_noise import with_pose_noise
 from .scatter import Scatter, recordings_of, scatter_of, single_fits
 
-NoiseOption = Literal["auto", "given", "estimated"]
 Errors = Literal["independent", "autocorrelated"]
-ErrorsOption = Literal["auto", "independent", "autocorrelated"]
 
 # A damping that ended at its bound is not told at all if it may be this many times the usual.
 UNINFORMED = 100.0
@@ -63,8 +62,50 @@ CONSEQUENCE = 1.05
 REPLICAS = 39
 
 
+@dataclass(frozen=True)
+class ErrorModel(Options):
+    """What is assumed of the measurements' errors.
+
+    Attributes
+    ----------
+    noise : {"auto", "given", "estimated"}
+        Trust sigma_m, or scale it by the residuals; auto where they ask for it.
+    errors : {"auto", "independent", "autocorrelated"}
+        What to assume of the errors; auto tests the residuals.
+    """
+
+    noise: Literal["auto", "given", "estimated"] = "auto"
+    errors: Literal["auto", "independent", "autocorrelated"] = "auto"
+
+
+AUTO = ErrorModel()
+
+
 @dataclass(frozen=True, eq=False)
-class Uncertainty:
+class ErrorBasis:
+    """What error bars are based on.
+
+    Attributes
+    ----------
+    noise : {"given", "estimated", "by-marker"}
+    errors : {"independent", "autocorrelated"}
+    level : NoiseLevel
+        How large the residuals of each marker are.
+    dependence : Dependence
+        The test of the residuals.
+    outliers : tuple of Outlier
+        Samples that spoil what the residuals tell; `dependence` leaves them out.
+    """
+
+    noise: Noise
+    errors: Errors
+    level: NoiseLevel
+    dependence: Dependence
+    outliers: tuple[Outlier, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty(ErrorBasis):
     """What the data say, and do not say, about the parameters.
 
     Attributes
@@ -82,13 +123,6 @@ class Uncertainty:
     nuisance : by name, standard deviation of each parameter of a single experiment
         In the unit it is estimated in, that is deviations of its prior; NaN at a bound.
     nuisance_covariance : (k, k) of these, in their order
-    noise : {"given", "estimated", "by-marker"}
-    errors : {"independent", "autocorrelated"}
-        What the error bars are based on.
-    level : NoiseLevel
-        How large the residuals of each marker are.
-    dependence : Dependence
-        The test of the residuals.
     chi_squared : float
         Σ ((ŷ − h(x)) / σ)² of the markers, with the σ given.
     degrees_of_freedom : float
@@ -99,8 +133,6 @@ class Uncertainty:
         What the recordings say one by one, where there are several.
     wider : (nq,)
         By how much intervals are wider because they disagree.
-    outliers : tuple of Outlier
-        Samples that spoil what the residuals tell; `dependence` leaves them out.
     """
 
     names: tuple[str, ...]
@@ -111,16 +143,11 @@ class Uncertainty:
     derived: Mapping[str, Estimate]
     nuisance: Mapping[str, float]
     nuisance_covariance: Array
-    noise: Noise
-    errors: Errors
-    level: NoiseLevel
-    dependence: Dependence
     chi_squared: float
     degrees_of_freedom: float
     notes: tuple[str, ...]
     wider: Array
     scatter: Scatter | None = None
-    outliers: tuple[Outlier, ...] = ()
 
     @property
     def reduced_chi_squared(self) -> float:
@@ -128,20 +155,14 @@ class Uncertainty:
         return self.chi_squared / max(1.0, self.degrees_of_freedom)
 
 
-def covariance(
-    collocation: Collocation,
-    z: Array,
-    noise: NoiseOption = "auto",
-    errors: ErrorsOption = "auto",
-) -> Uncertainty:
+def covariance(collocation: Collocation, z: Array, errors: ErrorModel = AUTO) -> Uncertainty:
     """Uncertainty of the parameters at a solution.
 
     Parameters
     ----------
     collocation : Collocation
     z : (variables,) a point that satisfies the equations of motion, the optimum
-    noise, errors
-        See `uncertainty_of`.
+    errors : ErrorModel
 
     Raises
     ------
@@ -150,20 +171,13 @@ def covariance(
     SimulationError
         Where the equations of motion are singular.
     """
-    _check(noise, errors)
-    fit = linearised_fit(collocation, z)
-    q, (extra, _) = z[: collocation.nq], pose_noise_draws(collocation, z)
-    return uncertainty_of(fit, collocation.parameters, q, noise, errors, extra)
+    fit, _ = with_pose_noise(linearised_fit(collocation, z), collocation, z)
+    return uncertainty_of(fit, collocation.parameters, z[: collocation.nq], errors)
 
 
 @one_blas_thread()
 def uncertainty_of(
-    fit: LinearisedFit,
-    parameters: Parameters,
-    q: Array,
-    noise: NoiseOption = "auto",
-    errors: ErrorsOption = "auto",
-    extra: Extra | None = None,
+    fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel = AUTO
 ) -> Uncertainty:
     """Uncertainty of the parameters from the fit near its answer.
 
@@ -172,38 +186,35 @@ def uncertainty_of(
     fit : LinearisedFit
     parameters : Parameters
     q : (nq,) the estimated parameters in the solver's coordinates at the answer
-    noise : {"auto", "given", "estimated"}
-        "given" trusts the markers' σ, "estimated" scales it by the residuals: then only the ratios
-        between markers matter. "auto" tests the residuals: it scales σ where they are larger or
-        clearly smaller, for each marker by itself where markers differ.
-    errors : {"auto", "independent", "autocorrelated"}
-        What to assume of the errors; "auto" tests the residuals. The size of correlated errors
-        always follows from the residuals, but with σ given it is at least that. Correlated
-        residuals smaller than σ do not lower it: they may be small only where they were fitted.
-    extra : sequence of (K, T, M, 3), optional
-        Samples of what the residuals have besides their noise, in units of σ, by experiment.
+    errors : ErrorModel
+        The noise "given" trusts the markers' σ, "estimated" scales it by the residuals: then only
+        the ratios between markers matter. "auto" tests the residuals: it scales σ where they are
+        larger or clearly smaller, for each marker by itself where markers differ. The size of
+        correlated errors always follows from the residuals, but with σ given it is at least that.
+        Correlated residuals smaller than σ do not lower it: they may be small only where they
+        were fitted.
 
     Raises
     ------
     InputError
         If the noise is to be estimated from fewer measurements than parameters.
     """
-    _check(noise, errors)
     factored, shared = information(fit), fit.shared
     freedom = fit.measurements - round(factored.fitted, 9)
-    if noise == "estimated" and freedom < 1:
+    if errors.noise == "estimated" and freedom < 1:
         raise InputError(
             f"the noise cannot be estimated from {fit.measurements} measurements of "
             f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
-    bars = _error_bars(fit, factored, noise, errors, extra)
-    of_all, bounded = _known(bars.covariance, fit, parameters, q)
-    scatter = _scatter(fit, parameters, q, noise, errors, extra)
-    of_q, quantiles, wider = _widened(of_all[:shared, :shared], bars.quantiles, scatter)
+    all_free, quantiles, basis = _error_bars(fit, factored, errors)
+    of_all, bounded = _known(all_free, fit, parameters, q)
+    scatter = _scatter(fit, parameters, q, errors)
+    of_q, quantiles, wider = _widened(of_all[:shared, :shared], quantiles, scatter)
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
     longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
     sizes, deviations = relative_slopes(parameters, q), np.sqrt(np.diag(of_all)[shared:]).tolist()
     return Uncertainty(
+        **vars(basis),
         names=fit.names[:shared],
         covariance=of_q * np.outer(sizes, sizes),
         correlation=correlation_of(of_q),
@@ -212,51 +223,30 @@ def uncertainty_of(
         derived=derived_estimates(fit.derived, of_q, bounded, quantiles),
         nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
         nuisance_covariance=of_all[shared:, shared:],
-        noise=bars.noise,
-        errors=bars.errors,
-        level=bars.level,
-        dependence=bars.dependence,
         chi_squared=fit.chi_squared,
         degrees_of_freedom=freedom,
         notes=(
             *parameter_notes(parameters, estimates),
             *memory_notes(estimates, longest_s),
-            *size_notes(noise, bars.noise, bars.level, bars.errors),
-            *correlation_notes(errors, bars.errors, bars.dependence),
+            *size_notes(errors.noise, basis.noise, basis.level, basis.errors),
+            *correlation_notes(errors.errors, basis.errors, basis.dependence),
             *scatter_notes(fit, scatter),
         ),
         scatter=scatter,
         wider=wider,
-        outliers=bars.outliers,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _ErrorBars:
-    """Covariance of all parameters, quantiles of the shared ones, and what they are based on."""
-
-    covariance: Array
-    quantiles: Array
-    noise: Noise
-    errors: Errors
-    level: NoiseLevel
-    dependence: Dependence
-    outliers: tuple[Outlier, ...]
-
-
 def _error_bars(
-    fit: LinearisedFit,
-    factored: Information,
-    noise: NoiseOption,
-    errors: ErrorsOption,
-    extra: Extra | None,
-) -> _ErrorBars:
-    level = noise_level(fit, factored, extra)
+    fit: LinearisedFit, factored: Information, asked: ErrorModel
+) -> tuple[Array, Array, ErrorBasis]:
+    """Covariance of all parameters, quantiles of the shared ones, and what they are based on."""
+    level = noise_level(fit, factored)
     rest, outliers = set_apart(fit)
-    found, dependent = _dependence(rest, extra)
-    correlated = errors == "autocorrelated" or (errors == "auto" and dependent)
-    kind: Noise = level.kind if noise == "auto" else noise
-    if noise == "auto" and correlated and level.pooled < 1:
+    seen, dependent = _dependence(rest)
+    correlated = asked.errors == "autocorrelated" or (asked.errors == "auto" and dependent)
+    kind: Noise = level.kind if asked.noise == "auto" else asked.noise
+    if asked.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
     of_score, freedom = level.score_covariance(kind, factored, fit.shared)
     covariance, used = factored.fit.covariance(of_score), "independent"
@@ -265,10 +255,9 @@ def _error_bars(
         persistent = factored.fit.covariance(of_score)
         before, after = (np.diag(each)[: fit.shared] for each in (covariance, persistent))
         widens = (after > CONSEQUENCE**2 * before).any()
-        if errors == "autocorrelated" or kind != "given" or widens:
+        if asked.errors == "autocorrelated" or kind != "given" or widens:
             covariance, freedom, used = persistent, of_few, "autocorrelated"
-    quantiles = student_ppf(0.975, freedom)
-    return _ErrorBars(covariance, quantiles, kind, used, level, found, outliers)
+    return covariance, student_ppf(0.975, freedom), ErrorBasis(kind, used, level, seen, outliers)
 
 
 def _known(
@@ -303,22 +292,16 @@ def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Ar
 
 
 def _scatter(
-    fit: LinearisedFit,
-    parameters: Parameters,
-    q: Array,
-    noise: NoiseOption,
-    errors: ErrorsOption,
-    extra: Extra | None,
+    fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel
 ) -> Scatter | None:
     """What recordings say one by one, with error bars of their own."""
     if len(recordings_of(fit)) < 2:
         return None
     known, sizes = {}, relative_slopes(parameters, q)
-    for blocks, alone, step in single_fits(fit):
+    for alone, step in single_fits(fit):
         if alone.measurements <= len(alone.names):
             continue
-        own = None if extra is None else [extra[k] for k in blocks]
-        found = uncertainty_of(alone, parameters, q, noise, errors, own)
+        found = uncertainty_of(alone, parameters, q, errors)
         independent = least_squares(alone).errors[: fit.shared] ** 2
         variances = np.diag(found.covariance) / sizes**2
         known[alone.blocks[0].name] = step[: fit.shared], variances, independent
@@ -335,34 +318,21 @@ def _no_information(parameters: Parameters, q: Array, variances: Array) -> NDArr
     return np.array(found, dtype=bool)
 
 
-def _check(noise: str, errors: str) -> None:
-    for name, value, known in (
-        ("noise", noise, get_args(NoiseOption)),
-        ("errors", errors, get_args(ErrorsOption)),
-    ):
-        if value not in known:
-            raise InputError(f"{name} is {value!r}; expected one of {', '.join(known)}")
-
-
-def _dependence(fit: LinearisedFit, extra: Extra | None) -> tuple[Dependence, bool]:
+def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     """How the residuals hang together, and whether more than what is known to add to the noise."""
     factored = information(fit)
-    level, found = noise_level(fit, factored, extra), dependence(fit, factored)
+    level, found = noise_level(fit, factored), dependence(fit, factored)
     found = replace(found, lag1_deviation=found.lag1_deviation * level.unevenness)
-    return found, found.found and not _expected(fit, factored, level, found, extra)
+    return found, found.found and not _expected(fit, factored, level, found)
 
 
 def _expected(
-    fit: LinearisedFit,
-    factored: Information,
-    level: NoiseLevel,
-    found: Dependence,
-    extra: Extra | None,
+    fit: LinearisedFit, factored: Information, level: NoiseLevel, found: Dependence
 ) -> bool:
     """Whether what is known to add to the noise makes residuals as dependent as they are."""
-    if extra is None or all(each is None for each in extra):
+    added = drawn(fit)
+    if not len(added[0]):
         return False
-    added = drawn(fit, extra)
     rng = np.random.default_rng(0)
     size = np.sqrt(max(1.0, level.pooled))
     errors = [

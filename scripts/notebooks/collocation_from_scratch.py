@@ -69,7 +69,7 @@ from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.diagnostics import diagnose
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.profile import profile_of
-from collocation_sysid.statistics.uncertainty import uncertainty_of
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_of
 
 mpl.rcParams["figure.dpi"] = 110
 HERE = [Path.cwd(), *Path.cwd().parents]
@@ -1072,7 +1072,7 @@ aware = replace(wrong, nuisance=Nuisance.none(camera_offset_m=0.005))
 offsets = {}
 for name, experiment in (("as told", wrong), ("offset estimated", aware)):
     found, local = fit(experiment)
-    bars = uncertainty_of(local, problem.parameters, found.q, "given", "independent")
+    bars = uncertainty_of(local, problem.parameters, found.q, ErrorModel("given", "independent"))
     offsets[name] = np.log(list(found.parameters.values())), np.sqrt(np.diag(bars.covariance))
     print(f"{name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(bars.estimates)
@@ -1147,7 +1147,7 @@ drifting = replace(
 )
 found, local = fit(drifting)
 for errors in ("independent", "auto"):
-    bars = uncertainty_of(local, problem.parameters, found.q, errors=errors)
+    bars = uncertainty_of(local, problem.parameters, found.q, ErrorModel(errors=errors))
     print(f"errors = {errors!r} → {bars.errors}")
     table(bars.estimates)
 print("\n".join(bars.notes))
@@ -1431,7 +1431,7 @@ for name, text in texts.items():
     (mine / "problem.toml").write_text(text)
     loaded = cs.Problem.read(mine / "problem.toml")
     found, local = fit(loaded.experiments[0], loaded.parameters)
-    bars = uncertainty_of(local, loaded.parameters, found.q, errors="independent")
+    bars = uncertainty_of(local, loaded.parameters, found.q, ErrorModel(errors="independent"))
     spread[name] = np.sqrt(np.diag(bars.covariance))
     print(f"places {name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(bars.estimates)
