@@ -200,6 +200,16 @@ class Solution:
         """Values by the user's names."""
         return self.collocation.parameters.values(self.q)
 
+    @cached_property
+    def parts(self) -> list[Part]:
+        """Every fitted experiment at the solution."""
+        return self.collocation.parts(self.z)
+
+    def part_of(self, experiment: str) -> Part | None:
+        """That of one experiment, by name; None where it was not fitted."""
+        named = {part.segment.experiment.name: part for part in self.parts}
+        return named.get(experiment)
+
     @property
     def positions_m(self) -> list[Array]:
         """Node positions (N, n, 3) on the collocation grid of each fitted experiment."""
@@ -209,13 +219,12 @@ class Solution:
     @cached_property
     def readings_m(self) -> list[Array]:
         """Fitted markers (T, M, 3) of each experiment, with its φ."""
-        parts = self.collocation.parts(self.z)
-        return [part.segment.markers.of_positions(part.x, part.phi) for part in parts]
+        return [part.segment.markers.of_positions(part.x, part.phi) for part in self.parts]
 
     @cached_property
     def wrenches(self) -> dict[str, list[Array]]:
         """What the sensors of each fitted experiment should read, (S, 6), NaN where not known."""
-        parts = [part for part in self.collocation.parts(self.z) if part.segment.sensors]
+        parts = [part for part in self.parts if part.segment.sensors]
         return {part.segment.experiment.name: part.sensing.wrenches(part.x) for part in parts}
 
     @cached_property
@@ -236,7 +245,7 @@ class Solution:
                 gauge.gauge.name: gauge.said(gauge.of_motion(part.motion, part.phi))
                 for gauge in part.segment.gauges
             }
-            for part in self.collocation.parts(self.z)
+            for part in self.parts
         }
 
     @cached_property

@@ -68,12 +68,9 @@ def _told_of_cells(finished: Answer, body: Body) -> dict[str, Any]:
 
 
 def _write_all_frames(finished: Answer, place: Path) -> None:
-    solution = finished.solution
-    collocation = solution.collocation
-    for part in collocation.parts(solution.z):
+    for part in finished.solution.parts:
         segment, positions = part.segment, part.x.reshape(len(part.x), -1, 3)
-        alone = len(collocation.segments) == 1
-        here = place if alone else place / segment.experiment.name
+        here = place if len(finished.solution.parts) == 1 else place / segment.experiment.name
         here.mkdir(exist_ok=True)
         body = segment.body
         residual = np.zeros((len(positions), segment.dofs))
@@ -86,21 +83,17 @@ def _write_all_frames(finished: Answer, place: Path) -> None:
             body.element,
             body.nodes_m,
             {"residual_force_n": residual.reshape(positions.shape)},
-            fields=ElementFields.of(body, body.theta(solution.parameters)),
+            fields=ElementFields.of(body, body.theta(finished.solution.parameters)),
             cell_data=_told_of_cells(finished, body),
         )
 
 
 def replays(finished: Answer) -> list[Replay]:
     """The experiments as they are looked at: those fitted, then those for validation."""
-    solution = finished.solution
-    fitted = {
-        segment.experiment.name: (positions[segment.markers.grid_rows], readings)
-        for segment, positions, readings in zip(
-            solution.collocation.segments, solution.positions_m, solution.readings_m, strict=True
-        )
-    }
-    seen = []
+    fitted, seen = {}, []
+    for part, readings in zip(finished.solution.parts, finished.solution.readings_m, strict=True):
+        x = part.x[part.segment.markers.grid_rows]
+        fitted[part.segment.experiment.name] = x.reshape(len(x), -1, 3), readings
     for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
@@ -121,14 +114,13 @@ def replays(finished: Answer) -> list[Replay]:
 
 def _seen(finished: Answer, experiment: Experiment) -> dict[str, Array]:
     """What depth cameras see, see `Replay.seen`; nothing of what was not fitted."""
-    if not experiment.depths:
+    part = finished.solution.part_of(experiment.name)
+    if part is None or not experiment.depths:
         return {}
     from .seen import seen_as_fitted  # which needs matplotlib
 
     return {
         reading.sighting.view.depth.name: seen_as_fitted(part, reading, looked)
-        for part in finished.solution.collocation.parts(finished.solution.z)
-        if part.segment.experiment.name == experiment.name
         for reading, looked in part.sights
     }
 
@@ -139,9 +131,8 @@ def _touched(
     """Gaps and pressures of the surface; None where there is nothing to touch."""
     if not experiment.obstacles:
         return None
-    for part in finished.solution.collocation.parts(finished.solution.z):
-        if part.segment.experiment.name == experiment.name:
-            experiment = part.segment.corrected(part.phi)
+    if (part := finished.solution.part_of(experiment.name)) is not None:
+        experiment = part.segment.corrected(part.phi)
     theta = experiment.body.theta(finished.solution.parameters)
     return on_surface(experiment, np.array(theta), positions_m.reshape(len(positions_m), -1))
 
@@ -160,13 +151,10 @@ def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
     """(S, 19) of each sensor: time, and the wrench as measured, fitted and simulated."""
     sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
     rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
-    readings = []
-    for k, sensor in enumerate(sensors):
-        nothing = np.full_like(sensor.values, np.nan)
-        fit = fitted[experiment.name][k] if experiment.name in fitted else nothing
-        rolled = rollout.wrenches[k] if isinstance(rollout, Rollout) else nothing
-        readings.append(np.column_stack([sensor.t_s, sensor.values, fit, rolled]))
-    return readings
+    fit = fitted.get(experiment.name, [None] * len(sensors))
+    rolled = rollout.wrenches if isinstance(rollout, Rollout) else [None] * len(sensors)
+    both = zip(sensors, fit, rolled, strict=True)
+    return [_compared(sensor.t_s, sensor.values, *models) for sensor, *models in both]
 
 
 def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
@@ -175,15 +163,15 @@ def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
     rolled = rollout.readings if isinstance(rollout, Rollout) else {}
     both = fit.get(experiment.name, {}), rolled
     return {
-        gauge.name: np.column_stack(
-            [
-                gauge.times,
-                gauge.measured,
-                *(each.get(gauge.name, np.full_like(gauge.measured, np.nan)) for each in both),
-            ]
-        )
+        gauge.name: _compared(gauge.times, gauge.measured, *(each.get(gauge.name) for each in both))
         for gauge in experiment.readings
     }
+
+
+def _compared(t_s: Array, measured: Array, *models: Array | None) -> Array:
+    """(S, 1 + 3m) times, what is measured, fitted and simulated; NaN where there is none."""
+    there = (np.full_like(measured, np.nan) if each is None else each for each in models)
+    return np.column_stack([t_s, measured, *there])
 
 
 def _places_m(finished: Answer, experiment: str) -> Array | None:

@@ -27,7 +27,7 @@ from ..runs.result import Result
 
 ARRAYS_FILE = "trajectory.npz"
 # What stands before the number of a wrench, and the names of readings of one's own and of fields.
-WRENCH, READING, FIELD, SEEN = "wrench_", "reading_", "field_", "seen_"
+WRENCH, GROUPS = "wrench_", {"readings": "reading_", "fields": "field_", "seen": "seen_"}
 # Of the body, and so the same for all experiments of a run.
 OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes,
@@ -216,9 +216,8 @@ class Replay:
         stored["static"] = np.array(True) if self.static else None
         stored["residuals_m"] = None if self.markers_m is None else self.markers_m - self.measured_m
         stored |= {f"{WRENCH}{k}": values for k, values in enumerate(self.wrenches, start=1)}
-        stored |= {f"{READING}{name}": values for name, values in self.readings.items()}
-        stored |= {f"{FIELD}{name}": values for name, values in self.fields.items()}
-        stored |= {f"{SEEN}{name}": values for name, values in self.seen.items()}
+        for group, front in GROUPS.items():
+            stored |= {f"{front}{name}": values for name, values in getattr(self, group).items()}
         there = {key: value for key, value in stored.items() if value is not None}
         return {key if key in OF_BODY else prefix + key: value for key, value in there.items()}
 
@@ -239,12 +238,9 @@ class Replay:
         }
         keys = (f"{prefix}{WRENCH}{k}" for k in count(1))
         stored["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
-        said = f"{prefix}{READING}"
-        stored["readings"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
-        said = f"{prefix}{FIELD}"
-        stored["fields"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
-        said = f"{prefix}{SEEN}"
-        stored["seen"] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
+        for group, front in GROUPS.items():
+            said = f"{prefix}{front}"
+            stored[group] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)
         stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
@@ -304,15 +300,16 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
             raise ValueError(f"{key} holds numbers that are not finite")
         if kinds == "f" and float(np.nanmax(np.abs(array), initial=0.0)) > LARGEST:
             raise ValueError(f"{key} holds numbers above {LARGEST:g}")
-    for name, said in arrays["readings"].items():
-        if said.dtype.kind != "f" or said.ndim != 2 or said.shape[1] % 3 != 1 or said.size < 4:
-            raise ValueError(f"{READING}{name} is {said.dtype} of shape {said.shape}")
-    for name, said in arrays["fields"].items():
-        if said.dtype.kind != "f" or said.shape != (len(arrays["tetrahedra"]), 4):
-            raise ValueError(f"{FIELD}{name} is {said.dtype} of shape {said.shape}")
-    for name, said in arrays["seen"].items():
-        if said.dtype.kind != "f" or said.ndim != 2 or said.shape[1] != 8:
-            raise ValueError(f"{SEEN}{name} is {said.dtype} of shape {said.shape}")
+    elements = len(arrays["tetrahedra"])
+    fits = {
+        "readings": lambda shape: len(shape) == 2 and shape[0] and shape[1] % 3 == 1 < shape[1],
+        "fields": lambda shape: shape == (elements, 4),
+        "seen": lambda shape: shape[1:] == (8,),
+    }
+    for group, front in GROUPS.items():
+        for name, said in arrays[group].items():
+            if said.dtype.kind != "f" or not fits[group](said.shape):
+                raise ValueError(f"{front}{name} is {said.dtype} of shape {said.shape}")
     for key in ("tetrahedra", "surface", "surface_nodes"):
         if arrays[key].min() < 0 or arrays[key].max() >= sizes["n"]:
             raise ValueError(f"{key} names nodes that are not there")

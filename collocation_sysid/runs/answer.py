@@ -146,8 +146,8 @@ class Answer:
     @cached_property
     def places(self) -> dict[str, dict[str, Place]]:
         """Where the markers sit on the undeformed body, by fitted experiment and by marker."""
-        parts = self.solution.collocation.parts(self.solution.z)
-        return {p.segment.experiment.name: places_of(p, self.uncertainty) for p in parts}
+        named = ((part.segment.experiment.name, part) for part in self.solution.parts)
+        return {name: places_of(part, self.uncertainty) for name, part in named}
 
     @cached_property
     def trust(self) -> Trust:

@@ -16,6 +16,7 @@ from ..methods.solution import Solution, reading_rms, wrench_rms
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
 from ..program.channel import Forced, Motion
+from ..program.collocation import Part
 from ..program.gauge import gauge_readings
 from ..program.segment import Segment
 from ..program.simulation import Trajectory, simulate
@@ -92,12 +93,8 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
     own = zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)
     places = zip(experiment.markers.names, segment.places_m(phi).tolist(), strict=True)
     x = trajectory.positions_m.reshape(len(trajectory.positions_m), -1)
-    gauged = {
-        gauge.gauge.name: gauge.said(read)
-        for gauge, read in zip(
-            segment.gauges, _gauged(segment, x, trajectory.reactions, phi), strict=True
-        )
-    }
+    read = zip(segment.gauges, _gauged(segment, x, trajectory.reactions, phi), strict=True)
+    gauged = {gauge.gauge.name: gauge.said(each) for gauge, each in read}
     return Rollout(
         root_mean(present**2),
         float(present.max(initial=0.0)),
@@ -113,15 +110,13 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     """The experiment with its φ: those of the fit, or fitted with θ as found."""
-    collocation = solution.collocation
-    for part in collocation.parts(solution.z):
-        if part.segment.experiment.name == experiment.name:
-            return part.segment, part.phi
+    if (part := solution.part_of(experiment.name)) is not None:
+        return part.segment, part.phi
     values, body = solution.parameters, experiment.body
     alone = replace(
-        collocation,
+        solution.collocation,
         experiments=[replace(experiment, validation=False)],
-        parameters=collocation.parameters.fixed_at(
+        parameters=solution.collocation.parameters.fixed_at(
             {name: values[name] for name in body.used_names(list(values))}
         ),
     )
@@ -150,8 +145,9 @@ def step_error(
     moving = [s.experiment for s in collocation.segments if not s.experiment.static]
     if not moving or any(experiment.obstacles for experiment in moving):
         return None
-    for segment, readings in zip(collocation.segments, solution.readings_m, strict=True):
-        experiment, rollout = segment.experiment, rollouts.get(segment.experiment.name)
+    for part, readings in zip(solution.parts, solution.readings_m, strict=True):
+        segment, experiment = part.segment, part.segment.experiment
+        rollout = rollouts.get(experiment.name)
         share = _share(problem, segment)
         if not isinstance(rollout, Rollout) or share is None:
             return None
@@ -161,20 +157,17 @@ def step_error(
         for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
             way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
             apart.append(way.reshape(-1, 2, 3))
-        apart += _of_gauges(solution, segment, rollout.trajectory, share)
+        apart += _of_gauges(part, rollout.trajectory, share)
     change = changes_towards(fit, apart)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
     linear, order = problem.parameters.linear, as_scheme(problem.scheme).order
     return Refinement(numerical_errors(estimates, [values_of(collocation, q)], [], order, linear))
 
 
-def _of_gauges(
-    solution: Solution, segment: Segment, trajectory: Trajectory, share: float
-) -> list[Array]:
+def _of_gauges(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
     """A share of the way of one's own readings to a forward simulation, of each (S, G, 3)."""
-    if not segment.gauges:
+    if not (segment := part.segment).gauges:
         return []
-    (part,) = (p for p in solution.collocation.parts(solution.z) if p.segment is segment)
     fitted = part.x[segment.markers.grid_rows], (Grid.of(segment.dynamics), part.motion.forced)
     rolled = trajectory.positions_m.reshape(len(fitted[0]), -1), trajectory.reactions
     here, there = (_gauged(segment, *each, part.phi) for each in (fitted, rolled))

@@ -143,7 +143,7 @@ def _solved(
 
 def _seen(solution: Solution) -> Iterator[str]:
     """How near the surface is to what depth cameras saw, and what of that was left out."""
-    for part in solution.collocation.parts(solution.z):
+    for part in solution.parts:
         for reading, looked in part.sights:
             apart_m, seen = reading.apart_m(looked, part.phi), reading.sighting
             said = ", ".join(f"{count} {why}" for why, count in seen.left_out.items() if count)

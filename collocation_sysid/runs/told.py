@@ -178,7 +178,7 @@ def _recordings(answer: Answer) -> dict[str, RecordingsAgreement] | None:
 
 def _fit(answer: Answer) -> FoundFit:
     solution, experiments = answer.solution, {}
-    for part in solution.collocation.parts(solution.z):
+    for part in solution.parts:
         experiment = part.segment.experiment
         name, markers, sensors = experiment.name, experiment.markers, part.segment.sensors
         sigmas = [s.wrench.sigmas**2 * np.where(s.wrench.measured, 1.0, np.nan) for s in sensors]
@@ -236,7 +236,7 @@ def _nuisance(answer: Answer) -> dict[str, dict[str, FoundNuisance]]:
     """Nuisance parameters but the places."""
     deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     named: dict[str, dict[str, FoundNuisance]] = {}
-    for part in answer.solution.collocation.parts(answer.solution.z):
+    for part in answer.solution.parts:
         for entry, name, value in part.segment.nuisance.valued(part.phi):
             error = deviations[name] * entry.sigma if name in deviations else None
             here = named.setdefault(part.segment.experiment.name, {})

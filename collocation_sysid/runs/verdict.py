@@ -61,8 +61,7 @@ def concerns(
         yield Concern("solve/no-error-bars", "doubtful")
     yield from allowance_concerns(solution)
     yield from marker_concerns(diagnoses)
-    parts = solution.collocation.parts(solution.z)
-    for part in parts:
+    for part in solution.parts:
         nuisance = part.segment.nuisance
         low, high = nuisance.limits(part.segment.chart.samples)
         # A lag and a tool may well be none.
@@ -72,7 +71,7 @@ def concerns(
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(instabilities(solution.collocation, solution.z))
-    yield from contact_concerns(touched(parts))
+    yield from contact_concerns(touched(solution.parts))
     for name, rollout in rollouts.items():
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
     collocation = solution.collocation

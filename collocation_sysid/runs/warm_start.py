@@ -79,7 +79,7 @@ class Earlier:
     def of(cls, solution: Solution) -> Earlier:
         """What was just found."""
         collocation, nuisance, places_m = solution.collocation, {}, {}
-        for part in collocation.parts(solution.z):
+        for part in solution.parts:
             segment = part.segment
             name = segment.experiment.name
             nuisance |= {f"{name}: {e.label}": v for e, _, v in segment.nuisance.valued(part.phi)}

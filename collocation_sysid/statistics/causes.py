@@ -293,7 +293,7 @@ UNITS = (
 
 def wrench_causes(solution: Solution) -> list[Hypothesis]:
     """What is likely described wrongly of the wrenches; empty where they fit."""
-    if not any(map(_missed, solution.collocation.parts(solution.z))):
+    if not any(map(_missed, solution.parts)):
         return []
     found = []
     for part in _from_markers(solution.collocation):
@@ -324,8 +324,7 @@ def _from_markers(collocation: Collocation) -> list[Part]:
     except (InputError, SimulationError):
         return []
     found = []
-    pairs = zip(seen, solution.collocation.parts(solution.z), strict=True)
-    for segment, part in pairs:
+    for segment, part in zip(seen, solution.parts, strict=True):
         known = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
         phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
         found.append(Part(segment, part.q, phi, part.x))

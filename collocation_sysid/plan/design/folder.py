@@ -14,6 +14,7 @@ import tomli_w
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from ...fem.constants import is_mode
+from ...problem.recording_schema import MovedSection
 from ...problem.schema import ProblemFile, completed
 from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
 from ...result.animation import film
@@ -30,16 +31,7 @@ NAME = "designed"
 SCHEMA = 1
 FRAMES_PER_SECOND = 25.0
 # What says how the files of a recording are read; those of a design are in the package's own form.
-OF_POSES = (
-    "poses",
-    "displacement",
-    "markers",
-    "weights",
-    "max_residual_m",
-    "quaternion",
-    "length_unit",
-    "interpolation",
-)
+OF_POSES = MovedSection.model_fields.keys() - {"gripper_to_body"}
 OF_MARKERS = (
     "names",
     "labels",
