@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,15 @@ from collocation_sysid import run
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.beginning import SWUNG, YOUNG_PA
+from collocation_sysid.problem.beginning import TEMPLATES
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.tables import read_pressure
 from collocation_sysid.statistics.modal import doubts
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from make_templates import KINDS, SWUNG, YOUNG_PA
 
 TIMES = [0.0, 0.1, 0.2]
 PRESSED_MM = [0.0, 0.25, 0.5]
@@ -315,6 +321,20 @@ def test_a_new_problem_of_each_kind_runs_as_it_is(tmp_path, monkeypatch, kind, d
     assert found.trust.verdict == "good"
     low, high = found.interval("young_pa")
     assert low < (SWUNG["young_pa"] if kind == "swing" else YOUNG_PA) < high
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_recordings_of_templates_are_what_a_simulation_gives(tmp_path, kind):
+    shutil.copytree(TEMPLATES / kind, tmp_path / kind)
+    shipped = sorted((TEMPLATES / kind).glob("*.csv"))
+    for file in shipped:
+        (tmp_path / kind / file.name).unlink()
+    KINDS[kind](tmp_path / kind)
+    for file in shipped:
+        made, there = ((at / file.name).read_text() for at in (tmp_path / kind, file.parent))
+        assert made.splitlines()[0] == there.splitlines()[0]
+        numbers = [np.genfromtxt(t.splitlines()[1:], delimiter=",") for t in (made, there)]
+        np.testing.assert_allclose(*numbers, rtol=1e-6, atol=1e-6 if kind == "swing" else 2e-4)
 
 
 def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):

@@ -14,8 +14,7 @@ from ..plan.design import Criterion, DesignOptions, Limits
 from ..plan.design import design as designed
 from ..plan.design.information import Kind, Over
 from ..result.writers import require_replaceable
-from ..tree import as_json
-from .common import EXIT_INTERRUPTED, errors, show
+from .common import EXIT_INTERRUPTED, errors
 from .options import OfProblem, OneExperiment, Out, Told, command
 
 commands = typer.Typer()
@@ -97,8 +96,5 @@ def design(options: Design) -> None:
             key = error.where in Limits.model_fields and error.source is None
             raise (error.located(options.limits) if key else error) from error
         write_design(answer, folder, options.film, progress.say)
-    if options.as_json:
-        typer.echo(as_json(as_dict(answer)))
-    else:
-        show(design_summary(answer, folder))
+    options.tell(as_dict(answer), design_summary(answer, folder))
     raise typer.Exit(EXIT_INTERRUPTED if answer.best.interrupted else 0)

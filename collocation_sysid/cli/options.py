@@ -9,7 +9,7 @@ are told before those of the bases.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache, reduce
@@ -31,9 +31,11 @@ import typer
 from typer.models import OptionInfo, ParameterInfo
 
 from ..checked import Options
+from ..display import Shown
 from ..errors import InputError
 from ..stated import attributes
-from .common import errors
+from ..tree import as_json
+from .common import errors, show
 
 if TYPE_CHECKING:
     from ..problem import Problem  # which takes a second to import
@@ -190,3 +192,10 @@ class Told(Options):
 
     as_json: AsJson = False
     quiet: Quiet = False
+
+    def tell(self, answer: Any, shown: Shown | Iterable[Shown]) -> None:
+        """Print the answer as JSON, or else what is shown of it."""
+        if self.as_json:
+            typer.echo(as_json(answer))
+        else:
+            show(shown)

@@ -16,7 +16,6 @@ from ..pipeline import run
 from ..result.synthesis import Recipe, write_data
 from ..result.writers import require_replaceable
 from ..runs.check import check_problem, glance
-from ..tree import as_json
 from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors, show
 from .options import OfProblem, Out, Told, command
 
@@ -90,10 +89,7 @@ def solve(options: Solve) -> None:
         finished = run(problem, *how, scheduler=options.scheduler, probe=options.probe)
         progress.say("writing the run folder")
         finished.save(folder)
-    if options.as_json:
-        typer.echo(as_json(finished.result))
-    else:
-        show(summary(finished.result, folder, options.budget))
+    options.tell(finished.result, summary(finished.result, folder, options.budget))
     status = finished.solution.status
     if status is Status.INTERRUPTED or finished.missing:
         raise typer.Exit(EXIT_INTERRUPTED)
@@ -180,10 +176,7 @@ def check(options: Check) -> None:
         _overlay(problem, options.out or Path("runs") / f"{run_name(options.problem)}_check")
     with Progress(errors, quiet=options.quiet) as progress:
         findings = check_problem(problem, progress.say, options.full)
-    if options.as_json:
-        typer.echo(json.dumps(findings.as_dict(), indent=1))
-    else:
-        show(closer_table(findings))
+    options.tell(findings.as_dict(), closer_table(findings))
     good = findings.derivatives_agree and not findings.causes
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 

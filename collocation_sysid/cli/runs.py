@@ -52,10 +52,8 @@ def refine(options: Refine) -> None:
         refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
     except KeyboardInterrupt:
         raise interrupted(f"what was solved is kept in {options.run_folder}") from None
-    if options.as_json:
-        typer.echo(as_json({**content(refinement), "trust": result.trust}))
-    else:
-        show([refinement_table(refinement.errors), verdict_of(result.trust)])
+    told = {**content(refinement), "trust": result.trust}
+    options.tell(told, [refinement_table(refinement.errors), verdict_of(result.trust)])
 
 
 @dataclass(frozen=True, kw_only=True)

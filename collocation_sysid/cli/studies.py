@@ -26,7 +26,6 @@ from ..plan.arguments import parse_methods, parse_over, read_truth
 from ..plan.table import Yardstick
 from ..plan.variants import models, parse_branches, parse_materials
 from ..problem import Problem
-from ..tree import as_json
 from .common import errors, interrupted, show
 from .options import OfProblem, Out, Told, command
 
@@ -198,7 +197,4 @@ def _study(
         write_report(report, folder)
     if not ended:
         raise interrupted(f"{len(report.records)} of {len(planned)} runs are kept in {folder}")
-    if options.as_json:
-        typer.echo(as_json(report_json(report)))
-    else:
-        show(study_tables(report, folder))
+    options.tell(report_json(report), study_tables(report, folder))

@@ -129,15 +129,15 @@ class New:
 )
 def new(options: New) -> None:
     """Write a commented problem file to start from."""
-    from ..problem.beginning import begin, write_template
+    from ..problem.beginning import begin
 
     folder, kind = Path(options.name), options.kind
-    file, *data = [write_template(folder)] if kind is None else begin(folder, kind.value)
+    file, *data = begin(folder, kind and kind.value)
     typer.echo(file)
     for each in data:
         typer.echo(each)
     yours = "put your mesh, poses and marker tracks beside it and name them in it"
-    example = "it runs as it is, on data simulated here; then put your own in their place"
+    example = "it runs as it is, on simulated data; then put your own in their place"
     errors.print(f"Next: {yours if kind is None else example}.", soft_wrap=True)
     for next_ in ("check", "solve"):
         errors.print(f"  collocation-sysid {next_} {shlex.quote(str(file))}", soft_wrap=True)

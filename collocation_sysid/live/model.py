@@ -6,7 +6,7 @@ rows have the stencils of the start, and its last row those of all later ones.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -346,10 +346,6 @@ class Model:
 def _only_experiment(problem: Problem) -> Experiment:
     fitted = [each for each in problem.experiments if not each.validation]
 
-    def refused(found: str, expected: str) -> InputError:
-        where = f"experiment '{fitted[0].name}'"
-        return InputError(f"{found} cannot be live; expected {expected}", problem.path, where)
-
     if len(fitted) != 1:
         raise InputError(
             f"{len(fitted)} experiments are fitted; live there is one, expected the others to be "
@@ -358,38 +354,41 @@ def _only_experiment(problem: Problem) -> Experiment:
             "experiment",
         )
     (experiment,) = fitted
-    if experiment.static:
-        raise refused("a static experiment", "a motion")
-    if experiment.start == "given":
-        raise refused("a start that is given", "one in equilibrium, or undeformed")
-    if experiment.body.remembers:
-        raise refused("a material with memory", "one without Prony branches")
-    if any(placed.force.carries for placed in experiment.body.placed_forces):
-        raise refused("a force that carries something from step to step", "none")
-    if experiment.actuators:
-        raise refused("tensions and pressures, which frames do not bring,", "none")
-    if experiment.depths:
-        raise refused("depth cameras, which frames do not bring,", "none")
-    if experiment.obstacles and experiment.nuisance.obstacle_time_s:
-        raise refused("an obstacle whose delay is estimated", "one whose clock is known")
-    if experiment.nuisance.sensor_lag_s and any(grasp.wrench for grasp in experiment.grasps):
-        raise refused("a sensor with a low-pass (sensor_lag)", "one without")
-    own = (generated(each.force, each.points.dofs) for each in experiment.body.placed_forces)
-    if any(law.takes(0) for law in own):
-        raise refused("a force that depends on time", "one that does not")
-    if not experiment.markers.names:
-        raise refused("an experiment without markers", "markers")
-    if any(np.isfinite([g.from_s, g.until_s]).any() for g in experiment.grasps):
-        raise refused("a grasp that holds for a while only", "grasps throughout")
-    if any(grasp.zero for grasp in experiment.grasps):
-        raise refused("a grasp whose zero is estimated", "one whose zero is known")
-    if not any(len(grasp.poses.t_s) > 1 for grasp in experiment.grasps):
-        raise refused("an experiment whose grasps never move", "a pose that moves")
-    for loads in (experiment.tied_mass_kg, experiment.node_forces_n):
-        found = loads(experiment.t_s)
-        if not np.allclose(found, found[:1]):
-            raise refused("a load that joins, leaves or changes", "loads that are always there")
+    for found, there, expected in _not_live(experiment):
+        if there:
+            where, message = f"experiment '{experiment.name}'", f"{found} cannot be live"
+            raise InputError(f"{message}; expected {expected}", problem.path, where)
     return experiment
+
+
+def _not_live(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
+    """What live does without, whether this has it, and what is expected instead."""
+    body, grasps, nuisance = experiment.body, experiment.grasps, experiment.nuisance
+    yield "a static experiment", experiment.static, "a motion"
+    given = experiment.start == "given"
+    yield "a start that is given", given, "one in equilibrium, or undeformed"
+    yield "a material with memory", body.remembers, "one without Prony branches"
+    carry = any(placed.force.carries for placed in body.placed_forces)
+    yield "a force that carries something from step to step", carry, "none"
+    yield "tensions and pressures, which frames do not bring,", experiment.actuators, "none"
+    yield "depth cameras, which frames do not bring,", experiment.depths, "none"
+    delayed = experiment.obstacles and nuisance.obstacle_time_s
+    yield "an obstacle whose delay is estimated", delayed, "one whose clock is known"
+    filtered = nuisance.sensor_lag_s and experiment.wrenches
+    yield "a sensor with a low-pass (sensor_lag)", filtered, "one without"
+    own = (generated(each.force, each.points.dofs) for each in body.placed_forces)
+    timed = any(law.takes(0) for law in own)
+    yield "a force that depends on time", timed, "one that does not"
+    yield "an experiment without markers", not experiment.markers.names, "markers"
+    brief = any(np.isfinite([g.from_s, g.until_s]).any() for g in grasps)
+    yield "a grasp that holds for a while only", brief, "grasps throughout"
+    zeroed = any(grasp.zero for grasp in grasps)
+    yield "a grasp whose zero is estimated", zeroed, "one whose zero is known"
+    moves = any(len(grasp.poses.t_s) > 1 for grasp in grasps)
+    yield "an experiment whose grasps never move", not moves, "a pose that moves"
+    loads = (each(experiment.t_s) for each in (experiment.tied_mass_kg, experiment.node_forces_n))
+    changing = not all(np.allclose(each, each[:1]) for each in loads)
+    yield "a load that joins, leaves or changes", changing, "loads that are always there"
 
 
 def _still(experiment: Experiment, collocation: Collocation) -> Experiment:

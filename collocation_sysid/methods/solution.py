@@ -292,8 +292,8 @@ def wrench_rms(
 
     None of what is not measured.
     """
-    sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-    apart = [read - sensor.values for read, sensor in zip(readings, sensors, strict=True)]
+    pairs = zip(readings, experiment.wrenches, strict=True)
+    apart = [read - sensor.values for read, sensor in pairs]
     both = np.concatenate(apart) if apart else np.zeros((0, 6))
     force, torque = (
         float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else None

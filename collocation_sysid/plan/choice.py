@@ -437,9 +437,8 @@ def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[st
     t_s, apart = experiment.t_s, rollout.trajectory.markers_m - markers.positions_m
     counted = markers.present
     if not markers.samples:
-        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-        t_s = np.concatenate([sensor.t_s for sensor in sensors])
-        pairs = zip(rollout.wrenches, sensors, strict=True)
+        t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
+        pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
         apart = np.concatenate([(read - sensor.values)[:, :3] for read, sensor in pairs])
         order, unit = np.argsort(t_s, kind="stable"), "N"
         t_s, apart = t_s[order], apart[order, None]

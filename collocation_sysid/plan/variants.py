@@ -201,7 +201,7 @@ def _measured(problem: Problem) -> dict[str, int]:
     """How many numbers each recording that is fitted has measured."""
     return {
         e.name: 3 * e.markers.samples
-        + sum(int(np.isfinite(g.wrench.values).sum()) for g in e.grasps if g.wrench is not None)
+        + sum(int(np.isfinite(wrench.values).sum()) for wrench in e.wrenches)
         for e in problem.experiments
         if not e.validation
     }

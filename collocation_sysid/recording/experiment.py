@@ -28,6 +28,7 @@ from .obstacle import Obstacle, with_frames_of
 from .pressure import Pressure
 from .tables import within
 from .tendon import Tendon
+from .wrench import Wrench
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -160,6 +161,11 @@ class Experiment:
     def gripping(self) -> tuple[Grasp, ...]:
         """The grasps that hold nodes of the body."""
         return tuple(grasp for grasp in self.grasps if not isinstance(grasp, Obstacle))
+
+    @property
+    def wrenches(self) -> tuple[Wrench, ...]:
+        """What the sensors of its grasps have measured, in their order."""
+        return tuple(grasp.wrench for grasp in self.grasps if grasp.wrench is not None)
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:

@@ -149,7 +149,7 @@ def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:
 
 def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
     """(S, 19) of each sensor: time, and the wrench as measured, fitted and simulated."""
-    sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
+    sensors = experiment.wrenches
     rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
     fit = fitted.get(experiment.name, [None] * len(sensors))
     rolled = rollout.wrenches if isinstance(rollout, Rollout) else [None] * len(sensors)

@@ -137,22 +137,17 @@ def _write_tables(
     """Write markers, poses and wrenches into the files of `_tables`."""
     noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
     names, tracks = experiment.markers.names, trajectory.markers_m + noise
-    write_markers_csv(files[0], experiment.t_s, names, tracks)
-    count = len(experiment.grasps)
-    for file, grasp in zip(files[1 : 1 + count], experiment.grasps, strict=True):
-        write_poses_csv(file, grasp.poses)
-    sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-    sensed = zip(files[1 + count :], sensors, trajectory.wrenches, strict=False)
-    for file, sensor, wrench in sensed:
+    left = iter(files)
+    write_markers_csv(next(left), experiment.t_s, names, tracks)
+    for grasp in experiment.grasps:
+        write_poses_csv(next(left), grasp.poses)
+    for sensor, wrench in zip(experiment.wrenches, trajectory.wrenches, strict=True):
         measured = np.where(sensor.measured, wrench, np.nan)
         noise = np.repeat([recipe.noise_n, recipe.noise_nm], 3) * rng.normal(size=wrench.shape)
-        write_wrench_csv(file, sensor.t_s, measured + noise)
-    own = zip(
-        files[1 + count + len(sensors) :], experiment.readings, trajectory.readings, strict=True
-    )
-    for file, gauge, read in own:
+        write_wrench_csv(next(left), sensor.t_s, measured + noise)
+    for gauge, read in zip(experiment.readings, trajectory.readings, strict=True):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
-        write_gauge_csv(file, gauge.times, gauge.columns, read + noise)
+        write_gauge_csv(next(left), gauge.times, gauge.columns, read + noise)
 
 
 def _refuse_unguessed(problem: Problem) -> None:
@@ -180,9 +175,8 @@ def _refuse_inputs(problem: Problem, place: Path) -> None:
 
 def _tables(experiment: Experiment, place: Path) -> list[Path]:
     """The marker file, one of poses for each grasp, and one for each sensor and own reading."""
-    sensors = sum(grasp.wrench is not None for grasp in experiment.grasps)
     kinds = [("poses", k) for k in range(len(experiment.grasps))]
-    kinds += [("wrench", k) for k in range(sensors)]
+    kinds += [("wrench", k) for k in range(len(experiment.wrenches))]
     names = [f"{kind}_{k + 1}" if k else kind for kind, k in kinds]
     names += [f"reading_{gauge.name}" for gauge in experiment.readings]
     return [place / f"{experiment.name}_{name}.csv" for name in ("markers", *names)]

@@ -68,8 +68,7 @@ def write_design(
         experiment = design.experiment
         markers = experiment.markers
         write_markers_csv(place / MARKERS_FILE, markers.t_s, markers.names, markers.positions_m)
-        sensors = [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
-        for sensor, wrench in zip(sensors, design.predicted.wrenches, strict=True):
+        for sensor, wrench in zip(experiment.wrenches, design.predicted.wrenches, strict=True):
             write_wrench_csv(place / WRENCH_FILE, sensor.t_s, wrench)
         if design.recording.problem.origin is not None:
             text = HEAD + tomli_w.dumps(_content(design, target.resolve()))

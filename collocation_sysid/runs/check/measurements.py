@@ -104,7 +104,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
         int(markers.missing.sum()),
         tuple(findings),
         (
-            *(["the wrench"] if any(g.wrench is not None for g in experiment.grasps) else []),
+            *["the wrench"] * bool(experiment.wrenches),
             *(gauge.name for gauge in experiment.readings),
             *(f"{sum(map(len, d.clouds)):,} points of '{d.name}'" for d in experiment.depths),
         ),

@@ -1,0 +1,96 @@
+"""Make the recordings beside the templates of `collocation-sysid new --kind`, simulated with noise.
+
+Poses and forces come from midpoint simulations and equilibria at `YOUNG_PA` or `SWUNG`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from collocation_sysid.arrays import Array
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.selection import Box
+from collocation_sysid.fem.structured import cylinder_of_edge
+from collocation_sysid.files import write_whole
+from collocation_sysid.problem import Problem
+from collocation_sysid.problem.beginning import TEMPLATES
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import (
+    Experiment,
+    Grasp,
+    Markers,
+    PoseSequence,
+    write_markers_csv,
+    write_poses_csv,
+)
+
+YOUNG_PA = 8e4
+SWUNG = {"young_pa": 8000.0, "poisson": 0.3, "gamma_r_s": 0.005, "gamma_m_1_s": 1.0}
+SEED = 1
+
+
+def swing(folder: Path) -> None:
+    """A foam cylinder that hangs from a gripper, which moves it to and fro."""
+    mesh = cylinder_of_edge(0.05, 0.15, 0.025)
+    body = Body(mesh, mass_kg=0.1)
+    t_s = np.arange(81) * np.float64(0.01)
+    hanging = Rotation.from_euler("x", 180, degrees=True).as_quat()
+    shift_m = 0.03 * np.outer(1 - np.cos(7 * t_s), [1, 0, 0]) + 0.02 * np.outer(
+        np.sin(11 * t_s) ** 2, [0, 1, 0]
+    )
+    poses = PoseSequence(t_s, shift_m, np.tile(hanging, (len(t_s), 1)))
+    places_m = np.array([[25, 0, 60], [0, 25, 105], [25, 0, 150], [-25, 0, 150]]) / 1000
+    markers = Markers(t_s, np.zeros((len(t_s), 4, 3)), 1e-3, places_m=places_m)
+    grasp = Grasp(Box((-1, -1, -1e-3), (1, 1, 1e-3)), poses)
+    tracks_m = simulate(Experiment(body, t_s, [grasp], markers), SWUNG).markers_m
+    tracks_m = tracks_m + np.random.default_rng(SEED).normal(scale=1e-3, size=tracks_m.shape)
+    mesh.write(folder / "body.vtu")
+    write_poses_csv(folder / "poses.csv", poses)
+    write_markers_csv(folder / "markers.csv", t_s, ["low", "middle", "end_1", "end_2"], tracks_m)
+
+
+def compression(folder: Path) -> None:
+    """A cylinder pressed by a fifth, as a machine writes it: compression is positive."""
+    t_s = np.arange(0.0, 60.5, 0.5)
+    names = "Time (s),Displacement (mm),Force (N)"
+    benched(folder, names, t_s, 0.1 * t_s, noise=0.1, scale=-4.0)
+
+
+def tension(folder: Path) -> None:
+    """A bar pulled by a third, in strain and stress."""
+    t_s = np.arange(0.0, 60.5, 0.5)
+    names = "Time (s),Strain (%),Stress (kPa)"
+    area_m2 = 2.56e-4
+    benched(folder, names, t_s, 0.5 * t_s, noise=0.02e-3 / area_m2, scale=4e-3 / area_m2)
+
+
+def benched(folder: Path, names: str, t_s: Array, moved: Array, noise: float, scale: float) -> None:
+    """The table of a test bench: what the crosshead does, and what the model answers to it.
+
+    The reaction of the part that is modelled is multiplied by `scale`.
+    """
+    file = folder / "run_1.csv"
+
+    def write(measured: Array) -> None:
+        rows = [f"{t:.1f},{m:.4f},{f:.4f}" for t, m, f in zip(t_s, moved, measured, strict=True)]
+        write_whole(file, "\n".join([names, *rows, ""]))
+
+    write(np.zeros(len(t_s)))
+    at_truth = [f"parameters.young_pa.guess={YOUNG_PA}"]
+    problem = Problem.read(folder / "problem.toml", at_truth, simulation=True)
+    (experiment,) = problem.experiments
+    (reaction,) = simulate(experiment, problem.parameters).wrenches
+    (sensor,) = experiment.wrenches
+    measured = scale * CubicSpline(sensor.t_s, reaction[:, 2])(t_s)  # between equilibria smooth
+    write(measured + np.random.default_rng(SEED).normal(scale=noise, size=len(t_s)))
+
+
+KINDS = {"swing": swing, "compression": compression, "tension": tension}
+
+if __name__ == "__main__":
+    for kind, write in KINDS.items():
+        write(TEMPLATES / kind)
