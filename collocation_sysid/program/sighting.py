@@ -65,7 +65,7 @@ FARTHEST = 4.0
 # Flat triangles that stand for a face of three nodes, or of six with those on ab, bc, ca.
 CORNERS = np.vstack([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
 FLAT = {3: np.array([[0, 1, 2]]), 6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])}
-LEFT_OUT = ("far", "turned away", "not chosen")
+LEFT_OUT = ("far", "grazing", "turned away", "not chosen")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +131,14 @@ class Skin:
         points = self.points(x, faces, np.tile(places, (len(self.faces), 1)))[1]
         return points.reshape(-1, 3, 3)
 
-    def facing(self, x: Array, eye_m: Array | None) -> NDArray[np.bool_]:
-        """(F·k,) flat triangles that are turned to a camera; all where there is none."""
+    def facing(self, x: Array, eye_m: Array | None, least: float = 0.0) -> NDArray[np.bool_]:
+        """(F·k,) flat triangles whose cosine to the way to a camera is larger; all of a cloud."""
         if eye_m is None:
             return np.ones(len(self.flat), dtype=bool)
         a, b, c = x[self.flat].transpose(1, 0, 2)
         normal, way = np.cross(b - a, c - a), eye_m - (a + b + c) / 3
         sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
-        return np.sum(normal * way, axis=1) >= GRAZING * sizes
+        return np.sum(normal * way, axis=1) > least * sizes
 
     def nearest(self, x: Array, points: Array, among: Index) -> tuple[Index, Array]:
         """Faces (P,), and places (P, 3) on them, nearest to points (P, 3), of some triangles."""
@@ -365,7 +365,7 @@ class Sighting:
 
     def missed_m(self, x: Array, phi: Array) -> Array:
         """How far (P,) parts of a first shape x (n, 3) that face the camera are from its points."""
-        view, turned = self.view, self.skin.facing(x, self.view.eye_m(phi, 0))
+        view, turned = self.view, self.skin.facing(x, self.view.eye_m(phi, 0), GRAZING)
         middles = x[self.skin.flat[turned]].mean(axis=1)
         limit_m = WIDE * float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
         return np.minimum(KDTree(view.world(phi, 0)).query(middles)[0], limit_m)
@@ -397,12 +397,15 @@ def _seen(
     low, high = x.min(axis=0) - gate_m, x.max(axis=0) + gate_m
     near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
     rotations, _ = view.motion
-    turned = np.flatnonzero(skin.facing(x, view.eye_m(phi, sample)))
+    eye_m = view.eye_m(phi, sample)
+    turned = np.flatnonzero(skin.facing(x, eye_m))
     near = near if len(turned) else near[:0]
     faces, places = near, np.zeros((0, 3))
     if len(near):
         faces, places = skin.nearest(x, world[near], turned)
     weights, feet, normals = skin.points(x, faces, places)
+    ways = normals if eye_m is None else eye_m - feet
+    seen = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
     away = world[near] - feet
     distance = np.linalg.norm(away, axis=1)
     across = np.linalg.norm(away - np.sum(away * normals, axis=1)[:, None] * normals, axis=1)
@@ -412,7 +415,7 @@ def _seen(
     alike = np.ones(len(near), dtype=bool)
     if cloud.shape[1] == 6:
         alike = np.sum(normals * (cloud[near, 3:] @ rotations[sample].T), axis=1) >= GRAZING
-    checks = [distance <= gate_m, alike, skin.chosen[faces]]
+    checks = [distance <= gate_m, seen, alike, skin.chosen[faces]]
     left = np.cumprod([np.ones(len(near), dtype=bool), *checks], axis=0)
     reasons = -np.diff(left.sum(axis=1))
     reasons[0] += len(cloud) - len(near)
