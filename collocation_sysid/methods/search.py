@@ -119,6 +119,8 @@ class ReducedSearch:
             self.p = collocation.parameters_of(start)
             self.x = [part.segment.grasped(part.x, part.phi) for part in collocation.parts(start)]
         self.point: Iterate | None = None
+        # The last trial, where cameras have looked anew.
+        self.looked: Any = None, None, None
         nodes = [segment.body.nodes_m for segment in collocation.segments]
         self.edge_m = min(segment.length_m for segment in collocation.segments)
         self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
@@ -332,14 +334,19 @@ class ReducedSearch:
 
     def _follow(self, rung: Horizon, point: Iterate) -> Iterate:
         """The point read where its estimates are."""
-        counts = [segment.rows_to_follow for segment in self.collocation.segments]
-        rows = rung.first_rows(point.trajectories, counts)
-        collocation, p = self.collocation.following(point.p, rows)
+        trial, collocation, after = self.looked
+        known = trial is point
+        if known:
+            p = after.p
+        else:
+            counts = [segment.rows_to_follow for segment in self.collocation.segments]
+            rows = rung.first_rows(point.trajectories, counts)
+            collocation, p = self.collocation.following(point.p, rows)
         if collocation is self.collocation or self.rereadings >= REREADINGS:
             return point
         self.rereadings += 1
         self._read_in(rung, collocation, p)
-        return rung.reread(p, point)
+        return after if known else rung.reread(p, point)
 
     def _is_seen_better(self, rung: Horizon, point: Iterate, trial: Iterate) -> bool:
         """Whether it is better where depth cameras look anew, too.
@@ -354,6 +361,7 @@ class ReducedSearch:
         self.most_seen = max(self.most_seen, before.measurements)
         after = self._follow(rung, trial)
         self.rereadings -= self.collocation is not before
+        self.looked = trial, self.collocation, after
         seen = self.collocation.measurements
         each, before_each = after.loss / max(1, seen), point.loss / max(1, before.measurements)
         self._read_in(rung, before, point.p)

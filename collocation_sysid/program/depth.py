@@ -24,7 +24,7 @@ from ..recording.nuisance import DEPTH_TIME
 from ..recording.placement import Placement
 from .channel import Points
 from .charts import Chart
-from .reading import GROUP, Pooled, Reading, Window, lagrange_weights, times_around
+from .reading import GROUP, Instrument, Pooled, Reading, Window, lagrange_weights, times_around
 from .sighting import Sighting
 
 # Times around a sample.
@@ -78,6 +78,10 @@ class DepthReading(Reading):
             sighting=sighting,
             at_s=at_s,
         )
+
+    @property
+    def _instruments(self) -> dict[tuple[int, int], Instrument]:
+        return self.sighting.view.instruments
 
     @cached_property
     def _times(self) -> NDArray[np.int64]:

@@ -159,11 +159,14 @@ class Segment:
     def depths(self) -> tuple[DepthReading, ...]:
         """Those of depth cameras."""
         how = self.dynamics.t_s, self.nuisance, self.huber
-        views = (
-            View.of(self.experiment, k, self.nuisance) for k in range(len(self.chart.sightings))
-        )
-        seen = zip(self.chart.sightings, views, strict=True)
+        seen = zip(self.chart.sightings, self.views, strict=True)
         return tuple(DepthReading.of(replace(each, view=view), *how) for each, view in seen)
+
+    @cached_property
+    def views(self) -> tuple[View, ...]:
+        """Of depth cameras."""
+        numbers = range(len(self.experiment.depths))
+        return tuple(View.of(self.experiment, k, self.nuisance) for k in numbers)
 
     @cached_property
     def readings(self) -> tuple[Reading, ...]:

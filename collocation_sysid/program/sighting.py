@@ -39,8 +39,8 @@ from ..recording.placement import nearest_on
 OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME)
 # Triangles, by their middles, of which the nearest point is taken.
 NEARBY = 10
-# Steps to it on a curved face.
-SETTLING = 3
+# Steps to it on a curved face, and shorter ones that end them.
+SETTLING, STILL = 3, 1e-6
 # Below this cosine between normal and view a point is seen at a grazing angle; measured normals
 # may be off by as much.
 GRAZING = 0.3
@@ -55,8 +55,8 @@ SAME = 0.2
 # at first, and the weight of how far points are beside those of how far they are along normals.
 # They count as so many independent ones beside the prior.
 SAMPLES, ITERATIONS, REACH, SLIDING, INDEPENDENT = 500, 25, 0.35, 0.2, 10000
-# Turns [rad] that it is begun from besides none.
-TURNED, EXACT = 0.2, 1e6
+# Turns [rad] that it is begun from besides none, and how many are followed to the end.
+TURNED, KEPT, EXACT = 0.2, 2, 1e6
 # More points of a cloud only make it slower.
 ENOUGH = 4000
 # An alignment farther than this many deviations of its prior is of something else.
@@ -143,27 +143,42 @@ class Skin:
     def nearest(self, x: Array, points: Array, among: Index) -> tuple[Index, Array]:
         """Faces (P,), and places (P, 3) on them, nearest to points (P, 3), of some triangles."""
         corners = x[self.flat[among]]
-        near = KDTree(corners.mean(axis=1)).query(points, min(NEARBY, len(corners)))[1]
-        near = near.reshape(len(points), -1)
-        repeated = np.repeat(points, near.shape[1], axis=0)
-        feet = nearest_on(repeated, corners[near.ravel()]).reshape(*near.shape, 3)
-        best = np.linalg.norm(feet - points[:, None], axis=2).argmin(axis=1)
-        rows = np.arange(len(points))
-        triangles, feet = near[rows, best], feet[rows, best]
+        middles = corners.mean(axis=1)
+        sizes = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+        found = KDTree(middles).query(points, min(NEARBY, len(corners)))
+        away, near = (np.reshape(each, (len(points), -1)) for each in found)
+        # Triangles whose middles are farther than this by their own size cannot be nearer.
+        triangles, least = near[:, 0].copy(), np.full(len(points), np.inf)
+        feet = np.zeros_like(points)
+        for rank, own in enumerate(near.T):
+            here = np.flatnonzero(away[:, rank] - sizes[own] < least)
+            on = nearest_on(points[here], corners[own[here]])
+            apart = np.linalg.norm(on - points[here], axis=1)
+            nearer = apart < least[here]
+            here, on, apart = here[nearer], on[nearer], apart[nearer]
+            triangles[here], feet[here], least[here] = own[here], on, apart
         a, b, c = corners[triangles].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         squares = np.sum(normal**2, axis=1)
         of_b = np.sum(np.cross(feet - a, c - a) * normal, axis=1) / squares
         of_c = np.sum(np.cross(b - a, feet - a) * normal, axis=1) / squares
         faces, places = self.at(among[triangles], np.column_stack([1 - of_b - of_c, of_b, of_c]))
-        for _ in range(SETTLING if self.faces.shape[1] > 3 else 0):
+        moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
+        for _ in range(SETTLING):
             # Faces are curved: what is nearest on the flat triangle is beside what is on them.
-            _, feet, along = self._along(x, faces, places)
-            way = np.einsum("pki,pi->pk", along, points - feet)
-            squares = np.einsum("pki,pli->pkl", along, along)
-            step = np.linalg.solve(squares, way[..., None])[..., 0]
-            places = np.clip(places + np.column_stack([step, -step.sum(axis=1)]), 0.0, 1.0)
-            places /= places.sum(axis=1, keepdims=True)
+            _, feet, along = self._along(x, faces[moving], places[moving])
+            by_a, by_b = along.transpose(1, 0, 2)
+            aa, ab, bb = (
+                np.sum(u * v, axis=1) for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
+            )
+            to_a, to_b = (np.sum(u * (points[moving] - feet), axis=1) for u in (by_a, by_b))
+            step = np.column_stack([bb * to_a - ab * to_b, aa * to_b - ab * to_a])
+            step /= (aa * bb - ab**2)[:, None]
+            settled = np.clip(places[moving] + np.column_stack([step, -step.sum(axis=1)]), 0.0, 1.0)
+            settled /= settled.sum(axis=1, keepdims=True)
+            far = np.abs(settled - places[moving]).max(axis=1) > STILL
+            places[moving] = settled
+            moving = moving[far]
         return faces, places
 
 
@@ -192,6 +207,11 @@ class View:
         rotations, translations = depth.camera.motion(depth.times[:1])
         pivot_m = (experiment.body.nodes_m.mean(axis=0) - translations[0]) @ rotations[0]
         return cls(depth, number, nuisance, pivot_m)
+
+    @cached_property
+    def instruments(self) -> dict[tuple[int, int], Any]:
+        """Of its readings, whose derivatives are generated once."""
+        return {}
 
     @cached_property
     def own(self) -> Index:
@@ -451,17 +471,26 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
     cloud, size = view.depth.points_m[sample], float(np.linalg.norm(np.ptp(x, axis=0)))
     tree = KDTree(cloud[:: 1 + len(cloud) // ENOUGH])
     gates = np.geomspace(REACH * size, view.depth.gate_m, ITERATIONS)
-    starts = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
-    tried = (_aligned(view, tree, places, normals, gates, start) for start in starts)
-    _, turn, shift = min(tried, key=lambda each: each[0])
+    turns = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
+    tried = [(1.0, Rotation.from_rotvec(turn), np.zeros(3)) for turn in turns]
+    for some in np.array_split(gates, 2):
+        tried = [_aligned(view, tree, places, normals, some, *start) for _, *start in tried]
+        tried = sorted(tried, key=lambda each: each[0])[:KEPT]
+    _, turn, shift = tried[0]
     return turn.as_rotvec(), shift
 
 
 def _aligned(
-    view: View, tree: KDTree, places: Array, normals: Array, gates: Array, start: Array
+    view: View,
+    tree: KDTree,
+    places: Array,
+    normals: Array,
+    gates: Array,
+    turn: Rotation,
+    shift: Array,
 ) -> tuple[float, Rotation, Array]:
-    """How much of the surface at (P, 3) misses the cloud, turn and shift, from some turn on."""
-    turn, shift, pivot = Rotation.from_rotvec(start), np.zeros(3), view.pivot_m
+    """How much of the surface at (P, 3) misses the cloud, turn and shift, from some on."""
+    pivot = view.pivot_m
     prior = np.concatenate([view.prior(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
     missed = 1.0
     for gate in gates:

@@ -15,30 +15,36 @@ import numpy as np
 
 from ...arrays import Array
 
+# So many are mapped at once, and more of them in blocks: a map takes longer to make than to use.
+BLOCK = 1024
+
 Instances = Callable[[list[Array]], list[Array]]
 
 
 def instances_by_casadi(function: ca.Function) -> Instances:
-    """The reference: mapped over so many instances as there are."""
+    """The reference: mapped over the instances."""
     mapped: dict[int, ca.Function] = {}
 
     def evaluate(inputs: list[Array]) -> list[Array]:
         count = inputs[0].shape[1]
-        if count not in mapped:
-            mapped[count] = function.map(count)
-        # Through buffers, as CasADi's own matrices take ten times as long.
-        buffer, run = mapped[count].buffer()
-        # CasADi declares no type for what it takes.
-        take: Any = buffer.set_arg
-        give: Any = buffer.set_res
         arguments = [np.ascontiguousarray(each.T, float) for each in inputs]
         outputs = [np.empty((count, function.nnz_out(k))) for k in range(function.n_out())]
-        for place, each in enumerate(arguments):
-            if each.size:
-                take(place, each.data)
-        for place, each in enumerate(outputs):
-            give(place, each.data)
-        run()
+        for first in range(0, count, BLOCK):
+            block = slice(first, min(count, first + BLOCK))
+            size = block.stop - first
+            if size not in mapped:
+                mapped[size] = function.map(size)
+            # Through buffers, as CasADi's own matrices take ten times as long.
+            buffer, run = mapped[size].buffer()
+            # CasADi declares no type for what it takes.
+            take: Any = buffer.set_arg
+            give: Any = buffer.set_res
+            for place, each in enumerate(arguments):
+                if each.size:
+                    take(place, each[block].data)
+            for place, each in enumerate(outputs):
+                give(place, each[block].data)
+            run()
         return [each.T for each in outputs]
 
     return evaluate
