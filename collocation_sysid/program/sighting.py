@@ -8,7 +8,7 @@ it follows, as charts of markers' places do. Between, residuals along the normal
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -54,11 +54,11 @@ SAME = 0.2
 # Of an alignment: points of the surface, iterations, the share of a body's size that it may be off
 # at first, and the weight of how far points are beside those of how far they are along normals.
 # They count as so many independent ones beside the prior.
-SAMPLES, ITERATIONS, REACH, SLIDING, INDEPENDENT = 500, 25, 0.35, 0.2, 10000
+SAMPLES, ITERATIONS, REACH, SLIDING, INDEPENDENT = 250, 25, 0.35, 0.2, 10000
 # Turns [rad] that it is begun from besides none, and how many are followed to the end.
 TURNED, KEPT, EXACT = 0.2, 2, 1e6
 # More points of a cloud only make it slower.
-ENOUGH = 4000
+ENOUGH = 2000
 # An alignment farther than this many deviations of its prior is of something else.
 FARTHEST = 4.0
 
@@ -364,8 +364,10 @@ class Sighting:
         far = np.abs(moved[view.own]).max(initial=0.0) > FARTHEST
         gate_m = max(WIDE * float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))), view.depth.gate_m)
         phi = phi if far else moved
-        wide = cls.of(view, body, shapes_m, phi, gate_m)
-        return wide.narrowed(shapes_m, phi) or wide
+        some = tuple(cloud[:: 1 + len(cloud) // ENOUGH] for cloud in view.depth.clouds)
+        rough = View(replace(view.depth, clouds=some), view.number, view.nuisance, view.pivot_m)
+        gate_m = cls.of(rough, body, shapes_m, phi, gate_m).next_gate_m(shapes_m, phi)
+        return cls.of(view, body, shapes_m, phi, gate_m)
 
     def following(self, shapes_m: Array, phi: Array) -> Sighting:
         """That in the first shapes (s, n, 3), which are known; itself where nothing has moved."""
@@ -377,10 +379,9 @@ class Sighting:
         for k in range(known if still else 0):
             way = self.view.world(phi, k) - self.view.world(before, k)
             still = still and np.abs(way).max(initial=0.0) < limit_m
-        narrow = self.narrowed(whole, phi)
-        if still:
-            return narrow or self
-        gate_m = self.gate_m if narrow is None else narrow.gate_m
+        gate_m = self.next_gate_m(whole, phi)
+        if still and gate_m == self.gate_m:
+            return self
         return Sighting.of(self.view, self.body, whole, phi, gate_m)
 
     def missed_m(self, x: Array, phi: Array) -> Array:
@@ -390,12 +391,10 @@ class Sighting:
         limit_m = WIDE * float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
         return np.minimum(KDTree(view.world(phi, 0)).query(middles)[0], limit_m)
 
-    def narrowed(self, shapes_m: Array, phi: Array) -> Sighting | None:
-        """That within a narrower gate, where points are near enough to the surface for one."""
+    def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
+        """A narrower gate, where points are near enough to the surface for one; else its own."""
         gate_m = max(self._scatter_m(shapes_m, phi), self.view.depth.gate_m)
-        if gate_m > NARROWER * self.gate_m:
-            return None
-        return Sighting.of(self.view, self.body, shapes_m, phi, gate_m)
+        return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
 
     def _scatter_m(self, shapes_m: Array, phi: Array) -> float:
         """How far points of the body may be from the surface, by how far half of them are."""

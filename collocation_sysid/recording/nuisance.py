@@ -328,7 +328,7 @@ DEPTH_BIAS = NuisanceRow("depth_bias_m", "m", 5e-3, key="depth_bias", of="depth"
     label="bias of {which}", told="depth is off by {size}",
     said="what is to be added to each depth of an image")
 DEPTH_SCALE = NuisanceRow("depth_scale", "1", 5e-3, key="depth_scale", of="depth",
-    changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, by="worst",
+    changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, reach=4.0, by="worst",
     label="scale of {which}", told="depth is off by {size} of itself",
     said="a factor on each depth of an image, how far from one")
 DEPTH_TIME = NuisanceRow("depth_time_s", "s", 5e-3, key="depth_time", of="depth",
