@@ -170,6 +170,54 @@ def test_other_methods_find_the_same_field(method):
         assert solution.parameters[name] == pytest.approx(value, rel=1e-4, abs=1e-4)
 
 
+HEAVY, OF_DENSITY = 1.4, cs.Field(0.05, "density_kg_m3", 20, 0.3)
+
+
+@cache
+def weighed() -> tuple[cs.Solution, FieldEstimate]:
+    """A bar whose lower half is heavier, of as much mass as is stated, and its field of density."""
+    lower = centres(bar())[:, 2] < 0.06
+    light = 200.0 / (1 + HEAVY)
+    half = cs.Region("half", lower, density_kg_m3=HEAVY * light)
+    true = Body(bar().mesh, density_kg_m3=light, regions=[half])
+    values = {**KNOWN, "young_pa": YOUNG_PA}
+    tracks = cs.simulate(swung(true), values, "midpoint").markers_m
+    noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
+    seen = cs.with_markers(swung(bar(OF_DENSITY)), tracks + noise)
+    unknown = {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}
+    solution = cs.solve(cs.Problem([seen], unknown, substeps=1))
+    collocation = solution.collocation
+    known = covariance(collocation, solution.z)
+    body = collocation.segments[0].body
+    (field,) = fields_of(body, collocation.parameters, solution.q, known)
+    return solution, field
+
+
+def test_a_heavier_half_is_found_beside_the_stiffness():
+    solution, field = weighed()
+    assert solution.status.converged
+    z_m, light = centres(bar())[:, 2], 200.0 / (1 + HEAVY)
+    truth = light * np.where(z_m < 0.06, HEAVY, 1.0)
+    low, high = field.ci95
+    told = field.told
+    assert told.mean() > 0.5
+    assert np.mean((low < truth) & (truth < high)) > 0.9
+    upper, lower = (field.value[part].mean() for part in (z_m > 0.08, z_m < 0.04))
+    assert 1.2 < lower / upper < 1.6
+    assert solution.parameters["young_pa"] == pytest.approx(YOUNG_PA, rel=0.1)
+
+
+def test_a_field_of_density_weighs_what_its_shapes_say(rng):
+    body = bar(OF_DENSITY)
+    shares = rng.normal(size=20)
+    values = {**KNOWN, "young_pa": YOUNG_PA, **dict(zip(body.mode_names, shares, strict=True))}
+    mass_kg = body.mass_of_dofs(body.theta(values))[::3]
+    local = 100.0 * (1 + body.parts[0].field.shapes @ shares)
+    expected = np.zeros(len(body.nodes_m))
+    np.add.at(expected, body.cells, (local * body.mesh.volumes_m3 / 4)[:, None])
+    np.testing.assert_allclose(mass_kg, expected, rtol=1e-12)
+
+
 def test_an_even_body_is_found_even():
     field = found(1.0)
     assert held_share(field, 1.0) >= 0.95
@@ -214,7 +262,10 @@ def test_evidence_is_that_of_a_normal_marginal_likelihood(rng):
 @pytest.mark.parametrize(
     ("stated", "message"),
     [
-        ({"parameter": "density_kg_m3"}, "expected one of young_pa, lambda_pa, mu_pa, gamma_r_s"),
+        (
+            {"parameter": "E"},
+            "expected one of young_pa, lambda_pa, mu_pa, gamma_r_s, density_kg_m3",
+        ),
         ({"modes": 1000}, "expected at most 60, with 63 nodes"),
         ({"length_m": 0.0}, "length_m of a field is 0; expected a number above 0"),
         ({"length_m": []}, "length_m of a field is"),

@@ -144,9 +144,16 @@ def differing(moved: Experiment, scheme: str = "midpoint", values=GUESS, **body)
     """Stiffness from place to place, of a body that is uneven already."""
     field = cs.Field(0.1, modes=3)
     made = cs.Body(moved.body.mesh, density_kg_m3=30.0, **({"field": field} | body))
+    made = made.with_free_densities(made.weighed_by(values.names))
     known = values.with_fields([made])
     uneven = {name: 0.4 * (-1) ** k for k, name in enumerate(made.mode_names)}
     return program(replace(moved, body=made), parameters=known.with_guess(uneven), scheme=scheme)
+
+
+IN_MASS, OF_DENSITY = (
+    cs.Field(0.1, "density_kg_m3", 3),
+    Parameters.of({"density_kg_m3": cs.Unknown(25.0)}),
+)
 
 
 def differing_core() -> Collocation:
@@ -406,6 +413,13 @@ PROGRAMS: dict[str, Make] = {
     "field, bdf2": lambda: differing(swung(), "bdf2"),
     "field, paper's damping": lambda: differing(swung(), damping="rayleigh"),
     "field, shear": lambda: differing(swung(), field=cs.Field(0.1, "mu_pa", 2)),
+    "field, density": lambda: differing(swung(), field=IN_MASS),
+    "field, density, free, bdf2": lambda: differing(
+        swung(), "bdf2", Parameters((*GUESS.items, *OF_DENSITY.items)), field=IN_MASS
+    ),
+    "field, density, static": lambda: differing(
+        measured(block("z", gravity_m_s2=HANGING)), field=IN_MASS
+    ),
     "field, regions": differing_core,
     "field, memory": lambda: differing(
         measured(hung_cube(3, (1, 1, 2))), values=guesses(TWO, 1.1), prony=["prony_1", "prony_2"]

@@ -179,11 +179,11 @@ class Body(Discretisation):
         """Names of what is kept and follows from the rest."""
         return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
-    def _lumped(self, part: BodyPart) -> Array:
-        """(n,) lumped volume of a part."""
-        shares = self.mesh.volumes_m3[part.cells, None] * self.element.mass_shares
+    def _lumped(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
+        """(n,) lumped volume of a part, or of shares (E,) of its cells."""
+        volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
-        np.add.at(volume, self.cells[part.cells], shares)
+        np.add.at(volume, self.cells[part.cells], volumes_m3[:, None] * self.element.mass_shares)
         return volume
 
     def with_free_densities(self, parts: Collection[str]) -> Body:
@@ -262,7 +262,7 @@ class Body(Discretisation):
         found: list[int] = []
         for part, start, modes in zip(self.parts, self.starts, self.mode_places, strict=False):
             found += [*range(start, start + len(part.material.constants))]
-            found += [*range(modes.start, modes.stop)]
+            found += [*range(modes.start, modes.stop)] if part.stress_field else []
         return found
 
     @property
@@ -272,17 +272,26 @@ class Body(Discretisation):
 
     @cached_property
     def mass_slopes(self) -> dict[int, Array]:
-        """∂M/∂ρ (3n,) of each density that is free, by its place in θ [m³]."""
-        return {
-            place + 1: volume
-            for part, place, volume in zip(
-                self.parts, self._gamma_places, self._lumped_m3, strict=True
-            )
-            if part.free_density
-        }
+        """∂M/∂ρ (3n,) of each density that is free [m³], by its place in θ, and those by the shares
+        of the shapes of a density's field [kg].
+        """
+        return {place: slope for own in self._mass_slopes for place, slope in own.items()}
+
+    @cached_property
+    def _mass_slopes(self) -> list[dict[int, Array]]:
+        """The same part by part."""
+        found: list[dict[int, Array]] = []
+        places = zip(self._gamma_places, self.mode_places, strict=True)
+        for part, (gamma, modes), volume in zip(self.parts, places, self._lumped_m3, strict=True):
+            found.append({gamma + 1: volume} if part.free_density else {})
+            if part.field is not None and part.stress_field is None:
+                shares = part.density_kg_m3 * part.field.shapes.T
+                lumped = (np.repeat(self._lumped(part, share), 3) for share in shares)
+                found[-1] |= dict(zip(range(modes.start, modes.stop), lumped, strict=True))
+        return found
 
     def densities(self, theta: Theta) -> list[float]:
-        """Of each part [kg/m³]."""
+        """Of each part [kg/m³]; of a field the mean."""
         return [
             float(theta[place + 1]) if part.free_density else part.density_kg_m3
             for part, place in zip(self.parts, self._gamma_places, strict=True)
@@ -292,7 +301,15 @@ class Body(Discretisation):
         """(3n,) lumped mass of every degree of freedom [kg]."""
         if not self.mass_slopes:
             return self.dof_mass
-        return self._weighed(self.densities(theta))
+        return np.sum(self._masses(theta), axis=0)
+
+    def _masses(self, theta: Theta) -> list[Array]:
+        """(3n,) of each part."""
+        found = []
+        for part, volume, own in zip(self.parts, self._lumped_m3, self._mass_slopes, strict=True):
+            stated = 0.0 if part.free_density else part.density_kg_m3
+            found.append(sum((theta[k] * slope for k, slope in own.items()), stated * volume))
+        return found
 
     def _weighed(self, densities: Sequence[float]) -> Array:
         """(3n,) mass of every dof."""
@@ -485,9 +502,10 @@ class Body(Discretisation):
                 bends = carried.bends[:, columns, columns]
                 theta_theta[:, columns, columns] += by_theta[:, first, None, None] * bends
         self._spread_stiffening(by_theta[:, None], carried)
-        for density, slope in self.mass_slopes.items():
-            mixed = -np.einsum("ti,ti,i->t", w, v, slope)
-            theta_theta[:, density, density - 1] = theta_theta[:, density - 1, density] = mixed
+        for gamma, own in zip(self._gamma_places, self._mass_slopes, strict=True):
+            for place, slope in own.items():
+                mixed = -np.einsum("ti,ti,i->t", w, v, slope)
+                theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = mixed
         none = np.zeros((len(x), 0))
         return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew, none)
 
@@ -511,8 +529,7 @@ class Body(Discretisation):
 
         Mass that is tied to a node is damped as the part's own there, by its share as stated.
         """
-        for k, density in enumerate(self.densities(theta)):
-            damped = density * self._lumped_m3[k]
+        for k, damped in enumerate(self._masses(theta)):
             if tied_kg is not None:
                 damped = damped + self._tied_shares[k] * tied_kg
             yield self._gamma_places[k], damped
@@ -532,5 +549,5 @@ class Body(Discretisation):
     def _drag_slopes(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
         """Places in θ, and the slopes of that by them."""
         yield from self._damped(theta, tied_kg)
-        for density, slope in self.mass_slopes.items():
-            yield density, theta[density - 1] * slope
+        for gamma, own in zip(self._gamma_places, self._mass_slopes, strict=True):
+            yield from ((place, theta[gamma] * slope) for place, slope in own.items())

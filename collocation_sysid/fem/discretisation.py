@@ -113,7 +113,7 @@ class Discretisation(Model):
 
     def brought(self, number: int, theta: Theta, carried: Array | None = None) -> Array | None:
         """What the points of a part carry (T, any), then the logarithms of its field."""
-        field = self.parts[number].field
+        field = self.parts[number].stress_field
         if field is None:
             return carried
         logs = (field.shapes @ np.asarray(theta)[self.mode_places[number]])[None]
@@ -126,9 +126,9 @@ class Discretisation(Model):
         """How the fields of parts add up, by the number of the part."""
         found = {}
         for number, part in enumerate(self.parts):
-            if part.field is not None:
+            if part.stress_field is not None:
                 cells, _ = self._laid_out(part)
-                found[number] = Spread(part.field.shapes, dofs_of(cells), self.pattern.size)
+                found[number] = Spread(part.stress_field.shapes, dofs_of(cells), self.pattern.size)
         return found
 
     def _laid_out(self, part: BodyPart) -> tuple[Index, Array]:
@@ -332,7 +332,7 @@ class Discretisation(Model):
             sets = 2 if name == "curvature" else 1
             carried = np.concatenate([places_of + k * width for k in range(sets)], axis=-1)
             width *= sets
-        if part.field is not None:
+        if part.stress_field is not None:
             logs = np.broadcast_to(width + np.arange(count)[:, None, None], (*carried.shape[:2], 1))
             carried = np.concatenate([carried, logs], axis=-1)
         own = carried if carried.shape[-1] else None

@@ -10,6 +10,9 @@ Laplacian, free at the surface,
 scaled so that the prior has the same deviation, the amplitude, everywhere. The v that is the same
 everywhere is left out: it is the mean. What finer shapes than these m would add is a share of the
 variance that belongs to the interval of every element, see `FieldModes.left_out`.
+
+Of a density, stated as ρ_s, not the logarithm is such a field but ρ / ρ_s: masses are linear in
+what is estimated, and it differs little within a material.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from ..checked import AtLeastOne, Positive, Text
 from ..errors import InputError
 from ..section import ByForm
 from ..stated import key, stated
-from .constants import YOUNG, Constant, is_modulus, mode
+from .constants import DENSITY, YOUNG, Constant, is_modulus, mode
 from .elements import ELEMENTS, reference_geometry
 from .mesh import TetMesh
 
@@ -41,19 +44,21 @@ Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByFor
 
 @stated
 class Field:
-    """A stiffness, or another constant, that differs from place to place within a material.
+    """A stiffness, density or another constant that differs from place to place within a material.
 
     Parameters
     ----------
     parameter : str
-        The constant: of the material or its damping law; young_pa is all moduli of a material.
+        The constant: of the material or its damping law; young_pa is all moduli of a material;
+        density_kg_m3.
     length_m : float or list
         Over which distance it changes: the correlation of places so far apart is 1/e. Of several
         the likeliest is taken.
     modes : int
         How many shapes make up the field; one more costs what one more right-hand side does.
     amplitude : float
-        How much it differs: the prior standard deviation of the logarithm.
+        How much it differs: the prior standard deviation of the logarithm, of a density that over
+        its stated value.
     """
 
     length_m: float | tuple[float, ...] = key(Lengths)
@@ -161,7 +166,7 @@ class FieldModes:
     field : Field
     laplacian : Laplacian
     scaled : tuple of int
-        Which constants of the material and the damping law follow it.
+        Which constants of the material and the damping law follow it; none of a density.
     length_m : float
     volumes_m3 : (E,)
     """
@@ -186,8 +191,8 @@ class FieldModes:
         scaled = moduli if field.parameter == ALL_MODULI else []
         if field.parameter in names:
             scaled = [names.index(field.parameter)]
-        if not scaled:
-            known = [ALL_MODULI] * bool(moduli) + names
+        if not scaled and field.parameter != DENSITY.name:
+            known = [ALL_MODULI] * bool(moduli) + [*names, DENSITY.name]
             raise InputError(
                 f"parameter of a field is {field.parameter!r}; expected one of {', '.join(known)}"
             )

@@ -116,6 +116,11 @@ class BodyPart:
         return self.of_law + bool(self.prony)
 
     @property
+    def stress_field(self) -> FieldModes | None:
+        """The field, where stress depends on it: not that of a density."""
+        return self.field if self.field and self.field.scaled else None
+
+    @property
     def field_name(self) -> str:
         """The constant that differs from place to place."""
         return self.full_name(self.field.field.parameter) if self.field else ""

@@ -129,7 +129,7 @@ class Stresses:
         for number, part in enumerate(body.parts):
             if part.prony:
                 count, places = len(part.material.constants), body.memory.of_part(number)
-                field = part.field
+                field = part.stress_field
                 out = np.zeros((len(x), (count + bool(field)) * places.size))
                 self._run("stress_by_theta", number, [x], theta, out, add=False)
                 first = body.starts[number]

@@ -77,11 +77,10 @@ class Setting:
         """∂(M a)/∂p, (…, k, m), of rows at accelerations (…, k) of dofs."""
         if not self.mass_moves:
             return 0.0
-        found = np.zeros((*acceleration.shape, len(self.p)))
-        for place, mass in self.dynamics.forces.mass_by_input.items():
-            by_p = self._of_rows[0 if self._steady else rows, place][..., None, :]
-            found += (mass[dofs] * acceleration)[..., None] * by_p
-        return found
+        masses = self.dynamics.forces.mass_by_input
+        by_p = self._of_rows[0 if self._steady else rows][..., [*masses], :]
+        mass = np.array([*masses.values()])[:, dofs]
+        return acceleration[..., None] * (mass.T @ by_p)
 
     def curvature(self, x: Array, of_forces: Curvature, row_weights: Array) -> tuple[Array, Array]:
         """Second derivatives of Σ weights · c by (x, p), (N, 3n, m), and by p, (m, m).
@@ -100,10 +99,11 @@ class Setting:
         by_u, inertia = of_forces.theta, np.zeros_like(of_forces.theta)
         if self.mass_moves:
             acceleration = dynamics.acceleration(x)
-            for place, mass in dynamics.forces.mass_by_input.items():
-                pulled = (row_weights * mass)[..., None] * self._of_rows[:, None, place]
-                by_x -= dynamics.combine_transposed(dynamics.tables.s, pulled) / step_s**2
-                inertia[:, place] = (row_weights * acceleration) @ mass
+            masses = dynamics.forces.mass_by_input
+            mass, places = np.array([*masses.values()]), [*masses]
+            pulled = row_weights[..., None] * (mass.T @ self._of_rows[:, places])
+            by_x -= dynamics.combine_transposed(dynamics.tables.s, pulled) / step_s**2
+            inertia[:, places] = (row_weights * acceleration) @ mass.T
             by_u = by_u - dynamics.to_evaluations(inertia)
         twice = self.by_p.swapaxes(1, 2) @ of_forces.theta_theta @ self.by_p
         return by_x, twice.sum(axis=0) + self.inputs.curvature(self.p, by_u)

@@ -54,7 +54,9 @@ class ElementFields:
             width = len(NAMES) * len(body.cells)
             cells, geometry = body.cells[part.cells], body.geometry[part.cells]
             logs = np.broadcast_to(np.arange(len(cells))[:, None, None], (*geometry.shape[:2], 1))
-            batch = Batch(kernel, cells, geometry, places, width, logs if part.field else None)
+            batch = Batch(
+                kernel, cells, geometry, places, width, logs if part.stress_field else None
+            )
             evaluators.append(body.make_evaluator(batch))
         volumes = body.geometry[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)

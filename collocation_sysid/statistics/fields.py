@@ -1,5 +1,7 @@
 """Constants that differ from place to place: value and interval in every element, and how likely.
 
+"The logarithm" is that of the constant or, of a density, the density over the one that is stated.
+
 With the posterior covariance C of the shares a and of all else that is estimated, the logarithm in
 an element has the variance gᵀC g + d², where g are the element's shapes and the slopes of the mean,
 and d is the deviation that finer shapes would add. The prior of the shares is N(0, I). So what the
@@ -53,6 +55,8 @@ class FieldEstimate:
     cells : (k,) numbers of the elements
     value : (k,) the constant in each
     deviation : (k,) standard deviation of its logarithm; NaN without error bars
+    stated : float or None
+        A density as stated, which the deviation is a share of.
     quantile : float
         Half width of the 95 % intervals, in deviations.
     shares : (m,) a
@@ -67,10 +71,14 @@ class FieldEstimate:
     quantile: float
     shares: Array
     covariance: Array
+    stated: float | None = None
 
     @property
     def ci95(self) -> tuple[Array, Array]:
         """(k,) lower and upper ends of the 95 % intervals."""
+        if self.stated is not None:
+            away = self.quantile * self.deviation * self.stated
+            return self.value - away, self.value + away
         factor = np.exp(self.quantile * self.deviation)
         return self.value / factor, self.value * factor
 
@@ -162,6 +170,9 @@ def fields_of(
             continue
         here = body.mode_places[number]
         mean, slopes = _mean(constants, number, modes).slopes(q, NOTHING)
+        local, stated = mean[0] + modes.shapes @ theta[here], None
+        if part.stress_field is None:
+            stated = part.density_kg_m3
         gradient = slopes + modes.shapes @ by_q[here]
         # What is at a bound has no variance: it is taken for known.
         used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
@@ -174,11 +185,12 @@ def fields_of(
                 part.field_name,
                 modes,
                 part.cells,
-                np.exp(mean[0] + modes.shapes @ theta[here]),
+                np.exp(local) if stated is None else stated * local,
                 deviation if known is not None else np.full_like(deviation, np.nan),
                 quantile,
                 theta[here],
                 covariance[np.ix_(free, free)],
+                stated,
             )
         )
     return found
@@ -196,11 +208,13 @@ def fields_by_information(collocation: Collocation, z: Array) -> dict[str, Field
 
 
 def _mean(constants: ThetaMap, number: int, modes: FieldModes) -> Generated:
-    """The logarithm of the mean of a part's field, by q."""
+    """The logarithm of the mean of a part's field, by q; a density's over the one stated."""
     body, part = constants.body, constants.body.parts[number]
 
     def logarithm(q: ca.SX, _: ca.SX) -> ca.SX:
         own = body.split(constants.expression(q))[number]
+        if part.stress_field is None:
+            return own[part.of_gamma_m + 1] / part.density_kg_m3 if part.free_density else ca.SX(1)
         if modes.field.parameter != ALL_MODULI:
             return ca.log(own[modes.scaled[0]])
         lame = part.material.lame(own[: len(part.material.constants)])

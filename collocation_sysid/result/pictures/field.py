@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
@@ -48,7 +48,7 @@ def field_picture(seen: Replay, name: str, values: Array) -> Figure:
     known = values[np.isfinite(values[:, 0])]
     # The ends of where nothing is told would leave no colours to what is.
     low, high = np.quantile(known[:, 1], 0.05), np.quantile(known[:, 2], 0.95)
-    scale = ScalarMappable(LogNorm(low, high), COLOURS)
+    scale = ScalarMappable((LogNorm if low > 0 else Normalize)(low, high), COLOURS)
     untold = np.clip((values[:, 3] - TOLD) / (UNTOLD - TOLD), 0.0, PALEST)[:, None]
     none = np.zeros(len(nodes_m), dtype=bool)
     for row, own in enumerate(rows):
@@ -65,7 +65,8 @@ def field_picture(seen: Replay, name: str, values: Array) -> Figure:
                 axes.text(*middle, title, ha="center", va="center", fontsize=SMALL_PT)
     place = (PAGE_MM - BAR_ROOM_MM + 4, FOOT_MM, 2.5, total - HEAD_MM - FOOT_MM - 4)
     beside = axes.inset_axes(place, transform=axes.transData)
-    bar = figure.colorbar(scale, cax=beside, ticks=LogLocator(subs=(1.0, 2.0, 5.0)), format="%.3g")
+    ticks = LogLocator(subs=(1.0, 2.0, 5.0)) if low > 0 else None
+    bar = figure.colorbar(scale, cax=beside, ticks=ticks, format="%.3g")
     bar.ax.minorticks_off()
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=1.5)
     end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}

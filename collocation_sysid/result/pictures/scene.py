@@ -25,7 +25,7 @@ SKINS = ("#B4D0EA", "#F0D3A0", "#B9DDC2", "#E2C3D9", "#D9D9A8", "#C9C3E6")
 # Of more triangles than this one would see nothing but edges.
 EDGED = 6000
 _DOT = {"ls": "", "marker": "o", "ms": 3.2, "mec": VERMILION, "mew": 0.7}
-_SEEN = {"ls": "", "marker": ".", "ms": 1.6, "mec": "none", "mfc": BLUE}
+_SEEN = {"ls": "", "marker": ".", "ms": 2.4, "mec": "none", "mfc": BLUE}
 # More points of depth cameras only take longer to draw.
 MOST_SEEN = 1000
 _SQUARE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none"}
