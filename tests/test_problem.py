@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import casadi as ca
@@ -36,6 +37,7 @@ from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.runs.check import check_problem
+from collocation_sysid.runs.check.derivatives import shortened
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"
@@ -460,10 +462,11 @@ def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
         if "how to get it" not in str(error):
             raise
         pytest.skip(str(error))
-    findings = check_problem(problem)
+    few = replace(problem, experiments=problem.experiments[:2], substeps=1)
+    findings = check_problem(shortened(few))
     assert findings.derivatives_agree
-    grasps = [grasp for each in problem.experiments for grasp in each.grasps]
-    assert findings.samples > 0 or any(grasp.wrench for grasp in grasps)
+    for each in problem.experiments:
+        assert each.markers.present.any() or any(grasp.wrench for grasp in each.grasps)
     assert all(body.smallest_element_quality > 0.1 for body in findings.bodies)
 
 
@@ -471,10 +474,15 @@ def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
 def test_a_shipped_problem_follows_the_schema(path):
     content = tomllib.loads(path.read_text())
     ProblemFile.model_validate(content)
+    schema_validator().validate(content)
+
+
+@cache
+def schema_validator():
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads(json.dumps(ProblemFile.model_json_schema()))
     jsonschema.Draft202012Validator.check_schema(schema)
-    jsonschema.validate(content, schema)
+    return jsonschema.Draft202012Validator(schema)
 
 
 # What else a recording's table may say ------------------------------------------------------------
