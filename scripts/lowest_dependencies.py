@@ -13,13 +13,20 @@ def lowest(requirements: list[str]) -> list[str]:
     """A pin for each requirement of the form "name>=version", without its extras."""
     pins = []
     for requirement in requirements:
-        found = re.fullmatch(r"([\w.-]+)(?:\[.*\])?>=([\d.]+)", requirement)
-        if found is None:
+        match = re.fullmatch(r"([\w.-]+)(?:\[.*\])?>=([\d.]+)", requirement)
+        if match is None:
             raise ValueError(f"{requirement!r} states no lowest version")
-        pins.append(f"{found[1]}=={found[2]}")
+        pins.append(f"{match[1]}=={match[2]}")
     return pins
 
 
-if __name__ == "__main__":
+def of_project() -> list[str]:
+    """Of the package and its extras, but for what they ask of each other and on some machines."""
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
-    print("\n".join(lowest(project["dependencies"])))
+    extras = [each for extra in project["optional-dependencies"].values() for each in extra]
+    stated = [e for e in extras if ";" not in e and not e.startswith(project["name"])]
+    return lowest([*project["dependencies"], *stated])
+
+
+if __name__ == "__main__":
+    print("\n".join(of_project()))

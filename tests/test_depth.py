@@ -206,7 +206,8 @@ def test_clouds_and_images_are_read_from_every_format(tmp_path):
         ("image.exr", "OpenEXR"),
     ],
 )
-def test_files_that_cannot_be_read_are_refused_with_a_remedy(tmp_path, name, said):
+def test_files_that_cannot_be_read_are_refused_with_a_remedy(tmp_path, monkeypatch, name, said):
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)  # as where it is missing
     file = tmp_path / name
     if name == "flat.npy":
         np.save(file, np.zeros((3, 2)))
@@ -218,6 +219,15 @@ def test_files_that_cannot_be_read_are_refused_with_a_remedy(tmp_path, name, sai
         file.write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA binary_compressed\n")
     with pytest.raises(InputError, match=said):
         read_depth(file, None, 1.0)
+
+
+def test_an_exr_image_is_read(tmp_path):
+    library = pytest.importorskip("OpenEXR")
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+    with library.File(header, {"Z": image_m().astype(np.float32)}) as image:
+        image.write(str(tmp_path / "image.exr"))
+    read = read_depth(tmp_path / "image.exr", None, 1.0)
+    np.testing.assert_allclose(read.images_m[0], image_m(), rtol=1e-6)
 
 
 def test_a_problem_file_states_depth(tmp_path):

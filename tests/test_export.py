@@ -10,6 +10,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import casadi as ca
@@ -480,6 +481,14 @@ def test_mujoco_swings_alike(tmp_path):
     assert abs(frequency.relative) < 1e-6  # the same energy, mesh and masses
     assert motion.ours > 1e-3
     assert abs(motion.relative) < 0.03
+
+
+def test_an_older_mujoco_that_makes_bodies_stiffer_is_refused(tmp_path, monkeypatch):
+    body = held_bar(moving=True)
+    folder = exported(body, "mujoco", tmp_path)
+    monkeypatch.setitem(sys.modules, "mujoco", SimpleNamespace(__version__="3.17.0"))
+    with pytest.raises(InputError, match=r"found MuJoCo 3\.17\.0, .* expected 4 or newer"):
+        verify_export(body, "mujoco", folder)
 
 
 def laid_block(shape: Solid) -> Identified:

@@ -142,20 +142,15 @@ class OnCluster:
     def _unless_lost(self) -> Iterator[None]:
         """End the search where the cluster is gone."""
         dask = distributed()
-        killed, cut = dask.scheduler.KilledWorker, (dask.client.CancelledError, OSError)
         try:
             yield
+        except dask.scheduler.KilledWorker as error:
+            raise _lost("A recording ended every worker that had it: mind their memory.") from error
         except (Exception, dask.client.CancelledError) as error:
-            if self.client.status != "running":
-                why = "Its scheduler answers no more"
-            elif isinstance(error, killed):
-                why = "A recording ended every worker that it was given to: mind their memory"
-            elif isinstance(error, cut):
-                why = " ".join(str(error).split()) or type(error).__name__
-            else:
+            cut = isinstance(error, (OSError, dask.client.CancelledError))
+            if isinstance(error, Ended) or (self.client.status == "running" and not cut):
                 raise
-            sentence = f"{Status.CLUSTER_LOST.sentence} {why.rstrip('.')}."
-            raise Ended(Status.CLUSTER_LOST, sentence) from error
+            raise _lost("Its scheduler answers no more.") from error
 
     def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
         # By the name of the function dask knows how long such tasks take.
@@ -234,7 +229,11 @@ def _refusal(message: str) -> InputError:
 
 def _require_some(threads: dict[str, int]) -> None:
     if not threads:
-        raise OSError("No worker is left")
+        raise _lost("No worker is left.")
+
+
+def _lost(why: str) -> Ended:
+    return Ended(Status.CLUSTER_LOST, f"{Status.CLUSTER_LOST.sentence} {why}")
 
 
 # On the workers -----------------------------------------------------------------------------------
