@@ -151,6 +151,17 @@ def test_the_front_page_shows_the_answer_that_the_readme_shows():
     assert [line for line in shown.splitlines() if line not in lines] == []
 
 
+def test_every_claim_beside_other_tools_has_a_test_or_a_script_that_is_there():
+    page = (ROOT / "docs" / "compared.md").read_text()
+    shown = re.findall(r"`((?:tests|scripts)/\w+\.py)(?:::(\w+))?`", page)
+    assert len(shown) > 20
+    for file, test in shown:
+        assert f"def {test}(" in (ROOT / file).read_text() or not test
+    claims = [line for line in page.splitlines() if line.startswith("| ")][8:]
+    assert len(claims) > 12
+    assert [line for line in claims if "`" not in line] == []
+
+
 # Pages made when the documentation is built
 
 
