@@ -65,7 +65,10 @@ FARTHEST = 4.0
 # Flat triangles that stand for a face of three nodes, or of six with those on ab, bc, ca.
 CORNERS = np.vstack([np.eye(3), [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]]])
 FLAT = {3: np.array([[0, 1, 2]]), 6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])}
-LEFT_OUT = ("far", "grazing", "turned away", "not chosen")
+LEFT_OUT = ("far", "grazing", "turned away", "not chosen", "hidden")
+# What is in front by less than this share of the spacing of points is beside it, and a shape that
+# moves by less has settled.
+FRONT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +142,37 @@ class Skin:
         normal, way = np.cross(b - a, c - a), eye_m - (a + b + c) / 3
         sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
         return np.sum(normal * way, axis=1) > least * sizes
+
+    def hidden(
+        self, x: Array, eye_m: Array | None, points_m: Array, front_m: float
+    ) -> NDArray[np.bool_]:
+        """(P,) whether another part is in front of points (P, 3), seen by a camera, by so much."""
+        behind = np.zeros(len(points_m), dtype=bool)
+        if eye_m is None or not len(points_m):
+            return behind
+        # Seen from there in the plane at distance one.
+        ahead, *across = np.linalg.svd((x.mean(axis=0) - eye_m)[None])[2]
+        ahead *= np.sign(ahead @ (x.mean(axis=0) - eye_m))
+        depths, away = (x - eye_m) @ ahead, (points_m - eye_m) @ ahead
+        corners = self.flat[self.facing(x, eye_m, 0.0)]
+        corners = corners[(depths[corners] > 0).all(axis=1)]
+        places = ((x - eye_m) @ np.transpose(across) / depths[:, None])[corners]
+        seen = (points_m - eye_m) @ np.transpose(across) / away[:, None]
+        middles = places.mean(axis=1)
+        reach = np.linalg.norm(places - middles[:, None], axis=2).max(initial=0.0)
+        near = KDTree(middles).query_ball_point(seen, reach)
+        point = np.repeat(np.arange(len(seen)), [len(each) for each in near])
+        triangle = np.concatenate([*near, []]).astype(int)
+        first = depths[corners[triangle]].min(axis=1) < away[point] - front_m
+        point, triangle = point[first], triangle[first]
+        a, b, c = places[triangle].transpose(1, 0, 2)
+        way, whole = seen[point] - a, _cross(b - a, c - a)
+        of_b, of_c = _cross(way, c - a) / whole, _cross(b - a, way) / whole
+        shares = np.column_stack([1 - of_b - of_c, of_b, of_c])
+        # What is linear on a triangle is one over the depth in the plane.
+        hit = 1 / np.sum(shares / depths[corners[triangle]], axis=1) < away[point] - front_m
+        behind[point[(shares >= 0).all(axis=1) & hit]] = True
+        return behind
 
     def nearest(self, x: Array, points: Array, among: Index) -> tuple[Index, Array]:
         """Faces (P,), and places (P, 3) on them, nearest to points (P, 3), of some triangles."""
@@ -316,6 +350,9 @@ class Sighting:
     left_out : mapping of the reason to the number of points
     shapes_m : (S, n, 3) of the surface, and `seen_m` (S, E, 3) in the world, as they were then
     start : mapping of the label of what is not known of the camera to its value then
+    settled : bool
+        Whether shapes had hardly moved before: what these hide from the camera does not count. From
+        shapes that are still sought too much would seem hidden, and all of the rest fit.
     """
 
     view: View
@@ -332,12 +369,22 @@ class Sighting:
     left_out: Mapping[str, int]
     shapes_m: Array
     start: Mapping[str, float]
+    settled: bool
 
     @classmethod
-    def of(cls, view: View, body: Body, shapes_m: Array, phi: Array, gate_m: float) -> Sighting:
+    def of(
+        cls,
+        view: View,
+        body: Body,
+        shapes_m: Array,
+        phi: Array,
+        gate_m: float,
+        settled: bool = False,
+    ) -> Sighting:
         """That in shapes (S, n, 3) of the surface."""
         skin = Skin.of(body, view.depth)
-        seen = [_seen(view, skin, body, k, x, phi, gate_m) for k, x in enumerate(shapes_m)]
+        how = phi, gate_m, settled
+        seen = [_seen(view, skin, body, k, x, *how) for k, x in enumerate(shapes_m)]
         most = max(1, *(len(each["used"]) for each in seen))
         arrays: dict[str, Any] = {
             name: np.stack(
@@ -351,7 +398,7 @@ class Sighting:
         }
         total = np.sum([each["reasons"] for each in seen], axis=0).tolist()
         own: dict[str, Any] = {"left_out": dict(zip(LEFT_OUT, total, strict=True))}
-        own |= {"start": view.told(phi), "gate_m": gate_m, "shapes_m": shapes_m}
+        own |= {"start": view.told(phi), "gate_m": gate_m, "shapes_m": shapes_m, "settled": settled}
         return cls(view, body, skin, **own, **arrays)
 
     @classmethod
@@ -373,16 +420,15 @@ class Sighting:
         """That in the first shapes (s, n, 3), which are known; itself where nothing has moved."""
         known = len(shapes_m)
         whole = np.concatenate([shapes_m, self.shapes_m[known:]])
-        limit_m = SAME * self.view.depth.sigma_m
-        still = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0) < limit_m
-        before = self.view.phi(self.start)
-        for k in range(known if still else 0):
+        depth, before = self.view.depth, self.view.phi(self.start)
+        moved_m = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0)
+        for k in range(known if moved_m < FRONT * depth.spacing_m else 0):
             way = self.view.world(phi, k) - self.view.world(before, k)
-            still = still and np.abs(way).max(initial=0.0) < limit_m
-        gate_m = self.next_gate_m(whole, phi)
-        if still and gate_m == self.gate_m:
+            moved_m = max(moved_m, np.abs(way).max(initial=0.0))
+        gate_m, settled = self.next_gate_m(whole, phi), moved_m < FRONT * depth.spacing_m
+        if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.settled:
             return self
-        return Sighting.of(self.view, self.body, whole, phi, gate_m)
+        return Sighting.of(self.view, self.body, whole, phi, gate_m, settled)
 
     def missed_m(self, x: Array, phi: Array) -> Array:
         """How far (P,) parts of a first shape x (n, 3) that face the camera are from its points."""
@@ -408,7 +454,14 @@ class Sighting:
 
 
 def _seen(
-    view: View, skin: Skin, body: Body, sample: int, x: Array, phi: Array, gate_m: float
+    view: View,
+    skin: Skin,
+    body: Body,
+    sample: int,
+    x: Array,
+    phi: Array,
+    gate_m: float,
+    settled: bool,
 ) -> dict[str, NDArray]:
     """What one sample sees: of points within the gate, and the reasons for leaving others out."""
     depth, cloud = view.depth, view.depth.clouds[sample]
@@ -434,7 +487,10 @@ def _seen(
     alike = np.ones(len(near), dtype=bool)
     if cloud.shape[1] == 6:
         alike = np.sum(normals * (cloud[near, 3:] @ rotations[sample].T), axis=1) >= GRAZING
-    checks = [distance <= gate_m, seen, alike, skin.chosen[faces]]
+    open_to = np.ones(len(near), dtype=bool)
+    if settled:
+        open_to = ~skin.hidden(x, eye_m, feet, FRONT * depth.spacing_m)
+    checks = [distance <= gate_m, seen, alike, skin.chosen[faces], open_to]
     left = np.cumprod([np.ones(len(near), dtype=bool), *checks], axis=0)
     reasons = -np.diff(left.sum(axis=1))
     reasons[0] += len(cloud) - len(near)
@@ -516,6 +572,10 @@ def _aligned(
         )[0]
         turn, shift = Rotation.from_rotvec(step[:3]) * turn, shift + step[3:]
     return missed, turn, shift
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _skew(vectors: Array) -> Array:
