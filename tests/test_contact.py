@@ -18,6 +18,8 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.contact import contacts
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.force_term import States
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.program.near_contact import NearContact
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.program.touches import rubbings
 from collocation_sysid.recording import (
@@ -168,6 +170,30 @@ def test_friction_dissipates_and_stays_within_its_cone():
     own = slice(3 * len(experiment.body.nodes.points_m))
     most = 0.4 * np.linalg.norm(pressing.force(states)[0, own].reshape(-1, 3), axis=1).sum()
     assert np.linalg.norm(along[own].reshape(-1, 3).sum(axis=0)) <= most
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_a_step_sees_of_contact_what_all_points_of_the_surface_do(friction):
+    experiment, states = pushed(friction)
+    forces = Forces.of(experiment, experiment.t_s[-1:], states.theta)
+    rest, touching = forces.without_contact()
+    assert len(touching) == 2
+    near, rates = NearContact(touching, states.theta, forces.pattern), (0.7, 30.0)
+    force, *parts = near.linearise(states.xi, states.nu, rates)
+    whole, other = (each.linearise(states.xi, states.nu) for each in (forces, rest))
+    own = np.arange(states.xi.size) < 3 * len(experiment.body.nodes.points_m)
+    between = own[forces.pattern.rows] & own[forces.pattern.columns]
+    pairs = ("by_position", "by_velocity"), ("by_position_skew", "by_velocity_skew")
+    for part, names in zip(parts, pairs, strict=True):
+        by = [(getattr(whole, name) - getattr(other, name))[0] for name in names]
+        known = np.zeros(len(between))
+        for rate, slope in zip(rates, by, strict=True):
+            known += rate * (slope if slope.size else 0.0)
+        shown = part[between] if part.size else np.zeros(between.sum())
+        np.testing.assert_allclose(shown, known[between], atol=1e-12 * np.abs(parts[0]).max())
+    expected = (whole.force - other.force)[0]
+    np.testing.assert_allclose(force[own], expected[own], atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_array_equal(near.force(states.xi, states.nu), force)
 
 
 def test_a_sensor_of_an_obstacle_reads_the_sum_of_its_contact_forces():

@@ -150,6 +150,20 @@ class ContactLaw:
         return Generated(self.force, 3 * VECTORS + moving + len(self.columns), 2, compiled=True)
 
     @cached_property
+    def push(self) -> Generated:
+        """The force (3,) on a point by its own part of (y, ẏ); the rest and c are data, first."""
+        moving = 1 + self.obstacle.rubs
+
+        def force(u: ca.SX, data: ca.SX) -> ca.SX:
+            own, frame = ca.vertsplit(u, 3), ca.vertsplit(data, [0, 9 * moving, data.numel()])
+            ends = ca.vertsplit(frame[0], 9)
+            y = [part for pair in zip(own, ends, strict=True) for part in pair]
+            constants, given = ca.vertsplit(frame[1], [0, len(self.columns), len(self.columns) + 2])
+            return self.force(ca.vertcat(*y, constants), given)[:3]
+
+        return Generated(force, 3 * moving, 9 * moving + len(self.columns) + 2, compiled=True)
+
+    @cached_property
     def pressed(self) -> Generated:
         """The forces at b, and what is zero where b is right, of (y, c, b)."""
         return Generated(self._pressed, 3 * VECTORS + len(self.columns) + 1, 2, compiled=True)
@@ -266,6 +280,11 @@ class Contact(Pointwise):
     @property
     def by_velocity(self) -> bool:
         """Where it rubs."""
+        return self.contact.obstacle.rubs
+
+    @property
+    def turns(self) -> bool:
+        """Where it rubs; else its slopes have no skew part, to the last digit."""
         return self.contact.obstacle.rubs
 
     def at(self, u: Array) -> Self:

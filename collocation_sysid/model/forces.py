@@ -147,6 +147,14 @@ class Forces:
         further = self.further[:number], self.further[number + 1 :]
         return replace(self, further=(*further[0], term, *further[1]))
 
+    def without_contact(self) -> tuple[Forces, list[Contact]]:
+        """The same on the same pattern but for contact by an energy, and that."""
+        touching = [term for term in self.further if isinstance(term, Contact) and not term.relaxed]
+        further = tuple(term for term in self.further if term not in touching)
+        places = [p.entries for t, p in self._placed if t.couplings and t not in touching]
+        joined = Joined(self.pattern, (self.joined.places[0], *places))
+        return replace(self, further=further, joined=joined), touching
+
     def undriven(self) -> Forces:
         """Weight and loads alone, without what drives the body or acts by a law of its own."""
         return replace(self, further=(), joined=Joined.of((self.body.pattern,)))
@@ -166,7 +174,7 @@ class Forces:
         at = self.body.linearise(xi, still_nu, self.theta, out, self.mass.tied, self.past)
         if self.still:
             at.by_velocity[:] = 0.0
-        if self.further or self._ends[-1] > self._ends[0]:
+        if self._is_wider:
             spread = self.joined.spread
             at = Linearisation(
                 at.force,
@@ -179,6 +187,12 @@ class Forces:
         for term, places in self._placed:
             term.add_slopes(at, places, of(term))
         return at
+
+    @property
+    def _is_wider(self) -> bool:
+        """Whether there is, or is room for, more than what the body's own forces have."""
+        more = self._ends[-1] > self._ends[0] or self.pattern is not self.body.pattern
+        return bool(self.further) or more
 
     @property
     def linearisation_width(self) -> int:
@@ -203,7 +217,7 @@ class Forces:
                 at.position_velocity_skew,
             ):
                 by_velocity[:] = 0.0
-        if self.further or self._ends[-1] > self._ends[0]:
+        if self._is_wider:
             spread, widened = self.joined.spread, self._widened
             at = Curvature(
                 spread(at.position_position),

@@ -61,6 +61,11 @@ class Pointwise(ForceTerm):
     weighed: Array | None = None
 
     @property
+    def turns(self) -> bool:
+        """Whether its slopes by positions have a skew part."""
+        return True
+
+    @property
     @abstractmethod
     def law(self) -> Generated:
         """F(y, ẏ, c), or (F, h)(y, ẏ, c, h_{k−1})."""
@@ -134,7 +139,7 @@ class Pointwise(ForceTerm):
         by_x, by_v, by_c = (slopes[:, part] for part in (here.y, here.v, here.c))
         at_x, add = (places.entries, by_x, here.chosen), points.add_entries
         add(at.by_position, *at_x)
-        if at.by_position_skew.size:
+        if self.turns and at.by_position_skew.size:
             add(at.by_position_skew, *at_x, skew=True)
         at_v = places.entries, by_v, here.chosen
         if self.by_velocity:
@@ -280,6 +285,11 @@ class PointForces(Pointwise):
     def spins(self) -> bool:  # type: ignore[override]
         """Whether the user's law does."""
         return self.placed.force.spins
+
+    @property
+    def turns(self) -> bool:
+        """Whether the user's law does."""
+        return self.placed.force.turns
 
     @property
     def carries(self) -> int:  # type: ignore[override]

@@ -13,6 +13,7 @@ from ..model.dynamics import Dynamics, StencilRow, weighted
 from ..model.histories import AnyLeft, ahead, following
 from ..recording.experiment import Experiment
 from .lapack import one_blas_thread
+from .near_contact import NearContact
 from .newton import (
     NewtonFailure,
     NewtonOptions,
@@ -152,6 +153,10 @@ class RowEquations:
         if left:
             self.forces = ahead(self.forces, left, float(dynamics.until_next_s[t - 1]))
         self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
+        self.rest, contacts = self.forces, []
+        if not dynamics.static:
+            self.rest, contacts = self.forces.without_contact()
+        self.contact = NearContact(contacts, self.rest.theta, self.rest.pattern)
         row = self.row
         first, shape = max(0, t - dynamics.reach), x.shape[1:]
         past, past_forces = x[first:t][::-1], forces[first:t][::-1]
@@ -165,12 +170,14 @@ class RowEquations:
         """The same when a share of the change of a static load has come."""
         found = copy(self)
         if self.forces_before is not None:
-            found.forces = self.forces_before.towards(self.forces, share)
+            found.rest = self.forces_before.towards(self.forces, share)
         return found
 
     def force(self, x: Array) -> Array:
         """F_t."""
-        return self.forces.total(*self.states(x))[0]
+        states = self.states(x)
+        rest = self.rest.total(*states)[0]
+        return rest + self.contact.force(*states) if self.contact.acts else rest
 
     def states(self, x: Array) -> tuple[Array, Array]:
         """ξ_t and ν_t, (1, 3n) each."""
@@ -187,10 +194,17 @@ class RowEquations:
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
         """c_t and the lower triangles of both parts of −∂c_t/∂x_t."""
-        at = self.forces.linearise(*self.states(x))
-        matrix = self.row.block(at.by_position[0], at.by_velocity[0], self.forces.pattern)
-        skew = self.row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
-        return self.balanced(at.force[0], x), matrix, skew
+        states, row = self.states(x), self.row
+        at = self.rest.linearise(*states)
+        matrix = row.block(at.by_position[0], at.by_velocity[0], self.rest.pattern)
+        skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
+        if not self.contact.acts:
+            return self.balanced(at.force[0], x), matrix, skew
+        force, symmetric, askew = self.contact.linearise(*states, (row.p[0], row.q[0]))
+        matrix -= row.w[0] * symmetric
+        if askew.size:
+            skew -= row.w[0] * askew
+        return self.balanced(at.force[0] + force, x), matrix, skew
 
 
 def solve_row(

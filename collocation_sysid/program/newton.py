@@ -118,8 +118,8 @@ class Solver:
         """
         x = x.copy() if goal is None else self._moved(x, goal, linearise)
         self._require_upright(x)
-        if self._kept is not None and not keep_definite:
-            x, done = self._nearer(x, residual, self._kept)
+        if not keep_definite:
+            x, done = self._chords(x, residual, linearise)
             if done:
                 return x
         value, *matrix = self._timed(linearise, x)
@@ -133,21 +133,36 @@ class Solver:
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
         raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
 
+    def _chords(self, x: Array, residual: Residual, linearise: Linearise) -> tuple[Array, bool]:
+        """As near to the solution as steps lead with few factors, and whether that is there."""
+        is_own = False
+        for _ in range(self.options.iterations):
+            if self._kept is not None:
+                nearer, done = self._nearer(x, residual, self._kept)
+                if done:
+                    return nearer, True
+                if nearer is x and is_own:
+                    break
+                x = nearer
+            _, *matrix = self._timed(linearise, x)
+            self._kept, is_own = self._factorise(matrix, x, False), True
+        return x, False
+
     def _nearer(self, x: Array, residual: Residual, kept: Factor) -> tuple[Array, bool]:
         """As near to the solution as the kept factor leads fast, and whether that is there."""
-        found, before, done = x.copy(), None, False
+        nearer, before, done = x.copy(), None, False
         for _ in range(OFTEN):
-            step = self._step(kept, self._timed(residual, found))
+            step = self._step(kept, self._timed(residual, nearer))
             length = float(np.linalg.norm(step))
             rate = length / before if before else 1.0
             if not rate <= 1.0:
                 return x, False
-            found[self.free] += step
+            nearer[self.free] += step
             done = self._is_last(rate * step, LEFT)
             if done or (before and rate > FAST):
                 break
             before = length
-        return (found, done) if self.is_upright(found) else (x, False)
+        return (nearer, done) if self.is_upright(nearer) else (x, False)
 
     def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
         """The state with the held dofs at their goal, to first order in equilibrium."""
