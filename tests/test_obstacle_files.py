@@ -10,6 +10,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from problem_files import run_command
 from problems_small import TRUTH, as_theta, pressed_cube
 
 import collocation_sysid as cs
@@ -67,7 +68,8 @@ def written(folder: Path, ball: str = BALL, friction: str = '"ball_friction"') -
     cube = pressed_cube(5)
     cube.body.mesh.write(folder / "cube.vtu")
     write_poses_csv(folder / "ball.csv", cube.obstacles[0].poses)
-    write_markers_csv(folder / "markers.csv", cube.t_s, ["m1", "m2"], np.zeros((6, 2, 3)) + 0.1)
+    resting = np.broadcast_to([[0.0, 0.0, 0.1], [0.1, 0.0, 0.1]], (6, 2, 3))
+    write_markers_csv(folder / "markers.csv", cube.t_s, ["m1", "m2"], resting)
     write_wrench_csv(folder / "force.csv", cube.t_s, np.full((6, 3), 0.05))
     parameter = "ball_friction = { guess = 0.4 }" if "friction" in friction else ""
     content = PROBLEM.format(ball=ball, friction=friction, parameter=parameter)
@@ -113,6 +115,21 @@ def test_what_a_file_says_of_obstacles(tmp_path: Path):
 def test_what_cannot_be_is_refused(tmp_path: Path, ball: str, friction: str, message: str):
     with pytest.raises(InputError, match=message):
         cs.Problem.read(written(tmp_path, ball, friction), simulation=True)
+
+
+@pytest.mark.parametrize("command", ["check", "solve"])
+def test_friction_is_refused_beside_complementarity_before_anything_is_done(
+    tmp_path: Path, command: str
+):
+    keys = ("solver.method=interior-point", "solver.interior-point.contact=complementarity")
+    arguments = [command, str(written(tmp_path)), *(w for k in keys for w in ("--set", k))]
+    before = sorted(tmp_path.iterdir())
+    outcome = run_command(*arguments)
+    assert outcome.code == 2
+    said = " ".join(outcome.err.split())
+    assert "experiment 'pressed': ball has friction, which contact as complementarity" in said
+    assert 'expected friction = 0, or contact = "energy"' in said
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_two_obstacles_have_two_names():

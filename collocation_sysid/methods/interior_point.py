@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -11,7 +11,9 @@ from pydantic import BeforeValidator
 
 from ..arrays import Array
 from ..checked import Count, Finite, NotNegative, Options, Positive, Text, Whole
+from ..errors import located
 from ..program.collocation import Collocation
+from ..recording.experiment import Experiment
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import hardened, require_smooth
@@ -115,6 +117,18 @@ class InteriorPoint(Options):
     max_time_s: Positive = 1e6
     ipopt: Mapping[str, IpoptValue] = field(default_factory=dict)
 
+    def require(self, experiments: Iterable[Experiment]) -> None:
+        """Refuse friction where contact is complementarity.
+
+        Raises
+        ------
+        InputError
+        """
+        if self.contact == "complementarity":
+            for each in experiments:
+                with located(where=f"experiment '{each.name}'"):
+                    require_smooth(each.obstacles)
+
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
@@ -125,10 +139,9 @@ class InteriorPoint(Options):
         InputError
             If IPOPT does not know an option.
         """
-        touched = [o for segment in collocation.segments for o in segment.experiment.obstacles]
-        is_hard = self.contact == "complementarity" and bool(touched)
-        if is_hard:
-            require_smooth(touched)
+        experiments = [segment.experiment for segment in collocation.segments]
+        self.require(experiments)
+        is_hard = self.contact == "complementarity" and any(e.obstacles for e in experiments)
         found = self._solved(collocation, watch, start)
         if not is_hard or not found.status.converged:
             return found

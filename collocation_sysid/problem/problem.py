@@ -13,6 +13,7 @@ from ..arrays import Array
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..methods import METHODS, require_method
+from ..methods.interior_point import InteriorPoint
 from ..methods.solution import Method
 from ..model.parameters import Parameters, Tied, Unknown
 from ..model.schemes import Scheme, as_scheme
@@ -179,15 +180,17 @@ class Problem:
         Raises
         ------
         InputError
-            For an unknown name.
+            For an unknown name, or a method whose options the experiments rule out.
         """
         chosen = self.method if method is None else method
-        if not isinstance(chosen, str):
-            return chosen
-        if chosen in self.methods:
-            return self.methods[chosen]
-        require_method(chosen, "method")
-        return METHODS[chosen]()
+        if isinstance(chosen, str) and chosen in self.methods:
+            chosen = self.methods[chosen]
+        elif isinstance(chosen, str):
+            require_method(chosen, "method")
+            chosen = METHODS[chosen]()
+        if isinstance(chosen, InteriorPoint):
+            chosen.require(self.experiments)
+        return chosen
 
     def _check(self) -> None:
         names = [experiment.name for experiment in self.experiments]
