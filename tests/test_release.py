@@ -80,3 +80,10 @@ def test_every_dependency_has_its_licence_told():
         *(each for extra in told for each in extras[extra]),
     ]:
         assert re.match(r"[\w-]+", requirement)[0] in page, requirement
+
+
+def test_all_data_of_others_have_their_licence_told():
+    page = (ROOT / "docs" / "licences.md").read_text()
+    scripts = [file.stem.removeprefix("get_") for file in (ROOT / "scripts").glob("get_*.py")]
+    assert len(scripts) >= 4
+    assert [name for name in scripts if f"`problems/{name}`" not in page] == []
