@@ -31,7 +31,7 @@ class Design(OfProblem, Told):
     limits : FILE
         A file (TOML) with what the robot may do and what cameras see.
     criterion : str
-        What is made small: worst, the largest error bar; A, their mean square; D, the volume of
+        What to minimise: worst, the largest error bar; A, their mean square; D, the volume of
         their ellipsoid.
     for_ : A,B,…
         Parameters and moduli that count; all by default.

@@ -32,7 +32,7 @@ class Solve(OfProblem, Told):
     Attributes
     ----------
     method : str
-        The method, in place of the problem's.
+        The method, instead of the problem's.
     start : RUN
         Start from the answer in this run folder.
     scheduler : ADDRESS
@@ -42,7 +42,7 @@ class Solve(OfProblem, Told):
     strict : bool
         Exit code 1 if the verdict is doubtful.
     budget : bool
-        Show all that the variance of each estimate is made of.
+        Show what the variance of each estimate is made of.
     probe : bool
         Look harder: refit parts of the data, and with each assumption freed.
     """
@@ -72,7 +72,7 @@ def solve(options: Solve) -> None:
 
     --scheduler shares the experiments among the workers of a cluster.
 
-    Options of a method stand in its table of the file, [solver.reduced-space] and so on, or follow
+    Set a method's options in its table of the file, [solver.reduced-space] and so on, or with
     --set, as in --set solver.reduced-space.tolerance=1e-6; the command methods lists them.
     """
     from ..result.progress import Progress
@@ -160,7 +160,7 @@ class Check(OfProblem, Told):
     "check problem.toml --set transcription.scheme=backward-euler",
 )
 def check(options: Check) -> None:
-    """Say what is wrong with a problem before solving it.
+    """Check a problem before solving it, and say what will go wrong.
 
     Bodies, recordings and grasps are shown at once. Derivatives, costs and the simulation at the
     guess follow, of the first samples only where whole recordings take more than ten seconds.

@@ -63,7 +63,7 @@ class Export(OfRun):
     Attributes
     ----------
     to : TARGET
-        mujoco, newton, sofa, febio, calculix or json.
+        mujoco, usd, newton, sofa, febio, calculix or json.
     verify : bool
         Simulate the exported body in the target, and compare.
     """
@@ -82,7 +82,7 @@ class Export(OfRun):
 def export(options: Export) -> None:
     """Write the identified body for another simulator: mesh, material, damping, grasp.
 
-    It says what the target cannot express. The files go to a folder export-TARGET in the run's.
+    What the target cannot express is printed. The files go to export-TARGET in the run folder.
     """
     from ..result.export import (
         Identified,
@@ -152,7 +152,7 @@ class Report:
 def report(options: Report) -> None:
     """Write one HTML page about a run or a study, or a Markdown file.
 
-    It holds everything that was found, and its pictures; Markdown links to them.
+    It has all results and the pictures; Markdown links to them.
     """
     from ..result.report import as_file, comparison_report
     from ..result.run_sections import run_report

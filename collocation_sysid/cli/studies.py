@@ -86,7 +86,7 @@ class Compare(Many):
     "compare problem.toml --materials neo-hookean,yeoh",
 )
 def compare(options: Compare) -> None:
-    """Run methods side by side from many starts, or fit several models and say which to use.
+    """Compare methods from many starts, or fit several models and say which to use.
 
     With --materials, --prony or --with each model is fitted to all recordings, and to all but each
     of them, which it then predicts; of one recording the last third is held out. In a body with
@@ -139,7 +139,7 @@ class SweepOptions(Many):
     over : KEY=VALUES
         Key and its values: a,b,c or first:last:count or first:last:log:count.
     method : str
-        The method, in place of the problem's.
+        The method, instead of the problem's.
     """
 
     over: list[str]

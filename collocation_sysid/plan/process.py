@@ -205,7 +205,7 @@ class RunOptions(Options):
     scheduler : ADDRESS
         A dask.distributed scheduler to run on; its workers see the same files.
     time_limit_s : --time-limit SECONDS
-        A run is ended after this, loading included; it counts as a failure.
+        A run is stopped after this, loading included, and counts as a failure.
     """
 
     workers: AtLeastOne | None = None

@@ -38,11 +38,11 @@ class Recipe(Options):
     noise_m : float
         Standard deviation of the markers' noise.
     noise_n : float
-        The same of measured forces.
+        That of measured forces.
     noise_nm : float
-        The same of measured torques.
+        That of measured torques.
     noise_own : float
-        The same of readings of one's own, in their sigmas.
+        That of custom readings, in their sigmas.
     seed : int
         Seed of the noise.
     frames : --frames/--no-frames
