@@ -15,7 +15,7 @@ import numpy as np
 from ..display import Table
 from ..fem.constants import bare, is_damping, symbol_of, with_unit
 from ..statistics.budget import BudgetLine
-from ..statistics.numerical import Coordinate
+from ..statistics.estimates import Coordinate
 from .table import Row
 
 # Ratio of what alike models find beyond which they disagree.

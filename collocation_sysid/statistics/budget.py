@@ -19,8 +19,9 @@ from ..arrays import Array
 from ..model.parameters import Parameters
 from .considered import Changes
 from .distributions import student_ppf
+from .estimates import Coordinate
 from .linearised import LinearisedFit, least_squares
-from .numerical import Coordinate, NumericalError, shifts
+from .numerical import NumericalError, shifts
 from .uncertainty import Uncertainty
 
 # Half a 95 % interval of what is normal, in deviations.

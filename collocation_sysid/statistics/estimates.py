@@ -10,7 +10,7 @@ What error bars do not tell by themselves, notes do, in sentences that end with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +59,44 @@ class Estimate:
     ci95: tuple[float, float] | None = None
     at_bound: bool = False
     reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """In which an interval is symmetric: a logarithm, ln ν/(½ − ν), or the value itself."""
+
+    odds: bool
+    linear: bool
+
+    @classmethod
+    def of(cls, name: str, values: Iterable[float], linear: bool) -> Coordinate:
+        """That of an estimate, of these values and ends of intervals."""
+        lowest = min(values)
+        return cls(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """What values it has."""
+        return -np.inf if self.linear and not self.odds else 0.0, 0.5 if self.odds else np.inf
+
+    def slope(self, value: float) -> float:
+        """Its derivative by the value."""
+        if self.odds:
+            return 0.5 / (value * (0.5 - value))
+        return 1.0 if self.linear else 1 / value
+
+    def at(self, value: float) -> float:
+        """Where it is."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.odds:
+                return float(np.log(value / (0.5 - value)))
+            return value if self.linear else float(np.log(value))
+
+    def value(self, x: float) -> float:
+        """The value there."""
+        if self.odds:
+            return float(0.5 / (1 + np.exp(-x)))
+        return x if self.linear else float(np.exp(x))
 
 
 def correlation_of(covariance: Array) -> Array:
@@ -182,23 +220,15 @@ def _estimate(name: str, value: float, deviation: float, quantile: float) -> Est
     """An estimate whose logarithm has this standard deviation."""
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
-    if bare(name) == "poisson":
-        odds = value / (0.5 - value)
-        low, high = _around(odds, deviation * 0.5 / (0.5 - value), quantile)
-        low, high = 0.5 - 0.5 / (1 + low), 0.5 - 0.5 / (1 + high)
-        wide, reason = high - low > WIDE_POISSON, "its 95 % interval covers nearly all of (0, 0.5)"
-    else:
-        low, high = _around(value, deviation, quantile)
-        wide = high > WIDE_FACTOR * low
-        reason = f"its 95 % interval spans more than a factor of {WIDE_FACTOR:g}"
-    if wide:
+    at = Coordinate.of(name, [value], linear=False)
+    reach = min(quantile * deviation * value * at.slope(value), UNDETERMINED)
+    low, high = (at.value(at.at(value) + way * reach) for way in (-1, 1))
+    reason = f"its 95 % interval spans more than a factor of {WIDE_FACTOR:g}"
+    if at.odds:
+        reason = "its 95 % interval covers nearly all of (0, 0.5)"
+    if high - low > WIDE_POISSON if at.odds else high > WIDE_FACTOR * low:
         return Estimate(value, None, (low, high), reason=reason)
     return Estimate(value, value * deviation, (low, high))
-
-
-def _around(value: float, deviation: float, quantile: float) -> tuple[float, float]:
-    spread = float(np.exp(min(quantile * deviation, UNDETERMINED)))
-    return value / spread, value * spread
 
 
 # A relaxation time beyond so many recordings is not seen to end.

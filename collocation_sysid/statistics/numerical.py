@@ -27,16 +27,15 @@ with the p-th power of their number.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
 
 from ..arrays import Array
-from ..fem.constants import bare
 from ..program.least_squares import LeastSquares
-from .estimates import Estimate
+from .estimates import Coordinate, Estimate
 from .linearised import LinearisedFit
 
 # Roache's factor of safety for an observed order.
@@ -234,44 +233,6 @@ def numerical_errors(
         if any(value != estimate.value for value in (*steps, *meshes)):
             found[name] = numerical_error(name, estimate, steps, meshes, step_order, name in linear)
     return found
-
-
-@dataclass(frozen=True)
-class Coordinate:
-    """In which an interval is symmetric, see `estimates`; what may be negative is its own."""
-
-    odds: bool
-    linear: bool
-
-    @classmethod
-    def of(cls, name: str, values: Iterable[float], linear: bool) -> Coordinate:
-        """That of an estimate, of these values and ends of intervals."""
-        lowest = min(values)
-        return cls(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """What values it has."""
-        return -np.inf if self.linear and not self.odds else 0.0, 0.5 if self.odds else np.inf
-
-    def slope(self, value: float) -> float:
-        """Its derivative by the value."""
-        if self.odds:
-            return 0.5 / (value * (0.5 - value))
-        return 1.0 if self.linear else 1 / value
-
-    def at(self, value: float) -> float:
-        """Where it is."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if self.odds:
-                return float(np.log(value / (0.5 - value)))
-            return value if self.linear else float(np.log(value))
-
-    def value(self, x: float) -> float:
-        """The value there."""
-        if self.odds:
-            return float(0.5 / (1 + np.exp(-x)))
-        return x if self.linear else float(np.exp(x))
 
 
 def changes_towards(fit: LinearisedFit, apart: Sequence[Array]) -> Array:
