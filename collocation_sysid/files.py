@@ -1,4 +1,4 @@
-"""Files as they are read and written: regular, of their folder, whole or not there at all."""
+"""Files and folders as they are read and written: regular, possible, whole or not there at all."""
 
 from __future__ import annotations
 
@@ -187,3 +187,19 @@ def reason(error: BaseException) -> str:
     """The error on one line that is not too long."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return text if len(text) <= LONGEST_REASON else f"{text[: LONGEST_REASON - 1]}…"
+
+
+def run_name(problem: Path) -> str:
+    """Name of a problem file's runs: its folder's where it is called problem.toml, else its own."""
+    return problem.resolve().parent.name if problem.stem == "problem" else problem.stem
+
+
+def require_possible(folder: Path) -> None:
+    """Refuse a folder that cannot be made, before any work is done for it."""
+    for place in (folder, *folder.parents):
+        if place.is_dir():
+            if not os.access(place, os.W_OK):
+                raise InputError("this folder cannot be written in; choose another", place)
+            return
+        if place.exists():
+            raise InputError("this is a file; expected a folder to write in", place)

@@ -9,7 +9,7 @@ from typing import cast
 import typer
 
 from ..errors import InputError
-from ..folders import require_possible, run_name
+from ..files import require_possible, run_name
 from ..plan.design import Criterion, DesignOptions, Limits
 from ..plan.design import design as designed
 from ..plan.design.information import Kind, Over

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from ..folders import require_possible, run_name
+from ..files import require_possible, run_name
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import run

@@ -10,8 +10,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from ..files import write_whole
-from ..folders import require_possible
+from ..files import require_possible, write_whole
 from ..tree import as_json, content
 from .common import errors, interrupted, show
 from .options import AllowCode, AsJson, OfRun, OneExperiment, Out, Quiet, Told, command

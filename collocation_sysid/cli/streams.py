@@ -13,7 +13,7 @@ from rich.text import Text
 
 from ..checked import NotNegative, Options, Positive
 from ..errors import InputError
-from ..folders import require_possible
+from ..files import require_possible
 from ..live import Estimator, LiveOptions
 from ..live.sources import problem_in
 from .common import EXIT_BAD_INPUT, errors, show

@@ -11,7 +11,7 @@ import typer
 
 from ..checked import Positive
 from ..errors import InputError
-from ..folders import require_possible, run_name
+from ..files import require_possible, run_name
 from ..plan import (
     PlannedRun,
     RunOptions,

@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 
 from ..errors import InputError
-from ..files import whole_file, write_whole
-from ..folders import require_possible
+from ..files import require_possible, whole_file, write_whole
 
 # A folder for each kind, see scripts/make_templates.py.
 TEMPLATES = Path(__file__).parent / "templates"
