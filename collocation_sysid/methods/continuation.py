@@ -17,7 +17,9 @@ from ..arrays import Array
 from ..checked import Options
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
+from ..recording.depth import begun
 from ..recording.experiment import Experiment
+from ..recording.tables import FEWEST
 from .comparison.casadi_nlp import Sleqp, SqpMethod
 from .comparison.penalty import AugmentedLagrangian, Penalty
 from .comparison.shooting import Shooting
@@ -99,11 +101,13 @@ class Continuation(Options):
 
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
-    """The first samples of a recording, as many as wanted and needed to see a marker."""
+    """The first samples of a recording, as many as wanted and needed to see anything."""
     markers = experiment.markers
     stop = min(len(experiment.t_s), max(count, markers.first_seen + 1, 3))
+    fewest = 1 if experiment.static else FEWEST
+    stop, depths = begun(experiment.depths, experiment.t_s, stop, fewest)
     shorter = replace(markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop])
-    return replace(experiment, t_s=experiment.t_s[:stop], markers=shorter)
+    return replace(experiment, t_s=experiment.t_s[:stop], markers=shorter, depths=depths)
 
 
 def first_part(collocation: Collocation, share: float) -> Collocation:

@@ -7,6 +7,7 @@ optical axis. Images are turned into points as they are taken; a cloud is points
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..fem.selection import Selection
 from ..section import Vector
 from ..stated import as_given, key, stated
 from .arrays import read_only_floats
-from .clock import first_time_fault
+from .clock import TIME_TOLERANCE_S, first_time_fault
 from .poses import PoseSequence
 from .selected import Nodes, selection
 
@@ -228,6 +229,19 @@ class Depth:
     def first(self) -> int:
         """The first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
+
+
+def begun(depths: Sequence[Depth], t_s: Array, count: int, fewest: int) -> tuple[int, list[Depth]]:
+    """How many of some samples, as many as wanted at least, have a few first images of each camera
+    with points among them; and the images until then.
+    """
+    for depth in depths:
+        last_s = depth.times[min(max(fewest - 1, depth.first), len(depth.times) - 1)]
+        count = max(count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1)
+    end_s = t_s[:count][-1] + TIME_TOLERANCE_S
+    counts = [int(np.searchsorted(depth.times, end_s)) for depth in depths]
+    pairs = zip(depths, counts, strict=True)
+    return count, [replace(d, t_s=d.times[:n], clouds=d.clouds[:n]) for d, n in pairs]
 
 
 def points_of(image_m: Array, camera: DepthCamera) -> Array:

@@ -187,14 +187,14 @@ class Replay:
         return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
 
     def seen_m(self, t: int) -> Array:
-        """(P, 3) points that depth cameras saw about sample `t`: as they do often, or as it is."""
+        """(P, 3) points that depth cameras saw nearest to sample `t`, within half a step of it."""
+        near_s = float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
         found = [np.zeros((0, 3))]
         for rows in self.seen.values():
             points = rows[np.isfinite(rows[:, 4])]
             times = np.unique(points[:, 0])
-            steps_s = [float(np.median(np.diff(x))) for x in (times, self.t_s) if len(x) > 1]
             apart_s = np.abs(times - self.t_s[t])
-            if apart_s.min(initial=np.inf) <= max(steps_s, default=0.0) / 2 + TIME_TOLERANCE_S:
+            if apart_s.min(initial=np.inf) <= near_s:
                 found.append(points[points[:, 0] == times[apart_s.argmin()], 5:])
         return np.concatenate(found)
 

@@ -284,7 +284,7 @@ def _simulated(name: str, simulated: SimulatedExperiment) -> str:
         most_mm = 1e3 * (simulated.max_m or 0.0)
         said.insert(0, f"{_mm(simulated.rms_m)} mm RMS, at most {most_mm:.2f} mm")
     said += [f"{reading} {rms:.2g} RMS" for reading, rms in (simulated.reading_rms or {}).items()]
-    return f"{kind} '{name}': {'; '.join(said)}"
+    return f"{kind} '{name}': {'; '.join(said) or 'compared with nothing but depth images'}"
 
 
 def _mm(metres: float) -> str:

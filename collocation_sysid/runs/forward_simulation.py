@@ -158,6 +158,7 @@ def step_error(
             way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
             apart.append(way.reshape(-1, 2, 3))
         apart += _of_gauges(part, rollout.trajectory, share)
+        apart += _of_depths(part, rollout.trajectory, share)
     change = changes_towards(fit, apart)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
     linear, order = problem.parameters.linear, as_scheme(problem.scheme).order
@@ -174,6 +175,21 @@ def _of_gauges(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
     return [
         share * np.nan_to_num(far - near) / gauge.sigmas[:, None]
         for gauge, near, far in zip(segment.gauges, here, there, strict=True)
+    ]
+
+
+def _of_depths(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
+    """The same of depth cameras, of each (S, M, 3), at the points that they see as fitted."""
+    if not (sights := part.sights):
+        return []
+    known_s, rows_s = part.segment.experiment.t_s, part.segment.dynamics.t_s
+    fitted = part.x[part.segment.markers.grid_rows]
+    way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
+    along_m = np.array([np.interp(rows_s, known_s, each) for each in way_m.T])
+    by = along_m.T.reshape(len(rows_s), -1, 3, 1)
+    return [
+        reading.changes(looked, by[:, reading.sighting.skin.nodes], part.phi)[..., 0]
+        for reading, looked in sights
     ]
 
 

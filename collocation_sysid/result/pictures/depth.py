@@ -61,10 +61,15 @@ def depth_picture(seen: Array) -> Figure:
             looks = {"cmap": "RdBu", "vmin": -end, "vmax": end, "s": dot}
             apart = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", looks)
             rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
-            column[1].set_title(f"{rms:.2g} mm RMS of {len(used):,} points", fontsize=SMALL_PT)
-    figure.colorbar(image, ax=axes[0], label="depth [m]", shrink=0.8)
-    if fitted:
-        figure.colorbar(apart, ax=axes[1], label="behind the surface [mm]", shrink=0.8)
+            column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)
+    scales = [(image, "depth [m]"), *([(apart, "behind surface [mm]")] if fitted else [])]
+    for row, (scale, label) in zip(axes, scales, strict=True):
+        bar = figure.colorbar(scale, ax=row)
+        bar.set_label(label, fontsize=SMALL_PT)
+        bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
+        row[0].set_ylabel("v", fontsize=SMALL_PT)
+    for panel in axes[-1]:
+        panel.set_xlabel("u", fontsize=SMALL_PT)
     return figure
 
 
@@ -80,7 +85,8 @@ def _panel(
     low, high = np.maximum(both.min(axis=0), low - room), np.minimum(both.max(axis=0), high + room)
     margin = 0.03 * (high - low).max()
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin))
-    axes.set(aspect="equal", xlabel="u", ylabel="v")
+    axes.set(aspect="equal")
+    axes.tick_params(labelsize=SMALL_PT, width=0.6)
     if not ((lines >= low) & (lines <= high)).all(axis=1).any():
         axes.text(0.5, 0.02, "the body is not in view", transform=axes.transAxes, ha="center")
     return drawn

@@ -11,6 +11,7 @@ from ...arrays import Array
 from ...model.contact import contacts
 from ...problem import Problem
 from ...program.collocation import Collocation, carried_over
+from ...recording.depth import begun
 from ...recording.experiment import Experiment
 from ...recording.tables import FEWEST
 from ...recording.wrench import Wrench
@@ -21,6 +22,8 @@ SAMPLES, STATIC_SAMPLES = 12, 3
 STEP = 1e-5
 # Over the gap in which a pressure rises: steps that leave it say nothing of slopes within.
 OF_WIDTH = 1e-3
+# Of a thousand points some are where Huber's loss begins to be linear, and differences go across.
+WITHOUT_KINK = 1e9
 # With more entries memory and wrenches are not laid out as variables: their slopes are checked.
 LAID_OUT = 5e6
 
@@ -37,16 +40,17 @@ def shortened(problem: Problem) -> Problem:
 
 
 def first_samples(experiment: Experiment, samples: int) -> Experiment:
-    """The same experiment with its first samples only."""
+    """The same experiment with its first samples only, and more where cameras see later."""
+    fewest = 1 if experiment.static else FEWEST
+    samples, depths = begun(experiment.depths, experiment.t_s, samples, fewest)
     markers, here = experiment.markers, slice(samples)
     tracks = markers.positions_m[here]
     if not np.isfinite(tracks).any():
         tracks = np.nan_to_num(tracks)  # at least one sample has to be there
     markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
     t_s = experiment.t_s[here]
-    fewest = 1 if experiment.static else FEWEST
     grasps = [replace(g, wrench=_begun(g.wrench, t_s, fewest)) for g in experiment.grasps]
-    return replace(experiment, t_s=t_s, markers=markers, grasps=grasps)
+    return replace(experiment, t_s=t_s, markers=markers, grasps=grasps, depths=depths)
 
 
 def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
@@ -61,6 +65,8 @@ def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
 
 def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
     """Largest relative deviations of J and H along a random direction at a disturbed start."""
+    if any(segment.depths for segment in collocation.segments):
+        collocation = replace(collocation, huber=WITHOUT_KINK)
     rng, of_slopes, step = np.random.default_rng(0), 0.0, _step(collocation)
     program, plain = collocation.made_explicit(), collocation
     if program.explicit:  # methods use these without memory and wrenches as variables
