@@ -276,9 +276,9 @@ def test_a_problem_file_states_depth(tmp_path):
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Of twins with noise alike over three pixels and a bias; see scripts/study_depth.py."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-    from study_depth import held
+    from study_depth import holds
 
-    assert 0.9 <= np.mean([held(seed) for seed in range(40)]) <= 1.0
+    assert 0.9 <= np.mean([holds(seed) for seed in range(40)]) <= 1.0
 
 
 def test_a_dropout_is_a_cloud_without_points():

@@ -511,8 +511,9 @@ def _seen(
 def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Array]:
     """Turn (3,) and shift (3,) of the camera that bring what it sees to a shape x (n, 3).
 
-    From where the camera is stated to be, and turned from there both ways about each axis: the best
-    of all. What is not of the body is nearest to nothing.
+    From where the camera is stated to be, or with what it sees there brought to the middle of the
+    shape, and turned from there both ways about each axis: the best of all. What is not of the body
+    is nearest to nothing.
     """
     rotations, translations = view.motion
     corners = ((x - translations[sample]) @ rotations[sample])[skin.flat]
@@ -527,7 +528,9 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
     tree = KDTree(cloud[:: 1 + len(cloud) // ENOUGH])
     gates = np.geomspace(REACH * size, view.depth.gate_m, ITERATIONS)
     turns = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
-    tried = [(1.0, Rotation.from_rotvec(turn), np.zeros(3)) for turn in turns]
+    seen = np.asarray(tree.data)[KDTree(places).query(tree.data)[0] < gates[0]]
+    shifts = [np.zeros(3), places.mean(axis=0) - seen.mean(axis=0) if len(seen) else np.zeros(3)]
+    tried = [(1.0, Rotation.from_rotvec(turn), shift) for turn in turns for shift in shifts]
     for some in np.array_split(gates, 2):
         tried = [_aligned(view, tree, places, normals, some, *start) for _, *start in tried]
         tried = sorted(tried, key=lambda each: each[0])[:KEPT]
