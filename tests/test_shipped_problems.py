@@ -61,7 +61,10 @@ def test_foam_cylinder_errors_are_consistent_with_the_noise(method: str, tmp_pat
 @pytest.mark.parametrize(
     "method", ["reduced-space", pytest.param("interior-point", marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize(("file", "within"), [("problem_scheme", 1e-4), ("problem", 1e-2)])
+@pytest.mark.parametrize(
+    ("file", "within"),
+    [("problem_scheme", 1e-4), pytest.param("problem", 1e-2, marks=pytest.mark.long)],
+)
 def test_table1_recovers_the_truth(file: str, within: float, method: str, tmp_path: Path):
     result = solved(PROBLEMS / "table1" / f"{file}.toml", tmp_path / "run", method)
     assert result["status"] == "converged"
@@ -317,6 +320,7 @@ def test_neither_remedy_is_enough_for_the_noisy_cylinder(huber: bool, offsets: b
     assert standard_errors_off(solution).max() > 4.5
 
 
+@pytest.mark.long
 def test_the_misplaced_marker_is_found_where_it_is_glued():
     places = dict(noisy_run().places["swing"])
     found = places.pop(MISPLACED)
@@ -325,6 +329,7 @@ def test_the_misplaced_marker_is_found_where_it_is_glued():
     assert max(place.moved_m for place in places.values()) < 0.001
 
 
+@pytest.mark.long
 def test_the_noisy_cylinders_gaps_and_swaps_are_reported(tmp_path: Path):
     folder = noisy_run().save(tmp_path / "run", frames=False)
     result = json.loads((folder / "result.json").read_text())
