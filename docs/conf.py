@@ -6,6 +6,7 @@ from pathlib import Path
 
 from docutils import nodes
 from latex2mathml.converter import convert
+from sphinx.ext.napoleon import NumpyDocstring
 
 sys.path.insert(0, str(Path(__file__).parent))
 from reference import write_pages
@@ -22,9 +23,11 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "gallery"]
 html_theme = "furo"
+html_static_path, html_css_files = ["_static"], ["pages.css"]
 
 # Scripts with a recorded object in them run where its data have been fetched.
 _measured = {
@@ -44,19 +47,23 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_memory": False,
+    "write_computation_times": False,
 }
 html_math_renderer = "mathml"  # which browsers draw themselves, without a network
 html_title = f"collocation_sysid {release}"
 html_show_copyright = False
 
+templates_path = ["_templates"]  # of a page for each name
 autosummary_generate = True
 autosummary_filename_map = {"collocation_sysid.Run": "collocation_sysid.run-class"}  # beside `run`
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings give shapes and units, which types cannot
-napoleon_numpy_docstring = True
+napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
+# A colon in the sentence of a property parts no type from it.
+NumpyDocstring._parse_attribute_docstring = lambda self: list(self._lines)
 # The package exports what its modules define: a name then has two places, either will do.
 suppress_warnings = ["ref.python"]
 

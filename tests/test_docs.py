@@ -127,6 +127,24 @@ def test_links_between_pages_lead_somewhere():
                 assert (page.parent / target).exists(), f"{name_of(page)}: {target}"
 
 
+def test_every_page_stands_in_the_list_of_pages():
+    index = (ROOT / "docs" / "index.md").read_text()
+    pages = sorted((ROOT / "docs" / "howto").glob("*.md"))
+    assert [name_of(each) for each in pages if f"\nhowto/{each.stem}\n" not in index] == []
+
+
+def test_links_to_a_section_lead_to_its_heading():
+    broken = []
+    for page in PAGES:
+        for target, section in re.findall(r"\]\(([\w/.]*)#([\w-]+)\)", page.read_text()):
+            file = (page.parent / target) if target else page
+            if file.suffix == ".md":
+                heads = re.findall(r"(?m)^#+ (.+)$", file.read_text())
+                known = {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+                broken += [f"{name_of(page)}: {target}#{section}"] * (section not in known)
+    assert broken == []
+
+
 def test_the_glossary_is_in_order_and_its_words_stand_on_the_pages_they_lead_to():
     glossary = ROOT / "docs" / "glossary.md"
     rows = re.findall(

@@ -427,7 +427,8 @@ def _pictures(run: Path) -> Iterator[Picture]:
 
 def _provenance(result: Result, run: Path) -> Iterator[Shown]:
     rows = content(result.problem) | content(result.provenance)
-    yield Table("", (), tuple((key, str(each)) for key, each in rows.items()), texts=1)
+    told = ((key, each if isinstance(each, list) else [each]) for key, each in rows.items())
+    yield Table("", (), tuple((key, ", ".join(map(str, each))) for key, each in told), texts=1)
     file = run / "problem.toml"
     if is_own(run, file):
         yield Listing("The problem file as run", file.read_text(encoding="utf-8"))

@@ -142,11 +142,12 @@ def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
     low, high = axes.get_ylim()
     widen = max(1.0, least_ratio / (high / low)) ** 0.5
     axes.set_ylim(low / widen, high * widen)
-    few = high / low < 1e3
+    plain = low > 1e-3 and high < 1e5
+    few = high / low < (1e3 if plain else 30.0)  # powers beside all else are too wide
     subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10 else (1.0, 2.0, 5.0)
     axes.yaxis.set_major_locator(LogLocator(subs=subs if few else (1.0,), numticks=7))
     axes.yaxis.set_minor_locator(NullLocator())
-    if few and low > 1e-3 and high < 1e5:
+    if few and plain:
         plain_numbers(axes.yaxis)
     else:
         axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(inf, inf)))

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
 from ...arrays import Array
-from ...fem.constants import symbol_of
 from ...runs.result import Result
 from ...statistics.budget import largest_first, worded
 from ...statistics.estimates import correlation_of
@@ -150,11 +149,7 @@ class _Scale:
         return -self.reach, self.reach
 
     def title(self, name: str) -> str:
-        return _label(name) + self.unit
-
-
-def _label(name: str) -> str:
-    return mathematical(name)
+        return mathematical(name) + self.unit
 
 
 def correlation_matrix(known: Confidence) -> Figure:
@@ -174,7 +169,7 @@ def correlation_matrix(known: Confidence) -> Figure:
             j, i, f"{value:.2f}".replace("-", "−"), ha="center", va="center",
             fontsize=SMALL_PT, color="white" if abs(value) > 0.65 else BLACK,
         )  # fmt: skip
-    symbols = [_label(name) for name in known.names]
+    symbols = [mathematical(name) for name in known.names]
     dress(axes, "correlation")
     axes.grid(False)
     axes.set_xticks(range(count), symbols, fontsize=TEXT_PT)
@@ -201,7 +196,7 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
     """
     drawn = largest_first(shares, LITTLE)
     rows = list(shares)[::-1]
-    figure = framed_figure(COLUMN_MM, 30 + 7 * len(rows), 14, 2, 10, 20)
+    figure = framed_figure(COLUMN_MM, 30 + 7 * len(rows), 14, 4, 10, 20)
     axes, left = figure.subplots(), [0.0] * len(rows)
     colours = colormaps["tab20"](range(20))
     for source, colour in zip([*drawn, OTHERS], colours, strict=False):
@@ -213,7 +208,7 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
         ]
         axes.barh(range(len(rows)), widths, left=left, color=colour, label=worded(source))
         left = [a + b for a, b in zip(left, widths, strict=True)]
-    axes.set_yticks(range(len(rows)), [symbol_of(row) for row in rows])
+    axes.set_yticks(range(len(rows)), [mathematical(row) for row in rows])
     axes.set_xlim(0, 1)
     dress(axes, "", "share of the variance", "")
     figure.legend(loc="upper center", ncols=3, frameon=False, fontsize="x-small")
