@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, hint_at, require_among
+from ..errors import InputError, require_among
 from ..fem.constants import bare, usual_value
 from ..fem.materials import MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
@@ -213,11 +213,11 @@ def _listed(measured: Mapping[str, int]) -> str:
 
 def _refuse_region(body: Mapping[str, Any], region: str | None, branches: bool, path: Path) -> None:
     names = [each["name"] for each in body.get("region", [])]
-    if region is not None and region not in names:
-        known = (
-            f"expected one of {', '.join(names)}" if names else "expected none: it has no regions"
-        )
-        raise InputError(f"found {region!r}; {known}{hint_at(region, names)}", path, "--region")
+    if region is not None and not names:
+        message = f"found {region!r}; expected none: it has no regions"
+        raise InputError(message, path, "--region")
+    if region is not None:
+        require_among(region, names, path, "--region")
     owners = {each.get("region") for each in body.get("prony", [])}
     if branches and owners - {region}:
         owner = next(iter(owners - {region}))

@@ -72,14 +72,8 @@ class Criterion:
     over: Over = "mean"
 
     def __post_init__(self) -> None:
-        for option, chosen, known in (
-            ("--criterion", self.kind, get_args(Kind)),
-            ("--over", self.over, get_args(Over)),
-        ):
-            if chosen not in known:
-                raise InputError(
-                    f"found {chosen!r}; expected one of {', '.join(known)}", None, option
-                )
+        require_among(self.kind, get_args(Kind), None, "--criterion")
+        require_among(self.over, get_args(Over), None, "--over")
 
     def log_size(self, errors: Errors) -> float:
         """The logarithm of the error bar that is to be small."""
