@@ -11,6 +11,7 @@ from test_depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
 
 import collocation_sysid as cs
 from collocation_sysid.methods.continuation import first_samples
+from collocation_sysid.plan.choice import without
 from collocation_sysid.program.sighting import Skin
 from collocation_sysid.result.record import replays
 from collocation_sysid.runs.check import check_problem
@@ -83,3 +84,10 @@ def test_first_samples_have_the_images_of_their_time():
     for count, samples, images in ((3, 9, 3), (12, 12, 4), (15, 15, 5)):
         part = first_samples(whole, count)
         assert (len(part.t_s), len(part.depths[0].times)) == (samples, images)
+
+
+def test_images_that_are_held_out_are_not_fitted():
+    known, start_s = without(problem(), "swing")
+    (whole,), (left,) = problem().experiments, known.experiments
+    np.testing.assert_array_equal(left.depths[0].times, times(SAMPLES)[[2, 5, 8]])
+    assert left.depths[0].times[-1] <= start_s < whole.depths[0].times[3]

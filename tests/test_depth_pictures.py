@@ -139,6 +139,15 @@ def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
     assert "points of 'front'" in checked.out
 
 
+def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):
+    file = stated(tmp_path, POSE)
+    both = "neo-hookean,st-venant-kirchhoff"
+    compared = run_command("compare", file, "--materials", both, "--out", tmp_path / "both")
+    assert compared.code == 2
+    assert "'hanging' has neither markers nor a measured wrench" in " ".join(compared.err.split())
+    assert not (tmp_path / "both").exists()
+
+
 @pytest.fixture(scope="module")
 def found():
     return fitted(noisy(np.random.default_rng(3)), POSE)

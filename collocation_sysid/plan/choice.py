@@ -414,7 +414,8 @@ def without(problem: Problem, name: str) -> tuple[Problem, float]:
         start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
         tracks = np.where((chosen.t_s > start_s)[:, None, None], np.nan, chosen.markers.positions_m)
         grasps = tuple(_until(grasp, start_s) for grasp in chosen.grasps)
-        left = replace(with_markers(chosen, tracks), grasps=grasps)
+        depths = [each for d in chosen.depths if (each := d.until(start_s)) is not None]
+        left = replace(with_markers(chosen, tracks), grasps=grasps, depths=depths)
     experiments = [left if e is chosen else e for e in problem.experiments]
     return replace(problem, experiments=experiments), start_s
 

@@ -212,8 +212,16 @@ def plan_models(
     Raises
     ------
     InputError
-        For a model that its problem file cannot have.
+        For a model that its problem file cannot have, and a recording that has nothing to compare
+        predictions with.
     """
+    for each in problem.experiments:
+        if not (each.validation or each.markers.samples or each.wrenches):
+            raise InputError(
+                f"'{each.name}' has neither markers nor a measured wrench; expected one of these, "
+                "by which models are told apart: predictions are not compared with depth images or "
+                "readings"
+            )
     planned = []
     for held_out in ("", *recordings(problem)):
         for variant in variants:

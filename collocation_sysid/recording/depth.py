@@ -225,6 +225,13 @@ class Depth:
         """(P, 3) of each sample, in the camera's frame."""
         return [cloud[:, :3] for cloud in self.clouds]
 
+    def until(self, end_s: float) -> Depth | None:
+        """The same up to some time; None without points there."""
+        count = int(np.searchsorted(self.times, end_s, side="right"))
+        if not any(map(len, self.clouds[:count])):
+            return None
+        return replace(self, t_s=self.times[:count], clouds=self.clouds[:count])
+
     @property
     def first(self) -> int:
         """The first sample that has points."""
@@ -239,9 +246,8 @@ def begun(depths: Sequence[Depth], t_s: Array, count: int, fewest: int) -> tuple
         last_s = depth.times[min(max(fewest - 1, depth.first), len(depth.times) - 1)]
         count = max(count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1)
     end_s = t_s[:count][-1] + TIME_TOLERANCE_S
-    counts = [int(np.searchsorted(depth.times, end_s)) for depth in depths]
-    pairs = zip(depths, counts, strict=True)
-    return count, [replace(d, t_s=d.times[:n], clouds=d.clouds[:n]) for d, n in pairs]
+    shorter = (depth.until(end_s) for depth in depths)
+    return count, [depth for depth in shorter if depth is not None]
 
 
 def points_of(image_m: Array, camera: DepthCamera) -> Array:
