@@ -80,7 +80,7 @@ def face_normals(depth_m: Array, matrix: Array) -> Array:
         ]
         for i in range(3)
     ]
-    values, vectors = np.linalg.eigh(np.moveaxis(spread, 2, 0))
+    values, vectors = np.linalg.eigh(np.moveaxis(np.array(spread), 2, 0))
     return vectors[np.sqrt(np.maximum(values[:, 0], 0)) < ROUGH_M, :, 0]
 
 
