@@ -394,7 +394,7 @@ PROGRAMS: dict[str, Make] = {
     ),
     **{f"contact, {scheme}": lambda scheme=scheme: touched(scheme=scheme) for scheme in SCHEMES},
     "contact, friction": lambda: touched("friction"),
-    "contact, friction, bdf2": lambda: touched(0.4, scheme="bdf2"),
+    "contact, friction, bdf2": lambda: touched("friction", scheme="bdf2"),
     "contact, unknown place": lambda: touched("friction", nuisance=OF_OBSTACLES),
     "contact, wrench": lambda: touched("friction", felt=True, nuisance=OF_OBSTACLES),
     "contact, static": lambda: touched(kind="static", felt=True),
