@@ -10,11 +10,13 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from ...arrays import Array
-from ..style import BLACK, PAGE_MM, SMALL_PT
+from ..style import PAGE_MM, SMALL_PT, VERMILION
 
 MM_PER_INCH = 25.4
 # No panel is wider than this share of the page; titles are so high, and panels between these.
 WIDEST, TITLES, HIGH = 0.6, 0.4, (0.3, 1.0)
+# Lines are of one point for so many rows of outlines, and thinner for more.
+FACES = 600
 # Points cover about this share of where they lie.
 COVERED = 0.3
 # The scale ends where this share of the points does.
@@ -51,7 +53,7 @@ def depth_picture(seen: Array) -> Figure:
         here = points[points[:, 0] == t_s]
         lines = seen[(seen[:, 0] == t_s) & np.isnan(seen[:, 3]), 1:3]
         looks = {"cmap": "viridis", "vmin": near, "vmax": far, "s": dot}
-        image = _panel(column[0], here[:, 1:3], here[:, 3], lines, BLACK, looks)
+        image = _panel(column[0], here[:, 1:3], here[:, 3], lines, VERMILION, looks)
         title = f"t = {t_s:.4g} s" if len(times) > 1 else ""
         column[0].set_title(title, fontsize=SMALL_PT)
         if fitted:
@@ -78,7 +80,9 @@ def _panel(
 ) -> PathCollection:
     """Points and outlines; what of these is far from all points is cut off."""
     drawn = axes.scatter(*places.T, c=values, linewidths=0, zorder=1, **looks)
-    axes.plot(*lines.T, color=colour, linewidth=0.4, zorder=2)
+    # Of more faces thinner ones, or these would hide the points.
+    thin = min(0.5, FACES / max(1, len(lines)))
+    axes.plot(*lines.T, color=colour, linewidth=thin, zorder=2)
     low, high = places.min(axis=0), places.max(axis=0)
     room = BEYOND * (high - low).max()
     both = np.vstack([places, lines[np.isfinite(lines).all(axis=1)]])
