@@ -239,3 +239,25 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     assert run.result.parameters["mu_pa"].ci95_holds == ("noise",)
     free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).gripping))
     assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None
+
+
+@pytest.mark.parametrize("unknown", ["obstacle_offset_m", "obstacle_tilt_rad", "obstacle_time_s"])
+@pytest.mark.parametrize("zero", ["", "y"])
+def test_what_is_found_of_an_obstacle_moves_it_in_a_forward_simulation_as_in_the_fit(unknown, zero):
+    pressed = pressed_cube(8, nuisance=cs.Nuisance.none(**{unknown: 1e-4}))
+    displaced = [replace(obstacle, zero=zero) for obstacle in pressed.obstacles]
+    (segment,) = cs.Problem([pressed.with_obstacles(displaced)], GUESS).collocation().segments
+    as_stated = segment.grasping.at(np.zeros(segment.nuisance.size))
+    for phi in np.eye(segment.nuisance.size):
+        change_m = segment.grasping.at(phi).positions_m - as_stated.positions_m
+        simulated_m = segment.corrected(phi).held_positions(segment.dynamics.t_s)
+        assert np.abs(change_m).max() > 1e-6
+        np.testing.assert_allclose(
+            simulated_m - as_stated.positions_m, change_m, atol=0.01 * np.abs(change_m).max()
+        )
+
+
+def test_a_place_is_off_along_the_displacement_or_else_along_the_normal():
+    ball, plate = pressed_cube().obstacles
+    assert replace(ball, zero="y").direction.tolist() == [0.0, 1.0, 0.0]
+    np.testing.assert_array_equal(plate.direction, plate.shape.normal)
