@@ -36,6 +36,7 @@ from collocation_sysid.recording import (
     PoseSequence,
     Solid,
     Sphere,
+    Wrench,
 )
 from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
 from collocation_sysid.result.export.identified import alone
@@ -609,6 +610,22 @@ def test_calculix_is_pressed_with_the_same_force(tmp_path):
     assert force.ours > 0.5
     assert abs(moved.relative) < 5e-3
     assert abs(force.relative) < 5e-3
+
+
+def test_a_body_of_which_only_a_force_was_measured_is_exported(tmp_path):
+    body = pressed_block(SOLIDS["plane"])
+    assert body.touching is not None
+    (tip,) = body.obstacles
+    felt = replace(tip, wrench=Wrench(body.touching.t_s, np.zeros((3, 6)), 0.01, 1.0))
+    whole = replace(body.touching, grasps=[*body.touching.gripping, felt], markers=None)
+    still = alone(whole)
+    np.testing.assert_array_equal(still.held([0.0])[0], body.held)
+    lone = replace(body, experiment=still, body=still.body, touching=whole)
+    decks = [
+        (exported(each, "calculix", tmp_path / str(k)) / "body.inp").read_text()
+        for k, each in enumerate((body, lone))
+    ]
+    assert decks[0] == decks[1]
 
 
 def test_febio_gets_what_is_touched_as_rigid_facets(tmp_path):

@@ -20,7 +20,7 @@ from ...errors import InputError, listed, located
 from ...fem.body import Body
 from ...fem.moduli import engineering
 from ...problem import Problem
-from ...recording import Experiment, Obstacle
+from ...recording import Experiment, Markers, Obstacle
 from ...recording.solids import name_of
 from ...runs.result import FoundValue, Result
 from ...runs.warm_start import Earlier
@@ -77,17 +77,21 @@ class IdentifiedRegion:
 
 def alone(experiment: Experiment) -> Experiment:
     """The experiment without obstacles, which targets have beside the body if at all."""
-    own = len(experiment.body.nodes.points_m)
+    body, t_s = experiment.body, experiment.t_s
+    own = len(body.nodes.points_m)
     started = {
         name: None if (given := getattr(experiment, name)) is None else given[:own]
         for name in ("start_positions_m", "start_velocities_m_s")
     }
+    # Nothing here looks at measurements, of which there may be none but of what was touched.
+    some = Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, ["corner"], body.nodes_m[:1])
+    unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
     try:
-        return replace(experiment, grasps=experiment.gripping, **started)
+        return replace(experiment, grasps=experiment.gripping, **started, **unmeasured)
     except InputError as error:
         raise InputError(
             "exports have no equilibrium of a body that obstacles alone carry; expected a "
-            "recording in which it is grasped, or that starts undeformed"
+            f"recording in which it is grasped, or that starts undeformed: {error}"
         ) from error
 
 
