@@ -138,6 +138,25 @@ def test_what_is_beside_the_body_is_left_out_and_counted(rng):
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
 
 
+def test_a_point_whose_normal_is_turned_from_that_of_the_surface_is_left_out():
+    camera = cs.DepthCamera(MATRIX, pose=POSE)
+    depth = cs.Depth.of_images("front", image_m(), camera, NOISE_M, spacing_m=0.004)
+
+    def sighting(depth: cs.Depth) -> Sighting:
+        experiment = hanging((depth,))
+        nuisance = NuisanceMap.of(experiment)
+        view = View.of(experiment, 0, nuisance)
+        return Sighting.of(view, bar(), hanging_m()[None], np.zeros(nuisance.size), depth.gate_m)
+
+    plain = sighting(depth)
+    used, normals = plain.used[0], plain.normals[0] @ POSE[:3, :3]
+    cloud = np.hstack([plain.points[0], normals])[used]
+    cloud[:20, 3:] *= -1  # of another body, as close
+    turned = sighting(replace(depth, clouds=[cloud]))
+    assert turned.left_out["turned away"] == 20
+    assert turned.used.sum() == len(cloud) - 20 > 100
+
+
 @pytest.mark.long
 def test_an_interior_point_method_finds_the_same(rng):
     image = noisy(rng)
