@@ -20,7 +20,10 @@ from collocation_sysid.fem.refinement import refined
 from collocation_sysid.result.pictures.field import field_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.check.body import body_finding
+from collocation_sysid.statistics.considered import assumed
 from collocation_sysid.statistics.fields import FieldEstimate, fields_of
+from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.numerical import shifts
 from collocation_sysid.statistics.uncertainty import covariance
 
 SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
@@ -168,6 +171,29 @@ def test_other_methods_find_the_same_field(method):
     assert solution.status.converged
     for name, value in expected.parameters.items():
         assert solution.parameters[name] == pytest.approx(value, rel=1e-4, abs=1e-4)
+
+
+def test_a_body_of_another_size_moves_a_field_as_its_budget_says():
+    larger, shape = 1e-4, bar()
+    field = cs.Field(0.05, modes=8)
+    clamp_m = shape.nodes_m[shape.nodes_m[:, 2] > 0.119].mean(axis=0)
+    true = Body(
+        cs.TetMesh(clamp_m + (1 + larger) * (shape.nodes_m - clamp_m), shape.mesh.tetrahedra),
+        density_kg_m3=100.0,
+    )
+    values, free = {**KNOWN, "young_pa": YOUNG_PA}, {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)}
+    solutions = [
+        cs.solve(cs.Problem([cs.with_markers(swung(bar(field)), tracks)], free, substeps=1))
+        for body in (shape, true)
+        for tracks in [cs.simulate(swung(body), values, "midpoint").markers_m]
+    ]
+    moved = np.subtract(*(solution.q for solution in reversed(solutions)))
+    fitted = solutions[0]
+    changes = assumed(fitted.collocation, fitted.z, {"body_scale": larger})
+    told = shifts(linearised_fit(fitted.collocation, fitted.z), changes.blocks)
+    size = changes.names.index("body_scale")
+    assert np.abs(moved).max() > 0.05
+    np.testing.assert_allclose(moved, -told[: len(moved), size], atol=0.03 * np.abs(moved).max())
 
 
 HEAVY, OF_DENSITY = 1.4, cs.Field(0.05, "density_kg_m3", 20, 0.3)
