@@ -291,6 +291,27 @@ def test_a_problem_file_states_depth(tmp_path):
         cs.Problem.read(file)
 
 
+@pytest.mark.long
+def test_noise_that_persists_from_image_to_image_widens_the_interval():
+    """By up to √((1 + 0.9) / (1 − 0.9)) = 4.4 of many images, by less of twenty."""
+    rng, widths = np.random.default_rng(0), []
+    for share in (0.0, 0.9):
+        noise, images = noisy(rng) - image_m(), []
+        for _ in range(20):
+            noise = share * noise + np.sqrt(1 - share**2) * (noisy(rng) - BIAS_M - image_m())
+            images.append(image_m() + noise)
+        camera, t_s = cs.DepthCamera(MATRIX, pose=POSE), np.arange(20.0)
+        depth = cs.Depth.of_images("front", images, camera, NOISE_M, t_s=t_s, spacing_m=0.006)
+        held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
+        kept = hanging((NOTHING,)).nuisance
+        experiment = cs.Experiment(bar(), t_s, [held], kind="static", depths=[depth], nuisance=kept)
+        unknown = {**TRUTH, "young_pa": cs.Unknown(1.6e5)}
+        solution = cs.solve(cs.Problem([experiment], cs.Parameters.of(unknown)))
+        low, high = covariance(solution.collocation, solution.z).estimates["young_pa"].ci95
+        widths.append(np.log(high / low))
+    assert 2 < widths[1] / widths[0] < 4.4
+
+
 @pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Of twins with noise alike over three pixels and a bias; see scripts/study_depth.py."""
