@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
-from collocation_sysid.program.sighting import Skin
+from collocation_sysid.program.skin import Skin
 from collocation_sysid.statistics.uncertainty import covariance
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}

@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance import NuisanceMap
-from collocation_sysid.program.sighting import Sighting, Skin, View
+from collocation_sysid.program.sighting import Sighting
+from collocation_sysid.program.skin import Skin
+from collocation_sysid.program.view import View
 from collocation_sysid.recording.depth import points_of
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.statistics.uncertainty import covariance

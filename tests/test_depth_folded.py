@@ -9,7 +9,9 @@ from test_depth import MATRIX, NOISE_M, SHAPE, looking
 
 import collocation_sysid as cs
 from collocation_sysid.model.nuisance import NuisanceMap
-from collocation_sysid.program.sighting import Sighting, Skin, View
+from collocation_sysid.program.sighting import Sighting
+from collocation_sysid.program.skin import Skin
+from collocation_sysid.program.view import View
 
 # A strip folded to a U that lies on its side: arms so far apart, the one behind longer.
 ARM_M, BEHIND_M, APART_M, THICK_M = 0.08, 0.12, 0.02, 0.008

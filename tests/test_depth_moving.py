@@ -12,7 +12,7 @@ from test_depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
 import collocation_sysid as cs
 from collocation_sysid.methods.continuation import first_samples
 from collocation_sysid.plan.choice import without
-from collocation_sysid.program.sighting import Skin
+from collocation_sysid.program.skin import Skin
 from collocation_sysid.result.record import replays
 from collocation_sysid.runs.check import check_problem
 

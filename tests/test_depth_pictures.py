@@ -22,7 +22,7 @@ from test_depth import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid.program.sighting import Skin
+from collocation_sysid.program.skin import Skin
 from collocation_sysid.recording.depth import points_of
 from collocation_sysid.result.animation import Film
 from collocation_sysid.result.pictures.depth import depth_picture

@@ -36,7 +36,7 @@ from .markers import MarkerReading
 from .motion_rows import MotionRows, ahead
 from .reading import Reading
 from .sharing import Local
-from .sighting import View
+from .view import View
 from .wrench import WrenchReading, wrench_readings
 from .wrench_channel import Grid, sensed_dofs
 

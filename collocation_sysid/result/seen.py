@@ -12,7 +12,8 @@ from ..arrays import Array
 from ..model.nuisance import NuisanceMap
 from ..program.depth import DepthReading
 from ..program.part import Part
-from ..program.sighting import Skin, View
+from ..program.skin import Skin
+from ..program.view import View
 from ..recording.experiment import Experiment
 from .pictures.album import save_pictures
 from .pictures.camera import Camera

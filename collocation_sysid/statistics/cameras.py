@@ -15,7 +15,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..arrays import Array
-from ..program.sighting import ENOUGH, WIDE, Skin
+from ..program.camera_alignment import ENOUGH
+from ..program.sighting import WIDE
+from ..program.skin import Skin
 from ..recording.depth import Depth
 from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
