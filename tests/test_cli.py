@@ -441,6 +441,18 @@ def test_a_new_problem_file_is_valid(tmp_path, monkeypatch, name):
     assert file.experiment[0].grasps[0].poses == "poses.csv"
 
 
+def test_a_new_problem_leaves_the_data_that_are_there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    own = tmp_path / "mine" / "markers.csv"
+    own.write_text("measured")
+    outcome = run_command("new", "mine", "--kind", "swing")
+    assert outcome.code == 2
+    assert "markers.csv: it is there already" in outcome.err
+    assert [*own.parent.iterdir()] == [own]
+    assert own.read_text() == "measured"
+
+
 def test_the_template_names_only_what_there_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_command("new", "mine")

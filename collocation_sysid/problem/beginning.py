@@ -30,16 +30,17 @@ def begin(folder: Path, kind: str | None = None) -> list[Path]:
     Raises
     ------
     InputError
-        Where there is a problem already, or the folder cannot be made.
+        Where there is one of these files already, or the folder cannot be made.
     """
     file, template = folder / "problem.toml", TEMPLATES / (kind or "swing")
     require_possible(folder)
-    if file.exists():
-        raise InputError("it is there already; choose another name", file)
+    data = sorted(each for each in template.iterdir() if kind and each.name != file.name)
+    for each in (file, *(folder / each.name for each in data)):
+        if each.exists():
+            raise InputError("it is there already; choose another name", each)
     title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
     text = (template / file.name).read_text(encoding="utf-8")
     write_whole(file, text.replace('title = ""', f"title = {title}", 1))
-    data = sorted(each for each in template.iterdir() if kind and each.name != file.name)
     for each in data:
         with whole_file(folder / each.name) as draft:
             shutil.copyfile(each, draft)

@@ -67,8 +67,7 @@ def solve(
     ------
     InputError
         For an unknown method, a start that is no run or has no parameter of these, where no start
-        is found, for a scheduler that does not answer or has lost its workers, and when the
-        solver refuses the problem.
+        is found, for a scheduler that does not answer, and when the solver refuses the problem.
     """
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):
