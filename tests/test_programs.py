@@ -424,6 +424,12 @@ PROGRAMS: dict[str, Make] = {
     "field, memory": lambda: differing(
         measured(hung_cube(3, (1, 1, 2))), values=guesses(TWO, 1.1), prony=["prony_1", "prony_2"]
     ),
+    "field, density, memory": lambda: differing(
+        measured(hung_cube(3, (1, 1, 2))),
+        values=guesses(TWO, 1.1),
+        prony=["prony_1", "prony_2"],
+        field=IN_MASS,
+    ),
     "field, wrench": lambda: differing(sensing(hung_cube(4, (1, 1, 2)), frame="grasp")),
     "field, contact": lambda: differing(measured(pressed_cube(4, 0.0))),
     "field, static": lambda: differing(measured(block("z", gravity_m_s2=HANGING))),

@@ -246,14 +246,14 @@ class Stresses:
         elif "nodes" in kernel.contractions.values():
             destinations, length = dofs_of(cells), body.pattern.size
         elif name == "stress_by_theta":
-            count = len(part.material.constants) + bool(part.field)
+            count = len(part.material.constants) + bool(part.stress_field)
             columns = places.size * np.arange(count)
             destinations = (columns[:, None] + own - places[0, 0, 0]).reshape(len(cells), -1)
             length = places.size * len(columns)
         else:
             destinations, length = own.reshape(len(cells), 6), self.width
         carried = own if KERNELS[name][2] else own[..., :0]
-        if part.field:
+        if part.stress_field:
             width = self.width if KERNELS[name][2] else 0
             logs = width + np.repeat(np.arange(len(part.cells)), points)
             carried = np.concatenate([carried, logs[:, None, None]], axis=-1)
