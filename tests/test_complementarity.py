@@ -16,6 +16,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.contact import contacts
 from collocation_sysid.recording import Experiment
+from collocation_sysid.runs.forward_simulation import Rollout, roll_out
 
 TRUTH = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.3}
 STIFFER = np.array([1.0, 10.0])
@@ -141,3 +142,14 @@ def test_friction_is_refused():
     rough = pressed(cs.Plane(-UP, 0.03 * UP), friction=0.3)
     with pytest.raises(cs.InputError, match="plate has friction, which contact as complementarity"):
         solved(rough)
+
+
+def test_friction_of_a_recording_for_validation_is_simulated_by_the_contacts_energy():
+    smooth, answer = answered("plane")
+    rough = seen(pressed(cs.Plane(-UP, 0.03 * UP), friction=0.3))
+    predicted = replace(rough, name="rubbed", validation=True)
+    hard = InteriorPoint(contact="complementarity")
+    problem = cs.Problem([seen(smooth), predicted], TRUTH, scheme="bdf2", method=hard)
+    simulated = roll_out(problem, predicted, answer)
+    assert isinstance(simulated, Rollout), simulated
+    assert simulated.rms_m < 1e-4

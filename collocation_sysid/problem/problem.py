@@ -189,7 +189,8 @@ class Problem:
             require_method(chosen, "method")
             chosen = METHODS[chosen]()
         if isinstance(chosen, InteriorPoint):
-            chosen.require(self.experiments)
+            # Validation recordings are only simulated forward, by the contact's energy.
+            chosen.require(each for each in self.experiments if not each.validation)
         return chosen
 
     def _check(self) -> None:
