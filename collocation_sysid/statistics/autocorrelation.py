@@ -268,12 +268,12 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
     pairs = zip(fit.blocks, information.slopes, strict=True)
     over_space = [found for each in pairs if (found := spatial_errors(*each))]
     space_p = min((len(over_space) * found.p for found in over_space), default=1.0)
-    if all(len(block.t_s) < 2 for block in fit.blocks):  # nothing follows on anything
-        return Dependence(0.0, np.inf, _shared_p(fit), space_p)
     found = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
     products, expected = pool @ found.products, pool @ found.expected @ pool.T
+    if not expected[1, 1] > 0:  # nothing follows on anything
+        return Dependence(0.0, np.inf, _shared_p(fit), space_p)
     variance = products[0] / expected[0, 0]
     lag1_variance = (products[1] - variance * expected[1, 0]) / expected[1, 1]
     return Dependence(
