@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problem_files import run_command
+from problem_files import pictures_drawn, run_command
+from results_small import a_result
 from test_depth import (
     MATRIX,
     NOISE_M,
     POSE,
     SHAPE,
+    TRUTH,
     bar,
     fitted,
     hanging,
@@ -22,15 +24,19 @@ from test_depth import (
 )
 
 import collocation_sysid as cs
+from collocation_sysid.pipeline import run
+from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.skin import Skin
 from collocation_sysid.recording.depth import points_of
 from collocation_sysid.result.animation import Film
+from collocation_sysid.result.pictures.album import album
 from collocation_sysid.result.pictures.depth import depth_picture
 from collocation_sysid.result.replay import Replay
-from collocation_sysid.result.seen import seen_as_fitted, seen_before
+from collocation_sysid.result.seen import save_overlays, seen_as_fitted, seen_before
 from collocation_sysid.statistics.cameras import camera_mistakes
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
+AWAY = np.eye(4) + 5 * np.outer(np.eye(4)[2], np.eye(4)[3])  # 5 m above, and looks up
 IN_MM = POSE * np.array([[1, 1, 1, 1000]] * 3 + [[1, 1, 1, 1]])
 
 
@@ -137,6 +143,46 @@ def test_check_draws_the_image_and_the_body_and_names_what_is_wrong(tmp_path):
     assert "depth_hanging_front.png" in checked.out
     assert "inverted" in " ".join(checked.out.split())
     assert "points of 'front'" in checked.out
+
+
+def test_check_draws_the_image_of_a_camera_that_looks_away_and_says_that_it_does(tmp_path):
+    checked = run_command("check", stated(tmp_path, AWAY), "--out", tmp_path / "seen")
+    assert checked.code == 1
+    assert (tmp_path / "seen" / "depth_hanging_front.png").is_file()
+    assert "points of 'front'" in checked.out
+    (rows,) = seen_before(seeing(AWAY)).values()
+    said = [text.get_text() for text in depth_picture(rows).axes[0].texts]
+    assert said == ["the body is not in view"]
+
+
+def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures(tmp_path):
+    tip = np.flatnonzero(bar().nodes_m[:, 0] > 0.12 - 1e-9)[:3]
+    still = cs.Markers([0.0], np.zeros((1, 3, 3)), 1e-4, places_m=bar().nodes_m[tip])
+    marked = replace(seeing(AWAY), markers=still, nuisance=cs.Nuisance.none())
+    marked = with_markers(marked, cs.simulate(marked, TRUTH).markers_m)
+    unknown = TRUTH | {"young_pa": cs.Unknown(2e5)}
+    solved = run(cs.Problem([marked], cs.Parameters.of(unknown)), seek_causes=False)
+    assert solved.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=1e-3)
+    assert any("0 points of 'front' count" in note for note in solved.solution.notes)
+    with pictures_drawn():
+        solved.save(tmp_path / "run", frames=False)
+    assert (tmp_path / "run" / "depth_experiment_front.png").is_file()
+    (text,) = depth_picture(np.zeros((0, 8))).axes[0].texts
+    assert text.get_text() == "no point is near enough to the body to count"
+
+
+def test_cameras_whose_names_meet_in_one_file_name_have_a_picture_each(tmp_path):
+    (rows,) = seen_before(seeing(POSE)).values()
+    named = [("a_b", "c"), ("a", "b_c")]
+    twins = [
+        replace(seeing(POSE), name=name, depths=(replace(seeing(POSE).depths[0], name=camera),))
+        for name, camera in named
+    ]
+    drawn = save_overlays(twins, tmp_path)
+    assert [file.name for file in drawn] == ["depth_a_b_c.png", "depth_a_b_c_2.png"]
+    shape_m = bar().nodes_m[None], np.zeros((1, 0, 3))
+    shown = [replace(Replay.of(each, shape_m), seen={each.depths[0].name: rows}) for each in twins]
+    assert {"depth_a_b_c", "depth_a_b_c_2"} <= album(shown, a_result()).keys()
 
 
 def test_models_are_not_compared_by_what_only_a_depth_camera_sees(tmp_path):

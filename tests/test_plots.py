@@ -507,8 +507,8 @@ def test_type_can_be_read_in_a_column():
 def test_validation_is_drawn_by_its_simulation():
     seen = replace(replay(), positions_m=None, markers_m=None)
     pictures = album([seen], a_result())
-    assert "shapes_hung cube" in pictures
-    assert len(pictures["error_hung cube"].axes[0].lines) == 1
+    assert "shapes_hung_cube" in pictures
+    assert len(pictures["error_hung_cube"].axes[0].lines) == 1
 
 
 @pytest.mark.parametrize(("first", "wrong"), [(0, np.inf), (6, np.nan)])
@@ -517,7 +517,7 @@ def test_what_went_astray_leaves_gaps(tmp_path, wrong, first):
     positions, markers = seen.positions_m.copy(), seen.markers_m.copy()
     positions[first:], markers[first:] = wrong, wrong
     pictures = album([replace(seen, positions_m=positions, markers_m=markers)], a_result())
-    assert ("shapes_hung cube" in pictures) == (first > 0)
+    assert ("shapes_hung_cube" in pictures) == (first > 0)
     save_pictures(tmp_path, pictures)
 
 

@@ -15,7 +15,7 @@ from ..program.part import Part
 from ..program.skin import Skin
 from ..program.view import View
 from ..recording.experiment import Experiment
-from .pictures.album import save_pictures
+from .pictures.album import of_different_names, save_pictures
 from .pictures.camera import Camera
 from .pictures.depth import depth_picture
 
@@ -77,8 +77,8 @@ class Projection:
         return np.column_stack([t_s, self.points(points_m, world), apart_m, world])
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
-        """(k, 8) of the outlines of a shape."""
-        drawn = self.outlines(shape_m, sample)
+        """(k, 8) of the outlines of a shape; a row without a place where none is in view."""
+        drawn = np.vstack([self.outlines(shape_m, sample), np.full((1, 2), np.nan)])
         rows = np.full((len(drawn), 8), np.nan)
         rows[:, 0], rows[:, 1:3] = self.view.depth.times[sample], drawn
         return rows
@@ -117,9 +117,11 @@ def seen_before(experiment: Experiment) -> dict[str, Array]:
 
 def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]:
     """Draw `seen_before` of all, before anything is fitted, and return the files."""
-    pictures = {
-        f"depth_{experiment.name}_{name}": depth_picture(rows)
-        for experiment in experiments
-        for name, rows in seen_before(experiment).items()
-    }
-    return save_pictures(folder, pictures)
+    return save_pictures(
+        folder,
+        of_different_names(
+            (f"depth_{experiment.name}_{name}", depth_picture(rows))
+            for experiment in experiments
+            for name, rows in seen_before(experiment).items()
+        ),
+    )

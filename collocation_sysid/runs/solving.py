@@ -146,11 +146,15 @@ def _seen(solution: Solution) -> Iterator[str]:
         for reading, looked in part.sights:
             apart_m, seen = reading.apart_m(looked, part.phi), reading.sighting
             said = ", ".join(f"{count} {why}" for why, count in seen.left_out.items() if count)
+            off = "count, as none is near enough to the body"
+            if seen.used.any():
+                off = (
+                    f"are off by {1e3 * np.sqrt(np.nanmean(apart_m**2)):.3g} mm (RMS; half of them "
+                    f"by less than {1e3 * np.nanmedian(np.abs(apart_m)):.3g})"
+                )
             yield (
                 f"experiment '{part.segment.experiment.name}': {seen.used.sum()} points of "
-                f"'{seen.view.depth.name}' are off by {1e3 * np.sqrt(np.nanmean(apart_m**2)):.3g} "
-                f"mm (RMS; half of them by less than {1e3 * np.nanmedian(np.abs(apart_m)):.3g}); "
-                f"left out: {said or 'none'}"
+                f"'{seen.view.depth.name}' {off}; left out: {said or 'none'}"
             )
 
 

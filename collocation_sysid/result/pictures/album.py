@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
@@ -53,35 +54,42 @@ def album(
         pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
         for name, values in body.fields.items():
             pictures[f"field_{name}"] = field_picture(body, name, values)
-    for replay in replays:
-        pictures |= _of_experiment(replay)
-    return pictures
+    drawn = (named for replay in replays for named in _of_experiment(replay))
+    return of_different_names(chain(pictures.items(), drawn))
 
 
-def _of_experiment(replay: Replay) -> dict[str, Figure]:
+def of_different_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figure]:
+    """Pictures by file name; one whose name is taken has a number."""
+    named = dict[str, Figure]()
+    for text, figure in pictures:
+        name = safe_name(text)
+        numbered = (f"{name}_{k}" for k in count(2))
+        named[next(free for free in chain([name], numbered) if free not in named)] = figure
+    return named
+
+
+def _of_experiment(replay: Replay) -> Iterator[tuple[str, Figure]]:
     t_s, measured = replay.t_s, replay.measured_m
     fitted, rolled_out = _finite(replay.markers_m), _finite(replay.rolled_out_m)
-    pictures, names = dict[str, Figure](), replay.marker_names
+    names = replay.marker_names
     if len(names):
-        pictures[f"tracks_{replay.name}"] = tracks(t_s, names, measured, fitted, rolled_out)
-        pictures[f"error_{replay.name}"] = error_over_time(t_s, measured, fitted, rolled_out)
+        yield f"tracks_{replay.name}", tracks(t_s, names, measured, fitted, rolled_out)
+        yield f"error_{replay.name}", error_over_time(t_s, measured, fitted, rolled_out)
     if len(names) and not replay.static:
-        spectral = spectrum(t_s, measured, fitted, replay.natural_hz)
-        pictures[f"spectrum_{replay.name}"] = spectral
+        yield f"spectrum_{replay.name}", spectrum(t_s, measured, fitted, replay.natural_hz)
     for k, sensed in enumerate(replay.wrenches, start=1):
         which = "" if len(replay.wrenches) == 1 else f"_{k}"
-        pictures[f"wrench_{replay.name}{which}"] = readings_picture(sensed, COMPONENTS, UNITS)
+        yield f"wrench_{replay.name}{which}", readings_picture(sensed, COMPONENTS, UNITS)
     for name, said in replay.readings.items():
-        count = said.shape[1] // 3
-        names = [f"{name} {k + 1}" for k in range(count)] if count > 1 else [name]
-        pictures[f"reading_{replay.name}_{name}"] = readings_picture(said, names)
+        places = said.shape[1] // 3
+        names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
+        yield f"reading_{replay.name}_{name}", readings_picture(said, names)
     for name, seen in replay.seen.items():
-        pictures[f"depth_{replay.name}_{name}"] = depth_picture(seen)
+        yield f"depth_{replay.name}_{name}", depth_picture(seen)
     if replay.has_shapes:
-        pictures[f"shapes_{replay.name}"] = shapes(replay)
-        coloured = contact_shapes(replay).items()
-        pictures |= {f"{name}_{replay.name}": figure for name, figure in coloured}
-    return pictures
+        yield f"shapes_{replay.name}", shapes(replay)
+        for name, figure in contact_shapes(replay).items():
+            yield f"{name}_{replay.name}", figure
 
 
 def _finite(markers_m: Array | None) -> Array | None:

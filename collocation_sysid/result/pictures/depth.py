@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from ...arrays import Array
 from ..style import PAGE_MM, SMALL_PT, VERMILION
@@ -28,7 +29,8 @@ BEYOND = 0.5
 def depth_picture(seen: Array) -> Figure:
     """Draw an image and the outlines of the surface over it, and below it how far they are apart.
 
-    Of several samples those that have outlines are shown. Without a fit there is nothing below.
+    Of several samples those that have outlines are shown. Without a fit there is nothing below;
+    where no point counts only that is said.
 
     Parameters
     ----------
@@ -36,43 +38,57 @@ def depth_picture(seen: Array) -> Figure:
     """
     times = np.unique(seen[np.isnan(seen[:, 3]), 0])
     points = seen[np.isfinite(seen[:, 3])]
+    if not len(points):
+        return _sentence("no point is near enough to the body to count")
     fitted = bool(np.isfinite(points[:, 4]).any())
-    inch = PAGE_MM / MM_PER_INCH
-    across = min(1 / max(1, len(times)), WIDEST)
-    width, height = np.ptp(points[:, 1:3], axis=0)
-    panel = across * inch * float(np.clip(height / max(width, 1e-12), *HIGH)) + TITLES
-    size = (max(WIDEST, across * len(times)) * inch, panel * (1 + fitted))
-    figure = Figure(figsize=size, layout="constrained")
-    dot = COVERED * (72 * across * inch) ** 2 * HIGH[0] / max(1, len(points) / max(1, len(times)))
-    axes = figure.subplots(1 + fitted, max(1, len(times)), squeeze=False)
-    end = 1.0
-    if fitted:
-        end = max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SHOWN)))
+    axes, dot = _sheet(points, times, 1 + fitted)
     near, far = np.percentile(points[:, 3], [1, 99])
-    for column, t_s in zip(axes.T, times, strict=False):
+    depth = {"cmap": "viridis", "vmin": near, "vmax": far, "s": dot}
+    end = max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SHOWN))) if fitted else 1.0
+    behind = {"cmap": "RdBu", "vmin": -end, "vmax": end, "s": dot}
+    for column, t_s in zip(axes.T, times, strict=True):
         here = points[points[:, 0] == t_s]
         lines = seen[(seen[:, 0] == t_s) & np.isnan(seen[:, 3]), 1:3]
-        looks = {"cmap": "viridis", "vmin": near, "vmax": far, "s": dot}
-        image = _panel(column[0], here[:, 1:3], here[:, 3], lines, VERMILION, looks)
+        image = _panel(column[0], here[:, 1:3], here[:, 3], lines, VERMILION, depth)
+        scales = [(image, "depth [m]")]
         title = f"t = {t_s:.4g} s" if len(times) > 1 else ""
         column[0].set_title(title, fontsize=SMALL_PT)
         if fitted:
             used = here[np.isfinite(here[:, 4])]
             left = here[~np.isfinite(here[:, 4])]
             column[1].plot(*left[:, 1:3].T, ".", ms=1.5, color="0.7")
-            looks = {"cmap": "RdBu", "vmin": -end, "vmax": end, "s": dot}
-            apart = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", looks)
+            apart = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
+            scales.append((apart, "behind surface [mm]"))
             rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
             column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)
-    scales = [(image, "depth [m]"), *([(apart, "behind surface [mm]")] if fitted else [])]
     for row, (scale, label) in zip(axes, scales, strict=True):
-        bar = figure.colorbar(scale, ax=row)
+        bar = row[0].figure.colorbar(scale, ax=row)
         bar.set_label(label, fontsize=SMALL_PT)
         bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
         row[0].set_ylabel("v", fontsize=SMALL_PT)
     for panel in axes[-1]:
         panel.set_xlabel("u", fontsize=SMALL_PT)
+    return axes[0, 0].figure
+
+
+def _sentence(text: str) -> Figure:
+    """What is said where there is nothing to draw."""
+    figure = Figure(figsize=(WIDEST * PAGE_MM / MM_PER_INCH, TITLES), layout="constrained")
+    axes = figure.subplots()
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=SMALL_PT)
     return figure
+
+
+def _sheet(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_], float]:
+    """Panels (rows, times) of the shape of what points cover, and the area of a point there."""
+    inch, count = PAGE_MM / MM_PER_INCH, len(times)
+    across = min(1 / count, WIDEST)
+    width, height = np.ptp(points[:, 1:3], axis=0)
+    panel = across * inch * float(np.clip(height / max(width, 1e-12), *HIGH)) + TITLES
+    size = (max(WIDEST, across * count) * inch, panel * rows)
+    dot = COVERED * (72 * across * inch) ** 2 * HIGH[0] / max(1, len(points) / count)
+    return Figure(figsize=size, layout="constrained").subplots(rows, count, squeeze=False), dot
 
 
 def _panel(
