@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -142,16 +142,25 @@ class Messages:
         content = np.frombuffer(data, "u1")
         return t_s, topic, name, self.made(name, self.header(t_s, "camera"), form, content)
 
-    def camera(self, t_s: float, matrix: Any, distortion: Any, projection: Any) -> Message:
+    def camera(
+        self,
+        t_s: float,
+        matrix: Any,
+        distortion: Any = (),
+        projection: Any = (0.0,) * 12,
+        shape: tuple[int, int] = (120, 160),
+        binned: int = 0,
+        corner: int = 0,
+    ) -> Message:
         name = "sensor_msgs/msg/CameraInfo"
         numbers = (np.asarray(each, dtype=float).ravel() for each in (distortion, matrix))
         whole = np.asarray(projection, dtype=float).ravel()
-        area = self.made("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-        told = "plumb_bob", *numbers, np.eye(3).ravel(), whole, 0, 0, area
-        info = self.made(name, self.header(t_s, "camera"), 120, 160, *told)
+        area = self.made("sensor_msgs/msg/RegionOfInterest", corner, corner, 0, 0, False)
+        told = "plumb_bob", *numbers, np.eye(3).ravel(), whole, binned, binned, area
+        info = self.made(name, self.header(t_s, "camera"), *shape, *told)
         return t_s, "/camera/camera_info", name, info
 
-    def cloud(self, t_s: float, columns: dict[str, np.ndarray], topic: str) -> Message:
+    def cloud(self, t_s: float, columns: Mapping[str, Any], topic: str) -> Message:
         name, count = "sensor_msgs/msg/PointCloud2", len(next(iter(columns.values())))
         form = np.dtype([(each, "<f4") for each in (*columns, "rgb")])
         rows = np.zeros(count, form)

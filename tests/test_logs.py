@@ -186,7 +186,7 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
     Image.fromarray(counts.astype(np.uint16)).save(tmp_path / "counts.png")
     squeezed = (tmp_path / "counts.png").read_bytes()
     raw, rectified = "/camera/depth/image_raw", "/camera/depth/image_rect_raw"
-    messages = [of.camera(0.0, **RAYS)]
+    messages = [of.camera(0.0, **RAYS, shape=(5, 7))]
     for t in (0.1, 0.2):
         metres = (counts * np.float32(1e-3) + np.float32(t)).astype("<f4")
         messages += [
@@ -196,6 +196,7 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
         ]
     log = bag(tmp_path / "trial", messages, kind)
     seen = read_depth(Path(f"{log}#{raw}"), None, 1.0)
+    assert seen.t_s is not None
     np.testing.assert_allclose(seen.t_s, (0.1, 0.2), atol=1e-9)
     np.testing.assert_allclose(seen.images_m, [counts * 1e-3] * 2)
     np.testing.assert_array_equal(seen.matrix, RAYS["matrix"])
@@ -240,7 +241,7 @@ def test_a_problem_states_depth_by_the_topic_of_a_log(tmp_path: Path) -> None:
     file = write_problem(tmp_path, {"swing": 12})
     of, flat = Messages(), np.full((120, 160), 400, dtype="<u2")
     square = [[100, 0, 80], [0, 100, 60], [0, 0, 1]]
-    messages = [of.camera(0.0, square, np.zeros(5), np.zeros((3, 4)))]
+    messages = [of.camera(0.0, square)]
     messages += [of.image(t, "16UC1", flat, "/camera/depth") for t in (0.0, 0.02, 0.04, 9.0)]
     bag(tmp_path / "trial", messages)
     stated = '[[experiment.depth]]\nfile = "trial#/camera/depth"\nsigma_m = 0.001\n'
@@ -250,22 +251,116 @@ def test_a_problem_states_depth_by_the_topic_of_a_log(tmp_path: Path) -> None:
     np.testing.assert_array_equal(depth.camera.matrix, square)
     np.testing.assert_allclose(depth.points_m[0][:, 2], 0.4)
     camera = "camera = { matrix = [[50, 0, 80], [0, 50, 60], [0, 0, 1]] }\n"
-    file.write_text(f"{file.read_text()}{camera}")
+    bag(tmp_path / "halved", [of.camera(0.0, square, shape=(60, 80)), *messages[1:]])
+    file.write_text(f"{file.read_text()}{camera}".replace("trial#", "halved#"))
     (depth,) = Problem.read(file).experiments[0].depths
     assert depth.camera.matrix[0, 0] == 50
 
 
-def test_a_lens_that_is_not_known_and_images_cut_short_are_refused(tmp_path: Path) -> None:
-    of, pixels = Messages(), np.full((4, 4), 400, dtype="<u2")
-    lens = dict(RAYS, distortion=np.ones(8))
-    t, topic, name, image = of.image(0.0, "16UC1", pixels, "/camera/image_raw")
-    short = replace(image, data=image.data[:-3])
-    messages = [of.camera(0.0, **lens), (t, topic, name, image), (t, "/short", name, short)]
-    log = bag(tmp_path / "trial", messages)
-    with pytest.raises(InputError, match="plumb_bob with 8 numbers; expected plumb_bob with five"):
-        read_depth(Path(f"{log}#{topic}"), None, 1.0)
-    with pytest.raises(InputError, match="45 bytes in a message; expected 4 rows of 4 times 2"):
-        _ = read_depth(Path(f"{log}#/short"), None, 1.0).images_m[0]
+PIXELS = np.full((4, 6), 400, dtype="<u2")
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/camera/depth/image_raw", False),
+        ("/camera/direct/depth", False),
+        ("/camera/depth/corrected", False),
+        ("/camera/depth/image_rect_raw", True),
+        ("/camera/depth/image_rectified", True),
+        ("/camera/rect/depth", True),
+    ],
+)
+def test_images_are_rectified_where_a_word_of_their_topic_says_so(
+    tmp_path: Path, topic: str, rectified: bool
+) -> None:
+    of = Messages()
+    camera = of.camera(0.0, **RAYS, shape=PIXELS.shape)
+    log = bag(tmp_path / "trial", [camera, of.image(0.0, "16UC1", PIXELS, topic)])
+    read = read_depth(Path(f"{log}#{topic}"), None, 1.0)
+    assert read.matrix is not None
+    assert read.matrix[0, 0] == (90 if rectified else 100)
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ({"shape": (2, 3)}, r"of 3 x 2 pixels, .* beside images of 6 x 4; .* state camera.matrix"),
+        ({"shape": (4, 6), "binned": 2}, r"binned by \[2, 2\], .* state camera.matrix"),
+        ({"shape": (4, 6), "corner": 8}, r"from \[8, 8\] on, .* state camera.matrix"),
+        ({"shape": (4, 6), "distortion": np.ones(8)}, "8 numbers; .* state camera.distortion"),
+    ],
+)
+def test_a_camera_of_other_images_is_refused_where_its_numbers_are_not_stated(
+    tmp_path: Path, camera: dict, message: str
+) -> None:
+    of = Messages()
+    image = of.image(0.0, "16UC1", PIXELS, "/camera/depth")
+    log = bag(tmp_path / "trial", [of.camera(0.0, **RAYS | camera), image])
+    with pytest.raises(InputError, match=f"trial#/camera/camera_info: .*{message}"):
+        read_depth(Path(f"{log}#/camera/depth"), None, 1.0)
+    stated = read_depth(Path(f"{log}#/camera/depth"), None, 1.0, {"matrix", "distortion"})
+    assert stated.matrix is stated.distortion is None
+    np.testing.assert_allclose(stated.images_m[0], 0.4)
+
+
+def bad_messages(of: Messages) -> dict[str, tuple]:
+    """By what is bad of each."""
+    image, cloud = (
+        of.image(0.0, "16UC1", PIXELS, ""),
+        of.cloud(0.0, {"x": [1], "y": [1], "z": [1]}, ""),
+    )
+    unknown = [replace(each, datatype=11) for each in cloud[3].fields]
+    beyond = [replace(each, offset=14) for each in cloud[3].fields]
+    return {
+        "short": (*image[:3], replace(image[3], data=image[3].data[:-3])),
+        "rvl": of.packed(0.0, "16UC1; compressedDepth rvl", bytes(40), ""),
+        "flat": of.cloud(0.0, {"u": [1], "v": [1]}, ""),
+        "unknown": (*cloud[:3], replace(cloud[3], fields=unknown)),
+        "beyond": (*cloud[:3], replace(cloud[3], fields=beyond)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("short", "61 bytes in a message; expected 4 rows of 6 times 2"),
+        ("rvl", "'16UC1; compressedDepth rvl' that is no PNG .*: take the topic of images that"),
+        ("flat", "has the columns u, v, rgb; expected x, y and z among them"),
+        ("unknown", "has the columns x of type 11, .*; expected each once, of types 1 to 8"),
+        ("beyond", "in points of 16 bytes; expected each once, of types 1 to 8, within these"),
+    ],
+)
+def test_messages_that_are_not_as_expected_are_refused_with_their_log_and_topic(
+    tmp_path: Path, bad: str, message: str
+) -> None:
+    t, _, name, content = bad_messages(Messages())[bad]
+    log = bag(tmp_path / "trial", [(t, "/bad", name, content)])
+    with pytest.raises(InputError, match=f"trial#/bad: .*{message}"):
+        _ = read_depth(Path(f"{log}#/bad"), None, 1.0).images_m[0]
+
+
+def test_a_camera_that_does_not_tell_its_lens_is_not_taken(tmp_path: Path) -> None:
+    camera = {"K": np.eye(3).ravel().tolist(), "P": [0.0] * 12, "height": 1, "width": 2}
+    image = {"encoding": "16UC1", "height": 1, "width": 2, "step": 4, "data": "kAGQAQ=="}
+    topics = {
+        "/camera_info": ("foxglove.CameraCalibration", [(0.0, camera)]),
+        "/depth": ("foxglove.RawImage", [(0.0, image)]),
+    }
+    log = json_mcap(tmp_path / "trial.mcap", topics)
+    read = read_depth(Path(f"{log}#/depth"), None, 1.0)
+    np.testing.assert_allclose(read.images_m[0], [[0.4, 0.4]])
+    assert read.matrix is None
+    told = {each.name: each.serves for each in listed_topics(log)}
+    assert "camera" not in told["/camera_info"]
+
+
+def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
+    of = Messages()
+    images = [of.image(0.0, "16UC1", each * PIXELS, "/depth") for each in np.array([1, 2], "<u2")]
+    log = bag(tmp_path / "trial", images)
+    (image,) = read_depth(Path(f"{log}#/depth"), None, 1.0).images_m
+    np.testing.assert_allclose(image, 0.4)
 
 
 @pytest.mark.parametrize(

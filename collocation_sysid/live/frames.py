@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..recording.formats.text import written_number
+from ..recording.formats.topics import POSE
 from ..recording.gauge import Gauge
-from ..recording.pose_files import POSE_COLUMNS
 from ..recording.poses import first_matrix_fault, first_pose_fault
 from ..recording.tables import WRENCH_COLUMNS
 from ..recording.wrench import Wrench
@@ -299,7 +299,7 @@ class FrameReader:
 
     def _pose_columns(self, number: int) -> list[str]:
         before = "" if len(self.grasps) == 1 else f"{number}."
-        return [before + name for name in POSE_COLUMNS[1:]]
+        return [before + name for name in POSE]
 
     @property
     def _told_columns(self) -> list[Sequence[str]]:

@@ -240,7 +240,8 @@ class RecordingReader:
         file = self.folder / section.file
         if not file.is_dir():
             file = existing_file(self.folder, section.file, f"depth.{k}.file")
-        seen = read_depth(file, section.count_m, METRES_PER_UNIT[section.length_unit])
+        unit_m, known = METRES_PER_UNIT[section.length_unit], section.camera.model_fields_set
+        seen = read_depth(file, section.count_m, unit_m, known)
         count = len(seen.images_m) or len(seen.clouds_m)
         t_s = section.t_s if section.t_s is not None else seen.t_s
         if t_s is None and count > 1 and not self._static:

@@ -23,10 +23,11 @@ from .formats.text import (
     read_grid,
     times_of,
 )
+from .formats.topics import POSE
 from .formats.units import METRES_PER_UNIT, refuse_unknown_unit, si_factor
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
-POSE_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+POSE_COLUMNS = ("t_s", *POSE)
 
 _MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 _ORDERS = ("xyzw", "wxyz")

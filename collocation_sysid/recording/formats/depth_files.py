@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path, PurePosixPath
@@ -13,16 +14,25 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError, located
 from ...files import reason, require_regular
-from .depth_messages import ENCODINGS, camera_of, columns_of, depth_in, image_of, is_camera, png
+from .depth_messages import (
+    ENCODINGS,
+    columns_of,
+    depth_in,
+    distortion_of,
+    image_of,
+    is_camera,
+    matrix_of,
+    png,
+)
 from .logs import Address, Log, opened, require_topic
 from .text import decode, read_bytes, read_grid, times_of
-from .topics import time_s
+from .topics import by_time
 
 # What a pixel of a PNG counts where nothing else is said, as depth cameras usually do.
 USUAL_COUNT_M = 1e-3
 IMAGES, CLOUDS = (".png", ".exr"), (".ply", ".pcd", ".npy", ".xyz")
-# The topic beside those of a camera's images that says how it projects.
-CAMERA = "camera_info"
+# The topic beside those of a camera's images that says how it projects; topics of rectified ones.
+CAMERA, RECTIFIED = "camera_info", re.compile(r"(?<![a-z])rect(ified)?(?![a-z])")
 NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 
 
@@ -52,15 +62,19 @@ class _Messages(Sequence[Array]):
 
     messages: Sequence[Any]
     count_m: float | None
+    path: Path
 
     def __len__(self) -> int:
         return len(self.messages)
 
     def __getitem__(self, place: Any) -> Any:
-        return _in_metres(image_of(self.messages[place]), self.count_m)
+        with located(self.path):
+            return _in_metres(image_of(self.messages[place]), self.count_m)
 
 
-def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
+def read_depth(
+    path: Path, count_m: float | None, length_m: float, known: Container[str] = ()
+) -> DepthFile:
     """Read a file, a topic of a log, or all files of a folder in the order of their names.
 
     Parameters
@@ -69,6 +83,8 @@ def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
         What an integer of an image counts; as the file says, or a millimetre, by default.
     length_m : float
         The unit of clouds.
+    known : of "matrix" and "distortion"
+        What of the camera is known: it is not read from a log.
 
     Raises
     ------
@@ -77,7 +93,7 @@ def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
     """
     if (address := Address.of(path)) is not None:
         with located(path):
-            return _topic(address, count_m, length_m)
+            return _topic(path, address, count_m, length_m, known)
     if path.is_dir():
         return _folder(path, count_m, length_m)
     require_regular(path)
@@ -99,39 +115,41 @@ def read_depth(path: Path, count_m: float | None, length_m: float) -> DepthFile:
         return DepthFile([_in_metres(found, count_m)], [])
 
 
-def _topic(address: Address, count_m: float | None, length_m: float) -> DepthFile:
+def _topic(
+    path: Path, address: Address, count_m: float | None, length_m: float, known: Container[str]
+) -> DepthFile:
     """Messages in the order of their times, and the camera that the log has beside them."""
     with opened(address.log, address.episode) as log:
         require_topic(log, address.topic)
-        timed = {
-            time_s(each, at_ns, log.start_ns): each for at_ns, each in log.messages(address.topic)
-        }
+        t_s, messages = by_time(list(log.messages(address.topic)), log.start_ns)
         camera = _camera_beside(log, address.topic)
-    t_s = np.array(sorted(timed))
-    messages = [timed[t] for t in t_s]
-    if not messages or not (held := depth_in(messages[0])):
+    if not messages or not (kind := depth_in(messages[0])):
         raise InputError(
             f"the topic {address.topic} has neither depth images ({', '.join(ENCODINGS)}, "
             "compressedDepth) nor clouds of points"
         )
-    if "images" not in held:
-        clouds = [_cloud(_of_columns(columns_of(each)), address.log, length_m) for each in messages]
+    if "images" not in kind:
+        clouds = [_cloud(_of_columns(columns_of(each)), path, length_m) for each in messages]
         return DepthFile([], clouds, t_s)
-    return DepthFile(_Messages(messages, count_m), [], t_s, *camera)
+    images, matrix, distortion = _Messages(messages, count_m, path), None, None
+    if camera is not None:
+        rectified = RECTIFIED.search(address.topic.lower()) is not None
+        with located(f"{address.log}#{camera[0]}"):
+            if "matrix" not in known:
+                matrix = matrix_of(camera[1], rectified, images[0].shape)
+            if "distortion" not in known:
+                distortion = distortion_of(camera[1], rectified)
+    return DepthFile(images, [], t_s, matrix, distortion=distortion)
 
 
-def _camera_beside(log: Log, topic: str) -> tuple[Array | None, None, Array | None]:
-    """Matrix, no pose, and distortion, of the first camera_info in a topic's namespace."""
+def _camera_beside(log: Log, topic: str) -> tuple[str, Any] | None:
+    """Topic and message of the first camera_info in a topic's namespace or above."""
     above = [str(each) for each in PurePosixPath(topic).parents]
     names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
     if (name := next((each for each in names if each in log.topics), None)) is None:
-        return None, None, None
+        return None
     message = next((each for _, each in log.messages(name)), None)
-    if not is_camera(message):
-        return None, None, None
-    with located(where=name):
-        matrix, distortion = camera_of(message, "rect" in topic)
-    return matrix, None, distortion
+    return (name, message) if is_camera(message) else None
 
 
 def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
@@ -209,6 +227,8 @@ def _ply(path: Path) -> Array:
 
 
 def _of_columns(columns: Mapping[str, Array]) -> Array:
+    if not {*"xyz"} <= {*columns}:
+        raise InputError(f"has the columns {', '.join(columns)}; expected x, y and z among them")
     return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
 
 

@@ -1,7 +1,7 @@
 """Messages of depth cameras: images, clouds of points, and how a camera projects.
 
-As ROS has them in sensor_msgs, and Foxglove's schemas of the same fields. They are known by what
-they hold.
+As ROS has them in sensor_msgs, and Foxglove in RawImage and CameraCalibration, of the same fields.
+They are known by what they hold.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError
+from ...files import reason
 
 # Of pixels: integers count, floats are metres.
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -38,30 +39,52 @@ def depth_in(message: Any) -> str:
 
 def is_camera(message: Any) -> bool:
     """Whether it says how a camera projects."""
-    return _told(message, "k") is not None and _told(message, "p") is not None
+    return all(_told(message, name) is not None for name in "kpd") and len(_told(message, "k")) == 9
 
 
-def camera_of(message: Any, rectified: bool) -> tuple[Array, Array]:
-    """Matrix (3, 3) and distortion of a camera; of rectified images those without a lens.
+def matrix_of(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
+    """Matrix (3, 3) of a camera whose images have so many rows and columns.
 
     Raises
     ------
     InputError
-        If it has a lens that is none of Brown and Conrady's.
+        If it tells of images of another size, or of a part of one.
     """
-    matrix, whole = (np.asarray(_told(message, name), dtype=float) for name in ("k", "p"))
+    size = [getattr(message, name, 0) for name in ("height", "width")]
+    binned = [getattr(message, f"binning_{axis}", 0) for axis in "xy"]
+    part = getattr(message, "roi", None)
+    offset = [getattr(part, f"{axis}_offset", 0) for axis in "xy"]
+    if size != [*shape] or max(binned) > 1 or any(offset):
+        rows, columns = size
+        raise InputError(
+            f"is the camera of images of {columns} x {rows} pixels, binned by {binned}, from "
+            f"{offset} on, beside images of {shape[1]} x {shape[0]}; expected one of whole images "
+            "of that size: state camera.matrix"
+        )
+    whole = np.asarray(_told(message, "p"), dtype=float)
     if rectified and whole.size == 12 and whole.any():
-        return whole.reshape(3, 4)[:, :3], np.zeros(0)
+        return whole.reshape(3, 4)[:, :3]
+    return np.asarray(_told(message, "k"), dtype=float).reshape(3, 3)
+
+
+def distortion_of(message: Any, rectified: bool) -> Array:
+    """What the lens of a camera bends; nothing in rectified images.
+
+    Raises
+    ------
+    InputError
+        If the lens is none of Brown and Conrady's.
+    """
     bent = np.asarray(_told(message, "d"), dtype=float)
     if rectified or not bent.any():
-        return matrix.reshape(3, 3), np.zeros(0)
+        return np.zeros(0)
     kind = getattr(message, "distortion_model", "plumb_bob")
     if kind != "plumb_bob" or len(bent) > 5:
         raise InputError(
             f"has the lens {kind} with {len(bent)} numbers; expected plumb_bob with five: take the "
             "topic of rectified images, or state camera.distortion"
         )
-    return matrix.reshape(3, 3), bent
+    return bent
 
 
 def _told(message: Any, name: str) -> Any:
@@ -79,10 +102,17 @@ def image_of(message: Any) -> Any:
 
 
 def _unpacked(kind: str, data: bytes) -> Any:
-    if "compressedDepth" not in kind:
-        return png(BytesIO(data))
-    counts = png(BytesIO(data[_PACKED.itemsize :]))
-    if "32FC1" not in kind:
+    packed = "compressedDepth" in kind
+    try:
+        counts = png(BytesIO(data[_PACKED.itemsize :] if packed else data))
+    except InputError:
+        raise
+    except Exception as error:  # the library has exceptions of its own
+        raise InputError(
+            f"has an image of the format {kind!r} that is no PNG ({reason(error)}): take the topic "
+            "of images that are not packed, or have them packed as PNG"
+        ) from error
+    if not packed or "32FC1" not in kind:
         return counts
     how = np.frombuffer(data, _PACKED, 1)[0]
     with np.errstate(divide="ignore"):
@@ -103,14 +133,21 @@ def columns_of(message: Any) -> dict[str, Array]:
     """The columns (P,) of a cloud by name."""
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     fields = list(message.fields)
-    form = np.dtype(
-        {
-            "names": [str(each.name) for each in fields],
-            "formats": [order + _TYPES[each.datatype] for each in fields],
-            "offsets": [each.offset for each in fields],
-            "itemsize": message.point_step,
-        }
-    )
+    try:
+        form = np.dtype(
+            {
+                "names": [str(each.name) for each in fields],
+                "formats": [order + _TYPES[each.datatype] for each in fields],
+                "offsets": [each.offset for each in fields],
+                "itemsize": message.point_step,
+            }
+        )
+    except (KeyError, ValueError) as error:
+        told = ", ".join(f"{each.name} of type {each.datatype}" for each in fields)
+        raise InputError(
+            f"has the columns {told} in points of {message.point_step} bytes; expected each once, "
+            "of types 1 to 8, within these"
+        ) from error
     rows = _rows(message, message.row_step, message.point_step)
     points = np.frombuffer(rows.tobytes(), form)
     return {name: points[name].astype(float) for name in form.names or ()}

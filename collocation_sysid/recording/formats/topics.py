@@ -101,8 +101,8 @@ def table(address: Address) -> bytes:
             static = address.topic + "_static"
             more = list(log.messages(static)) if static in log.topics else []
             return _written(POSE, *_chained(messages, more, address, log.start_ns))
-        times, rows = _rows(messages, log.start_ns)
-        unit = address.unit or log.unit
+        times, ordered = by_time(messages, log.start_ns)
+        rows, unit = [_row(each) for each in ordered], address.unit or log.unit
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
         raise InputError(
@@ -130,8 +130,8 @@ def _told(log: Log, path: Path, name: str) -> LogTopic:
     elif first and is_camera(first[0][1]):
         serves, write = "the camera's matrix, for the depth images beside it", []
     elif first:
-        _, rows = _rows(first, log.start_ns)
-        serves = _served(set().union(*rows), first[0][1])
+        columns = set[str]().union(*(_row(each) for _, each in first))
+        serves = _served(columns, first[0][1])
         if serves.startswith("positions"):
             write.append(f"{write[0]}#ROBOT.urdf#BASE>TOOL")
     return LogTopic(name, kind, count, rate, serves, tuple(write if serves else ()))
@@ -154,11 +154,11 @@ def _served(columns: set[str], message: Any) -> str:
 # From messages to rows ----------------------------------------------------------------------------
 
 
-def _rows(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Row]]:
-    """Rows in the order of their times; of several at a time the first."""
+def by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Any]]:
+    """Times, and messages in their order; of several at a time the first."""
     t_s = np.array([time_s(message, at_ns, start_ns) for at_ns, message in messages])
-    _, first = np.unique(t_s, return_index=True)
-    return t_s[first], [_row(messages[k][1]) for k in first]
+    times, first = np.unique(t_s, return_index=True)
+    return times, [messages[k][1] for k in first]
 
 
 def time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
