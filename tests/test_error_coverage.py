@@ -98,6 +98,22 @@ def test_the_test_for_persistence_knows_what_the_fit_took_out(name):
     assert kstest(scores, "norm").pvalue > 1e-3
 
 
+def test_a_sample_that_is_alone_among_its_times_follows_on_none():
+    of = PROBLEMS["one marker, 40 samples"]
+    ((fit, _),) = draws(of, 0.0, count=1)
+    (block,) = fit.blocks
+    alone = np.arange(len(block.t_s))[:, None] == 3
+    kept = {
+        "present": block.present & alone,
+        "residual": np.where(alone[..., None], block.residual, 0.0),
+        "slope": np.where(alone[..., None, None], block.slope, 0.0),
+    }
+    single = replace(fit, blocks=[replace(block, **kept)])
+    with np.errstate(all="raise"):
+        found = dependence(single, information(single))
+    assert (found.lag1, found.lag1_deviation) == (0.0, np.inf)
+
+
 def test_autocorrelation_is_that_of_the_errors_not_of_the_residuals():
     of = PROBLEMS["one marker, 40 samples"]
     corrected, raw = [], []
