@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import combinations
+from functools import partial, reduce
+from itertools import chain, combinations, product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -24,12 +24,16 @@ from .hypothesis import Hypothesis
 
 # Of the surface, how much has points nearby where it is hardly seen, and where it is.
 HARDLY, WELL = 0.1, 0.5
+# Descriptions by which a share less of the surface has them cannot be told from the best.
+ALIKE = 0.1
 # The axes of a camera in frames of other conventions: right, down and ahead in columns.
 FRAMES = {
     "x to the right, y up, z backwards": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
     "x to the left, y up, z forward": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
     "x forward, y to the left, z up": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
+    "x to the left, y down, z backwards": [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
 }
+EXPECTED = "state that of one with x to the right, y down, z forward"
 MILLI = 1e-3
 
 
@@ -61,24 +65,34 @@ def _turned(seeing: Seeing, turn: list[list[int]]) -> Seeing:
     return replace(seeing, pose=pose)
 
 
-# What may be wrong, and how it is undone; likelier ones first.
-MISTAKES: dict[str, Callable[[Seeing], Seeing]] = {
-    "camera.pose is inverted (it maps the camera's frame to the world)": lambda s: replace(
-        s, pose=np.linalg.inv(s.pose)
-    ),
-    "camera.poses are inverted": lambda s: replace(s, carrier=np.linalg.inv(s.carrier)),
-    **{
-        f"camera.pose is of a frame with {axes} (expected x to the right, y down, z forward)": (
-            partial(_turned, turn=turn)
-        )
+Undo = Callable[[Seeing], Seeing]
+# What may be wrong, as its sentence has it, and how it is undone. Of one kind only one can be so;
+# likelier kinds come first.
+MISTAKES: tuple[dict[str, Undo], ...] = (
+    {
+        "camera.pose were inverted (state the motion from the camera's frame to the world)": (
+            lambda s: replace(s, pose=np.linalg.inv(s.pose))
+        ),
+    },
+    {
+        "camera.poses were inverted (state the motions from what carries it to the world)": (
+            lambda s: replace(s, carrier=np.linalg.inv(s.carrier))
+        ),
+    },
+    {
+        f"camera.pose were of a frame with {axes} ({EXPECTED})": partial(_turned, turn=turn)
         for axes, turn in FRAMES.items()
     },
-    "its points are in mm (see count_m and length_unit)": lambda s: replace(s, factor=MILLI),
-    "its points are too small by 1000 (see count_m and length_unit)": lambda s: replace(
-        s, factor=1 / MILLI
-    ),
-    "camera.pose is in mm (expected m)": partial(_scaled, by=MILLI),
-}
+    {
+        "its points were in mm (state count_m or length_unit)": (
+            lambda s: replace(s, factor=MILLI)
+        ),
+        "its points were larger by 1000 (state count_m or length_unit)": (
+            lambda s: replace(s, factor=1 / MILLI)
+        ),
+    },
+    {"camera.pose were in mm (state it in m)": partial(_scaled, by=MILLI)},
+)
 
 
 def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -92,7 +106,8 @@ def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
         of, code = f"'{depth.name}' of '{experiment.name}'", "camera"
         strength = 1 / max(here, MILLI)
         if mistakes := view.likeliest():
-            data, code = {"mistakes": list(mistakes)}, "camera/likely"
+            either = "; or if ".join(" and ".join(names) for names in mistakes)
+            data, code = {"mistakes": either}, "camera/likely"
         yield Hypothesis(code, of, data, strength=strength)
 
 
@@ -134,16 +149,22 @@ class _OneCamera:
         nearest, _ = self.tree.query(own, distance_upper_bound=self.within_m / seeing.factor)
         return float(np.isfinite(nearest).mean())
 
-    def likeliest(self) -> tuple[str, ...]:
-        """One mistake without which it sees the body, or else two; those by which it does best."""
+    def likeliest(self) -> list[tuple[str, ...]]:
+        """One mistake without which it sees the body, or else two; all that do as well, best first.
+
+        A body that looks alike from two sides does not tell which of two it is.
+        """
         for count in (1, 2):
-            shares = {}
-            for names in combinations(MISTAKES, count):
-                seeing = self.stated
-                for name in names:
-                    seeing = MISTAKES[name](seeing)
-                shares[names] = self.share(seeing)
-            best = max(shares, key=lambda names: shares[names])
-            if shares[best] >= WELL:
-                return best
-        return ()
+            shares = {
+                names: self.share(self._without(names))
+                for kinds in combinations(MISTAKES, count)
+                for names in product(*kinds)
+            }
+            least = max(WELL, max(shares.values()) - ALIKE)
+            if well := [names for names in shares if shares[names] >= least]:
+                return sorted(well, key=lambda names: -shares[names])
+        return []
+
+    def _without(self, mistakes: tuple[str, ...]) -> Seeing:
+        undo = dict(chain.from_iterable(kind.items() for kind in MISTAKES))
+        return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.stated)

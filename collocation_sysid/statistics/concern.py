@@ -115,7 +115,7 @@ TOPICS: Mapping[str, Topic] = {
             "camera": "only {percent:.0f} % of the surface have points within {within_mm:.3g} mm: "
             "check camera.pose, that it is of a frame with x to the right, y down, z forward, and "
             "the unit of the depth; look at the picture that check draws",
-            "camera/likely": "hardly any points are near the body, but they are if {mistakes}",
+            "camera/likely": "hardly any points are near the body; they would be if {mistakes}",
             "wrench-tare": "it seems zeroed with the body in hand: zero it before, or widen "
             "nuisance.tare",
         },
