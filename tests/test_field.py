@@ -20,6 +20,7 @@ from collocation_sysid.fem.refinement import refined
 from collocation_sysid.result.pictures.field import field_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.check.body import body_finding
+from collocation_sysid.runs.forward_simulation import roll_out
 from collocation_sysid.statistics.considered import assumed
 from collocation_sysid.statistics.fields import FieldEstimate, fields_of
 from collocation_sysid.statistics.linearised import linearised_fit
@@ -242,6 +243,57 @@ def test_a_field_of_density_weighs_what_its_shapes_say(rng):
     expected = np.zeros(len(body.nodes_m))
     np.add.at(expected, body.cells, (local * body.mesh.volumes_m3 / 4)[:, None])
     np.testing.assert_allclose(mass_kg, expected, rtol=1e-12)
+
+
+def too_light(solution: cs.Solution, size: float = 30.0) -> cs.Solution:
+    """The same where a shape of the density is so large that nodes have no mass."""
+    place = [item.name for item in solution.collocation.parameters.free].index("field_1")
+    return replace(solution, z=np.r_[solution.z[:place], size, solution.z[place + 1 :]])
+
+
+def test_a_simulation_refuses_a_density_that_leaves_a_node_without_mass():
+    body = bar(OF_DENSITY)
+    values = {**KNOWN, "young_pa": YOUNG_PA}
+    with pytest.raises(cs.InputError, match=r"density_kg_m3 is so low near node .* lower the ampl"):
+        cs.simulate(swung(body), {**values, "field_1": 30.0})
+
+
+def test_an_answer_without_mass_somewhere_is_doubtful_and_says_why_it_cannot_be_simulated():
+    solution, field = weighed()
+    assert "field/negative" not in [concern.code for concern in field.concerns]
+    light = too_light(solution)
+    collocation = light.collocation
+    (light_field,) = fields_of(
+        collocation.segments[0].body, collocation.parameters, light.q, np.eye(len(light.q))
+    )
+    concern = light_field.concerns[0]
+    assert (concern.code, concern.grade) == ("field/negative", "doubtful")
+    assert "density_kg_m3 is not above zero in" in concern.sentence
+    problem = cs.Problem(collocation.experiments, collocation.parameters, substeps=1)
+    said = roll_out(problem, problem.experiments[0], light)
+    assert isinstance(said, str)
+    assert "expected masses above zero" in said
+
+
+def test_a_solve_keeps_clear_of_masses_below_zero():
+    lower = centres(bar())[:, 2] < 0.06
+    heavy = cs.Region("half", lower, density_kg_m3=190.0)
+    true = Body(bar().mesh, density_kg_m3=10.0, regions=[heavy])
+    values = {**KNOWN, "young_pa": YOUNG_PA}
+    tracks = cs.simulate(swung(true, steps=8), values, "midpoint").markers_m
+    body = bar(cs.Field(0.03, "density_kg_m3", 12, 0.5))
+    seen = cs.with_markers(swung(body, steps=8), tracks)
+    solution = cs.solve(cs.Problem([seen], values, substeps=1))
+    body = solution.collocation.segments[0].body
+    assert body.mass_of_dofs(body.theta(solution.parameters)).min() > 0
+
+
+def test_densities_by_the_default_amplitude_have_masses_above_zero(rng):
+    body = bar(cs.Field(0.03, "density_kg_m3", 30))
+    for _ in range(200):
+        shares = dict(zip(body.mode_names, rng.normal(size=30), strict=True))
+        theta = body.theta({**KNOWN, "young_pa": YOUNG_PA, **shares})
+        assert body.mass_of_dofs(theta).min() > 0
 
 
 def test_an_even_body_is_found_even():

@@ -27,7 +27,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from .constants import Constant
+from .constants import DENSITY, Constant
 from .discretisation import Discretisation
 from .field import Field
 from .materials import Damping, Energy, Material, Prony
@@ -302,6 +302,25 @@ class Body(Discretisation):
         if not self.mass_slopes:
             return self.dof_mass
         return np.sum(self._masses(theta), axis=0)
+
+    def massless(self, theta: Theta) -> str | None:
+        """What is wrong, and what helps, where a node's mass is not above zero."""
+        if not self.mass_slopes:
+            return None
+        masses = np.array(self._masses(theta))[:, ::3]
+        # Those of obstacles have none.
+        total = np.where(self.dof_volume_m3[::3] > 0, masses.sum(axis=0), np.inf)
+        node = int(total.argmin())
+        if total[node] > 0:
+            return None
+        part = self.parts[masses[:, node].argmin()]
+        density, remedy = part.full_name(DENSITY.name), "give a density above zero"
+        if part.field is not None and part.stress_field is None:
+            remedy = "lower the amplitude of its field to 0.3 or less, or its field_1, field_2, …"
+        return (
+            f"{density} is so low near node {node} that its mass is {total[node]:.2g} kg; "
+            f"expected masses above zero: {remedy}"
+        )
 
     def _masses(self, theta: Theta) -> list[Array]:
         """(3n,) of each part."""

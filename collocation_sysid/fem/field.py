@@ -56,20 +56,25 @@ class Field:
         the likeliest is taken.
     modes : int
         How many shapes make up the field; one more costs what one more right-hand side does.
-    amplitude : float
-        How much it differs: the prior standard deviation of the logarithm, of a density that over
-        its stated value.
+    amplitude : float, optional
+        How much it differs: the prior standard deviation of the logarithm, 0.5 by default; of a
+        density that over its stated value, 0.3 by default.
     """
 
     length_m: float | tuple[float, ...] = key(Lengths)
     parameter: str = key(Text, default=ALL_MODULI)
     modes: int = key(AtLeastOne, default=40)
-    amplitude: float = key(Positive, default=0.5)
+    amplitude: float | None = key(Positive | None, default=None)
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
         """Those to choose from."""
         return self.length_m if isinstance(self.length_m, tuple) else (self.length_m,)
+
+    @property
+    def deviation(self) -> float:
+        """The amplitude or its default: a density, unlike a logarithm, could fall below zero."""
+        return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,13 +212,13 @@ class FieldModes:
     @property
     def left_out(self) -> float:
         """Deviation of the logarithm by what finer shapes would add."""
-        return self.field.amplitude * float(np.sqrt(1 - self.share))
+        return self.field.deviation * float(np.sqrt(1 - self.share))
 
     @cached_property
     def shapes(self) -> Array:
         """φ (E, m) of the cells."""
         weighed = self.laplacian.weights(self.length_m)[:, None] * self.laplacian.vectors
-        deviation = self.field.amplitude * np.sqrt(self.share)
+        deviation = self.field.deviation * np.sqrt(self.share)
         return (deviation * weighed / np.linalg.norm(weighed, axis=0)).T
 
     @property
@@ -225,7 +230,7 @@ class FieldModes:
     def told(self) -> FieldShapes:
         """The same in numbers."""
         detail_m = float(np.pi / np.sqrt(self.laplacian.values[-1]))
-        own = self.field.modes, self.length_m, self.field.amplitude
+        own = self.field.modes, self.length_m, self.field.deviation
         return FieldShapes(*own, self.share, detail_m)
 
     def split_in_eight(self) -> FieldModes:

@@ -135,9 +135,12 @@ def swept(
     Raises
     ------
     SimulationError
-        Where it is singular or not finite.
+        Where it is singular or not finite, or a node has no mass.
     """
     part = _part(segment, p, positions(start))
+    dynamics = part.setting.dynamics
+    if (massless := dynamics.body.massless(dynamics.theta)) is not None:
+        raise SimulationError(massless, float(dynamics.t_s[0]))
     tangent = solver.forward(part.x, part.setting, known.tangent if known else None)
     return _read(part, huber, tangent, before, solver.stopwatch.taken())
 

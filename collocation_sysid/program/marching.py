@@ -73,6 +73,9 @@ def march_on(
     failure : SimulationError or None
         Why it stopped.
     """
+    if (massless := dynamics.body.massless(dynamics.theta)) is not None:
+        failure = SimulationError(massless, float(dynamics.t_s[0]))
+        return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
     solvers = Solvers(experiment, options, stopwatch)
     held = ~np.isnan(dynamics.goals_m)
     x = np.zeros((dynamics.rows, dynamics.body.pattern.size))

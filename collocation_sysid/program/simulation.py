@@ -99,7 +99,8 @@ def simulate(
     Raises
     ------
     InputError
-        For a step or substeps that are not positive, too many steps, or an unknown scheme.
+        For a step or substeps that are not positive, too many steps, an unknown scheme, or a
+        density that leaves a node without mass.
     SimulationError
         When a step fails even after halvings; names time and element.
     """
@@ -108,6 +109,8 @@ def simulate(
         raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
+    if (massless := experiment.body.massless(theta)) is not None:
+        raise InputError(massless)
     if integrator == "newmark" and not experiment.static:
         step = timestep_s or experiment.timestep_s / 4
         require_steps(experiment, step)

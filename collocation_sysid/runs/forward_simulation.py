@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..arrays import Array, root_mean
-from ..errors import SimulationError
+from ..errors import InputError, SimulationError
 from ..fem.kernels import side_by_side
 from ..methods.complementarity import with_energy
 from ..methods.reduced_space import ReducedSpace
@@ -82,7 +82,8 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
             timestep_s=_step_s(problem, segment),
             substeps=segment.substeps,
         )
-    except SimulationError as error:
+    except (InputError, SimulationError) as error:
+        # A density that leaves a node without mass is input of who simulates, but found here.
         return str(error)
     readings = segment.markers.of_samples(trajectory.positions_m, phi)
     distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)

@@ -300,6 +300,8 @@ TOPICS: Mapping[str, Topic] = {
         {
             "amplitude": "{name} differs more from place to place than its field allows for: the "
             "data want an amplitude of about {likely:.2g}, not {stated:.2g}",
+            "negative": "{name} is not above zero in {below} of {elements} elements, down to "
+            "{least:.3g}: lower the amplitude of its field, {stated:.2g}, or raise its length_m",
             "shapes": "the {modes} shapes of the field of {name} have only {share:.0%} of its "
             "variance with a length of {length_m:.2g} m: what is finer than {detail_m:.2g} m is "
             "left to the intervals; raise modes or length_m",

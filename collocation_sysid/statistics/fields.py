@@ -54,7 +54,8 @@ class FieldEstimate:
     modes : FieldModes
     cells : (k,) numbers of the elements
     value : (k,) the constant in each
-    deviation : (k,) standard deviation of its logarithm; NaN without error bars
+    deviation : (k,) standard deviation of its logarithm, of a density over the one stated; NaN
+        without error bars
     stated : float or None
         A density as stated, which the deviation is a share of.
     quantile : float
@@ -85,7 +86,7 @@ class FieldEstimate:
     @property
     def over_prior(self) -> Array:
         """(k,) deviation over that of the prior about the mean."""
-        return self.deviation / self.modes.field.amplitude
+        return self.deviation / self.modes.field.deviation
 
     @property
     def told(self) -> NDArray[np.bool_]:
@@ -141,14 +142,19 @@ class FieldEstimate:
 
     @property
     def concerns(self) -> list[Concern]:
-        """An amplitude that is too small, or a length that is too long, by what the data say."""
-        field, said = self.modes.field, dict[str, dict[str, float]]()
+        """A density that none has; an amplitude too small, or a length too long, by the data."""
+        amplitude, said = self.modes.field.deviation, dict[str, dict[str, float]]()
         best = max(AMPLITUDES, key=lambda factor: self.likelier(factor=factor))
         if best > 1 and self.likelier(factor=best) > LIKELIER:
-            said["amplitude"] = {"stated": field.amplitude, "likely": best * field.amplitude}
+            said["amplitude"] = {"stated": amplitude, "likely": best * amplitude}
         if self.likelier(self.modes.length_m / 2) > LIKELIER:
             said["length"] = {"stated": self.modes.length_m, "likely": self.modes.length_m / 2}
-        return [Concern(f"field/{what}", data={"name": self.name, **v}) for what, v in said.items()]
+        told = [Concern(f"field/{what}", data={"name": self.name, **v}) for what, v in said.items()]
+        if below := int((self.value <= 0).sum()):
+            counts = {"name": self.name, "below": below, "elements": len(self.value)}
+            least = {"least": float(self.value.min()), "stated": amplitude}
+            told.insert(0, Concern("field/negative", "doubtful", counts | least))
+        return told
 
 
 def fields_of(
