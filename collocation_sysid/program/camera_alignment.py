@@ -26,6 +26,11 @@ TURNED, KEPT = 0.2, 2
 ENOUGH = 2000
 
 
+def thinned(cloud: Array) -> Array:
+    """No more points of a cloud (P, k) than are enough, from all over it."""
+    return cloud[:: 1 + len(cloud) // ENOUGH]
+
+
 def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Array]:
     """Turn (3,) and shift (3,) of the camera that bring what it sees to a shape x (n, 3).
 
@@ -42,9 +47,9 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
     chosen = rng.choice(len(area), SAMPLES, p=whole / whole.sum())
     places = np.einsum("pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen])
     normals = sides[chosen] / area[chosen, None]
-    cloud, size = view.depth.points_m[sample], float(np.linalg.norm(np.ptp(x, axis=0)))
-    tree = KDTree(cloud[:: 1 + len(cloud) // ENOUGH])
-    gates = np.geomspace(REACH * size, view.depth.gate_m, ITERATIONS)
+    size_m = float(np.linalg.norm(np.ptp(x, axis=0)))
+    tree = KDTree(thinned(view.depth.points_m[sample]))
+    gates = np.geomspace(REACH * size_m, view.depth.gate_m, ITERATIONS)
     turns = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
     seen = np.asarray(tree.data)[KDTree(places).query(tree.data)[0] < gates[0]]
     shifts = [np.zeros(3), places.mean(axis=0) - seen.mean(axis=0) if len(seen) else np.zeros(3)]
@@ -71,8 +76,8 @@ def _aligned(
     missed = 1.0
     for gate in gates:
         # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
-        _, found = tree.query(turn.inv().apply(places - pivot - shift) + pivot)
-        moved = turn.apply(np.asarray(tree.data)[found] - pivot) + pivot + shift
+        _, nearest = tree.query(turn.inv().apply(places - pivot - shift) + pivot)
+        moved = turn.apply(np.asarray(tree.data)[nearest] - pivot) + pivot + shift
         away, turned = moved - places, np.ones(len(places), dtype=bool)
         if view.depth.camera.matrix is not None:
             ways = turn.apply(-pivot) + pivot + shift - places

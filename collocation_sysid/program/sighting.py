@@ -19,7 +19,7 @@ from ..arrays import Array, Index
 from ..fem.body import Body
 from ..model.nuisance import NuisanceMap
 from ..recording.experiment import Experiment
-from .camera_alignment import ENOUGH, alignment
+from .camera_alignment import alignment, thinned
 from .skin import GRAZING, Skin
 from .view import View
 
@@ -36,6 +36,11 @@ LEFT_OUT = ("far", "grazing", "turned away", "not chosen", "hidden")
 # What is in front by less than this share of the spacing of points is beside it, and a shape that
 # moves by less has settled.
 FRONT = 0.5
+
+
+def wide_m(shape_m: Array) -> float:
+    """How far points of a body of this shape (n, 3) may be off before anything is fitted."""
+    return WIDE * float(np.linalg.norm(np.ptp(shape_m, axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +121,9 @@ class Sighting:
         turn, shift_m = alignment(view, skin, shapes_m[first], first)
         moved = view.with_pose(phi, turn, shift_m)
         far = np.abs(moved[view.own]).max(initial=0.0) > FARTHEST
-        gate_m = max(WIDE * float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))), view.depth.gate_m)
+        gate_m = max(wide_m(body.nodes_m), view.depth.gate_m)
         phi = phi if far else moved
-        some = tuple(cloud[:: 1 + len(cloud) // ENOUGH] for cloud in view.depth.clouds)
+        some = tuple(map(thinned, view.depth.clouds))
         rough = View(replace(view.depth, clouds=some), view.number, view.nuisance, view.pivot_m)
         gate_m = cls.of(rough, body, shapes_m, phi, gate_m).next_gate_m(shapes_m, phi)
         return cls.of(view, body, shapes_m, phi, gate_m)
@@ -141,8 +146,8 @@ class Sighting:
         """How far (P,) parts of a first shape x (n, 3) that face the camera are from its points."""
         view, turned = self.view, self.skin.facing(x, self.view.eye_m(phi, 0), GRAZING)
         middles = x[self.skin.flat[turned]].mean(axis=1)
-        limit_m = WIDE * float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
-        return np.minimum(KDTree(view.world(phi, 0)).query(middles)[0], limit_m)
+        apart_m, _ = KDTree(view.world(phi, 0)).query(middles)
+        return np.minimum(apart_m, wide_m(self.body.nodes_m))
 
     def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
         """A narrower gate, where points are near enough to the surface for one; else its own."""
@@ -219,11 +224,11 @@ def sightings_of(experiment: Experiment) -> tuple[Sighting, ...]:
     """Those of an experiment's depth cameras, on the undeformed body as its grasp carries it."""
     if not experiment.depths:
         return ()
-    nuisance, found = NuisanceMap.of(experiment), []
+    nuisance, sightings = NuisanceMap.of(experiment), []
     for number, depth in enumerate(experiment.depths):
         view = View.of(experiment, number, nuisance)
         nodes = Skin.of(experiment.body, depth).nodes
         shapes_m = experiment.rigid_positions(depth.times)[:, nodes]
         nothing = np.zeros(nuisance.size)
-        found.append(Sighting.aligned(view, experiment.body, shapes_m, nothing))
-    return tuple(found)
+        sightings.append(Sighting.aligned(view, experiment.body, shapes_m, nothing))
+    return tuple(sightings)

@@ -12,6 +12,7 @@ from ..arrays import Array, Index
 from ..fem.body import Body
 from ..fem.touching import on_faces
 from ..recording.depth import Depth
+from ..recording.experiment import Experiment
 from ..recording.placement import nearest_on
 
 # Triangles, by their middles, of which the nearest point is taken.
@@ -52,6 +53,10 @@ class Skin:
             chosen[depth.faces.resolve_faces(body.mesh)] = True
         nodes, faces = np.unique(body.nodes.on_faces(triangles), return_inverse=True)
         return cls(nodes, faces.reshape(len(triangles), -1), chosen)
+
+    def first_m(self, experiment: Experiment, depth: Depth) -> Array:
+        """(n, 3) as grasps carry it, undeformed, when a camera first sees anything."""
+        return experiment.rigid_positions(depth.times[[depth.first]])[0, self.nodes]
 
     @property
     def flat(self) -> Index:

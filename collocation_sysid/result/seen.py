@@ -90,29 +90,29 @@ def seen_as_fitted(part: Part, reading: DepthReading, looked: Array) -> Array:
     apart_m, up = reading.apart_m(looked, phi), part.segment.experiment.up
     shown = Projection.of(seen.view, seen.skin, phi, shapes_m[0], up)
     samples = np.flatnonzero(seen.used[: len(shapes_m)].any(axis=1)).tolist()
-    found = [np.zeros((0, 8))]
+    rows = [np.zeros((0, 8))]
     for k in samples:
         within = seen.weights[k].any(axis=1)
         sights = seen.points[k], seen.rays[k], apart_m[k]
-        found.append(shown.rows(k, *(each[within] for each in sights)))
+        rows.append(shown.rows(k, *(each[within] for each in sights)))
     few = np.unique(np.linspace(0, len(samples) - 1, OUTLINED).round().astype(int))
-    found += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]
-    return np.vstack(found)
+    rows += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]
+    return np.vstack(rows)
 
 
 def seen_before(experiment: Experiment) -> dict[str, Array]:
     """(k, 8) of each depth camera's first image, and of the undeformed body as grasps carry it."""
-    nuisance, found = NuisanceMap.of(experiment), {}
+    nuisance, by_camera = NuisanceMap.of(experiment), {}
     for number, depth in enumerate(experiment.depths):
         view, skin = View.of(experiment, number, nuisance), Skin.of(experiment.body, depth)
-        shape_m = experiment.rigid_positions(depth.times[[depth.first]])[0, skin.nodes]
+        shape_m = skin.first_m(experiment, depth)
         shown = Projection.of(view, skin, np.zeros(nuisance.size), shape_m, experiment.up)
         points_m = depth.points_m[depth.first]
         rows = shown.rows(
             depth.first, points_m, view.rays[depth.first], np.full(len(points_m), np.nan)
         )
-        found[depth.name] = np.vstack([rows, shown.outline_rows(depth.first, shape_m)])
-    return found
+        by_camera[depth.name] = np.vstack([rows, shown.outline_rows(depth.first, shape_m)])
+    return by_camera
 
 
 def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]:

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..arrays import Array
-from ..program.camera_alignment import ENOUGH
-from ..program.sighting import WIDE
+from ..program.camera_alignment import thinned
+from ..program.sighting import wide_m
 from ..program.skin import Skin
 from ..recording.depth import Depth
 from ..recording.experiment import Experiment
@@ -125,17 +125,16 @@ class _OneCamera:
     within_m: float
 
     def __init__(self, experiment: Experiment, depth: Depth) -> None:
-        at_s, camera = depth.times[[depth.first]], depth.camera
+        camera = depth.camera
         self.skin, self.pinhole = Skin.of(experiment.body, depth), camera.matrix is not None
-        self.shape_m = experiment.rigid_positions(at_s)[0, self.skin.nodes]
-        points_m = depth.points_m[depth.first]
-        self.tree = KDTree(points_m[:: 1 + len(points_m) // ENOUGH])
+        self.shape_m = self.skin.first_m(experiment, depth)
+        self.tree = KDTree(thinned(depth.points_m[depth.first]))
         carrier = np.eye(4)
         if camera.poses is not None:
-            rotations, translations = camera.poses.at(at_s)
+            rotations, translations = camera.poses.at(depth.times[[depth.first]])
             carrier[:3, :3], carrier[:3, 3] = rotations[0], translations[0]
         self.stated = Seeing(carrier, camera.pose)
-        self.within_m = WIDE * float(np.linalg.norm(np.ptp(self.shape_m, axis=0)))
+        self.within_m = wide_m(self.shape_m)
 
     def share(self, seeing: Seeing) -> float:
         """Of the surface that is turned to the camera what has points nearby."""
