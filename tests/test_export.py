@@ -40,7 +40,7 @@ from collocation_sysid.recording import (
 )
 from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
 from collocation_sysid.result.export.identified import alone
-from collocation_sysid.result.export.solids import Facets
+from collocation_sysid.result.export.solids import Facets, walls
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
@@ -667,8 +667,14 @@ def test_sofa_gets_planes_and_balls_and_says_what_else_there_is(tmp_path):
     assert plane is not None
     assert ball is not None
     np.testing.assert_allclose(numbers_in(plane.get("normal")), (0, 0, -1), atol=1e-12)
-    assert float(plane.get("d", "")) == pytest.approx(-0.0386)
+    # Their surface is as far out as that at which the pressure begins: by half of the width.
+    out_m = walls(body)[0].width_m / 2
+    assert out_m > 1e-6
+    assert float(plane.get("d", "")) == pytest.approx(-0.0386 + out_m, rel=1e-9)
     np.testing.assert_allclose(numbers_in(ball.get("center")), (0.02, 0.02, 0.0586))
+    ball_m = SOLIDS["sphere"]
+    assert isinstance(ball_m, Sphere)
+    assert float(ball.get("radius", "")) == pytest.approx(ball_m.radius_m + out_m, rel=1e-9)
     told = json.loads((tmp_path / "sofa" / "identified.json").read_text())["not_expressed"]
     for said in ("it 0: nothing rubs on it", "it 2: what the body may touch", "it 4: what"):
         assert any(said in each for each in told)
@@ -702,6 +708,23 @@ def test_mujoco_has_the_frequency_of_other_energies(tmp_path):
     body = held_bar("neo-hookean")
     (frequency,) = verify_export(body, "mujoco", exported(body, "mujoco", tmp_path))
     assert abs(frequency.relative) < 0.03
+
+
+def test_newton_says_where_obstacles_touch_differently(tmp_path):
+    alike = pressed_block(SOLIDS["plane"], SOLIDS["sphere"], friction=0.2)
+    assert alike.touching is not None
+    first, second = alike.obstacles
+    obstacles = [first, replace(second, friction=0.8)]
+    whole = replace(alike.touching, grasps=[*alike.touching.gripping, *obstacles])
+    unlike = replace(alike, touching=whole)
+    for body, count in ((alike, 0), (unlike, 1)):
+        folder = exported(body, "newton", tmp_path / str(count))
+        told = json.loads((folder / "identified.json").read_text())["not_expressed"]
+        said = [each for each in told if "obstacles differ in friction, of which" in each]
+        assert len(said) == count
+        numbers = json.loads((folder / "body.json").read_text())
+        assert numbers["contact_mu"] == 0.2
+        assert numbers["contact_m"] == walls(body)[0].width_m / 2
 
 
 @pytest.mark.long

@@ -68,7 +68,7 @@ def _times_s(body: Identified) -> Array:
 
 def _walls(body: Identified, touched: Sequence[Wall]) -> str:
     """What is touched: a tetrahedron under each facet, none of whose nodes is free."""
-    deck, node, cell = "", len(body.nodes_m), len(body.body.cells)
+    deck = ""
     tetrahedra, numbers = body.body.mesh.tetrahedra, np.arange(len(body.body.cells)) + 1
     faces = {
         tuple(sorted(corners)): f"{number},S{side}"
@@ -76,13 +76,12 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> str:
         for corners, number in zip(tetrahedra[:, places].tolist(), numbers, strict=True)
     }
     for k, wall in enumerate(touched):
-        points = wall.points_m(body.start_s) + wall.back_m
         deck += f"*NODE,NSET=W{k}\n"
-        deck += "".join(f"{node + i},{_fields(*p)}\n" for i, p in enumerate(points, start=1))
+        numbered = enumerate(wall.start_m, start=wall.nodes + 1)
+        deck += "".join(f"{i},{_fields(*point)}\n" for i, point in numbered)
         deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
-        for i, (a, b, c) in enumerate(wall.facets.triangles + node + 1, start=1):
-            deck += f"{cell + i},{a},{c},{b},{node + len(points)}\n"
-        node, cell = node + len(points), cell + len(wall.facets.triangles)
+        for i, nodes in enumerate(wall.tetrahedra + 1, start=wall.cells + 1):
+            deck += f"{i},{','.join(map(str, nodes))}\n"
         touching = body.body.mesh.surface[wall.faces].tolist()
         sides = "".join(f"{faces[tuple(sorted(face))]}\n" for face in touching)
         stick = f"*FRICTION\n{_fields(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)}\n"
@@ -100,7 +99,7 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> str:
 def _step(body: Identified, touched: Sequence[Wall], t_s: float, linear: bool) -> str:
     """Grasped nodes and obstacles where they are then, gravity, and what else pulls."""
     moved = [body.experiment.grasped([t_s])[1][0] - body.nodes_m]
-    moved += [w.points_m(t_s) - w.points_m(body.start_s) - w.back_m for w in touched]
+    moved += [wall.points_m(t_s) - wall.start_m for wall in touched]
     rows = np.concatenate(moved)
     held = np.argwhere(np.isfinite(rows))
     boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(float(rows[n, a]))}\n" for n, a in held)

@@ -146,28 +146,23 @@ def _boundary(body: Identified) -> str:
 def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
     """Nodes and cells of what is touched, a tetrahedron under each facet; surfaces that touch."""
     solids, facets = "", ""
-    node, cell, corners = len(body.nodes_m), len(body.body.cells), body.body.mesh.surface
+    corners = body.body.mesh.surface
     for k, wall in enumerate(touched):
-        points = wall.points_m(body.start_s) + wall.back_m
         nodes = "".join(
             f'<node id="{i}">{numbers(point, ",")}</node>\n'
-            for i, point in enumerate(points, node + 1)
+            for i, point in enumerate(wall.start_m, wall.nodes + 1)
         )
-        triangles = wall.facets.triangles + node + 1
-        inner = np.full((len(triangles), 1), node + len(points))
-        cells = np.hstack([triangles[:, [0, 2, 1]], inner])
+        cells = _rows("elem", wall.tetrahedra + 1, wall.cells)
         solids += f'<Nodes name="nodes_wall_{k}">\n{nodes}</Nodes>\n'
-        solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{_rows("elem", cells, cell)}'
-        solids += "</Elements>\n"
+        solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{cells}</Elements>\n'
         touching = body.body.nodes.on_faces(corners[wall.faces]) + 1
-        for name, sides in (("body", touching), ("wall", triangles)):
+        for name, sides in (("body", touching), ("wall", wall.triangles + 1)):
             rows = _rows(f"tri{sides.shape[1]}", sides)
             facets += f'<Surface name="{name}_side_{k}">\n{rows}</Surface>\n'
         facets += (
             f'<SurfacePair name="pair_{k}"><primary>body_side_{k}</primary>'
             f"<secondary>wall_side_{k}</secondary></SurfacePair>\n"
         )
-        node, cell = node + len(points), cell + len(triangles)
     return solids, facets
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...recording import Obstacle
 from ...tree import content
 from .identified import Identified
-from .solids import Primitive, walls
+from .solids import OneContact, Primitive, walls
 from .target import Exported, Holds, heading, linear_cells
 
 MODULE = "body.py"
@@ -82,9 +82,9 @@ def model(device=None):
     builder.color()
     made = builder.finalize(device=device)
     if body["obstacles"]:
-        # Newton takes the mean of the body's and the obstacle's.
+        # Newton averages the body's and the obstacle's: SolverVBD geometrically.
         made.soft_contact_ke, made.soft_contact_kd = body["contact_n_m"], 0.0
-        made.soft_contact_mu = body["obstacles"][0]["friction"]
+        made.soft_contact_mu = body["contact_mu"]
     return made
 '''
 
@@ -101,8 +101,10 @@ def export(body: Identified) -> Exported:
         # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
         damping = region.gamma_r_s * region.mu_pa / 2
         constants.append(np.tile([region.mu_pa, region.lambda_pa, damping], (len(own), 1)))
+    contact = OneContact.of(walls(body))
     limits = [
         *HOLDS.lost(body),
+        *contact.lost,
         "SolverSemiImplicit takes other constants for the same material, k_mu = 4/3 μ and "
         "k_lambda = λ + 5/6 μ, and another damping",
         "positions are single precision",
@@ -117,11 +119,9 @@ def export(body: Identified) -> Exported:
         "node_mass_kg": body.mass_kg,
         "held": body.grasped,
         "gravity_m_s2": body.experiment.gravity_m_s2,
-    }
-    touched = walls(body)
-    numbers |= {
-        "contact_m": max((wall.width_m for wall in touched), default=0.0) / 2,
-        "contact_n_m": max((wall.node_n_m for wall in touched), default=0.0),
+        "contact_m": contact.radius_m,
+        "contact_n_m": contact.node_n_m,
+        "contact_mu": contact.friction,
         "obstacles": [_obstacle(each, body.start_s) for each in body.obstacles],
     }
     files = {

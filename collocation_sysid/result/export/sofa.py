@@ -6,7 +6,7 @@ import numpy as np
 
 from ...errors import InputError
 from .identified import Identified, IdentifiedRegion
-from .solids import Primitive, walls
+from .solids import Primitive, grown, walls
 from .target import Exported, Holds, heading, numbers
 
 SCENE = "body.scn"
@@ -82,10 +82,10 @@ def export(body: Identified) -> Exported:
 
 
 def _obstacles(body: Identified) -> str:
-    """Penalties on nodes, in proportion to their depth."""
+    """Penalties on nodes, in proportion to their depth; it begins half of δ further out."""
     lines = ""
     for wall in walls(body):
-        shape = Primitive.of(wall.obstacle.shape)
+        shape = Primitive.of(grown(wall.obstacle.shape, wall.width_m / 2))
         place_m, turn = shape.placed(wall.obstacle, body.start_s)
         stiff = f'stiffness="{wall.node_n_m!r}" damping="0"'
         if shape.kind == "plane":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -10,6 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from ...arrays import Array, Index
+from ...errors import listed
 from ...model.contact import contacts
 from ...recording import Capsule, Cuboid, Cylinder, Obstacle, Plane, Solid, Sphere
 from ...recording.solids import name_of
@@ -175,6 +177,9 @@ class Wall:
     facets : Facets
         In its frame.
     back_m : (3,) from where it is at the first sample to where it does not touch
+    start_m : (p, 3) its facets' points there, in the world
+    nodes, cells : int
+        How many are numbered before its own: the body's, and those of walls before it.
     stiffness_pa_m, node_n_m : float
         Of the surface, and as much for each of its nodes.
     width_m : float
@@ -185,6 +190,9 @@ class Wall:
     obstacle: Obstacle
     facets: Facets
     back_m: Array
+    start_m: Array
+    nodes: int
+    cells: int
     stiffness_pa_m: float
     node_n_m: float
     width_m: float
@@ -195,13 +203,25 @@ class Wall:
         (rotation,), (place,) = self.obstacle.poses.at([t_s])
         return self.facets.points_m @ rotation.T + place
 
+    @property
+    def triangles(self) -> Index:
+        """(f, 3) numbers of nodes of its facets."""
+        return self.facets.triangles + self.nodes
+
+    @property
+    def tetrahedra(self) -> Index:
+        """(f, 4) numbers of nodes of a tetrahedron under each facet."""
+        inner = np.full((len(self.triangles), 1), self.nodes + len(self.start_m) - 1)
+        return np.hstack([self.triangles[:, [0, 2, 1]], inner])
+
 
 def walls(body: Identified) -> tuple[Wall, ...]:
     """What a body may touch; facets that always turn away from it are left out."""
     if body.touching is None:
         return ()
     times, shape = body.touching.t_s, body.touching.rigid_positions([body.start_s])
-    found = []
+    made: list[Wall] = []
+    nodes, cells = len(body.nodes_m), len(body.body.cells)
     for obstacle, contact in zip(body.obstacles, contacts(body.touching), strict=True):
         law, (depth_m, normal) = contact.contact, contact.deepest(shape.ravel())
         rotations, places = obstacle.poses.at(times)
@@ -223,5 +243,47 @@ def walls(body: Identified) -> tuple[Wall, ...]:
         shown = facets.towards(
             np.concatenate([seen, seen[: len(corners[0])] - back_m @ rotations[0]])
         )
-        found.append(Wall(obstacle, shown, back_m, stiffness, of_node, law.width_m, faces))
-    return tuple(found)
+        start_m = shown.points_m @ rotations[0].T + places[0] + back_m
+        law_of = stiffness, of_node, law.width_m, faces
+        made.append(Wall(obstacle, shown, back_m, start_m, nodes, cells, *law_of))
+        nodes, cells = nodes + len(start_m), cells + len(shown.triangles)
+    return tuple(made)
+
+
+@dataclass(frozen=True)
+class OneContact:
+    """What Newton has once for all that a soft body touches.
+
+    Attributes
+    ----------
+    friction, node_n_m : float
+    radius_m : float
+        Of particles: half of δ.
+    lost : tuple of str
+        What is said where they touch differently.
+    """
+
+    friction: float
+    node_n_m: float
+    radius_m: float
+    lost: tuple[str, ...]
+
+    @classmethod
+    def of(cls, touched: Sequence[Wall]) -> OneContact:
+        """The friction of the first, and the largest stiffness and width."""
+        told = {
+            "friction": [float(wall.obstacle.friction) for wall in touched],
+            "stiffness": [wall.node_n_m for wall in touched],
+            "width": [wall.width_m for wall in touched],
+        }
+        friction, stiffness, width = (values or [0.0] for values in told.values())
+        unlike = [
+            name for name, values in told.items() if not np.allclose(values, values[:1], atol=0)
+        ]
+        lost = (
+            f"obstacles differ in {listed(unlike)}, of which a soft body in Newton has one: here "
+            f"the first's friction {friction[0]:.4g}, with which that of each other is averaged, "
+            f"and of all the largest stiffness {max(stiffness):.4g} N/m of a node and width "
+            f"{max(width):.4g} m"
+        )
+        return cls(friction[0], max(stiffness), max(width) / 2, (lost,) * bool(unlike))

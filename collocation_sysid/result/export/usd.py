@@ -19,7 +19,7 @@ from ...arrays import Array, Index
 from ...errors import InputError
 from ...recording import Grasp, Obstacle
 from .identified import Identified, IdentifiedRegion
-from .solids import Primitive, walls
+from .solids import OneContact, Primitive, walls
 from .target import Comparison, Exported, Holds, at_rest, heading, linear_cells, longest
 
 STAGE = "body.usda"
@@ -243,9 +243,9 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     except ImportError as error:
         raise InputError("install Newton to verify the export: pip install newton") from error
 
-    builder, touched = newton.ModelBuilder(), walls(body)
-    if touched:
-        builder.default_particle_radius = max(wall.width_m for wall in touched) / 2
+    builder, contact = newton.ModelBuilder(), OneContact.of(walls(body))
+    if body.obstacles:
+        builder.default_particle_radius = contact.radius_m
     # Its rigid bodies would be simulated too; what they hold stands still instead.
     builder.add_usd(str(folder / STAGE), ignore_paths=["/World/Gripper_.*"])
     held = np.flatnonzero(body.grasped)
@@ -253,10 +253,9 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         builder.particle_mass[k] = 0.0
     builder.color()
     model = builder.finalize(device="cpu")
-    if touched:
-        model.soft_contact_ke = max(wall.node_n_m for wall in touched)
-        model.soft_contact_mu = touched[0].obstacle.friction
-        model.shape_material_ke.fill_(model.soft_contact_ke)
+    if body.obstacles:
+        model.soft_contact_ke, model.soft_contact_mu = contact.node_n_m, contact.friction
+        model.shape_material_ke.fill_(contact.node_n_m)
     pipeline = newton.CollisionPipeline(model)
     # What is touched stands still, and is nothing to solve for.
     solver = newton.solvers.SolverVBD(
@@ -271,4 +270,5 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         before.particle_qd.assign(BRAKE * before.particle_qd.numpy())
     theirs = before.particle_q.numpy().astype(float) - body.nodes_m
     sag_m = longest(at_rest(body)[0][0])
-    return [Comparison("largest displacement at rest", longest(theirs), sag_m, "m")]
+    remark = "".join(contact.lost)
+    return [Comparison("largest displacement at rest", longest(theirs), sag_m, "m", remark)]
