@@ -361,6 +361,10 @@ def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
     log = bag(tmp_path / "trial", images)
     (image,) = read_depth(Path(f"{log}#/depth"), None, 1.0).images_m
     np.testing.assert_allclose(image, 0.4)
+    times = (0.0, 0.0, 1.0)
+    moves = [of.transform(t, "base", "tool", (k, 0, 0), STILL) for k, t in enumerate(times)]
+    log = bag(tmp_path / "moved", [of.tree(t, m) for t, m in zip(times, moves, strict=True)])
+    np.testing.assert_allclose(read_poses(Path(f"{log}#/tf")).positions_m[:, 0], (0, 2))
 
 
 @pytest.mark.parametrize(

@@ -267,13 +267,13 @@ def _child(transform: Any) -> tuple[str, str] | None:
 def _edges(
     messages: Iterator[tuple[int, Any]] | list[tuple[int, Any]], start_ns: int
 ) -> dict[tuple[str, str], dict[float, tuple[float, ...]]]:
-    """Poses by time of each child in its parent."""
+    """Poses by time of each child in its parent; of several at a time the first."""
     edges: dict[tuple[str, str], dict[float, tuple[float, ...]]] = {}
     for at_ns, message in messages:
         for each in _at(message, "transforms") or [message]:
             pose = _pose(each)
             if (edge := _child(each)) is not None and pose is not None:
-                edges.setdefault(edge, {})[time_s(each, at_ns, start_ns)] = pose
+                edges.setdefault(edge, {}).setdefault(time_s(each, at_ns, start_ns), pose)
     return edges
 
 
