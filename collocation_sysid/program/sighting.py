@@ -177,16 +177,8 @@ def _seen(
 ) -> dict[str, NDArray]:
     """What one sample sees: of points within the gate, and the reasons for leaving others out."""
     depth, cloud = view.depth, view.depth.clouds[sample]
-    world = view.world(phi, sample)
-    low, high = x.min(axis=0) - gate_m, x.max(axis=0) + gate_m
-    near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
-    rotations, _ = view.motion
-    eye_m = view.eye_m(phi, sample)
-    turned = np.flatnonzero(skin.facing(x, eye_m))
-    near = near if len(turned) else near[:0]
-    faces, places = near, np.zeros((0, 3))
-    if len(near):
-        faces, places = skin.nearest(x, world[near], turned)
+    world, eye_m = view.world(phi, sample), view.eye_m(phi, sample)
+    near, faces, places = _near(world, skin, x, eye_m, gate_m)
     weights, feet, normals = skin.points(x, faces, places)
     ways = normals if eye_m is None else eye_m - feet
     seen = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
@@ -196,28 +188,39 @@ def _seen(
     # A point beyond an edge of what the camera sees pulls that along the way to it.
     beyond = across > BESIDE * distance + depth.sigma_m
     normals[beyond] = away[beyond] / distance[beyond, None]
-    alike = np.ones(len(near), dtype=bool)
+    alike = open_to = everywhere = np.ones(len(near), dtype=bool)
     if cloud.shape[1] == 6:
-        alike = np.sum(normals * (cloud[near, 3:] @ rotations[sample].T), axis=1) >= GRAZING
-    open_to = np.ones(len(near), dtype=bool)
+        measured = cloud[near, 3:] @ view.motion[0][sample].T
+        alike = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
         open_to = ~skin.hidden(x, eye_m, feet, FRONT * depth.spacing_m)
-    checks = [distance <= gate_m, seen, alike, skin.chosen[faces], open_to]
-    left = np.cumprod([np.ones(len(near), dtype=bool), *checks], axis=0)
+    kept = distance <= gate_m
+    left = np.cumprod([everywhere, kept, seen, alike, skin.chosen[faces], open_to], axis=0)
     reasons = -np.diff(left.sum(axis=1))
     reasons[0] += len(cloud) - len(near)
-    kept = distance <= gate_m
     rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[skin.nodes][skin.faces[faces]])
-    return {
-        "nodes": skin.faces[faces][kept],
-        "weights": weights[kept],
-        "normals": normals[kept],
-        "points": cloud[near, :3][kept],
-        "rays": view.rays[sample][near][kept],
-        "places_m": rest_m[kept],
-        "used": left[-1].astype(bool)[kept],
-        "reasons": reasons,
+    of_points = {
+        "nodes": skin.faces[faces],
+        "weights": weights,
+        "normals": normals,
+        "points": cloud[near, :3],
+        "rays": view.rays[sample][near],
+        "places_m": rest_m,
+        "used": left[-1].astype(bool),
     }
+    return {name: each[kept] for name, each in of_points.items()} | {"reasons": reasons}
+
+
+def _near(
+    world: Array, skin: Skin, x: Array, eye_m: Array | None, gate_m: float
+) -> tuple[Index, Index, Array]:
+    """Points about a shape, and the nearest of what faces the camera: faces and places on them."""
+    low, high = x.min(axis=0) - gate_m, x.max(axis=0) + gate_m
+    near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
+    turned = np.flatnonzero(skin.facing(x, eye_m))
+    if not len(turned) or not len(near):
+        return near[:0], near[:0], np.zeros((0, 3))
+    return near, *skin.nearest(x, world[near], turned)
 
 
 def sightings_of(experiment: Experiment) -> tuple[Sighting, ...]:
