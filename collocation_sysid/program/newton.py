@@ -119,9 +119,10 @@ class Solver:
         x = x.copy() if goal is None else self._moved(x, goal, linearise)
         self._require_upright(x)
         if not keep_definite:
-            x, done = self._chords(x, residual, linearise)
+            # What these lead to without end may be far off: the search then begins where they did.
+            nearer, done = self._chords(x, residual, linearise)
             if done:
-                return x
+                return nearer
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
         step = self._step(factor, value)
@@ -145,7 +146,10 @@ class Solver:
                     break
                 x = nearer
             _, *matrix = self._timed(linearise, x)
-            self._kept, is_own = self._factorise(matrix, x, False), True
+            try:
+                self._kept, is_own = self._factorise(matrix, x, False), True
+            except NewtonFailure:
+                break
         return x, False
 
     def _nearer(self, x: Array, residual: Residual, kept: Factor) -> tuple[Array, bool]:
