@@ -251,31 +251,33 @@ def test_an_exr_image_is_read(tmp_path):
     np.testing.assert_allclose(read.images_m[0], image_m(), rtol=1e-6)
 
 
+PROBLEM = """
+[object]
+mesh = "bar.vtu"
+element = "tet10"
+density_kg_m3 = 1070.0
+[parameters]
+young_pa = { guess = 1.5e5 }
+poisson = 0.45
+gamma_r_s = 1e-3
+gamma_m_1_s = 0.1
+[[experiment]]
+name = "hanging"
+kind = "static"
+[experiment.grasp]
+nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
+[[experiment.depth]]
+name = "front"
+file = "front.npz"
+sigma_m = 0.0002
+"""
+
+
 def test_a_problem_file_states_depth(tmp_path):
     bar().mesh.write(tmp_path / "bar.vtu")
     np.savez(tmp_path / "front.npz", depth_m=image_m(), camera_matrix=MATRIX, camera_pose=POSE)
-    text = """
-    [object]
-    mesh = "bar.vtu"
-    element = "tet10"
-    density_kg_m3 = 1070.0
-    [parameters]
-    young_pa = { guess = 1e5 }
-    poisson = 0.45
-    gamma_r_s = 1e-3
-    gamma_m_1_s = 0.1
-    [[experiment]]
-    name = "hanging"
-    kind = "static"
-    [experiment.grasp]
-    nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
-    [[experiment.depth]]
-    file = "front.npz"
-    sigma_m = 0.0002
-    spacing_m = 0.005
-    [experiment.nuisance]
-    depth_pose = { prior_m = 0.01 }
-    """
+    more = "spacing_m = 0.005\n[experiment.nuisance]\ndepth_pose = { prior_m = 0.01 }\n"
+    text = PROBLEM.replace('name = "front"\n', "") + more
     file = tmp_path / "problem.toml"
     file.write_text(text)
     (experiment,) = cs.Problem.read(file).experiments

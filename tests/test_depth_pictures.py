@@ -13,6 +13,7 @@ from test_depth import (
     MATRIX,
     NOISE_M,
     POSE,
+    PROBLEM,
     SHAPE,
     TRUTH,
     bar,
@@ -129,28 +130,6 @@ def test_a_cloud_is_drawn_with_the_body_from_its_broad_side():
     assert 20 < high < 60
     # It hangs below the undeformed one, downwards in the picture.
     assert points[:, 2].max() > np.nanmax(lines[:, 2]) + 20
-
-
-PROBLEM = """
-[object]
-mesh = "bar.vtu"
-element = "tet10"
-density_kg_m3 = 1070.0
-[parameters]
-young_pa = { guess = 1.5e5 }
-poisson = 0.45
-gamma_r_s = 1e-3
-gamma_m_1_s = 0.1
-[[experiment]]
-name = "hanging"
-kind = "static"
-[experiment.grasp]
-nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
-[[experiment.depth]]
-name = "front"
-file = "front.npz"
-sigma_m = 0.0002
-"""
 
 
 def stated(folder: Path, pose: np.ndarray) -> Path:
