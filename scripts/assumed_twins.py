@@ -70,7 +70,7 @@ def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Arr
     """(T, M, 3) of a body whose stiffness drifts, one piece of the recording after another."""
     values = _lame(truth, values)
     if not drift:
-        return simulate(truth, values, SCHEME).markers_m
+        return simulate(truth, values, SCHEME, substeps=1).markers_m
     t_s, markers = truth.t_s, truth.markers
     moduli = [name for name in values if name.endswith("_pa")]
     tracks, start, velocity = [markers.positions_m[:0]], {}, 0.0
@@ -81,7 +81,7 @@ def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Arr
         now = {n: v * (1 + drift * since) if n in moduli else v for n, v in values.items()}
         seen = replace(markers, t_s=t_s[here], positions_m=markers.positions_m[here], located=None)
         piece = replace(truth, t_s=t_s[here], markers=seen, **start)
-        moved = simulate(piece, now, SCHEME)
+        moved = simulate(piece, now, SCHEME, substeps=1)
         for way in np.diff(moved.positions_m, axis=0):  # as the midpoint rule has it
             velocity = 2 * way / truth.timestep_s - velocity
         start = {

@@ -150,7 +150,7 @@ def swings(*gamma_r_s: float) -> Problem:
     rng, recordings = np.random.default_rng(5), []
     for k, damping in enumerate(gamma_r_s):
         swing = replace(hung_cube(25), name=f"swing {k}")
-        markers = simulate(swing, TRUTH | {"gamma_r_s": damping}, "midpoint").markers_m
+        markers = simulate(swing, TRUTH | {"gamma_r_s": damping}, "midpoint", substeps=1).markers_m
         noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(markers.shape)
         recordings.append(with_markers(swing, markers + noise_m))
     options = UncertaintyOptions(assumptions=Assumptions(**NOTHING), numerical=False)

@@ -109,7 +109,7 @@ def test_each_of_several_recordings_says_what_it_has_alone():
     rng, swings = np.random.default_rng(2), []
     for k, damping in enumerate((5e-3, 9e-3)):
         swing = replace(hung_cube(25), name=f"swing {k}")
-        tracks = simulate(swing, LAME | {"gamma_r_s": damping}, "midpoint").markers_m
+        tracks = simulate(swing, LAME | {"gamma_r_s": damping}, "midpoint", substeps=1).markers_m
         tracks = tracks + swing.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
         swings.append(with_markers(swing, tracks))
     exact = Assumptions(**{name: "none" for name in Assumptions().deviations})
