@@ -1,9 +1,10 @@
 """Forward simulation of an experiment: Newmark, or any collocation scheme.
 
-By default the steps are refined until the motion at the samples no longer depends on them. A run with
-automatic substeps solves with fine steps too, so that it recovers the parameters of data simulated
-by default. Data simulated with one step a sample belong to other parameters: the midpoint rule lowers
-the frequencies of fast modes, and a run that resolves these finds moduli that are too small.
+By default the steps are refined until the motion at the samples no longer depends on them. A run
+with automatic substeps solves with fine steps too, so that it recovers the parameters of data
+simulated by default. Data simulated with one step a sample belong to other parameters: the midpoint
+rule lowers the frequencies of fast modes, and a run that resolves these finds moduli that are too
+small.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ from .wrench_channel import Grid, sensed_dofs
 # Name of the integrator that is no collocation scheme, and its order of accuracy.
 NEWMARK = "newmark"
 NEWMARK_ORDER = 2
-# Steps a sample that automatic refinement begins with: Newmark's former default, and one of a scheme.
+# Steps a sample that automatic refinement begins with.
 FIRST_NEWMARK_STEPS = 4
 FIRST_SCHEME_STEPS = 1
-# Largest number of steps a sample that automatic refinement takes: the cost of all refinements together
-# is then 63 times that of one step a sample.
+# Largest number of steps a sample that automatic refinement takes: the cost of all refinements
+# together is then 63 times that of one step a sample.
 MOST_AUTOMATIC_STEPS = 32
-# Largest error of node positions at the samples, relative to the way of the node that moves farthest, that
-# automatic refinement accepts: it changes stiffness and damping by less than 0.1 %, which
-# is less than usual intervals.
+# Largest error of node positions at the samples, relative to the way of the node that moves
+# farthest, that automatic refinement accepts. For a swung block it changes E by 0.4 %
+# (`tests/test_substeps.py`), which a run's interval for its own step covers.
 STEP_TOLERANCE = 1e-4
 # Error relative to the size of the body that is rounding of Newton's method.
 ROUNDING = 1e-9
@@ -69,8 +70,8 @@ class Trajectory:
     steps_per_sample : int
         Time steps between samples; one in a static experiment.
     step_error_m : float or None
-        Largest error of node positions at the samples due to the time step [m], estimated by halving
-        the step; None where the step was given, or the experiment is static.
+        Largest error of node positions at the samples due to the time step [m], estimated by
+        halving the step; None where the step was given, or the experiment is static.
     """
 
     t_s: Array
@@ -196,8 +197,8 @@ def _with_automatic_steps(
 def _accepted_error_m(trajectory: Trajectory) -> float:
     """Return the error of positions that needs no finer steps [m].
 
-    It is relative to the largest distance of a node from its first position; of a body that stays where
-    it is, to rounding.
+    It is relative to the largest distance of a node from its first position; of a body that stays
+    where it is, it is rounding.
     """
     positions = trajectory.positions_m
     farthest_m = np.linalg.norm(positions - positions[0], axis=2).max()
