@@ -41,7 +41,8 @@ def parameters(guess: float) -> cs.Parameters:
 
 
 def seen(experiment: Experiment, integrator: str = "midpoint", sigma: float = 0.0) -> Experiment:
-    tracks = simulate(experiment, {**TRUTH, "drag_coefficient": DRAG}, integrator).markers_m
+    values = {**TRUTH, "drag_coefficient": DRAG}
+    tracks = simulate(experiment, values, integrator, substeps=1).markers_m
     noise = sigma * np.random.default_rng(4).normal(size=tracks.shape)
     return with_markers(experiment, tracks + noise)
 

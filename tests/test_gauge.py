@@ -256,7 +256,7 @@ def worn(tiny: Path) -> Path:
     write("mine.py", MINE)(tiny)
     text = (tiny / "problem.toml").read_text()
     (tiny / "problem.toml").write_text(text.partition("\n[experiment.markers]")[0] + READINGS)
-    truth = settings(*AT_TRUTH)
+    truth = settings(*AT_TRUTH, "transcription.substeps=1")  # the step that it is solved with
     done = run_command("simulate", *ALLOWED, *truth, "--integrator", "midpoint", "--out", "data")
     assert done.code == 0, done.err
     return tiny

@@ -290,7 +290,7 @@ def test_a_bar_stretched_at_a_constant_rate_follows_the_closed_form():
     satisfies at all times. The axial force over the undeformed area is then F₁₁ S₁₁.
     """
     young_pa, poisson, rate_1_s = 20e3, 0.3, 2.0
-    t_s = np.linspace(0.0, 0.2, 11)
+    t_s = np.linspace(0.0, 0.2, 6)
     body = Body(box().mesh, "st-venant-kirchhoff", 1e-3, damping="material")
     fixed = cs.PoseSequence.fixed()
     stretching = cs.PoseSequence(
@@ -322,13 +322,13 @@ def test_a_bar_stretched_at_a_constant_rate_follows_the_closed_form():
         "gamma_r_s": GAMMA_R_S,
         "gamma_m_1_s": 0.0,
     }
-    motion = cs.simulate(experiment, constants, "backward-euler", substeps=400)
+    motion = cs.simulate(experiment, constants, "backward-euler", substeps=40)
     stretch = 1 + rate_1_s * t_s
     strain = (stretch**2 - 1) / 2
     across = np.sqrt(1 - 2 * poisson * strain)
     force_n = EDGE_M**2 * stretch * young_pa * (strain + GAMMA_R_S * stretch * rate_1_s)
     theta = body.theta(constants)
-    for k in range(5, len(t_s)):  # after the start, where the velocity jumps
+    for k in range(2, len(t_s)):  # after the start, where the velocity jumps
         x = motion.positions_m[k].reshape(1, -1)
         expected = body.nodes_m * [across[k], across[k], stretch[k]]
         np.testing.assert_allclose(x.reshape(-1, 3), expected, atol=3e-3 * EDGE_M)
