@@ -1,4 +1,4 @@
-"""Kelvin and Voigt's damping in material form: its stress, its potential, and how it moves a body."""
+"""Kelvin and Voigt's damping in material form: stress, potential, derivatives and motion."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def matrix_times(body: Body, lower: np.ndarray, skew: np.ndarray, vector: np.nda
 
 
 def potential_w(body: Body, x: np.ndarray, v: np.ndarray) -> float:
-    """D = ½ γ_r Σ V_q (λ (tr Ė)² + 2 μ Ė:Ė) of linear elements, without the package's kernels [W]."""
+    """D = ½ γ_r Σ V_q (λ (tr Ė)² + 2 μ Ė:Ė) of linear elements, by NumPy [W]."""
     found = 0.0
     nodes = body.nodes_m
     for cell, volume_m3 in zip(body.cells, body.mesh.volumes_m3, strict=True):
@@ -284,10 +284,10 @@ def test_a_memory_leaves_the_damping_force_as_it_is(rng):
 
 
 def test_a_bar_stretched_at_a_constant_rate_follows_the_closed_form():
-    """St. Venant and Kirchhoff's material, free to contract: E₂₂ = −ν E₁₁ and S₁₁ = E (E₁₁ + γ Ė₁₁).
+    """St. Venant and Kirchhoff's material, free to contract: S₁₁ = E (E₁₁ + γ Ė₁₁), E₂₂ = −ν E₁₁.
 
-    With the side free of stress, (λ + 2μ + λ) (E₂₂ + γ Ė₂₂) = −λ (E₁₁ + γ Ė₁₁), which E₂₂ = −ν E₁₁
-    satisfies at all times. The axial force over the undeformed area is then F₁₁ S₁₁.
+    With the side free of stress, 2 (λ + μ) (E₂₂ + γ Ė₂₂) = −λ (E₁₁ + γ Ė₁₁), which
+    E₂₂ = −ν E₁₁ satisfies at all times. The axial force over the undeformed area is F₁₁ S₁₁.
     """
     young_pa, poisson, rate_1_s = 20e3, 0.3, 2.0
     t_s = np.linspace(0.0, 0.2, 6)

@@ -46,7 +46,7 @@ def holds(interval: tuple[float, float] | None, value: float) -> bool:
 
 
 def swung_block() -> cs.Experiment:
-    """A block of 200 kg/m³ that is swung 12 cm at 2 Hz, sampled at 50 Hz, without unknowns of its own."""
+    """A block of 200 kg/m³ that is swung 12 cm at 2 Hz and sampled at 50 Hz."""
     t_s = np.linspace(0.0, 0.5, 26)
     way_m = np.outer(0.06 * (1 - np.cos(4 * np.pi * t_s)), [1, 0, 0])
     body = cs.Body(cs.box_mesh((0.05, 0.05, 0.15), (1, 1, 3)), density_kg_m3=200.0)
