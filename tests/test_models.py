@@ -550,6 +550,6 @@ def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
 
 def test_there_must_be_something_to_compare(tiny: Path):
     nothing = run_command("compare", "problem.toml")
-    assert (nothing.code, "--materials, --prony or --with" in nothing.err) == (2, True)
+    assert (nothing.code, "--materials, --damping, --prony or --with" in nothing.err) == (2, True)
     several = ("compare", "problem.toml", "--materials", "gent,yeoh", "--methods")
     assert "expected one method" in run_command(*several, "reduced-space,shooting").err

@@ -116,7 +116,7 @@ def _basis(problem: Problem) -> Iterator[str]:
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     said = [law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws]
     if said:
-        yield f"{GAMMA_R.symbol} belongs to the damping law {' and '.join(said)}"
+        yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(said)}"
     if (relative := relative_sentence(problem.experiments, problem.parameters)) is not None:
         yield relative
 
