@@ -143,7 +143,7 @@ def identified(
     sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
     lines, true = budget(sources, found, {}), truth()
     whole = [
-        float(lines[n].whole95[0] <= true[n] <= lines[n].whole95[1]) if n in lines else np.nan
+        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
         for n in QUANTITIES
     ]
     return found, np.array(whole), solution.status.converged
