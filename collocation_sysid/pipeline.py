@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .display import plain_text
 from .errors import InputError, SimulationError
 from .methods.solution import Method, Solution, Status, Watch
@@ -229,18 +231,26 @@ def _fine_enough(
     say: Log,
     scheduler: str | None,
 ) -> tuple[Run, LinearisedFit | None]:
-    """The run again from its answer, with as many substeps as its error bars ask for."""
-    if coarse.refinement is None:
+    """Return the run solved again from its answer, with as many substeps as its error bars ask for.
+
+    A parameter that ended at a bound has no error bar, and coarse steps may have driven it there:
+    it starts from its guess again. Where all of them ended so, the most substeps are taken.
+    """
+    if coarse.refinement is None or fit is None:
         return coarse, fit
     first, problem = coarse.solution, coarse.problem
     substeps = coarse.refinement.substeps(coarse.optimum, as_scheme(problem.scheme).order)
+    worst, many = coarse.refinement.worst(coarse.optimum)
+    why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
+    if fit.at_bound[: fit.shared].all():
+        substeps = MOST_SUBSTEPS
+        why = "with one step a sample, every parameter ends at a bound"
     if substeps == 1:
         return coarse, fit
     say(f"solving again with {substeps} steps a sample")
-    worst, many = coarse.refinement.worst(coarse.optimum)
-    why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
+    p = np.where(fit.at_bound, again.guess_p, p)
     try:
         require_memory(problem, again, solver)
         positions, failure = marched(again, p)

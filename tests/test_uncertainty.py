@@ -336,8 +336,12 @@ def test_derived_error_bars_are_those_of_a_fit_in_the_other_convention():
         for name, estimate in derived.derived.items():
             assert estimate.value == pytest.approx(direct.estimates[name].value)
             assert estimate.std_error == pytest.approx(direct.estimates[name].std_error, rel=1e-6)
-    assert lame.derived["young_pa"].statistical95 == pytest.approx(young.estimates["young_pa"].statistical95)
-    assert young.derived["mu_pa"].statistical95 == pytest.approx(lame.estimates["mu_pa"].statistical95)
+    assert lame.derived["young_pa"].statistical95 == pytest.approx(
+        young.estimates["young_pa"].statistical95
+    )
+    assert young.derived["mu_pa"].statistical95 == pytest.approx(
+        lame.estimates["mu_pa"].statistical95
+    )
 
 
 def test_the_interval_of_poisson_stays_physical():
