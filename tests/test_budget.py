@@ -255,20 +255,20 @@ def fitted_block(made_with: str, fitted_with: str, **stated):
 def test_a_wrong_law_of_damping_is_covered_by_the_budget_not_by_the_noise(made_with, fitted_with):
     wrong = fitted_block(made_with, fitted_with, damping_law=1.0)
     truth = BLOCK["gamma_r_s"]
-    low, high = wrong.noise_estimates["gamma_r_s"].ci95
+    low, high = wrong.estimates["gamma_r_s"].statistical95
     assert not low < truth < high
     line = wrong.budget["gamma_r_s"]
-    assert line.whole95[0] < truth < line.whole95[1]
+    assert line.combined95[0] < truth < line.combined95[1]
     assert next(iter(line.shares)) == "damping_law"
-    assert wrong.budget["young_pa"].whole95[0] < BLOCK["young_pa"]
-    assert wrong.budget["young_pa"].whole95[1] > BLOCK["young_pa"]
+    assert wrong.budget["young_pa"].combined95[0] < BLOCK["young_pa"]
+    assert wrong.budget["young_pa"].combined95[1] > BLOCK["young_pa"]
 
 
 @pytest.mark.long
 def test_a_law_of_damping_that_is_known_is_no_source():
     """With the right law stated as known the statistical interval holds the truth."""
     right = fitted_block("material", "material")
-    low, high = right.noise_estimates["gamma_r_s"].ci95
+    low, high = right.estimates["gamma_r_s"].statistical95
     assert low < BLOCK["gamma_r_s"] < high
     assert "damping_law" not in right.budget["gamma_r_s"].shares
 
