@@ -88,7 +88,10 @@ def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(fi
 def test_the_material_is_found_within_its_error_bars(finished):
     for name, truth in TRUTH.items():
         estimate = finished.uncertainty.estimates[name]
-        assert abs(np.log(estimate.value / truth)) < 4 * estimate.std_error / estimate.value
+        assert (
+            abs(np.log(estimate.value / truth))
+            < 4 * estimate.statistical_std_error / estimate.value
+        )
 
 
 def test_the_result_says_what_its_error_bars_are_based_on(finished):
@@ -219,7 +222,7 @@ def test_what_the_data_do_not_tell_has_no_error_bar(tmp_path):
     outcome = run_command("solve", file, *REDUCED, *sigma, "--json", "--out", folder / "run")
     found = json.loads(outcome.out)
     poisson = found["parameters"]["poisson"]
-    assert poisson["std_error"] is None
+    assert poisson["statistical_std_error"] is None
     assert poisson["reason"]
     said = [sentence for sentence in found["uncertainty"]["verdicts"] if "poisson" in sentence]
     assert any("not identifiable" in s or "ended at its lower bound" in s for s in said)
