@@ -85,6 +85,17 @@ def test_a_simulation_takes_as_many_steps_as_its_motion_needs_and_says_how_far_o
     assert (stated.steps_per_sample, stated.step_error_m) == (2, None)
 
 
+def test_where_every_parameter_ends_at_a_bound_the_steps_are_checked_too():
+    """Coarse steps may have driven it there, and no error bar tells whether they did."""
+    block = hung_cube(10, divisions=(1, 1, 1))
+    seen = cs.with_markers(block, cs.simulate(block, TRUTH).markers_m)
+    bounded = cs.Unknown(TRUTH["mu_pa"] / 3, TRUTH["mu_pa"] / 4, TRUTH["mu_pa"] / 2)
+    answer = run(Problem([seen], {**TRUTH, "mu_pa": bounded}), seek_causes=False)
+    assert answer.solution.collocation.substeps == MOST_SUBSTEPS
+    assert any("every parameter ends at a bound" in note for note in answer.solution.notes)
+    assert answer.trust.verdict != "good"
+
+
 @pytest.mark.parametrize("substeps", [0, "many"])
 def test_steps_that_cannot_be_are_refused(substeps):
     with pytest.raises(cs.InputError, match="substeps"):

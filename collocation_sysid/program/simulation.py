@@ -185,8 +185,9 @@ def _with_automatic_steps(
             finer = None
         if finer is not None and coarser is not None:
             change_m = np.linalg.norm(finer.positions_m - coarser.positions_m, axis=2).max()
-            finer = replace(finer, step_error_m=float(change_m) / (2**order - 1))
-            if finer.step_error_m <= _accepted_error_m(finer):
+            error_m = float(change_m) / (2**order - 1)
+            finer = replace(finer, step_error_m=error_m)
+            if error_m <= _accepted_error_m(finer):
                 return finer
         if finer is not None and steps >= MOST_AUTOMATIC_STEPS:
             return finer
