@@ -14,7 +14,7 @@ from ..arrays import Array
 from ..errors import SimulationError
 from ..recording.experiment import Experiment
 from .factorisation import Factor, Factoriser
-from .retraction import Retraction, Update, added
+from .retraction import Retraction, added
 from .stopwatch import Stopwatch
 
 Residual = Callable[[Array], Array]
@@ -85,6 +85,8 @@ class Solver:
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
+        # A retraction moves surfaces off the obstacles that hold them.
+        self._is_free_of_contact = not experiment.obstacles
         self.options = options or NewtonOptions()
         at_start = experiment.held(experiment.t_s[:1])[0]
         holding = at_start if held is None else held
@@ -107,7 +109,7 @@ class Solver:
         A step is accepted when the next one, computed with the same factor, is shorter
         (Deuflhard's natural monotonicity test), no element is inverted, and with
         `keep_definite` only while −∂r/∂x stays positive definite. An equilibrium (`keep_definite`)
-        may be far from x, so that its steps are applied as rotation and strain, see `Retraction`.
+        may be far from x: without obstacles its steps are rotations and strains, see `Retraction`.
         Otherwise the factor of the solution before serves as long as steps shrink fast.
 
         Parameters
@@ -196,7 +198,7 @@ class Solver:
         """The next iterate, its factor and its step."""
         length = np.linalg.norm(step)
         share = 1.0
-        update: Update = self._retraction if keep_definite else added
+        update = self._retraction if keep_definite and self._is_free_of_contact else added
         for _ in range(self.options.backtracks):
             increment = np.zeros_like(x)
             increment[self.free] = share * step

@@ -16,7 +16,6 @@ they are x + δ, so that Newton's method keeps its order.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -108,14 +107,6 @@ def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
     free, fixed = np.flatnonzero(~prescribed), np.flatnonzero(prescribed)
     rows = normal[free]
     return _Axis(free, fixed, splu(sp.csc_matrix(rows[:, free])), sp.csc_array(rows[:, fixed]))
-
-
-class Update(Protocol):
-    """Positions (3n,) after an increment (3n,) of positions (3n,)."""
-
-    def __call__(self, x: Array, increment: Array) -> Array:
-        """Apply the increment."""
-        ...
 
 
 def added(x: Array, increment: Array) -> Array:
