@@ -42,23 +42,34 @@ NOISE_M = 1e-4
 
 
 @cache
-def probed(fault: str = "", off: float = 0.0) -> Run:
-    """A cube that was swung, of which something is off, solved as if nothing were."""
+def swung(fault: str = "", off: float = 0.0) -> Problem:
+    """A cube that was swung, of which something is off, described as if nothing were."""
     hung = hung_cube(80)
     hung = replace(hung, body=Body(hung.body.mesh, density_kg_m3=60.0), nuisance=Nuisance.none())
-    swung = wrong(hung, TRUTH, {} if fault == "clock_rate" else {fault: off})
-    tracks = swung.markers.positions_m
+    recorded = wrong(hung, TRUTH, {} if fault == "clock_rate" else {fault: off})
+    tracks = recorded.markers.positions_m
     if fault == "clock_rate":  # cameras' times are too large
-        tracks = CubicSpline(swung.t_s, tracks)(swung.t_s * (1 - off))
+        tracks = CubicSpline(recorded.t_s, tracks)(recorded.t_s * (1 - off))
     tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
-    seen = replace(swung.markers, positions_m=tracks, sigma_m=sigma_m)
+    seen = replace(recorded.markers, positions_m=tracks, sigma_m=sigma_m)
     parameters = Parameters.of({name: Unknown(value) for name, value in TRUTH.items()})
     exact = {n: "none" for n in Assumptions().deviations if n not in FREED}
     stated = Assumptions(**exact, density_gradient=0.1)
     options = UncertaintyOptions(assumptions=stated)
-    problem = Problem([replace(swung, markers=seen)], parameters, substeps=1, uncertainty=options)
-    return run(problem, seek_causes=False, probe=True)
+    return Problem([replace(recorded, markers=seen)], parameters, substeps=1, uncertainty=options)
+
+
+@cache
+def probed(fault: str = "", off: float = 0.0) -> Run:
+    """The answer, with all probes."""
+    return run(swung(fault, off), seek_causes=False, probe=True)
+
+
+@cache
+def plain(fault: str = "", off: float = 0.0) -> Run:
+    """The answer, with the probes of every solve."""
+    return run(swung(fault, off), seek_causes=False)
 
 
 def named(solved: Run, name: str) -> Probe:

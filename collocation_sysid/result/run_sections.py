@@ -33,7 +33,7 @@ from ..statistics.concern import Concern, topics_of
 from ..statistics.numerical import NumericalError
 from ..statistics.trust import Trust
 from ..tree import content
-from .probe_sections import FOREMOST, asks_for_probes, probe_section
+from .probe_sections import DEEPER, FOREMOST, is_deeper_check_worthwhile, probe_section
 from .replay import LARGEST, read_arrays, reading_run
 
 MEANINGS = {
@@ -147,9 +147,8 @@ def verdict_of(trust: Trust, linked: bool = False, most: int | None = None) -> S
 
 
 def _harder(result: Result) -> list[Line]:
-    """Whether to look harder."""
-    said = "look harder: solve --probe refits parts of the data, and with each assumption freed"
-    return [Line(said, "quiet")] if asks_for_probes(result) else []
+    """Return the recommendation of a deeper check, where it is worthwhile."""
+    return [Line(DEEPER, "quiet")] if is_deeper_check_worthwhile(result) else []
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, hint_at
-from ..fem.constants import unit_of
+from ..fem.constants import is_mode, unit_of
 from ..methods.solution import Solution
-from ..model.parameters import Parameters
+from ..model.parameters import Parameter, Parameters
 from ..problem import Problem
 from ..statistics.budget import BudgetLine, Sources, budget
 from ..statistics.concern import Concern
@@ -24,9 +24,9 @@ from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
 from ..statistics.numerical import Refinement
-from ..statistics.probes import Probe
 from ..statistics.profile import Profile
-from ..statistics.trust import Trust, cause_concerns, numerical_concerns
+from ..statistics.relaxation import Probe
+from ..statistics.trust import Trust, cause_concerns, numerical_concerns, probe_concerns
 from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout
@@ -58,7 +58,8 @@ class Answer:
     sources : Sources or None
         What moves the estimates beside the noise, where there are error bars.
     probes : tuple of Probe
-        Refits of parts of the data and with assumptions freed, where these were asked for.
+        Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
+        of parts of the data, where these were asked for. Empty without error bars.
     """
 
     problem: Problem
@@ -158,9 +159,16 @@ class Answer:
         numerical = numerical_concerns(self.estimates, self.refinement)
         of_fields = [concern for field in self.fields.values() for concern in field.concerns]
         if not self.missing:
-            return Trust.of((*cause_concerns(self.causes), *of_fit, *of_fields, *numerical))
+            probed = probe_concerns(self.probes, [item.name for item in self._reported])
+            causes = cause_concerns(self.causes)
+            return Trust.of((*causes, *of_fit, *of_fields, *probed, *numerical))
         interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.missing})
         return Trust.of((interrupted, *(of_fit if self.uncertainty is not None else ())))
+
+    @property
+    def _reported(self) -> list[Parameter]:
+        """The estimated parameters, without the shares of fields."""
+        return [item for item in self.started_from.free if not is_mode(item.name)]
 
     @cached_property
     def motions(self) -> dict[str, Motion]:

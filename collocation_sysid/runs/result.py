@@ -17,7 +17,7 @@ from ..program.touches import Rubbing
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
 from ..statistics.numerical import NumericalError
-from ..statistics.probes import Probe
+from ..statistics.relaxation import Probe
 from ..statistics.trust import Trust
 from ..statistics.uncertainty import Place
 from ..tree import optional, read
@@ -253,7 +253,8 @@ class Result:
     """The content of ``result.json``, whose names are its keys.
 
     `basis` says what the values rest on: the law of the damping, and what sets the scale; `budget`
-    has each source's share of an estimate's variance; `probes` are there where they were asked for.
+    has each source's share of an estimate's variance; `probes` are
+    refits with an assumption relaxed and, where that was asked for, of parts of the data.
     """
 
     schema: int

@@ -154,6 +154,19 @@ TOPICS: Mapping[str, Topic] = {
             "far": "{percent:.0f} % of the markers' samples lie far from where they can be",
         },
     ),
+    "assumption": Topic(
+        "Assumptions that the data contradict",
+        "budget",
+        "Find out whether the assumption is wrong, for instance by repeating the first recording "
+        "at the end, or whether the model lacks something that looks alike, such as memory, which "
+        "looks like a drift. solve --probe follows the effect beyond one linear step and relaxes "
+        "the other assumptions.",
+        {
+            "contradicted": "the data contradict the assumption that {assumption}: with "
+            "{name} = {size} ± {size_error} χ² falls by {chi_squared:.3g}, and the estimates are "
+            "{estimates}{instead}",
+        },
+    ),
     "information": Topic(
         "What the data do not tell",
         "trust",
