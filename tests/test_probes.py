@@ -136,7 +136,7 @@ def test_each_of_several_recordings_says_what_it_has_alone():
 
 def test_shares_of_both_intervals_stand_beside_every_change():
     solved = probed("density_gradient z", -0.1)
-    low, high = solved.estimates["young_pa"].ci95
+    low, high = solved.noise_estimates["young_pa"].ci95
     least, most = solved.estimates["young_pa"].whole95
     move = named(solved, "density_gradient z").moves["young_pa"]
     assert move.of_ci95 == pytest.approx(2 * move.change / (high - low))
@@ -149,18 +149,32 @@ def test_terminal_page_and_file_have_the_probes(tmp_path):
     result = Result.read(folder)
     assert {p.name for p in result.probes} == {p.name for p in solved.probes}
     said = plain_text(summary(result, folder))
-    assert "the data tell density gradient z: -0.1" in said
+    assert "the data determine density gradient z: -0.1" in said
     assert "−Δχ²" in said
     assert run_command("report", folder).code == 0
-    assert "the data tell density gradient z" in next(folder.glob("*.html")).read_text()
+    assert "the data determine density gradient z" in next(folder.glob("*.html")).read_text()
 
 
-def test_a_solve_probes_where_asked_to_and_says_where_it_would_help(tmp_path):
+def test_a_solve_makes_two_probes_and_all_of_them_where_asked_to(tmp_path):
     file = write_problem(tmp_path, {"swing": 12})
     plain = run_command("solve", file, "--out", tmp_path / "plain", "--quiet")
-    assert Result.read(tmp_path / "plain").probes == ()
-    assert "solve --probe" in plain.out
+    routine = Result.read(tmp_path / "plain").probes
+    assert [p.name for p in routine] == ["stiffness_drift", "clock_rate"]
+    assert all(p.routine for p in routine)
+    assert "all to first order" in " ".join(plain.out.split())
     probing = run_command("solve", file, "--out", tmp_path / "probed", "--quiet", "--probe")
-    assert Result.read(tmp_path / "probed").probes
+    deep = Result.read(tmp_path / "probed").probes
+    assert not any(p.routine for p in deep)
+    assert {p.kind for p in deep} == {"window", "assumption"}
     assert "solve --probe" not in probing.out
-    assert "in half widths of the 95 % and of the whole interval" in " ".join(probing.out.split())
+    assert "in half widths of the statistical and of the combined interval" in " ".join(
+        probing.out.split()
+    )
+
+
+def test_an_assumption_that_a_deep_probe_contradicts_means_check():
+    wrong_density = probed("density_gradient z", -0.1)
+    (concern,) = (c for c in wrong_density.trust.concerns if c.topic == "assumption")
+    assert concern.grade == "check"
+    assert concern.data["name"] == "density gradient z"
+    assert not [c for c in probed().trust.concerns if c.topic == "assumption"]
