@@ -128,8 +128,9 @@ def test_the_page_states_the_threshold_of_doubtful_residuals_that_the_code_uses(
     assert (float(check), float(doubtful)) == (MISFIT, GROSS_MISFIT)
     for seed in range(3):
         errors = autoregressive(RNG(seed), 80, 3, 0.97)
-        errors *= 1 / np.sqrt(np.mean(errors**2))
-        below, above = (verdict_of_fit(f * float(doubtful) * errors) for f in (0.7, 1.5))
+        (larger,) = (c for c in verdict_of_fit(20 * errors).concerns if c.code == "noise/larger")
+        unit = float(doubtful) / (larger.data["factor"] / 20)
+        below, above = (verdict_of_fit(f * unit * errors) for f in (0.9, 1.1))
         assert (below.verdict, above.verdict) == ("check", "doubtful")
         (persistent,) = (c for c in below.concerns if c.code == "residuals/persist")
         assert persistent.data["autocorrelation"] > 0.9
