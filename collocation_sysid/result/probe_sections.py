@@ -54,6 +54,19 @@ def probe_section(result: Result) -> Section:
     return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_said(result)))
 
 
+def probe_lines(result: Result) -> list[str | Table]:
+    """Return what a terminal shows of the probes: a line where every solve's found nothing."""
+    if is_routine(result) and not any(probe.told for probe in result.probes):
+        return [*_said(result)] if result.probes else []
+    return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
+
+
+def _first_order(probe: Probe) -> str:
+    """Return the size of a relaxed assumption and what it gains, in words."""
+    size, error = short(probe.size or 0.0), short(probe.size_error or 0.0)
+    return f"{worded(probe.name)} ({size} ± {error}, −Δχ² {probe.chi_squared:.1f})"
+
+
 def is_routine(result: Result) -> bool:
     """Whether only the probes of every solve were made, not those of a deeper check."""
     return all(probe.routine for probe in result.probes)
@@ -113,7 +126,7 @@ def _said(result: Result) -> Iterator[str]:
         if others := [f"{worded(p.name)} ({p.chi_squared:.3g})" for p in freed[1:]]:
             yield f"instead of it also {listed(others)}: one cause may look like another"
     elif not told:
-        tested = " or ".join(worded(p.name) for p in result.probes)
+        tested = " or ".join(_first_order(p) for p in result.probes)
         nothing = "no part of the data, and no relaxed assumption, fits better than by chance"
         yield f"no significant {tested}" if is_routine(result) else nothing
     if not is_routine(result):

@@ -296,6 +296,19 @@ TOPICS: Mapping[str, Topic] = {
             "fitted",
         },
     ),
+    "prediction": Topic(
+        "The prediction",
+        "trust",
+        "The parameters are stated, not estimated: make sure that they belong to this body, and "
+        "that sigma is the sensor's noise. Then look for what the model lacks, or estimate a "
+        "parameter.",
+        {
+            "misses": "the prediction of '{experiment}' misses {what} by {size}{sigmas:.2g} times "
+            "{stated}",
+            "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
+            "'{experiment}'",
+        },
+    ),
     "memory": Topic(
         "RAM",
         "large",

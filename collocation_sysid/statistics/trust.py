@@ -24,7 +24,7 @@ from ..recording.turning import FAST, fastest_turn
 from .budget import worded
 from .concern import Concern, concerned
 from .diagnostics import MOST_WILD, MarkerDiagnosis
-from .distributions import normal_isf
+from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, told_of
 from .hypothesis import Hypothesis
 from .noise import NoiseLevel
@@ -302,6 +302,45 @@ def rollout_concerns(
         experiment=name,
         rms_mm=1e3 * rms_m,
         fit_mm=1e3 * fit_rms_m,
+    )
+
+
+def prediction_concerns(
+    name: str,
+    what: str,
+    stated: str,
+    sigmas: float,
+    tame_sigmas: float,
+    numbers: int,
+    size: str = "",
+) -> list[Concern]:
+    """Return whether a prediction, of which nothing was fitted, misses the measurements.
+
+    Parameters
+    ----------
+    name : str
+        Of the experiment.
+    what, stated : str
+        What was measured, and what states its σ.
+    sigmas : float
+        Root mean square of the differences over σ.
+    tame_sigmas : float
+        The same without wild samples, by which the prediction is judged.
+    numbers : int
+        How many numbers were measured.
+    size : str
+        The root mean square in a unit, for people.
+    """
+    is_chance = float(chi2_sf(numbers * tame_sigmas**2, numbers)) > RARE
+    return concerned(
+        tame_sigmas > MISFIT and not is_chance,
+        tame_sigmas > GROSS_MISFIT,
+        "prediction/misses",
+        experiment=name,
+        what=what,
+        stated=stated,
+        sigmas=sigmas,
+        size=f"{size}, " if size else "",
     )
 
 
