@@ -20,7 +20,17 @@ from problems_small import (
 )
 from scipy.interpolate import CubicSpline
 
-from collocation_sysid import Body, Experiment, Grasp, PoseSequence, Problem, Run, Unknown, run
+from collocation_sysid import (
+    Body,
+    Experiment,
+    Grasp,
+    PoseSequence,
+    Problem,
+    Run,
+    UncertaintyOptions,
+    Unknown,
+    run,
+)
 from collocation_sysid.display import plain_text
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.model.parameters import Parameters
@@ -76,8 +86,13 @@ def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
     tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
-    parameters = Parameters.of({name: Unknown(value) for name, value in TRUTH.items()})
-    return Problem([replace(hung, markers=seen)], parameters, substeps=SUBSTEPS)
+    estimated = {name: Unknown(TRUTH[name]) for name in ("young_pa", "poisson", "gamma_r_s")}
+    parameters = Parameters.of(TRUTH | estimated)
+    # Nothing but the probes is to give concern: all assumptions are stated as exact.
+    exact = Assumptions(**dict.fromkeys(Assumptions().deviations, "none"))
+    options = UncertaintyOptions(assumptions=exact)
+    recorded = replace(hung, markers=seen)
+    return Problem([recorded], parameters, substeps=SUBSTEPS, uncertainty=options)
 
 
 @cache
@@ -90,10 +105,6 @@ def named(finished: Run, name: str) -> Probe:
     return probe
 
 
-def codes(finished: Run) -> list[str]:
-    return [concern.code for concern in finished.trust.concerns]
-
-
 # Whole solves -------------------------------------------------------------------------------------
 
 
@@ -102,13 +113,13 @@ def test_a_faultless_solve_has_both_probes_and_no_alarm():
     faultless = solved()
     assert [probe.name for probe in faultless.probes] == [DRIFT, CLOCK]
     assert not any(probe.told for probe in faultless.probes)
-    assert "assumption/contradicted" not in codes(faultless)
+    assert faultless.trust.verdict == "good"
     assert not is_deeper_check_worthwhile(faultless.result)
     assert "solve --probe" not in plain_text(summary(faultless.result, Path("runs")))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("fault", "off", "size"), [(DRIFT, -0.15, -0.15), (CLOCK, 2e-3, -2e-3)])
+@pytest.mark.parametrize(("fault", "off", "size"), [(DRIFT, -0.15, -0.15), (CLOCK, 7e-4, -7e-4)])
 def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(fault, off, size):
     wrongly = solved(fault, off)
     probe = named(wrongly, fault)
@@ -116,24 +127,16 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
     assert abs(probe.size - size) < 3 * probe.size_error
     assert probe.chi_squared > 15
     assert wrongly.trust.verdict == "check"
-    (concern,) = (c for c in wrongly.trust.concerns if c.code == "assumption/contradicted")
+    (concern,) = wrongly.trust.concerns
+    assert concern.code == "assumption/contradicted"
     assert fault.replace("_", " ") in concern.sentence
-    for symbol in ("E = ", "ν = ", "γ_r = ", "γ_m "):
+    for symbol in ("E = ", "ν = ", "γ_r = "):
         assert symbol in concern.sentence
     for name, move in probe.moves.items():
         if name in TRUTH:  # the corrected estimates are right
             assert abs(move.value - TRUTH[name]) < 3.5 * move.std_error
     assert is_deeper_check_worthwhile(wrongly.result)
     assert DEEPER in plain_text(summary(wrongly.result, Path("runs")))
-
-
-@pytest.mark.long
-def test_a_wrong_clock_rate_biases_the_damping_until_its_probe_corrects_it():
-    wrongly = solved(CLOCK, 2e-3)
-    assert wrongly.parameters["gamma_m_1_s"] > 5 * TRUTH["gamma_m_1_s"]
-    assert wrongly.parameters["gamma_r_s"] < 0.8 * TRUTH["gamma_r_s"]
-    move = named(wrongly, CLOCK).moves["gamma_r_s"]
-    assert move.value == pytest.approx(TRUTH["gamma_r_s"], rel=0.15)
 
 
 # Level of significance ----------------------------------------------------------------------------
@@ -200,15 +203,15 @@ def test_a_probe_alarms_if_it_is_significant_and_relevant():
 
 def test_the_concern_names_the_assumption_and_every_corrected_estimate():
     both = [probe(1.0, name=CLOCK, fall=12.0), probe(1.0)]
-    (concern,) = probe_concerns(both, ["young_pa", "poisson"])
+    (concern,) = probe_concerns(both, {"young_pa": 1.01, "poisson": 1.0})
     assert concern.grade == "check"
     assert Trust.of([concern]).verdict == "check"
     assert concern.sentence == (
         "the data contradict the assumption that the stiffness is constant during a recording: "
         "with stiffness drift = -0.05 ± 0.01 χ² falls by 20, and the estimates are "
-        "E = 8100 ± 40 Pa and ν not determined; less well also by clock rate (12)"
+        "E = 8181 ± 40 Pa and ν not determined; less well also by clock rate (12)"
     )
-    assert probe_concerns([probe(0.0)], ["young_pa"]) == []
+    assert probe_concerns([probe(0.0)], {"young_pa": 1.0}) == []
 
 
 # Static recordings --------------------------------------------------------------------------------

@@ -89,7 +89,7 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
 
 def _shown(result: Result) -> list[str]:
     """The estimates of the table."""
-    known = [n for n, each in result.values.items() if each.ci95]
+    known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in FOREMOST[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][:SHOWN]
 
@@ -97,7 +97,9 @@ def _shown(result: Result) -> list[str]:
 def _moved(move: Move | None, value: float) -> str:
     if move is None:
         return "–"
-    shares = ", ".join(f"{x:+.1f}" for x in (move.of_ci95, move.of_whole95) if x is not None)
+    shares = ", ".join(
+        f"{x:+.1f}" for x in (move.of_statistical95, move.of_combined95) if x is not None
+    )
     return f"{_change(move, value)} ({shares})"
 
 

@@ -44,7 +44,7 @@ class Move:
         The estimate of the refit, and its standard error.
     change : float
         From the fit of all data to the refit.
-    of_ci95, of_whole95 : float or None
+    of_statistical95, of_combined95 : float or None
         The same over the half widths of the statistical and of the combined interval of the fit;
         None where there is no such interval.
     """
@@ -52,8 +52,8 @@ class Move:
     value: float
     std_error: float
     change: float
-    of_ci95: float | None
-    of_whole95: float | None
+    of_statistical95: float | None
+    of_combined95: float | None
 
 
 @dataclass(frozen=True)
@@ -136,12 +136,12 @@ class Answered:
         """Return the changes of the estimates that a refit determines, by name."""
         went = {}
         for name, each in {**found.estimates, **found.derived}.items():
-            error, joint = each.std_error, self.statistical[name]
+            error, joint = each.statistical_std_error, self.statistical[name]
             if error and error < TELLING * abs(each.value):
                 change = each.value - joint.value
-                whole95 = self.budget[name].whole95 if name in self.budget else None
-                of_statistical = _share(change, joint.ci95)
-                of_combined = _share(change, whole95)
+                combined95 = self.budget[name].combined95 if name in self.budget else None
+                of_statistical = _share(change, joint.statistical95)
+                of_combined = _share(change, combined95)
                 went[name] = Move(each.value, error, change, of_statistical, of_combined)
         return went
 
@@ -274,10 +274,10 @@ def relevance(at: Answered, probe: Probe) -> float:
     """
     shares = [0.0]
     for name, move in probe.moves.items():
-        if move.of_ci95 is None or is_mode(name):
+        if move.of_statistical95 is None or is_mode(name):
             continue
-        shares.append(abs(move.of_ci95))
-        interval = at.statistical[name].ci95
+        shares.append(abs(move.of_statistical95))
+        interval = at.statistical[name].statistical95
         if probe.name == DRIFT and is_modulus(name) and interval is not None:
             half_width = max((interval[1] - interval[0]) / 2, 1e-300)
             shares.append(abs(0.5 * (probe.size or 0.0) * move.value) / half_width)
