@@ -48,8 +48,7 @@ def probe_section(result: Result) -> Section:
     ]
     read = (
         "changes of the estimates; in brackets in half widths of the statistical and of the "
-        f"combined interval; {'all' if is_routine(result) else 'of parts of the data'} to first "
-        "order"
+        "combined interval; to first order, but of significant assumptions"
     )
     return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_said(result)))
 
