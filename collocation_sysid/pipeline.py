@@ -27,13 +27,15 @@ from .runs.told import result_of
 from .runs.warm_start import Earlier
 from .statistics.budget import Sources
 from .statistics.causes import likely_causes
-from .statistics.considered import assumed
+from .statistics.considered import Changes, assumed
 from .statistics.diagnostics import diagnose
 from .statistics.linearised import LinearisedFit, linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes import Answered, Probe, probes
+from .statistics.probes import probes, probes_of_every_solve
 from .statistics.profile import Profile, profile_of
+from .statistics.relaxation import Answered, Probe, probed_changes
+from .statistics.routine_probes import probed_deviations
 from .statistics.trust import turn_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_of
 
@@ -152,9 +154,10 @@ def run(
         answer = replace(answer, notes=(*turns, *answer.notes))
         if answer.uncertainty is not None and fit is not None:
             profiles = _profiles(answer, fit, say)
-            sources = _sources(answer, fit, answer.uncertainty, say)
+            changes = _changes(answer, say)
+            sources = _sources(answer, fit, answer.uncertainty, changes)
             answer = replace(answer, profiles=profiles, sources=sources)
-            answer = replace(answer, probes=_probes(answer, fit, say)) if probe else answer
+            answer = replace(answer, probes=_probes(answer, fit, changes, say, deep=probe))
         if not seek_causes or answer.solution.status is Status.INTERRUPTED:
             return answer
         say("looking for causes of the misfit")
@@ -193,21 +196,43 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     return replace(answer, refinement=error), fit
 
 
-def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> Sources:
-    """What moves the estimates beside the noise."""
+def _changes(answer: Run, say: Log) -> Changes:
+    """Return how the residuals change by what is assumed, and by what every solve probes."""
     say("finding what is assumed is worth")
-    solution, stated = answer.solution, answer.problem.uncertainty.assumptions
-    changes = assumed(solution.collocation, solution.z, stated.deviations)
+    solution = answer.solution
+    deviations = probed_deviations(answer.problem.uncertainty.assumptions.deviations)
+    return assumed(solution.collocation, solution.z, deviations)
+
+
+def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, changes: Changes) -> Sources:
+    """Return what moves the estimates beside the noise; what is stated as exact does not."""
+    solution, stated = answer.solution, answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
-    return Sources.of(fit, changes, parameters, solution.q, known)
+    budgeted = changes.without(name for name, deviation in stated.items() if deviation is None)
+    return Sources.of(fit, budgeted, parameters, solution.q, known)
 
 
-def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
-    """Refits of parts of the data, and with assumptions freed."""
-    say("refitting parts of the data, and with assumptions freed")
+def _probes(
+    answer: Run, fit: LinearisedFit, changes: Changes, say: Log, deep: bool
+) -> tuple[Probe, ...]:
+    """Return the probes of every solve; of a deep check those of parts and assumptions instead."""
     solution, options = answer.solution, answer.problem.uncertainty
-    at, known = (solution.collocation, solution.z, fit), options.assumptions.deviations
-    return probes(Answered(*at, options, answer.optimum, answer.budget, known))
+    deviations = probed_deviations(options.assumptions.deviations)
+    collocation, z = solution.collocation, solution.z
+    answered = Answered(
+        collocation=collocation,
+        z=z,
+        fit=fit,
+        errors=options,
+        statistical=answer.optimum,
+        budget=answer.budget,
+        deviations=deviations,
+        changes=probed_changes(collocation, z, deviations, changes),
+    )
+    if not deep:
+        return probes_of_every_solve(answered)
+    say("refitting parts of the data, and with assumptions relaxed")
+    return probes(answered)
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
