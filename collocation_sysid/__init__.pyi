@@ -9,6 +9,7 @@ from .fem.materials import Material, Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
 from .fem.regions import Region
+from .fem.rest_shape import UnderGravity
 from .fem.selection import Ball, Box, Indices, Named
 from .fem.structured import box_mesh, cylinder_mesh
 from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
@@ -96,6 +97,7 @@ __all__ = [
     "Prony",
     "ReducedSpace",
     "Region",
+    "UnderGravity",
     "RolloutOptions",
     "Run",
     "Scheme",

@@ -204,6 +204,33 @@ class Body(Discretisation):
             return error.message
         return None
 
+    def stress_free_geometry(self, theta: Theta) -> Array:
+        """Return shape gradients and volumes (E, q, 3·nodes + 1) in the stress-free shape at θ."""
+        if self.inverse is None:
+            return self.geometry
+        positions_m, (count, points) = self.inverse.shape(theta).positions_m, self.geometry.shape[:2]
+        slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
+        G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
+        own = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(count, points, -1)
+        volumes = self.geometry[..., -1:] * np.linalg.det(G)[..., None]
+        return np.concatenate([own, volumes], axis=2)
+
+    def stress_free_mesh(self, theta: Theta) -> TetMesh:
+        """Return the mesh in its stress-free shape at θ (k,), with straight sides.
+
+        Raises
+        ------
+        RestShapeError
+            If there is none whose equilibrium under gravity is the mesh.
+        """
+        if self.inverse is None:
+            return self.mesh
+        positions_m = self.inverse.shape(theta).positions_m[: len(self.mesh.points_m)]
+        mesh = self.mesh
+        return TetMesh(
+            positions_m, mesh.tetrahedra, mesh.point_arrays, mesh.cell_arrays, mesh.face_sets
+        )
+
     @property
     def density_places(self) -> list[int]:
         """Where in θ the densities that are free are."""

@@ -363,8 +363,7 @@ class Discretisation(Model):
             logs = np.broadcast_to(width + np.arange(count)[:, None, None], (*carried.shape[:2], 1))
             carried = np.concatenate([carried, logs], axis=-1)
         if self.inverse is not None:
-            size = self.inverse.layout.count
-            carried = np.arange(count * geometry.shape[1] * size).reshape(count, -1, size)
+            carried = self.inverse.places_of_points(number)
         own = carried if carried.shape[-1] else None
         return Batch(kernel, cells, geometry, destinations, self._width(name), own)
 

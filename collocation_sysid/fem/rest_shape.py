@@ -372,6 +372,21 @@ class InverseEquilibrium:
             self._data[key] = self._of_points(fields)
         return self._data[key]
 
+    def places_of_points(self, part: int) -> Index:
+        """Return where in the data of a part, by its number, those of each point are (E, q, any)."""
+        count, points = self._parts[part][1].shape[:2]
+        size = self.layout.count
+        return np.arange(count * points * size).reshape(count, points, size)
+
+    def weight_slope(self, theta: ArrayLike) -> Array:
+        """Return the change (n, 3) of X for a relative change of gravity, to first order."""
+        constants = np.asarray(theta, dtype=float)
+        at = self._assembled(self.shape(constants).positions_m, constants, slopes=True)
+        factor = self._factor(at.by_position)
+        if factor is None:
+            raise RestShapeError(self._failure(constants, 1.0))
+        return self._step(factor, self._weight_n(constants))
+
     def data_of(self, positions_m: Array) -> list[Array]:
         """Return what the points are given where X is `positions_m`, whatever θ."""
         others = self.layout.inputs + len(self.layout.pairs)

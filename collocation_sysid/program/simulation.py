@@ -111,6 +111,8 @@ def simulate(
         raise InputError(f"substeps = {substeps}, expected at least 1")
     if (massless := experiment.body.massless(theta)) is not None:
         raise InputError(massless)
+    if (unreachable := experiment.body.unreachable(theta)) is not None:
+        raise InputError(unreachable)
     if integrator == "newmark" and not experiment.static:
         step = timestep_s or experiment.timestep_s / 4
         require_steps(experiment, step)
