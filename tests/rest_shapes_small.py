@@ -19,7 +19,7 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 
 SIZE_M = (0.12, 0.03, 0.03)
-TRUTH = {"young_pa": 6e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
+TRUTH = {"young_pa": 3e5, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
 DENSITY_KG_M3 = 1000.0
 # The bar was clamped at x = 0 and horizontal when it was scanned.
 SCAN_GRAVITY_M_S2 = (0.0, 0.0, -9.81)
@@ -105,7 +105,7 @@ def problem_of(experiment: Experiment, **changes) -> Problem:
 
     static = experiment.static
     parameters = {
-        "young_pa": Unknown(9e4),
+        "young_pa": Unknown(4e5),
         "poisson": TRUTH["poisson"],
         "gamma_r_s": TRUTH["gamma_r_s"] if static else Unknown(0.02),
         "gamma_m_1_s": TRUTH["gamma_m_1_s"],

@@ -163,7 +163,8 @@ class Body(Discretisation):
         threads: int | None = None,
     ) -> None:
         parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony, field)
-        self.rest_shape = rest_shape
+        generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
+        self.rest_shape = generated if rest_shape is None else rest_shape
         if rest_shape not in (None, "stress_free") and not isinstance(rest_shape, UnderGravity):
             raise InputError(
                 f"found {rest_shape!r}; expected 'stress_free' or UnderGravity(nodes, gravity)",
@@ -208,7 +209,21 @@ class Body(Discretisation):
         """Return shape gradients and volumes (E, q, 3·nodes + 1) in the stress-free shape at θ."""
         if self.inverse is None:
             return self.geometry
-        positions_m, (count, points) = self.inverse.shape(theta).positions_m, self.geometry.shape[:2]
+        return self._geometry_at(self.inverse.shape(theta).positions_m)
+
+    def with_stress_free(self, positions_m: Array) -> Body:
+        """Return the same body, free of stress where its nodes are at (n, 3), of the same mass."""
+        other = copy(self)
+        other.geometry = self._geometry_at(positions_m)
+        other.rest_shape = "stress_free"
+        for name in ("inverse", "stresses"):
+            vars(other).pop(name, None)
+        other._evaluators, other._framed = {}, {}
+        return other
+
+    def _geometry_at(self, positions_m: Array) -> Array:
+        """Shape gradients and volumes where nodes are at (n, 3) instead of where the mesh is."""
+        count, points = self.geometry.shape[:2]
         slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
         G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
         own = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(count, points, -1)

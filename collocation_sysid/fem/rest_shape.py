@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -32,12 +32,9 @@ from ..arrays import Array, Index
 from ..errors import InputError, SimulationError
 from .materials import Material
 from .mesh import Nodes
+from .regions import BodyPart
 from .rest_point import RestPoint
 from .selection import Selection
-
-if TYPE_CHECKING:
-    from .body import Body
-    from .regions import BodyPart
 
 # Stress-free shapes that a body keeps, by the constants that these depend on: those of an iterate,
 # of its neighbours in a difference, and of the iterate before.
@@ -295,7 +292,7 @@ class InverseEquilibrium:
     Parameters
     ----------
     body : Body
-        With `scan`.
+        With `scan`; `body` imports this module, hence no annotation.
 
     Attributes
     ----------
@@ -303,16 +300,14 @@ class InverseEquilibrium:
     layout : RestPoint
     """
 
-    def __init__(self, body: Body) -> None:
+    def __init__(self, body: Any) -> None:
         assert body.scan is not None
         self.body = body
         self.points_m: Array = body.nodes.points_m
         self.gravity_m_s2 = np.asarray(body.scan.gravity_m_s2, dtype=float)
         size = self.points_m.size
         held = body.scan.held_nodes(body.nodes)
-        self.free: Index = np.setdiff1d(
-            np.arange(size), (3 * held[:, None] + np.arange(3)).ravel()
-        )
+        self.free: Index = np.setdiff1d(np.arange(size), (3 * held[:, None] + np.arange(3)).ravel())
         self.places: Index = np.array([*body.elastic_places, *body.density_places], dtype=np.int64)
         self.layout = RestPoint(len(self.places), body.element.mean_dilatation)
         self._shapes: dict[bytes, RestShape] = {}
@@ -373,7 +368,7 @@ class InverseEquilibrium:
         return self._data[key]
 
     def places_of_points(self, part: int) -> Index:
-        """Return where in the data of a part, by its number, those of each point are (E, q, any)."""
+        """Return where in the data of a part, by its number, those of points are (E, q, any)."""
         count, points = self._parts[part][1].shape[:2]
         size = self.layout.count
         return np.arange(count * points * size).reshape(count, points, size)
@@ -626,5 +621,3 @@ def require_supported(parts: Sequence[BodyPart]) -> None:
                 "one without: leave the branches out, or state rest_shape = 'stress_free'",
                 where="rest_shape",
             )
-
-

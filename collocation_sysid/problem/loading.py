@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.rest_shape import UnderGravity
 from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.field import Field
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
+from ..fem.rest_shape import UnderGravity
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment

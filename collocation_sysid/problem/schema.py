@@ -218,7 +218,7 @@ class ObjectSection(Section):
             require_one(self, "mass_kg", "density_kg_m3")
         if (self.rest_shape == "under_gravity") != (self.scan is not None):
             raise ValueError(
-                "rest_shape = \"under_gravity\" and [object.scan] belong together; expected both, "
+                'rest_shape = "under_gravity" and [object.scan] belong together; expected both, '
                 "or neither"
             )
         regions = [region.name for region in self.region]

@@ -20,6 +20,7 @@ import numpy as np
 from ..arrays import Array
 from ..methods.start import marched
 from ..program.collocation import Collocation
+from .assumptions import CORRELATION_KEY
 from .budget import BudgetLine
 from .considered import Changes, assumed
 from .distributions import normal_isf
@@ -256,7 +257,8 @@ def _released(at: Answered, probe: Probe, limit: float) -> Probe:
     if not _is_told(probe, limit):
         return probe
     first, collocation = len(at.fit.names), at.collocation
-    alone = {name: s if name == _row(probe.name) else None for name, s in at.deviations.items()}
+    kept = _row(probe.name), CORRELATION_KEY
+    alone = {name: s if name in kept else None for name, s in at.deviations.items()}
     wide = with_freedom(at.fit, assumed(collocation, at.z, alone), probe.name)
     p, (_, near) = at.p, collocation.unpack(at.z)
     for _ in range(STEPS):
