@@ -525,7 +525,8 @@ class Body(Discretisation):
         for number, own in self._of_fields("linearisation", rows):
             self.spreads[number].nodal(own["by_theta"], by_theta[:, :, self.mode_places[number]])
         for column, slope in self._drag_slopes(theta, tied_kg):
-            by_theta[:, :, column] = -slope * v
+            # A density also changes the stress-free shape of a mesh made under gravity.
+            by_theta[:, :, column] += -slope * v
         self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta, skew, skew[:, :0])
 
@@ -582,8 +583,9 @@ class Body(Discretisation):
         )
         x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
         for column, slope in self._drag_slopes(theta, tied_kg):
-            v_theta[:, :, column] = -slope * w
-            by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
+            drag = -slope * w
+            v_theta[:, :, column] += drag
+            by_theta[:, column] += np.einsum("ti,ti->t", drag, v)
         theta_theta = theta_theta.reshape(len(x), k, k)
         for number, own in self._of_fields("curvature", rows):
             here, spread = self.mode_places[number], self.spreads[number]
