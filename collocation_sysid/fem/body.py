@@ -164,7 +164,9 @@ class Body(Discretisation):
     ) -> None:
         parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony, field)
         generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
-        self.rest_shape = generated if rest_shape is None else rest_shape
+        self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
+            generated if rest_shape is None else rest_shape
+        )
         if rest_shape not in (None, "stress_free") and not isinstance(rest_shape, UnderGravity):
             raise InputError(
                 f"found {rest_shape!r}; expected 'stress_free' or UnderGravity(nodes, gravity)",

@@ -102,7 +102,7 @@ def refined(body: Body) -> Body:
 def _finer_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
     """Return what is stated of the stress-free shape, with the held nodes of the finer mesh."""
     if body.scan is None:
-        return body.rest_shape  # type: ignore[return-value]
+        return None if body.rest_shape is None else "stress_free"
     if isinstance(body.scan.nodes, (Box, Ball)):
         return body.scan
     corners = len(body.mesh.points_m)

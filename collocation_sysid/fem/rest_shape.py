@@ -66,9 +66,9 @@ class InverseOptions:
     """
 
     tolerance: float = 1e-9
-    iterations: int = 30
-    halvings: int = 8
-    load_steps: int = 60
+    iterations: int = 15
+    halvings: int = 6
+    load_steps: int = 25
     least_volume_ratio: float = 0.02
 
 
