@@ -194,8 +194,9 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
 def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> Sources:
     """What moves the estimates beside the noise."""
     say("finding what is assumed is worth")
-    solution, stated = answer.solution, answer.problem.uncertainty.assumptions
-    changes = assumed(solution.collocation, solution.z, stated.deviations)
+    solution = answer.solution
+    considered = answer.problem.uncertainty.considered
+    changes = assumed(solution.collocation, solution.z, considered)
     parameters = solution.collocation.parameters
     return Sources.of(fit, changes, parameters, solution.q, known)
 
@@ -204,7 +205,7 @@ def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
     """Refits of parts of the data, and with assumptions freed."""
     say("refitting parts of the data, and with assumptions freed")
     solution, options = answer.solution, answer.problem.uncertainty
-    at, known = (solution.collocation, solution.z, fit), options.assumptions.deviations
+    at, known = (solution.collocation, solution.z, fit), options.considered
     return probes(Answered(*at, options, answer.optimum, answer.budget, known))
 
 

@@ -72,10 +72,7 @@ def _rest_shape(body: BodyFinding) -> str:
     if body.rest_shape == "stress_free":
         return "the mesh is free of stress"
     if body.rest_shape is None:
-        return (
-            "not stated: the mesh counts as free of stress, and the intervals include that it may "
-            "be a shape under gravity; state object.rest_shape"
-        )
+        return "not stated: see object.rest_shape"
     if np.isnan(body.rest_shape_change_m):
         return "the mesh was made under gravity; no stress-free shape at the guess"
     change = f"{1e3 * body.rest_shape_change_m:.3g} mm"

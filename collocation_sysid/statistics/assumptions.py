@@ -47,6 +47,7 @@ _AXES = "xyz"
 # Differences by a displacement: its largest entry over the length of an edge.
 SMALL_STRAIN = 1e-4
 _MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
+# Beside the deviations: the correlation length of the error of the surface.
 CORRELATION_KEY = "surface_correlation"
 
 
@@ -500,13 +501,6 @@ Attributes
 ----------
 """
 _FIELDS = [(row.name, row.sigma, f"{row.said} [{row.unit or 1}]") for row in ASSUMPTIONS]
-_FIELDS += [
-    (
-        CORRELATION_KEY,
-        CORRELATION,
-        "correlation length of the error of the surface, no deviation, over the longest extent [1]",
-    ),
-]
 _FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in ROWS]
 
 
