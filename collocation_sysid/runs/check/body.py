@@ -237,9 +237,16 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
         guess=_guess(body, theta),
         concerns=(*element_concerns(body, theta, shape, worst[0]), *_field_concerns(fields)),
         fields=fields,
-        rest_shape="under_gravity" if body.scan is not None else body.rest_shape,
+        rest_shape=_rest_shape(body),
         rest_shape_change_m=_rest_shape_change_m(body, theta),
     )
+
+
+def _rest_shape(body: Body) -> str | None:
+    """Return the name of what is stated of the stress-free shape, None where nothing is."""
+    if body.rest_shape is None:
+        return None
+    return "stress_free" if body.scan is None else "under_gravity"
 
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
