@@ -200,7 +200,7 @@ def _changes(answer: Run, say: Log) -> Changes:
     """Return how the residuals change by what is assumed, and by what every solve probes."""
     say("finding what is assumed is worth")
     solution = answer.solution
-    deviations = probed_deviations(answer.problem.uncertainty.assumptions.deviations)
+    deviations = probed_deviations(answer.problem.uncertainty.considered)
     return assumed(solution.collocation, solution.z, deviations)
 
 
@@ -217,7 +217,7 @@ def _probes(
 ) -> tuple[Probe, ...]:
     """Return the probes of every solve; of a deep check those of parts and assumptions instead."""
     solution, options = answer.solution, answer.problem.uncertainty
-    deviations = probed_deviations(options.assumptions.deviations)
+    deviations = probed_deviations(options.considered)
     collocation, z = solution.collocation, solution.z
     answered = Answered(
         collocation=collocation,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..fem.rest_shape import RestShapeError
 from ..program.collocation import Collocation, carried_over
 from .recorder import Recorder
 
@@ -63,6 +64,9 @@ class TimedFunction(ca.Callback):
                 [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
                 [np.frombuffer(r) if r is not None else None for r in results],
             )
+        except RestShapeError:
+            # The solver shortens its step, as after a value that is not finite.
+            return 1
         except BaseException as error:
             self._errors.append(error)
             return 1

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..errors import SimulationError
+from ..fem.rest_shape import RestShapeError
 from ..model.dynamics import Dynamics, StencilRow, weighted
 from ..model.histories import AnyLeft, ahead, following
 from ..recording.experiment import Experiment
@@ -75,6 +76,9 @@ def march_on(
     """
     if (massless := dynamics.body.massless(dynamics.theta)) is not None:
         failure = SimulationError(massless, float(dynamics.t_s[0]))
+        return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
+    if (unreachable := dynamics.body.unreachable(dynamics.theta)) is not None:
+        failure = RestShapeError(unreachable)
         return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
     solvers = Solvers(experiment, options, stopwatch)
     held = ~np.isnan(dynamics.goals_m)

@@ -146,6 +146,8 @@ def simulate(
         raise InputError(f"substeps = {substeps}, expected at least 1")
     if (massless := experiment.body.massless(theta)) is not None:
         raise InputError(massless)
+    if (unreachable := experiment.body.unreachable(theta)) is not None:
+        raise InputError(unreachable)
     if integrator == NEWMARK and timestep_s is not None and not experiment.static:
         require_steps(experiment, timestep_s)
         substeps = max(1, round(experiment.timestep_s / timestep_s))

@@ -16,19 +16,30 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..checked import Options, Positive
 from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import engineering
 from ..fem.node_force import surface_of
+from ..fem.rest_shape import RestShape
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters
 from ..program.collocation import Part
 from ..program.reaction import forces_on, reactions
+from ..program.touches import on_surface
+from ..recording.grasp import free_motions
 from ..recording.nuisance import ROWS
 from ..section import ByForm
+from .shape_error import (
+    CORRELATION,
+    SURFACE_MODES,
+    sag_m,
+    standing_nodes,
+    surface_modes,
+    thickness_m,
+)
 
 # Differences by a scale.
 SMALL = 1e-4
@@ -36,6 +47,11 @@ AIR_KG_M3 = 1.2
 _AXES = "xyz"
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
+# Differences by a displacement: its largest entry over the length of an edge.
+SMALL_STRAIN = 1e-4
+_MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
+# Beside the deviations: the correlation length of the error of the surface.
+CORRELATION_KEY = "surface_correlation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +82,7 @@ class Fitted:
 
     part: Part
     parameters: Parameters
+    surface_correlation: float = CORRELATION
 
     @property
     def body(self) -> Body:
@@ -108,17 +125,80 @@ class Fitted:
         return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
 
     def internal_n(
-        self, scale: float = 1.0, slower: float = 1.0, theta: Array | None = None
+        self,
+        scale: float = 1.0,
+        slower: float = 1.0,
+        theta: Array | None = None,
+        body: Body | None = None,
     ) -> Array:
-        """(N, 3n) what the material gives where space, or time, is scaled; without γ_m."""
+        """Return forces (N, 3n) of the material where space or time is scaled, without γ_m.
+
+        Of a body with another stress-free shape where that is given.
+        """
         still = (self.theta if theta is None else theta).copy()
         still[list(self.body.tied_shares)] = 0.0
         dynamics = self.dynamics.with_theta(still)
         carried = dynamics.forces_along(dynamics.histories(self.part.x)).past
         xi, nu = dynamics.evaluation_states(self.part.x)
+        evaluated = self.body if body is None else body
         return self.of_rows(
-            self.body.force(xi / scale, nu / (scale * slower), still, carried=carried)
+            evaluated.force(xi / scale, nu / (scale * slower), still, carried=carried)
         )
+
+    @cached_property
+    def internal_force_n(self) -> Array:
+        """Forces (N, 3n) of the material, without γ_m."""
+        return self.internal_n(body=self.body.with_stress_free(self.stress_free_m))
+
+    @cached_property
+    def stress_free_m(self) -> Array:
+        """Stress-free positions (n, 3) of the nodes, without frames of obstacles."""
+        body = self.body
+        return body.nodes.points_m if body.inverse is None else self._inverse.positions_m
+
+    @cached_property
+    def _inverse(self) -> RestShape:
+        assert self.body.inverse is not None
+        return self.body.inverse.shape(self.theta)
+
+    def of_reference(self, moved_m: Array) -> Array:
+        """Return the first-order change (N, 3n) of the material's forces by one (n, 3) of X."""
+        largest = float(np.abs(moved_m).max(initial=0.0))
+        if not largest:
+            return np.zeros_like(self.part.x)
+        step = SMALL_STRAIN * self.part.segment.length_m / largest
+        own = self.stress_free_m + step * moved_m[: len(self.stress_free_m)]
+        other = self.body.with_stress_free(own)
+        return (self.internal_n(body=other) - self.internal_force_n) / step
+
+    def of_heavier_scan(self) -> Array:
+        """Return the change (N, 3n) of forces per relative change of the weight during the scan."""
+        if self.body.inverse is None:
+            return np.zeros_like(self.part.x)
+        return self.of_reference(self.body.inverse.weight_slope(self.theta))
+
+    @cached_property
+    def surface_modes_m(self) -> Array:
+        """Displacements (modes, n, 3) where the surface is off by its thickness, mode by mode."""
+        segment = self.part.segment
+        gaps_m = on_surface(segment.experiment, self.theta, self.part.x)[0]
+        nearest = np.fmin.reduce(gaps_m, axis=0)
+        touched = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
+        known = np.unique(self.body.mesh.surface[touched])
+        modes = surface_modes(self.body, known, self.surface_correlation)
+        return thickness_m(self.body) * modes
+
+    @cached_property
+    def likely_held(self) -> Index:
+        """Dofs held while the mesh was made: those of the recording, or those the body stood on."""
+        held = self.part.setting.held.dofs
+        own = held[held < self.body.nodes.points_m.size]
+        points_m = self.body.nodes.points_m
+        if len(free_motions(points_m, _held_mask(own, len(points_m)))):
+            gravity = self.part.segment.experiment.gravity_m_s2
+            nodes = standing_nodes(self.body, gravity)
+            return (3 * nodes[:, None] + np.arange(3)).ravel()
+        return own
 
     def weight_of(self, mass_kg: Array) -> Array:
         """(N, 3n) what gravity and γ_m do to mass (3n,)."""
@@ -146,6 +226,13 @@ class Fitted:
     def young_pa(self) -> float:
         """Of the softest part, at small strain."""
         return min(engineering(*moduli)[0] for moduli in self.body.lame(self.theta).values())
+
+
+def _held_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
+    """Return which coordinates (n, 3) of the nodes are among the dofs."""
+    held = np.zeros(3 * nodes, dtype=bool)
+    held[dofs] = True
+    return held.reshape(nodes, 3)
 
 
 @dataclass(frozen=True)
@@ -192,19 +279,21 @@ def _size(at: Fitted, _: int) -> Effect:
     """
     larger, smaller = 1 + SMALL, 1 - SMALL
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
+    # Of a body made under gravity the deflection over the size grows with the weight over s².
+    heavier = at.of_heavier_scan() * (-2.0 if at.body.has_stated_mass else 1.0)
     mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
     grasping = at.part.segment.grasping
     turns: Array = np.nan_to_num(grasping.poses[0])
     off = grasping.places(at.part.phi)[0] - at.part.segment.nuisance.grasp_pivot_m
     moved = np.einsum("tgj,gj->tg", turns, off)
-    return Effect(force / (2 * SMALL) + at.weight_of(mass), mass, moved_m=moved)
+    return Effect(force / (2 * SMALL) + heavier + at.weight_of(mass), mass, moved_m=moved)
 
 
 def _mass(at: Fitted, _: int) -> Effect | None:
     """All of the body is heavier by a share."""
     if any(part.free_density for part in at.body.parts):
         return None
-    return Effect(at.weight_of(at.own_mass_kg), at.own_mass_kg)
+    return Effect(at.weight_of(at.own_mass_kg) + at.of_heavier_scan(), at.own_mass_kg)
 
 
 def _density_gradient(at: Fitted, axis: int) -> Effect:
@@ -222,8 +311,9 @@ def _anisotropy(at: Fitted, axis: int) -> Effect:
     """
     body, (xi, nu) = at.body, at.states
     count, points = body.geometry.shape[:2]
-    slopes = body.geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
-    weight, force = at.young_pa * body.geometry[..., -1], np.zeros_like(xi)
+    geometry = body.stress_free_geometry(at.theta)
+    slopes = geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
+    weight, force = at.young_pa * geometry[..., -1], np.zeros_like(xi)
     gamma = at.proportional_s[:, None, None]
     for x, v, own in zip(xi, nu, force, strict=True):
         stretch, rate = (
@@ -397,9 +487,33 @@ def _rayleigh_damping(at: Fitted, _: int) -> Effect | None:
     return _other_damping(at, "rayleigh")
 
 
+def _rest_shape(at: Fitted, axis: int) -> Effect | None:
+    """The mesh is the shape under the body's own weight along one of its axes, not the stress-free.
+
+    Meshes that are made of a shape, and those of which the stress-free shape is stated, are not.
+    """
+    if at.body.rest_shape is not None:
+        return None
+    return Effect(at.of_reference(sag_m(at.body, at.theta, at.likely_held, axis)))
+
+
+def _surface(at: Fitted, mode: int) -> Effect:
+    """The surface is off along its normal, by a mode of a smooth error of the thickness."""
+    moved_m = at.surface_modes_m[mode]
+    grasping = at.part.segment.grasping
+    turns: Array = np.nan_to_num(grasping.poses[0])
+    off = moved_m.ravel()[3 * (at.part.setting.held.dofs // 3)[:, None] + np.arange(3)]
+    return Effect(at.of_reference(moved_m), moved_m=np.einsum("tgj,gj->tg", turns, off))
+
+
 # fmt: off
 ASSUMPTIONS = (
     Assumption("body_scale", "1", 0.01, "size of the mesh", _size),
+    Assumption("rest_shape", "1", 0.58,
+        "weight under which a mesh hung that nothing is stated of, along each axis", _rest_shape,
+        "x y z"),
+    Assumption("surface", "1", 0.005,
+        "place of the surface along its normal over the thickness", _surface, _MODES),
     Assumption("mass", "1", 0.01, "mass of the body, where it is not estimated", _mass),
     Assumption("density_gradient", "1", 0.05,
         "density at one end of the body over that in its middle", _density_gradient, "x y z"),
@@ -445,7 +559,8 @@ class _Stated(Options):
     @classmethod
     def exact(cls) -> Assumptions:
         """Return assumptions of which each is exactly true, as of a simulated recording."""
-        return Assumptions(**{name: "none" for name in vars(Assumptions())})
+        none: Literal["none"] = "none"
+        return Assumptions(**{name: none for name in vars(Assumptions())})
 
     @property
     def deviations(self) -> dict[str, float | None]:

@@ -260,7 +260,8 @@ def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     known = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
     score = np.zeros((len(free), count))
     for block, change in zip(fit.blocks, changes, strict=True):
-        slope = block.slope[..., free].reshape(-1, len(free))
+        slope = block.slope[..., free]
+        slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
         known = known.add(np.zeros(len(slope)), slope)
         apart = change * block.weight[..., None] * block.seen[..., None]
         score += slope.T @ apart.reshape(len(slope), count)

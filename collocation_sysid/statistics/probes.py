@@ -18,6 +18,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..methods.start import marched
+from .assumptions import CORRELATION_KEY
 from .distributions import normal_isf
 from .linearised import FitBlock, LinearisedFit, best_step, least_squares, linearised_fit
 from .relaxation import (
@@ -149,8 +150,8 @@ def _released(at: Answered, probe: Probe, limit: float) -> Probe:
     if not probe.is_beyond(limit):
         return probe
     first, collocation = len(at.fit.names), at.collocation
-    own = assumption_of(probe.name)
-    alone = {name: deviation if name == own else None for name, deviation in at.deviations.items()}
+    kept = assumption_of(probe.name), CORRELATION_KEY
+    alone = {name: size if name in kept else None for name, size in at.deviations.items()}
     wide = with_freedom(at.fit, at.changes, probe.name, _widening(probe.name))
     p, (_, near) = at.p, collocation.unpack(at.z)
     for _ in range(STEPS):

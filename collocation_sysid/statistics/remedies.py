@@ -16,6 +16,9 @@ REMEDIES: Mapping[str, str] = {
     BETWEEN: "find out what differs between the recordings, such as temperature or clamping",
     LAW: "record larger strains, which distinguish the material laws",
     "body_scale": "measure two lengths of the real body and scale the mesh to them",
+    "rest_shape": "state object.rest_shape: whether the mesh is free of stress, or the shape in "
+    "which the body hung or stood during its scan",
+    "surface": "measure the thickness of the real body at several places",
     "mass": "weigh the body",
     "density_gradient": "weigh two halves of a specimen",
     "anisotropy": "record a second motion with the body held the other way round, or press a cube "
