@@ -22,12 +22,14 @@ from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
 from ..fem.moduli import engineering
 from ..fem.node_force import surface_of
+from ..model.contact import Contact
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters
 from ..program.collocation import Part
 from ..program.reaction import forces_on, reactions
 from ..recording.nuisance import ROWS
 from ..section import ByForm
+from .size_effect import obstacle_shifts_m
 
 # Differences by a scale.
 SMALL = 1e-4
@@ -131,6 +133,19 @@ class Fitted:
         return np.where(np.isnan(self.part.setting.held.positions_m), 0.0, given)
 
     @cached_property
+    def contacts(self) -> dict[int, Contact]:
+        """Contact by an energy, by its number among the further forces."""
+        further = enumerate(self.dynamics.forces.further)
+        return {k: each for k, each in further if isinstance(each, Contact) and not each.relaxed}
+
+    def contact_n(self, number: int) -> Array:
+        """Return the forces (N, 3n) of one of `contacts` at the evaluations [N]."""
+        xi, nu = self.dynamics.evaluation_states(self.part.x)
+        forces = self.dynamics.evaluated
+        term = forces.further[number]
+        return self.of_rows(term.force(forces.states(xi, nu)(term)))
+
+    @cached_property
     def proportional_s(self) -> Array:
         """(E,) γ_r of elements whose damping is γ_r K(x) v, zero of others."""
         gamma_r_s = np.zeros(len(self.body.cells))
@@ -182,18 +197,29 @@ class Assumption:
 
 
 def _size(at: Fitted, _: int) -> Effect:
-    """The body is larger by a share: f = s² f(x/s, v/s), its goals about the middle of its grasp.
+    """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
 
-    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths.
+    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
+    about the middle of the grasps; obstacles keep their size and are moved so that they first touch
+    the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
+    stiffness that is not stated falls by s, as it follows the edges of the mesh.
     """
-    larger, smaller = 1 + SMALL, 1 - SMALL
+    larger = 1 + SMALL
+    smaller = 1 - SMALL
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
+    force = force / (2 * SMALL)
     mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
-    grasping = at.part.segment.grasping
-    turns: Array = np.nan_to_num(grasping.poses[0])
-    off = grasping.places(at.part.phi)[0] - at.part.segment.nuisance.grasp_pivot_m
+    for number, contact in at.contacts.items():
+        stated = contact.contact.obstacle.stiffness_pa_m is not None
+        force += (2.0 if stated else 1.0) * at.contact_n(number)
+    segment = at.part.segment
+    turns: Array = np.nan_to_num(segment.grasping.poses[0])
+    off = segment.grasping.places(at.part.phi)[0] - segment.nuisance.grasp_pivot_m
     moved = np.einsum("tgj,gj->tg", turns, off)
-    return Effect(force / (2 * SMALL) + at.weight_of(mass), mass, moved_m=moved)
+    for obstacle, shift_m in obstacle_shifts_m(at.part):
+        along = np.searchsorted(segment.grasping.dofs, obstacle.dofs)
+        moved[:, along] = np.tile(shift_m, len(obstacle.nodes))
+    return Effect(force + at.weight_of(mass), mass, moved_m=moved)
 
 
 def _mass(at: Fitted, _: int) -> Effect | None:
