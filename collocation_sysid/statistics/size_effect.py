@@ -47,8 +47,9 @@ class FirstContact:
         nearest_m = np.inf
         row = 0
         for first in range(0, len(x), ROWS_AT_ONCE):
-            gaps_m = law.gaps(contact.points.vectors(x[first : first + ROWS_AT_ONCE])).min(axis=1)
-            touching = np.flatnonzero(gaps_m < law.width_m)
+            gaps_m = law.gaps(contact.points.vectors(x[first : first + ROWS_AT_ONCE]))
+            touching = np.flatnonzero((gaps_m < law.widths_m).any(axis=1))
+            gaps_m = gaps_m.min(axis=1)
             here = int(touching[0]) if len(touching) else int(gaps_m.argmin())
             if gaps_m[here] < nearest_m:
                 nearest_m = float(gaps_m[here])
@@ -69,7 +70,7 @@ class FirstContact:
 
 
 def obstacle_shifts_m(part: Part) -> Iterator[tuple[Obstacle, Array]]:
-    """Return, of each obstacle, the shift (N, 3) per unit of relative size that keeps first contact.
+    """Return of each obstacle the shift (N, 3) per relative size that keeps first contact.
 
     The body scales about the middle of its grasps. Along axes that no grasp holds, it scales about
     the place where the first obstacle touches it, of several the one that moves least: the body
