@@ -339,8 +339,23 @@ class Contact(Pointwise):
     def pressing(self, xi: Array) -> Array:
         """(1, T, i) b at states (T, 3n)."""
         gaps = self.contact.gaps(self.points.vectors(xi))
-        data = np.broadcast_to(self.contact.data[:, None], (2, *gaps.shape))
+        data = np.broadcast_to(self.contact.data[:, None], (DATA, *gaps.shape))
         return self.contact.pressing.value(gaps[None], data)
+
+    def rigid_limit_n(self, states: States) -> Array:
+        """Return the change (T, 3n) of the forces if contact were rigid, to first order [N].
+
+        With κ/ε and ε δ the pressure depends on the gap by g/ε alone. So at ε → 0 it is what it is
+        now at a gap that is larger by g, where it is not zero: points come back to the surface of
+        the obstacle from where they are inside it or before it. The states must be those of
+        a pressure that is not averaged.
+        """
+        here = self._at(states)
+        y = here.u[here.y]
+        gap, normal = self.contact.distance.slopes(y, _no_data(y))
+        _, slopes = self.law.slopes(here.u, here.data)
+        change = np.einsum("vkti,kti->vti", slopes[here.y, :3], normal[0, :3] * gap[0])
+        return self.share * self.points.summed(change, here.chosen)
 
     def rubbing(self, states: States) -> Array:
         """(6, T) sums over its points of what friction does, see the law's."""

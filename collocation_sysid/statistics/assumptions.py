@@ -22,7 +22,7 @@ from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
 from ..fem.moduli import engineering
 from ..fem.node_force import surface_of
-from ..model.contact import Contact
+from ..model.contact import Contact, contacts
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters
 from ..program.collocation import Part
@@ -353,6 +353,19 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
     return Effect(force) if platens else None
 
 
+def _contact_stiffness(at: Fitted, _: int) -> Effect | None:
+    """Return the effect of rigid contact in place of the pressure law, to first order."""
+    if not at.contacts:
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.part.x)
+    forces = at.dynamics.evaluated
+    change_n = np.zeros_like(xi)
+    for contact in contacts(at.part.segment.experiment):
+        if not contact.relaxed:
+            change_n += contact.rigid_limit_n(forces.states(xi, nu)(contact))
+    return Effect(at.of_rows(change_n))
+
+
 def _buoyancy(at: Fitted, _: int) -> Effect:
     """The air that the body displaces."""
     return Effect(np.broadcast_to(-AIR_KG_M3 * at.body.dof_volume_m3 * at.gravity, at.part.x.shape))
@@ -397,6 +410,8 @@ ASSUMPTIONS = (
     Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),
     Assumption("platen_friction", "", 0.1,
         "friction of what holds nodes across and lets them slide", _platen_friction),
+    Assumption("contact_stiffness", "1", 1.0,
+        "softness of contact with obstacles, in that of the pressure law", _contact_stiffness),
     Assumption("buoyancy", "1", 1.0, "air that the body displaces, in 1.2 kg/m³", _buoyancy),
     Assumption("added_mass", "1", 1.0, "air that moves with it, in half of that", _added_mass),
     Assumption("air_drag", "1", 1.0, "drag of the air, in that of a coefficient of one", _air_drag),

@@ -31,7 +31,7 @@ class FirstContact:
     row : int
         Index of the row in the grid.
     place_m : (3,)
-        Mean of the points that touch, weighted by their pressure.
+        Mean of the points that touch, weighted by their pressure, in the row before.
     normal : (3,)
         Of the obstacle there, in the world.
     """
@@ -64,8 +64,10 @@ class FirstContact:
             weights = (gaps_m == gaps_m.min()).astype(float)
         weights = weights / weights.sum()
         normal = slopes[0, :3, 0] @ weights
-        origin_m = x[row].reshape(-1, 3)[law.obstacle.nodes[0]]
-        place_m = origin_m + y[:3, 0] @ weights
+        # The row before has the surface as it is without contact.
+        before = max(row - 1, 0)
+        origin_m = x[before].reshape(-1, 3)[law.obstacle.nodes[0]]
+        place_m = origin_m + contact.points.vectors(x[before : before + 1])[:3, 0] @ weights
         return cls(row, place_m, normal / max(float(np.linalg.norm(normal)), 1e-9))
 
 
