@@ -53,6 +53,9 @@ STIFFNESS = 100.0
 # δ in the same edges: force begins so early, and the pressure κδ at a gap of zero is E/50. With ten
 # times that, a sphere on a mesh of two elements per contact radius gives 6 % more force.
 WIDTH = 2e-4
+# δ of contact with friction: where points slip, friction that follows a stiffer pressure takes the
+# stability of static equilibria away.
+FRICTION_WIDTH = 2e-3
 # δ of contact as complementarity, whose pressures are relaxed in shares of κδ².
 RELAXED_WIDTH = 2e-3
 # ε in mean edges of all faces a second, or a sample of a static experiment: by up to that much a
@@ -108,7 +111,9 @@ class ContactLaw:
         """(i,) δ at each point."""
         if self.obstacle.width_m is not None:
             return np.full(len(self.edges_m), self.obstacle.width_m)
-        return (WIDTH if self.obstacle.relaxed is None else RELAXED_WIDTH) * self.edges_m
+        if self.obstacle.relaxed is not None:
+            return RELAXED_WIDTH * self.edges_m
+        return (FRICTION_WIDTH if self.obstacle.rubs else WIDTH) * self.edges_m
 
     @property
     def width_m(self) -> float:

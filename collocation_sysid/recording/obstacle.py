@@ -44,8 +44,8 @@ class Obstacle(Grasp):
     """A rigid solid that pushes away the surface of a body, and may rub on it.
 
     It is a grasp that holds nothing but a frame of its own, so that poses, displacements and forces
-    are stated and read as those of grasps are. Its force is that on the body. Where a body hits it,
-    take the scheme "bdf2": under the midpoint rule contact rings.
+    are stated and read as those of grasps are. Its force is that on the body. Where a body comes
+    to rest on it, take the scheme "bdf2": under the midpoint rule contact rings.
 
     Parameters
     ----------
@@ -63,7 +63,8 @@ class Obstacle(Grasp):
         κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; a hundred times E over the mean edge
         of the face at each point by default, at the E of the trial.
     width_m : float, optional
-        δ, the gap at which it begins; a five-thousandth of that edge by default.
+        δ, the gap at which it begins; a five-thousandth of that edge by default, with friction a
+        five-hundredth.
     slip : float, optional
         Speed [m/s], or slip from sample to sample [m] of a static experiment, at which friction is
         seven tenths of its limit.
