@@ -547,7 +547,7 @@ def test_matrices_are_those_of_differences_and_laid_out_in_order(made: Collocati
     assert_derivative(made.objective, lambda d: gradient @ d, z, rng, 1e-7, 0.1, 1)
     for own in (slice(None), slice(made.nq), made.of_phi, slice(made.of_phi.stop, None)):
         scale = np.zeros(len(z))  # some columns would drown among the others
-        scale[own] = 0.1
+        scale[own] = 0.05
         if scale.any():
             values = made.constraint_values
             if np.abs(jacobian @ scale).max() > 0:

@@ -307,8 +307,8 @@ class Body(Discretisation):
     ) -> Body:
         """The same body and frames of so many obstacles: four nodes each that no cell has.
 
-        They are at `frame_m`, behind all others. `rubs` is whether any has friction, and
-        `frictions` are the coefficients that are parameters.
+        They are at `frame_m`, behind all others. `rubs` is whether slopes of contact have
+        a skew part, and `frictions` are the coefficients that are parameters.
         """
         key = count, rubs, frictions
         if key == (len(self.frames), self.rubs, self.frictions):

@@ -117,7 +117,10 @@ def march_on(
             x[t] = solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
-            return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
+            static = dynamics.static
+            return x[:t], simulation_error(
+                solver, failure, time_s, f"the step at row {t}", static=static
+            )
         forces[t] = row.force(x[t])
         forces[t, dynamics.taken[t]] = 0
         if left:

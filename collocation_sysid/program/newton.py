@@ -323,9 +323,12 @@ class Solvers:
 
 
 def simulation_error(
-    solver: Solver, failure: NewtonFailure, time_s: float, what: str
+    solver: Solver, failure: NewtonFailure, time_s: float, what: str, *, static: bool = False
 ) -> SimulationError:
-    """The error for the user: what failed, when, at which element, and what to change."""
+    """Return the error for the user: what failed, when, at which element, and what to change.
+
+    Of a static path it has the state where the path ended, see `lost_stability.explained`.
+    """
     element = solver.worst_element(failure.x)
     ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())
     return SimulationError(
@@ -333,4 +336,5 @@ def simulation_error(
         "Stiffer parameters, a smaller timestep or a finer mesh may help",
         time_s,
         element,
+        failure.x if static else None,
     )

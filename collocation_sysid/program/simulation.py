@@ -26,6 +26,7 @@ from ..recording.experiment import Experiment
 from ..recording.nuisance import Nuisance
 from .channel import Forced, Motion
 from .gauge import gauge_readings
+from .lost_stability import explained
 from .marching import Progress, march
 from .newmark import newmark
 from .newton import NewtonOptions
@@ -135,9 +136,28 @@ def simulate(
         For a step or substeps that are not positive, too many steps, an unknown scheme, or a
         density that leaves a node without mass.
     SimulationError
-        When a step fails even after halvings; names time and element.
+        When a step fails even after halvings; names time and element, and where an equilibrium
+        ceased to be stable the mode, see `program.lost_stability`.
     """
     theta = theta_of(experiment.body, parameters)
+    try:
+        return _simulate(experiment, theta, integrator, timestep_s, substeps, options, progress)
+    except SimulationError as error:
+        if (reason := explained(experiment, theta, error)) is error:
+            raise
+        raise reason from error
+
+
+def _simulate(
+    experiment: Experiment,
+    theta: Array,
+    integrator: str | Scheme,
+    timestep_s: float | None,
+    substeps: int | Literal["auto"],
+    options: NewtonOptions | None,
+    progress: Progress | None,
+) -> Trajectory:
+    """Return what `simulate` does, without the reasons of its errors."""
     if timestep_s is not None and not timestep_s > 0:
         raise InputError(f"timestep_s = {timestep_s:g}, expected a positive time")
     if isinstance(substeps, str) and substeps != "auto":

@@ -24,6 +24,7 @@ from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import engineering
 from ..fem.node_force import surface_of
 from ..fem.rest_shape import RestShape
+from ..model.contact import Contact, contacts
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters
 from ..program.collocation import Part
@@ -40,6 +41,7 @@ from .shape_error import (
     surface_modes,
     thickness_m,
 )
+from .size_effect import obstacle_shifts_m
 
 # Differences by a scale.
 SMALL = 1e-4
@@ -214,6 +216,19 @@ class Fitted:
         return np.where(np.isnan(self.part.setting.held.positions_m), 0.0, given)
 
     @cached_property
+    def contacts(self) -> dict[int, Contact]:
+        """Contact by an energy, by its number among the further forces."""
+        further = enumerate(self.dynamics.forces.further)
+        return {k: each for k, each in further if isinstance(each, Contact) and not each.relaxed}
+
+    def contact_n(self, number: int) -> Array:
+        """Return the forces (N, 3n) of one of `contacts` at the evaluations [N]."""
+        xi, nu = self.dynamics.evaluation_states(self.part.x)
+        forces = self.dynamics.evaluated
+        term = forces.further[number]
+        return self.of_rows(term.force(forces.states(xi, nu)(term)))
+
+    @cached_property
     def proportional_s(self) -> Array:
         """(E,) γ_r of elements whose damping is γ_r K(x) v, zero of others."""
         gamma_r_s = np.zeros(len(self.body.cells))
@@ -273,20 +288,31 @@ class Assumption:
 
 
 def _size(at: Fitted, _: int) -> Effect:
-    """The body is larger by a share: f = s² f(x/s, v/s), its goals about the middle of its grasp.
+    """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
 
-    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths.
+    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
+    about the middle of the grasps; obstacles keep their size and are moved so that they first touch
+    the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
+    stiffness that is not stated falls by s, as it follows the edges of the mesh.
     """
-    larger, smaller = 1 + SMALL, 1 - SMALL
+    larger = 1 + SMALL
+    smaller = 1 - SMALL
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
+    force = force / (2 * SMALL)
     # Of a body made under gravity the deflection over the size grows with the weight over s².
     heavier = at.of_heavier_scan() * (-2.0 if at.body.has_stated_mass else 1.0)
     mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
-    grasping = at.part.segment.grasping
-    turns: Array = np.nan_to_num(grasping.poses[0])
-    off = grasping.places(at.part.phi)[0] - at.part.segment.nuisance.grasp_pivot_m
+    for number, contact in at.contacts.items():
+        stated = contact.contact.obstacle.stiffness_pa_m is not None
+        force += (2.0 if stated else 1.0) * at.contact_n(number)
+    segment = at.part.segment
+    turns: Array = np.nan_to_num(segment.grasping.poses[0])
+    off = segment.grasping.places(at.part.phi)[0] - segment.nuisance.grasp_pivot_m
     moved = np.einsum("tgj,gj->tg", turns, off)
-    return Effect(force / (2 * SMALL) + heavier + at.weight_of(mass), mass, moved_m=moved)
+    for obstacle, shift_m in obstacle_shifts_m(at.part):
+        along = np.searchsorted(segment.grasping.dofs, obstacle.dofs)
+        moved[:, along] = np.tile(shift_m, len(obstacle.nodes))
+    return Effect(force + heavier + at.weight_of(mass), mass, moved_m=moved)
 
 
 def _mass(at: Fitted, _: int) -> Effect | None:
@@ -421,6 +447,19 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
     return Effect(force) if platens else None
 
 
+def _contact_stiffness(at: Fitted, _: int) -> Effect | None:
+    """Return the effect of rigid contact in place of the pressure law, to first order."""
+    if not at.contacts:
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.part.x)
+    forces = at.dynamics.evaluated
+    change_n = np.zeros_like(xi)
+    for contact in contacts(at.part.segment.experiment):
+        if not contact.relaxed:
+            change_n += contact.rigid_limit_n(forces.states(xi, nu)(contact))
+    return Effect(at.of_rows(change_n))
+
+
 def _buoyancy(at: Fitted, _: int) -> Effect:
     """The air that the body displaces."""
     return Effect(np.broadcast_to(-AIR_KG_M3 * at.body.dof_volume_m3 * at.gravity, at.part.x.shape))
@@ -534,6 +573,8 @@ ASSUMPTIONS = (
     Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),
     Assumption("platen_friction", "", 0.1,
         "friction of what holds nodes across and lets them slide", _platen_friction),
+    Assumption("contact_stiffness", "1", 1.0,
+        "softness of contact with obstacles, in that of the pressure law", _contact_stiffness),
     Assumption("buoyancy", "1", 1.0, "air that the body displaces, in 1.2 kg/m³", _buoyancy),
     Assumption("added_mass", "1", 1.0, "air that moves with it, in half of that", _added_mass),
     Assumption("air_drag", "1", 1.0, "drag of the air, in that of a coefficient of one", _air_drag),
@@ -559,8 +600,8 @@ class _Stated(Options):
     @classmethod
     def exact(cls) -> Assumptions:
         """Return assumptions of which each is exactly true, as of a simulated recording."""
-        none: Literal["none"] = "none"
-        return Assumptions(**{name: none for name in vars(Assumptions())})
+        exact: dict[str, Literal["none"]] = {name: "none" for name in vars(Assumptions())}
+        return Assumptions(**exact)
 
     @property
     def deviations(self) -> dict[str, float | None]:

@@ -32,6 +32,8 @@ REMEDIES: Mapping[str, str] = {
     "grip_layer_m": "glue the body to a stiff plate, or put markers beside the grip",
     "machine_compliance_m_n": "press the platens on each other and state the slope",
     "platen_friction": "lubricate the platens, or glue the specimen to them",
+    "contact_stiffness": "refine the mesh at the contact, or state a larger stiffness_pa_m and a "
+    "smaller width_m of the obstacle",
     "buoyancy": "state the density of the air",
     "added_mass": "repeat the motion more slowly, or with a heavier specimen",
     "air_drag": "repeat the motion more slowly, or with a heavier specimen",
