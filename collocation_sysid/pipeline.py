@@ -229,16 +229,22 @@ def _fine_enough(
     say: Log,
     scheduler: str | None,
 ) -> tuple[Run, LinearisedFit | None]:
-    """The run again from its answer, with as many substeps as its error bars ask for."""
+    """The run again from its answer, with as many substeps as its error bars ask for.
+
+    The answer may have several steps a sample already, where it was started from such a run.
+    """
     if coarse.refinement is None:
         return coarse, fit
     first, problem = coarse.solution, coarse.problem
-    substeps = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
-    if substeps == 1:
+    factor = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
+    before = first.collocation.substeps
+    substeps = min(before * factor, MOST_SUBSTEPS)
+    if substeps <= before:
         return coarse, fit
     say(f"solving again with {substeps} steps a sample")
     worst, many = coarse.refinement.worst(coarse.noise_estimates)
-    why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
+    steps = "one step" if before == 1 else f"{before} steps"
+    why = f"with {steps} a sample, the step moves {worst} by {many:.2g} standard errors"
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
     try:

@@ -119,6 +119,8 @@ def _solved(
     problem = problem if earlier is None else earlier.started(problem)
     try:
         whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
+        if earlier is not None and problem.substeps == "auto":
+            collocation = replace(collocation, substeps=earlier.substeps)
         require_memory(problem, collocation, solver)
         collocation, scan = started(collocation, whole)
         collocation, variables = placed_at_guess(collocation), None
