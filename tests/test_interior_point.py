@@ -28,18 +28,22 @@ from wrenches_small import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.moduli import engineering
+from collocation_sysid.methods.condensed import condensed
+from collocation_sysid.methods.initial_point import NEAR, adjoint_multipliers
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.start import carried_rigidly, initial_variables
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
-from collocation_sysid.pipeline import solve
+from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation, carried_over
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Markers, Nuisance
 
 PRECISE = InteriorPoint(tolerance=1e-11)
+# IPOPT alone, from the simulation at the guess.
+ALONE = InteriorPoint(initial="simulation")
 
 
 @cache
@@ -149,7 +153,7 @@ def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
     assert len(notes) == 1
     assert notes[0].startswith("experiment 'hung cube': the simulation at the guess failed (")
     assert notes[0].endswith("started from the rest shape carried rigidly by the grasp")
-    solution = PRECISE(collocation)
+    solution = replace(PRECISE, initial="simulation")(collocation)
     assert solution.notes == tuple(notes)
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-5
@@ -180,12 +184,134 @@ def test_a_given_start_is_used():
     np.testing.assert_allclose(again.theta, solved_cube().theta, rtol=1e-5)
 
 
+# The initial point
+
+
+def note_of(solution: Solution) -> str:
+    """The note on the initial point."""
+    (note,) = (each for each in solution.notes if each.startswith("initial point: "))
+    return note
+
+
+def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
+    seen: list[Iteration] = []
+    solution = PRECISE(cube(), watch=seen.append)
+    sweeps = len(ReducedSpace(tolerance=NEAR)(cube()).history)
+    assert re.fullmatch(
+        r"initial point: \d+ sweeps of reduced space, to within 0.1 % of a parameter; "
+        "IPOPT solved the whole program from there",
+        note_of(solution),
+    )
+    assert solution.iterations <= 4
+    assert len(seen) == sweeps + solution.iterations + 1
+    assert list(solution.history) == seen
+    numbers = [line.number for line in seen]
+    assert numbers == sorted(numbers)
+    np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
+
+
+def test_the_initial_point_is_not_the_answer():
+    solution = InteriorPoint(max_iterations=1, tolerance=1e-15)(cube())
+    assert solution.status is Status.ITERATION_LIMIT
+    coarse = ReducedSpace(tolerance=NEAR)(cube())
+    assert not np.array_equal(solution.z, coarse.z)
+
+
+def test_where_reduced_space_finds_no_motion_ipopt_starts_without_it():
+    collocation = Collocation([measured(hung_cube())], soft_guess())
+    solution = PRECISE(collocation)
+    assert "found none" in note_of(solution)
+    assert "started from the rest shape carried rigidly" in solution.notes[-1]
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-5
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, None])
+def test_the_search_for_the_initial_point_ends_at_once_and_keeps_its_best(
+    end: signal.Signals | None,
+):
+    def interrupt(iteration: Iteration) -> None:
+        if iteration.number == 2 and end is not None:
+            os.kill(os.getpid(), end)
+        if iteration.number == 2 and end is None:
+            time.sleep(0.3)
+
+    method = InteriorPoint(max_time_s=1e6 if end else 0.3)
+    solution = method(cube(), watch=interrupt)
+    assert solution.status is (Status.INTERRUPTED if end else Status.TIME_LIMIT)
+    assert solution.method == "interior-point"
+    assert solution.iterations == 0
+    assert solution.history[-1].number < len(ReducedSpace()(cube()).history)
+    assert np.isfinite(solution.rms_m)
+
+
+@pytest.mark.parametrize("name", ["memory", "places", "wrench"])
+def test_initial_multipliers_balance_the_lagrangian(name: str):
+    make, truth, _ = UNKNOWN[name]
+    given = {k: Unknown(v, 0.1 * v, 10 * v) for k, v in truth.items()}
+    collocation = Problem([make()], given, scheme="midpoint").collocation()
+    z, _ = initial_variables(collocation)
+    program = condensed(collocation.made_explicit())
+    found = adjoint_multipliers(program, collocation, z)
+    assert found is not None
+    at = carried_over(z, collocation, program)
+    slope = program.gradient(at) + program.jacobian(at).T @ found.constraints
+    lower, upper = program.bounds()
+    of_p = np.zeros(program.variables, dtype=bool)
+    of_p[: program.nq] = of_p[program.of_phi] = True
+    scale = np.abs(program.gradient(at)).max()
+    assert np.abs(slope[~of_p & (lower < upper)]).max() < 1e-8 * scale
+    bounded = of_p & (np.isfinite(lower) | np.isfinite(upper))
+    np.testing.assert_array_equal(found.bounds, np.where(bounded, -slope, 0.0))
+    assert bounded.any()
+
+
+def bar_with_distant_guesses(samples: int = 25) -> Problem:
+    """A soft bar with unknown places, and guesses wrong by factors of three."""
+    made, truth = unplaced(samples), dict(TRUTH)
+    factors = dict(zip(truth, (1 / 3, 3.0, 3.6, 3.0), strict=True))
+    given = {k: Unknown(factors[k] * v) for k, v in truth.items()}
+    return Problem([replace(made, nuisance=Nuisance())], given, scheme="midpoint")
+
+
+def test_distant_guesses_lead_to_the_optimum_of_reduced_space():
+    problem = bar_with_distant_guesses()
+    expected = solve(problem, ReducedSpace())
+    found = solve(problem, InteriorPoint())
+    assert found.status is Status.CONVERGED
+    assert "sweeps of reduced space" in note_of(found)
+    assert found.iterations <= 5
+    assert found.history[-1].loss == pytest.approx(expected.history[-1].loss, rel=1e-3)
+    assert found.kkt_residual < 1e-7
+
+
+def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
+    problem = bar_with_distant_guesses()
+    answer = run(problem, ReducedSpace(), seek_causes=False)
+    found = solve(problem, InteriorPoint(), start=answer.save(tmp_path / "answer"))
+    assert found.status is Status.CONVERGED
+    assert found.iterations <= 5
+    assert found.history[0].rms_m == pytest.approx(answer.solution.rms_m, rel=1e-3)
+
+
+def test_rows_of_the_equations_do_not_slow_the_last_steps():
+    problem = bar_with_distant_guesses()
+    near = solve(problem, ReducedSpace(tolerance=1e-3))
+    off = near.collocation
+    p, positions = off.unpack(near.z)
+    p = p + 0.3 * off.reach_p * np.sign(np.arange(len(p)) % 2 - 0.5)
+    p = np.clip(p, *off.bounds_p)
+    found = ALONE(off, start=off.pack(p, positions))
+    assert found.status is Status.CONVERGED
+    assert found.iterations <= 15
+
+
 # What is unknown by default
 
 
-def unplaced() -> Experiment:
+def unplaced(samples: int = 16) -> Experiment:
     """A bar in one hand; nothing is known of its markers but what they show."""
-    bar = bar_in_two_hands(16)
+    bar = bar_in_two_hands(samples)
     held = replace(bar, grasps=bar.grasps[1:])
     seen = noisy(held).markers
     return replace(held, markers=Markers(seen.t_s, seen.positions_m, seen.sigma_m, seen.names))
@@ -215,7 +341,7 @@ def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(name: str
     given = {k: v if k == known else Unknown(factors[k] * v) for k, v in truth.items()}
     problem = Problem([replace(make(), nuisance=Nuisance())], given, scheme="midpoint")
     expected = solve(problem, ReducedSpace(tolerance=1e-10))
-    precise = InteriorPoint(tolerance=1e-10, ipopt={"print_level": 5})
+    precise = replace(ALONE, tolerance=1e-10, ipopt={"print_level": 5})
     found = precise(expected.collocation)  # where its markers are read
     shifts = re.findall(ITERATION, capfd.readouterr().out, re.MULTILINE)
     assert found.status.converged
@@ -228,7 +354,7 @@ def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(name: str
 
 
 def test_the_iteration_limit_is_a_status_and_violations_are_listed():
-    solution = InteriorPoint(max_iterations=2)(cube())
+    solution = replace(ALONE, max_iterations=2)(cube())
     assert solution.status is Status.ITERATION_LIMIT
     assert not solution.status.converged
     assert solution.message.endswith("(IPOPT: Maximum_Iterations_Exceeded)")
@@ -280,7 +406,7 @@ def test_an_interruption_keeps_the_best_iterate():
             time.sleep(0.5)  # until it is heard, on the main thread
 
     handler = signal.getsignal(signal.SIGINT)
-    solution = InteriorPoint()(cube(), watch=interrupt)
+    solution = ALONE(cube(), watch=interrupt)
     assert signal.getsignal(signal.SIGINT) is handler
     assert solution.status is Status.INTERRUPTED
     assert solution.iterations == 4
@@ -358,7 +484,7 @@ def test_the_message_holds_the_sentence_and_what_ipopt_said():
 
 def test_the_history_counts_iterations_and_ends_at_the_answer():
     seen: list[Iteration] = []
-    solution = InteriorPoint()(cube(), watch=seen.append)
+    solution = ALONE(cube(), watch=seen.append)
     assert list(solution.history) == seen
     assert [iteration.number for iteration in seen] == list(range(solution.iterations + 1))
     assert (np.diff([iteration.time_s for iteration in seen]) >= 0).all()
