@@ -2,8 +2,8 @@
 
 A step of interior point factorises the matrix of all positions and parameters, which takes as long
 as dozens of sweeps of reduced space. Far from the optimum its steps also move nuisance parameters
-by many prior deviations, because the equations of motion hold only at the end. So the parameters are
-first brought near the optimum by reduced space, along motions that satisfy the equations of motion.
+by many prior deviations, because the equations of motion hold only at the end. So reduced space
+first brings the parameters near the optimum, along motions that satisfy the equations of motion.
 IPOPT then solves the whole program from these positions, parameters and multipliers.
 """
 
