@@ -327,6 +327,8 @@ def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
     assert found.iterations <= 5
     assert found.collocation.substeps == substeps
     assert found.history[0].rms_m == pytest.approx(answer.solution.rms_m, rel=1e-2)
+    again = solve(problem, InteriorPoint(), start=folder)
+    assert note_of(again).startswith(("initial point: the start given", "initial point: 1 sweep "))
 
 
 def test_a_start_with_finer_steps_is_continued_with_these():

@@ -79,14 +79,15 @@ def coarse_solution(
     reached_end = coarse.given_multipliers is None
     is_usable = reached_end and coarse.status not in UNUSABLE and bool(np.isfinite(coarse.z).all())
     is_near = is_usable and coarse.status is Status.CONVERGED
-    sweeps = f"{coarse.iterations} sweep{'s' * (coarse.iterations != 1)} of reduced space"
+    count = coarse.iterations
+    sweeps = f"{count} sweep{'s' * (count != 1)} of reduced space" if count else "the start given"
     then = "IPOPT solved the whole program from there"
     if is_near:
         note = f"initial point: {sweeps}, to within {100 * NEAR:g} % of a parameter; {then}"
     elif is_usable:
         note = f"initial point: {sweeps} ({coarse.status.value}); {then}"
     else:
-        note = f"initial point: {sweeps} found none ({coarse.message.rstrip('.')})"
+        note = f"initial point: reduced space found none ({coarse.message.rstrip('.')})"
     return InitialPoint(coarse, is_usable, is_near, note)
 
 

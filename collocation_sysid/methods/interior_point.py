@@ -90,13 +90,13 @@ class InteriorPoint(Options):
 
     Attributes
     ----------
+    hessian : {"exact", "gauss-newton", "limited-memory"}
+        Second derivatives of the Lagrangian: all of them once parameters move by less than
+        `warm_up`, those of the loss with readings that count as linear, or IPOPT's own.
     initial : {"reduced-space", "simulation"}
         Where IPOPT starts: near the optimum, after a coarse solution of the same program by reduced
         space, with multipliers of its adjoint; or at a simulation at the guess, or at the start
         given, with multipliers zero. Where reduced space finds no motion, the latter is done too.
-    hessian : {"exact", "gauss-newton", "limited-memory"}
-        Second derivatives of the Lagrangian: all of them once parameters move by less than
-        `warm_up`, those of the loss with readings that count as linear, or IPOPT's own.
     warm_up : float
         While an iteration still changes a parameter by more than this share (or a nuisance
         parameter, of its prior deviation), an exact Hessian is replaced by Gauss–Newton's with
@@ -126,8 +126,8 @@ class InteriorPoint(Options):
 
     name: ClassVar[str] = "interior-point"
 
-    initial: Literal["reduced-space", "simulation"] = "reduced-space"
     hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
+    initial: Literal["reduced-space", "simulation"] = "reduced-space"
     warm_up: NotNegative = 0.1
     proximal: NotNegative = 1e-5
     contact: Literal["energy", "complementarity"] = "energy"
