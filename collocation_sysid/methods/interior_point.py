@@ -225,7 +225,7 @@ class InteriorPoint(Options):
             hessian,
             settings,
             IPOPT_STATUS,
-            multipliers=multipliers,
+            initial_multipliers=multipliers,
         )
         if "Invalid_Option" not in solution.message:
             return solution

@@ -48,7 +48,7 @@ def solve(
     settings: Settings,
     statuses: Mapping[str, Status],
     judged: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
-    multipliers: Multipliers | None = None,
+    initial_multipliers: Multipliers | None = None,
 ) -> Solution:
     """Solve the recorder's collocation; Ctrl-C ends it after the iteration, or after 2 s.
 
@@ -67,7 +67,7 @@ def solve(
         Its words for how it ended in ours; a failure where one is not among them.
     judged : callable
         What to say of the status, variables and multipliers of the recorder's collocation.
-    multipliers : Multipliers, optional
+    initial_multipliers : Multipliers, optional
         Initial multipliers of the program; zeros by default.
 
     Raises
@@ -89,7 +89,9 @@ def solve(
         given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
         solver = _nlpsol(plugin, functions, given)
     began = carried_over(start, collocation, program)
-    z, multipliers, said, count = _run(solver, program.bounds(), began, monitor, multipliers)
+    z, multipliers, said, count = _run(
+        solver, program.bounds(), began, monitor, initial_multipliers
+    )
     if errors and not isinstance(errors[0], _LeftBehind):
         raise errors[0]
     watch.evaluations = earlier_evaluations_s + functions.seconds
