@@ -411,6 +411,7 @@ PROGRAMS: dict[str, Make] = {
     ),
     "field": lambda: differing(swung()),
     "field, bdf2": lambda: differing(swung(), "bdf2"),
+    "field, damping in material form": lambda: differing(swung(), damping="material"),
     "field, paper's damping": lambda: differing(swung(), damping="rayleigh"),
     "field, shear": lambda: differing(swung(), field=cs.Field(0.1, "mu_pa", 2)),
     "field, density": lambda: differing(swung(), field=IN_MASS),

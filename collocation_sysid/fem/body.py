@@ -211,7 +211,7 @@ class Body(Discretisation):
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
         """The same body, whose parts of the same cells have other constants."""
         other = copy(self)
-        for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
+        for name in self._following - {"pattern", "shape_gradients", "part_of_cells"}:
             vars(other).pop(name, None)
         Model.__init__(other, parts, self.forces, self.frictions)
         other._evaluators, other._framed = {}, {}

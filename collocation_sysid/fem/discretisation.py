@@ -194,7 +194,7 @@ class Discretisation(Model):
         nodes, (count, points) = len(self.nodes_m), self.geometry.shape[:2]
         x = self._states(positions)[0].reshape(-1, nodes, 3)
         by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
-        slopes = (self._shape_slopes @ by_node).reshape(3, count * points, 3, len(x))
+        slopes = (self.shape_gradients @ by_node).reshape(3, count * points, 3, len(x))
         a, b, c = slopes.transpose(0, 2, 1, 3)
         ratios = (
             a[0] * (b[1] * c[2] - b[2] * c[1])
@@ -204,8 +204,8 @@ class Discretisation(Model):
         return ratios.reshape(count, points, -1).transpose(2, 0, 1)
 
     @cached_property
-    def _shape_slopes(self) -> sp.csr_array:
-        """Slopes along each axis, at every quadrature point, of what has values at the nodes."""
+    def shape_gradients(self) -> sp.csr_array:
+        """Derivatives of the shape functions, (3 E q, n): axis by axis, at all quadrature points."""
         count, points = self.geometry.shape[:2]
         gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
         values = np.moveaxis(gradients, 3, 0)

@@ -144,7 +144,8 @@ class ObjectSection(Section):
     material : Material
         A material's name, or a table of file and function.
     damping : DampingName
-        Law of γ_r; rayleigh, the paper's, brakes rotation.
+        Law of γ_r: kelvin-voigt, a viscous fluid in the current shape; material, viscous in the
+        rate of the Green strain, as in MuJoCo; rayleigh, the paper's, also damps rotation.
     region : list of RegionSection
         [[object.region]] tables: cells that differ.
     prony : list of PronySection

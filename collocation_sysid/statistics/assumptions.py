@@ -9,7 +9,7 @@ does to the residuals. What changes only what cameras and clocks say is a nuisan
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -20,6 +20,7 @@ from ..arrays import Array
 from ..checked import Options, Positive
 from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
+from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import engineering
 from ..fem.node_force import surface_of
 from ..model.dynamics import Dynamics
@@ -33,6 +34,8 @@ from ..section import ByForm
 SMALL = 1e-4
 AIR_KG_M3 = 1.2
 _AXES = "xyz"
+# Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
+OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +157,9 @@ class Assumption:
     name : str
     unit : str
         Of its deviation.
-    sigma : float
-        The deviation, as a careful laboratory has it.
+    sigma : float, optional
+        The deviation, as a careful laboratory has it; None for what counts only where a problem
+        states its deviation.
     said : str
         What it is.
     effect : callable
@@ -167,7 +171,7 @@ class Assumption:
 
     name: str
     unit: str
-    sigma: float
+    sigma: float | None
     said: str
     effect: Callable[[Fitted, int], Effect | None]
     axes: str = ""
@@ -354,6 +358,45 @@ def _air_drag(at: Fitted, _: int) -> Effect | None:
     return Effect(drag.reshape(shape))
 
 
+def _other_damping(at: Fitted, law: str) -> Effect | None:
+    """The damping force of another law with the same γ_r, less that of the stated one.
+
+    Parts with a law that has no name keep it, and so does what is linear, which all laws damp
+    alike. None where that leaves no difference.
+    """
+    body = at.body
+    names = body.constants.items()
+    is_damped = any(
+        constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
+    )
+    if at.part.segment.experiment.static or not is_damped:
+        return None
+    parts = tuple(
+        replace(part, damping=DAMPINGS[law])
+        if part.damping in DAMPINGS.values() and part.material is not MATERIALS["linear"]
+        else part
+        for part in body.parts
+    )
+    if all(own.damping is other.damping for own, other in zip(body.parts, parts, strict=True)):
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.part.x)
+    carried = at.dynamics.forces_along(at.dynamics.histories(at.part.x)).past
+    forces_n = (
+        each.force(xi, nu, at.theta, carried=carried) for each in (body.with_parts(parts), body)
+    )
+    return Effect(at.of_rows(next(forces_n) - next(forces_n)))
+
+
+def _objective_damping(at: Fitted, number: int) -> Effect | None:
+    """The body obeys another objective law of damping than the stated one."""
+    return _other_damping(at, OBJECTIVE_DAMPINGS[number])
+
+
+def _rayleigh_damping(at: Fitted, _: int) -> Effect | None:
+    """The body obeys Rayleigh's law of damping, which is not objective."""
+    return _other_damping(at, "rayleigh")
+
+
 # fmt: off
 ASSUMPTIONS = (
     Assumption("body_scale", "1", 0.01, "size of the mesh", _size),
@@ -366,6 +409,12 @@ ASSUMPTIONS = (
         "stiffness at the end over that at the beginning", _drift),
     Assumption("time_scale", "1", 1e-4, "pace of all clocks", _pace),
     Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson),
+    Assumption("damping_law", "1", 1.0,
+        "damping force of another objective law, in its difference from the stated one",
+        _objective_damping, " ".join(OBJECTIVE_DAMPINGS)),
+    Assumption("rayleigh_damping", "1", None,
+        "damping force of Rayleigh's law, in its difference from the stated one",
+        _rayleigh_damping),
     Assumption("grip_layer_m", "m", 2e-4,
         "what grip and skin give way, as thickness of the body's own material", _grip),
     Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),

@@ -8,7 +8,7 @@ ones do, of the same program with them among its parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -60,6 +60,13 @@ class Changes(NamedTuple):
 
     names: tuple[str, ...]
     blocks: list[Array]
+
+    def without(self, assumptions: Iterable[str]) -> Changes:
+        """Return the changes by all others than some assumptions, each with all its components."""
+        left_out = set(assumptions)
+        kept = [k for k, name in enumerate(self.names) if name.partition(" ")[0] not in left_out]
+        names = tuple(self.names[k] for k in kept)
+        return Changes(names, [block[..., kept] for block in self.blocks])
 
 
 def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float | None]) -> Changes:

@@ -255,6 +255,8 @@ def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     changes : of each block (T, M, 3, a), in units of σ
     """
     free, count = np.flatnonzero(~fit.at_bound), changes[0].shape[-1] if changes else 0
+    if not free.size:
+        return np.zeros((len(fit.names), count))
     known = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
     score = np.zeros((len(free), count))
     for block, change in zip(fit.blocks, changes, strict=True):

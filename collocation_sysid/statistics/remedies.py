@@ -23,6 +23,9 @@ REMEDIES: Mapping[str, str] = {
     "stiffness_drift": "repeat the first recording at the end",
     "time_scale": "compare the clocks with a reference",
     "poisson": "measure Poisson's ratio in a tension test, or estimate it",
+    "damping_law": "compare the laws with compare --damping on faster and slower motions, or state "
+    'damping_law = "none" where the law is known',
+    "rayleigh_damping": "compare the laws with compare --damping on motions that rotate the body",
     "grip_layer_m": "glue the body to a stiff plate, or put markers beside the grip",
     "machine_compliance_m_n": "press the platens on each other and state the slope",
     "platen_friction": "lubricate the platens, or glue the specimen to them",
