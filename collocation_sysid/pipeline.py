@@ -258,19 +258,23 @@ def _fine_enough(
 ) -> tuple[Run, LinearisedFit | None]:
     """Return the run solved again from its answer, with as many substeps as its error bars ask for.
 
-    A parameter that ended at a bound has no error bar, and coarse steps may have driven it there:
-    it starts from its guess again. Where all of them ended so, the most substeps are taken.
+    The answer may have several steps a sample already, where it was started from such a run. A
+    parameter that ended at a bound has no error bar, and coarse steps may have driven it there: it
+    starts from its guess again. Where all of them ended so, the most substeps are taken.
     """
     if coarse.refinement is None or fit is None:
         return coarse, fit
     first, problem = coarse.solution, coarse.problem
-    substeps = coarse.refinement.substeps(coarse.optimum, as_scheme(problem.scheme).order)
+    before = first.collocation.substeps
+    factor = coarse.refinement.substeps(coarse.optimum, as_scheme(problem.scheme).order)
+    substeps = min(before * factor, MOST_SUBSTEPS)
+    steps = "one step" if before == 1 else f"{before} steps"
     worst, many = coarse.refinement.worst(coarse.optimum)
-    why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
+    why = f"with {steps} a sample, the step moves {worst} by {many:.2g} standard errors"
     if fit.at_bound[: fit.shared].all():
         substeps = MOST_SUBSTEPS
-        why = "with one step a sample, every parameter ends at a bound"
-    if substeps == 1:
+        why = f"with {steps} a sample, every parameter ends at a bound"
+    if substeps <= before:
         return coarse, fit
     say(f"solving again with {substeps} steps a sample")
     again = replace(first.collocation, substeps=substeps)

@@ -239,6 +239,7 @@ class Monitor(ca.Callback):
         self.stop = False
         self.best: tuple[Array, Array] | None = None
         self.seconds = 0.0
+        self.lines = 0
         self._best_merit = np.inf
         self.construct("monitor")
 
@@ -278,4 +279,6 @@ class Monitor(ca.Callback):
             self._best_merit, self.best = merit, (z, multipliers)
         recorder, loss = self.recorder, float(value[0]) / self.program.loss_scale
         at = carried_over(z, self.program, recorder.collocation)
-        recorder.line(len(recorder.history), at, loss)
+        number = recorder.history[-1].number + 1 if recorder.history else 0
+        self.lines += 1
+        recorder.line(number, at, loss)
