@@ -27,7 +27,7 @@ from collocation_sysid import (
     simulate,
     with_markers,
 )
-from collocation_sysid.statistics.assumptions import AIR_KG_M3
+from collocation_sysid.fem.air import ADDED_MASS_SHARE, DRAG_COEFFICIENT, FACING_SHARE
 
 Array = NDArray[np.float64]
 SCHEME, AXES = "midpoint", "xyz"
@@ -45,14 +45,15 @@ def wrong(
     experiment : Experiment
         With markers at nodes.
     values : mapping of parameter to its truth, by E and ν
-    off : mapping of assumption to how far it is off, in its unit
+    off : mapping of assumption to how far it is off, in its unit; those of the air are shares of
+        what the air around the experiment does in the model
     """
     body = _body(experiment, values, off)
     (grasp,) = experiment.grasps
     slower = 1 - off.get("time_scale", 0.0)
     poses = grasp.poses
     slowed = PoseSequence(slower * poses.t_s, poses.positions_m, poses.quaternions_xyzw)
-    masses, forces = _in_air(body, off)
+    masses, forces = _in_more_air(experiment, body, off)
     truth = replace(
         experiment,
         body=body,
@@ -113,7 +114,7 @@ def _body(experiment: Experiment, values: Mapping[str, float], off: Mapping[str,
     if any(stiffer):
         own |= {"material": _stiffer_along(stiffer), "evaluator": "casadi"}
     if off.get("air_drag"):
-        own["forces"] = [_drag(off["air_drag"])]
+        own["forces"] = [_drag(off["air_drag"] * experiment.air_density_kg_m3)]
     density = old.mass_kg / old.mesh.volume_m3 * (1 + off.get("mass", 0.0))
     body = Body(mesh, density_kg_m3=density, **own)
     factor = np.ones(len(body.nodes_m))
@@ -136,21 +137,23 @@ def _stiffer_along(shares: Sequence[float]) -> Material:
     return Material.of(energy)
 
 
-def _drag(coefficient: float) -> NodeForce:
-    """−½ ρ c_d a |v| v of each node, a being what its surface shows on average: a quarter."""
+def _drag(density_kg_m3: float) -> NodeForce:
+    """Return −½ ρ c_d a |v| v of each node, where a is the share of its surface that faces v."""
+    per_area = 0.5 * density_kg_m3 * DRAG_COEFFICIENT * FACING_SHARE
 
     def drag(x, v, at):
-        return -0.125 * AIR_KG_M3 * coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
+        return -per_area * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
 
     return NodeForce.of(drag)
 
 
-def _in_air(
-    body: Body, off: Mapping[str, float]
+def _in_more_air(
+    experiment: Experiment, body: Body, off: Mapping[str, float]
 ) -> tuple[tuple[PointMass, ...], tuple[Force, ...]]:
-    """What the air that the body displaces lifts, and what of it moves along."""
-    air_kg = AIR_KG_M3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg
-    buoyant, moving = off.get("buoyancy", 0.0), 0.5 * off.get("added_mass", 0.0)
+    """Return the masses and forces by which added mass and buoyancy differ from the model's."""
+    air_kg = experiment.air_density_kg_m3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg
+    buoyant = off.get("buoyancy", 0.0)
+    moving = ADDED_MASS_SHARE * off.get("added_mass", 0.0)
     lift_n = 9.81 * air_kg * (buoyant + moving)
     forces = tuple(Force([k], [0, 0, n]) for k, n in enumerate(lift_n) if n)
     return tuple(PointMass([k], moving * m) for k, m in enumerate(air_kg) if moving), forces

@@ -254,14 +254,14 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
 
 
 def drawn(names: Sequence[str]) -> Callable[..., Pair]:
-    """What is assumed is off, each drawn from its deviation; air never drives a body."""
+    """What is assumed is off, each drawn from its deviation."""
 
     def fault(experiment: Experiment, rng: Generator) -> Pair:
         off = {}
         for row in (row for row in ASSUMPTIONS if row.name in names):
             for name in row.components:
                 way = rng.standard_normal()
-                off[name] = row.sigma * (abs(way) if row.name in AIR else way)
+                off[name] = row.sigma * way
         values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
         return wrong(experiment, values, off), experiment
 

@@ -33,9 +33,10 @@ from collocation_sysid.statistics.uncertainty import covariance
 NOTHING = {name: "none" for name in Assumptions().deviations}
 
 
-def problem(**stated) -> Problem:
+def problem(air_density_kg_m3: float = 0.0, **stated) -> Problem:
     options = UncertaintyOptions(assumptions=Assumptions(**stated))
-    return Problem([measured(hung_cube(20))], GUESS, substeps=1, uncertainty=options)
+    experiment = measured(hung_cube(20, air_density_kg_m3=air_density_kg_m3))
+    return Problem([experiment], GUESS, substeps=1, uncertainty=options)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,7 @@ def test_one_assumption_alone_has_its_own_variance(finished):
 
 
 def test_what_is_as_large_as_an_estimate_adds_to_it_as_well_as_multiplies_it():
-    airy = run(problem(**NOTHING | {"air_drag": 20.0}), seek_causes=False)
+    airy = run(problem(1.2, **NOTHING | {"air_drag": 20.0}), seek_causes=False)
     deviation = assumed_deviation(airy, "gamma_m_1_s")
     assert deviation > 0.3
     # All of what is seen may be the air's.

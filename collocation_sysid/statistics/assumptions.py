@@ -21,8 +21,8 @@ from ..checked import Options, Positive
 from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
 from ..fem.moduli import engineering
-from ..fem.node_force import surface_of
 from ..model.dynamics import Dynamics
+from ..model.force_term import States
 from ..model.parameters import Parameters
 from ..program.collocation import Part
 from ..program.reaction import forces_on, reactions
@@ -31,7 +31,12 @@ from ..section import ByForm
 
 # Differences by a scale.
 SMALL = 1e-4
-AIR_KG_M3 = 1.2
+# Relative standard deviation of the density of the air: weather and room temperature, at the stated
+# altitude. At 2000 m the density is 20 % lower, and has to be stated.
+AIR_DENSITY_DEVIATION = 0.03
+# Relative standard deviation of the added mass and of the drag coefficient of a given body: they
+# depend on its shape, on edges, on amplitude and on frequency.
+AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
 
 
@@ -121,6 +126,27 @@ class Fitted:
         """(N, 3n) what gravity and γ_m do to mass (3n,)."""
         return mass_kg * (self.gravity - self.body.tied_drag(self.theta) * self.states[1])
 
+    @property
+    def buoyancy_n(self) -> Array:
+        """(N, 3n) buoyancy in the model; zero in a vacuum."""
+        lifted = -self.dynamics.mass.displaced_kg * self.gravity
+        return np.broadcast_to(lifted, self.part.x.shape)
+
+    @property
+    def added_mass_kg(self) -> Array:
+        """(3n,) air in the model that moves with the body; zero in a vacuum."""
+        return self.dynamics.mass.added_kg
+
+    @cached_property
+    def air_drag_n(self) -> Array:
+        """(N, 3n) drag of the air in the model; zero in a vacuum and where nothing moves."""
+        term = self.dynamics.forces.air_drag
+        if term is None:
+            return np.zeros_like(self.states[1])
+        drag = term.force(States(*self.states, self.theta))
+        drag[: self.dynamics.first_row] = 0.0
+        return drag
+
     @cached_property
     def grasp_force_n(self) -> Array:
         """(N, g) what the grasps give the grasped dofs."""
@@ -193,7 +219,12 @@ def _size(at: Fitted, _: int) -> Effect:
     turns: Array = np.nan_to_num(grasping.poses[0])
     off = grasping.places(at.part.phi)[0] - at.part.segment.nuisance.grasp_pivot_m
     moved = np.einsum("tgj,gj->tg", turns, off)
-    return Effect(force / (2 * SMALL) + at.weight_of(mass), mass, moved_m=moved)
+    air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
+    return Effect(
+        force / (2 * SMALL) + at.weight_of(mass) + air,
+        mass + 3.0 * at.added_mass_kg,
+        moved_m=moved,
+    )
 
 
 def _mass(at: Fitted, _: int) -> Effect | None:
@@ -245,8 +276,9 @@ def _pace(at: Fitted, _: int) -> Effect | None:
     if at.part.segment.experiment.static:
         return None
     slower, faster = at.internal_n(slower=1 + SMALL), at.internal_n(slower=1 - SMALL)
-    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.kg * at.states[1]
-    return Effect((faster - slower) / (2 * SMALL) - drag, stretched=-1.0)
+    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
+    air = 2.0 * at.air_drag_n
+    return Effect((faster - slower) / (2 * SMALL) - drag + air, stretched=-1.0)
 
 
 def _poisson(at: Fitted, _: int) -> Effect | None:
@@ -327,31 +359,21 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
     return Effect(force) if platens else None
 
 
-def _buoyancy(at: Fitted, _: int) -> Effect:
-    """The air that the body displaces."""
-    return Effect(np.broadcast_to(-AIR_KG_M3 * at.body.dof_volume_m3 * at.gravity, at.part.x.shape))
+def _buoyancy(at: Fitted, _: int) -> Effect | None:
+    """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
+    return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
 
 
 def _added_mass(at: Fitted, _: int) -> Effect | None:
-    """Half the air that the body displaces moves with it, as with a sphere."""
-    if at.part.segment.experiment.static:
+    """Return the effect of more added mass, as a share of that in the model; None in a vacuum."""
+    if at.part.segment.experiment.static or not at.added_mass_kg.any():
         return None
-    return Effect(mass_kg=0.5 * AIR_KG_M3 * at.body.dof_volume_m3)
+    return Effect(mass_kg=at.added_mass_kg)
 
 
 def _air_drag(at: Fitted, _: int) -> Effect | None:
-    """−½ ρ c_d a |v| v at the body's surface, c_d being one; a quarter of it faces the way it goes.
-
-    That is what a convex body shows on average (Cauchy).
-    """
-    if at.part.segment.experiment.static:
-        return None
-    area_m2, shape = surface_of(at.body.nodes)[0], at.states[1].shape
-    v = at.states[1].reshape(shape[0], -1, 3)[:, : len(area_m2)]
-    drag = np.zeros((shape[0], shape[1] // 3, 3))
-    speed = np.linalg.norm(v, axis=2, keepdims=True)
-    drag[:, : len(area_m2)] = -0.125 * AIR_KG_M3 * area_m2[:, None] * speed * v
-    return Effect(drag.reshape(shape))
+    """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
+    return Effect(at.air_drag_n) if at.part.segment.experiment.has_air_drag else None
 
 
 # fmt: off
@@ -371,9 +393,12 @@ ASSUMPTIONS = (
     Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),
     Assumption("platen_friction", "", 0.1,
         "friction of what holds nodes across and lets them slide", _platen_friction),
-    Assumption("buoyancy", "1", 1.0, "air that the body displaces, in 1.2 kg/m³", _buoyancy),
-    Assumption("added_mass", "1", 1.0, "air that moves with it, in half of that", _added_mass),
-    Assumption("air_drag", "1", 1.0, "drag of the air, in that of a coefficient of one", _air_drag),
+    Assumption("buoyancy", "1", AIR_DENSITY_DEVIATION,
+        "buoyancy over that in the model, by the density of the air", _buoyancy),
+    Assumption("added_mass", "1", AIR_COEFFICIENT_DEVIATION,
+        "air that moves with the body over that in the model", _added_mass),
+    Assumption("air_drag", "1", AIR_COEFFICIENT_DEVIATION,
+        "drag of the air over that in the model", _air_drag),
 )
 # fmt: on
 
