@@ -21,7 +21,6 @@ from collocation_sysid import (
     Grasp,
     Material,
     NodeForce,
-    PointMass,
     PoseSequence,
     TetMesh,
     simulate,
@@ -53,15 +52,16 @@ def wrong(
     slower = 1 - off.get("time_scale", 0.0)
     poses = grasp.poses
     slowed = PoseSequence(slower * poses.t_s, poses.positions_m, poses.quaternions_xyzw)
-    masses, forces = _in_more_air(experiment, body, off)
+    # Added mass is that of denser air, and what else this air does is taken back.
+    denser = 1 + off.get("added_mass", 0.0)
     truth = replace(
         experiment,
         body=body,
         t_s=slower * experiment.t_s,
         grasps=(Grasp(grasp.nodes, slowed),),
         markers=replace(experiment.markers, t_s=slower * experiment.t_s, located=None),
-        masses=masses,
-        forces=forces,
+        forces=_lift(experiment, body, off),
+        air_density_kg_m3=denser * experiment.air_density_kg_m3,
     )
     values = dict(values, poisson=values["poisson"] + off.get("poisson", 0.0))
     return with_markers(experiment, _tracks(truth, values, off.get("stiffness_drift", 0.0)))
@@ -113,8 +113,9 @@ def _body(experiment: Experiment, values: Mapping[str, float], off: Mapping[str,
     own: dict[str, Any] = {"damping": old.parts[0].damping}
     if any(stiffer):
         own |= {"material": _stiffer_along(stiffer), "evaluator": "casadi"}
-    if off.get("air_drag"):
-        own["forces"] = [_drag(off["air_drag"] * experiment.air_density_kg_m3)]
+    more_drag = off.get("air_drag", 0.0) - off.get("added_mass", 0.0)
+    if more_drag:
+        own["forces"] = [_drag(more_drag * experiment.air_density_kg_m3)]
     density = old.mass_kg / old.mesh.volume_m3 * (1 + off.get("mass", 0.0))
     body = Body(mesh, density_kg_m3=density, **own)
     factor = np.ones(len(body.nodes_m))
@@ -147,13 +148,10 @@ def _drag(density_kg_m3: float) -> NodeForce:
     return NodeForce.of(drag)
 
 
-def _in_more_air(
+def _lift(
     experiment: Experiment, body: Body, off: Mapping[str, float]
-) -> tuple[tuple[PointMass, ...], tuple[Force, ...]]:
-    """Return the masses and forces by which added mass and buoyancy differ from the model's."""
+) -> tuple[Force, ...]:
+    """Return the forces by which buoyancy differs from that of air with the true added mass."""
+    more = off.get("buoyancy", 0.0) - off.get("added_mass", 0.0)
     air_kg = experiment.air_density_kg_m3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg
-    buoyant = off.get("buoyancy", 0.0)
-    moving = ADDED_MASS_SHARE * off.get("added_mass", 0.0)
-    lift_n = 9.81 * air_kg * (buoyant + moving)
-    forces = tuple(Force([k], [0, 0, n]) for k, n in enumerate(lift_n) if n)
-    return tuple(PointMass([k], moving * m) for k, m in enumerate(air_kg) if moving), forces
+    return tuple(Force([k], [0, 0, 9.81 * more * m]) for k, m in enumerate(air_kg) if more * m)
