@@ -60,10 +60,10 @@ def one_twin(seed: tuple[int, int], everything: bool, in_vacuum: bool) -> Twin |
         stated = replace(stated, air_density_kg_m3="none")
     fit = fitted(with_markers(stated, tracks), ROWS[fault])
     line = fit.lines.get(GAMMA_M)
-    interval = fit.uncertainty.estimates[GAMMA_M].ci95
+    interval = fit.uncertainty.estimates[GAMMA_M].statistical95
     if not fit.converged or line is None or interval is None:
         return None
-    return Twin(fit.uncertainty.estimates[GAMMA_M].value, interval, line.whole95)
+    return Twin(fit.uncertainty.estimates[GAMMA_M].value, interval, line.combined95)
 
 
 def summary(twins: list[Twin], count: int) -> str:

@@ -146,7 +146,7 @@ def identified(
     fit, true = fitted(experiment, assumed), truth()
     lines = fit.lines
     whole = [
-        float(lines[n].whole95[0] <= true[n] <= lines[n].whole95[1]) if n in lines else np.nan
+        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
         for n in QUANTITIES
     ]
     return fit.uncertainty, np.array(whole), fit.converged
@@ -161,7 +161,8 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
     changes = changed_residuals(collocation, z, [(row, row.sigma) for row in assumed])
     fit = linearised_fit(collocation, z)
     sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
-    return Fit(found, budget(sources, found, {}), solution.status.converged)
+    lines = budget(sources, found, {}, problem.parameters)
+    return Fit(found, lines, solution.status.converged)
 
 
 def relative_errors(found: Uncertainty) -> Array:

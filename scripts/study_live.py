@@ -66,8 +66,8 @@ class Tally:
     def _count(self, at_s: float, update: Update) -> None:
         self.verdicts[at_s, update.trust.verdict] += 1
         for name, estimate in update.estimates.items():
-            if estimate.ci95 is not None:
-                low, high = estimate.ci95
+            if estimate.statistical95 is not None:
+                low, high = estimate.statistical95
                 self.told[at_s, name] += 1
                 self.held[at_s, name] += low <= SOFT[name] <= high
 

@@ -95,10 +95,10 @@ def _alone(problem: Problem, names: Sequence[str]) -> dict[str, FoundValue]:
 
 def _line(repeats: str, name: str, estimates: Sequence[FoundValue]) -> str:
     # Where intervals are, with what the step does to all repeats alike.
-    logs = np.array([np.log(e.ci95 or (e.value, e.value)).mean() for e in estimates])
+    logs = np.array([np.log(e.statistical95 or (e.value, e.value)).mean() for e in estimates])
     mean, count = logs.mean(), len(logs)
     scatter = 100 * float(logs.std(ddof=1)) if count > 1 else np.nan
-    told = [(e.ci95, e.whole95) for e in estimates]
+    told = [(e.statistical95, e.combined95) for e in estimates]
     halves, held = [], []
     for intervals in zip(*told, strict=True):
         ends = [np.log(np.maximum(interval, 1e-12)) for interval in intervals if interval]

@@ -50,7 +50,7 @@ def main(twins: int = 20, first: int = 0) -> None:
                     "chosen": chosen.estimates,
                 }
                 for key in NAMES[:3]:
-                    ends = {kind: each[key].ci95 for kind, each in kinds.items()}
+                    ends = {kind: each[key].statistical95 for kind, each in kinds.items()}
                     if all(ends.values()):
                         all_of_them += 1
                         held.update(k for k, e in ends.items() if e and e[0] <= truth[key] <= e[1])

@@ -79,7 +79,7 @@ def _line(name: str, specimen: str, changes: Sequence[str]) -> str:
 def _told(estimate: FoundValue, factor: float, form: str) -> str:
     """A value and its two intervals."""
     cells = [form.format(factor * estimate.value)]
-    for interval in (estimate.ci95, estimate.whole95):
+    for interval in (estimate.statistical95, estimate.combined95):
         ends = (form.format(factor * end) for end in interval or ())
         cells.append(" to ".join(ends) or "—")
     return " | ".join(cells)

@@ -54,23 +54,23 @@ def test_the_shares_of_a_budget_sum_to_one_largest_first(finished):
 
 def test_the_whole_interval_holds_the_other(finished):
     for name, line in finished.budget.items():
-        low, high = finished.estimates[name].ci95
-        assert line.whole95[0] < low < high < line.whole95[1]
-        assert finished.estimates[name].whole95 == line.whole95
+        low, high = finished.estimates[name].statistical95
+        assert line.combined95[0] < low < high < line.combined95[1]
+        assert finished.estimates[name].combined95 == line.combined95
 
 
 def test_where_nothing_is_assumed_both_are_the_same():
     exact = run(problem(**NOTHING), seek_causes=False)
     for name, line in exact.budget.items():
-        assert line.whole95 == pytest.approx(exact.estimates[name].ci95)
+        assert line.combined95 == pytest.approx(exact.estimates[name].statistical95)
         assert set(line.shares) <= {"noise", "nuisance parameters", "step and mesh"}
 
 
 def assumed_deviation(solved: Run, name: str) -> float:
     """How much wider the whole interval is upwards, as a deviation of the logarithm."""
-    least, most = solved.estimates[name].ci95
+    least, most = solved.estimates[name].statistical95
     half = np.log(most / least) / 2
-    above = np.log(solved.budget[name].whole95[1] / least) - half
+    above = np.log(solved.budget[name].combined95[1] / least) - half
     return float(np.sqrt(above**2 - half**2)) / 1.96
 
 
@@ -86,10 +86,10 @@ def test_what_is_as_large_as_an_estimate_adds_to_it_as_well_as_multiplies_it():
     deviation = assumed_deviation(airy, "gamma_m_1_s")
     assert deviation > 0.3
     # All of what is seen may be the air's.
-    least, most = airy.estimates["gamma_m_1_s"].ci95
+    least, most = airy.estimates["gamma_m_1_s"].statistical95
     middle = np.sqrt(least * most)
     lowest = middle - np.hypot(1.96 * deviation * middle, middle - least)
-    assert airy.budget["gamma_m_1_s"].whole95[0] == pytest.approx(max(0.0, lowest))
+    assert airy.budget["gamma_m_1_s"].combined95[0] == pytest.approx(max(0.0, lowest))
     assert lowest < middle * np.exp(-1.96 * deviation)
 
 
@@ -163,15 +163,15 @@ def test_what_recordings_disagree_on_is_in_the_whole_interval():
     unlike = run(swings(*truths), seek_causes=False)
     line = unlike.budget["gamma_r_s"]
     assert next(iter(line.shares)) == "between recordings"
-    assert line.whole95[0] < truths[0]
-    assert line.whole95[1] > truths[-1]
+    assert line.combined95[0] < truths[0]
+    assert line.combined95[1] > truths[-1]
 
 
 def test_recordings_that_agree_add_nothing():
     alike = run(swings(9e-3, 9e-3, 9e-3), seek_causes=False)
     for name, line in alike.budget.items():
-        low, high = alike.estimates[name].ci95
-        assert np.log(line.whole95[1] / line.whole95[0]) < 1.3 * np.log(high / low)
+        low, high = alike.estimates[name].statistical95
+        assert np.log(line.combined95[1] / line.combined95[0]) < 1.3 * np.log(high / low)
 
 
 def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):

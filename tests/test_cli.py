@@ -106,8 +106,8 @@ def test_the_result_has_every_promised_key(solved):
         assert key in solved.result
         assert inner <= set(solved.result[key] if inner else ())
     for item in solved.result["parameters"].values():
-        assert {"value", "guess", "std_error", "ci95", "at_bound"} <= set(item)
-        low, high = item["ci95"]
+        assert {"value", "guess", "std_error", "statistical95", "at_bound"} <= set(item)
+        low, high = item["statistical95"]
         assert low < item["value"] < high
     assert solved.result["parameters"]["mu_pa"]["guess"] == 200.0
 

@@ -69,7 +69,7 @@ def test_wide_intervals_are_told_by_their_factor(deviation, said):
 def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
     found = uncertainty(spread([0.9, 0.01, 0.02, 0.05]))
     assert found.estimates["lambda_pa"].std_error is None
-    low, high = found.estimates["lambda_pa"].ci95 or (0, 0)
+    low, high = found.estimates["lambda_pa"].statistical95 or (0, 0)
     assert np.log(high / low) == pytest.approx(2 * Z95 * 0.9, rel=1e-3)
     (sentence,) = [s for s in verdicts(found) if "not identifiable" in s]
     assert sentence in found.notes
@@ -79,7 +79,7 @@ def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
 
 def test_a_parameter_the_data_say_nothing_of_is_not_determined():
     found = uncertainty(spread([0.1, 0.01, 0.02, 1e4]))
-    assert found.estimates["gamma_m_1_s"].ci95 is None
+    assert found.estimates["gamma_m_1_s"].statistical95 is None
     said = verdicts(found)
     assert "gamma_m_1_s" not in said[0]
     silent = "gamma_m_1_s is not determined: no information on damping in these data"
@@ -164,7 +164,7 @@ def test_poisson_that_can_be_anything_is_not_identifiable():
     found = uncertainty(spread([0.01, 1.2, 0.02, 0.02]), of)
     estimate = found.estimates["poisson"]
     assert estimate.std_error is None
-    low, high = estimate.ci95 or (0.0, 1.0)
+    low, high = estimate.statistical95 or (0.0, 1.0)
     assert 0 < low < 0.05
     assert 0.45 < high < 0.5
     assert "(0, 0.5)" in (estimate.reason or "")

@@ -41,7 +41,7 @@ def test_three_levels_tell_order_and_limit(order):
 
 def test_two_levels_hold_the_limit_of_any_order_from_one_upwards():
     for order in (1.05, 2.0, 4.0):
-        low, high = errors_of(5.0, order, levels=2).ci95 or (0, 0)
+        low, high = errors_of(5.0, order, levels=2).statistical95 or (0, 0)
         assert low < np.exp(5.0) < high
     assert errors_of(5.0, 2.0, levels=2).extrapolated == pytest.approx(np.exp(5.0))
 
@@ -50,15 +50,15 @@ def test_the_mesh_may_converge_more_slowly():
     for order in (0.55, 1.0, 2.0, 4.0):
         values = [float(np.exp(5.0 - 0.1 * 2.0 ** (-order * k))) for k in range(2)]
         answer = Estimate(values[0], 0.01, (values[0] * 0.9999, values[0] * 1.0001))
-        low, high = numerical_error("mu_pa", answer, [], values[1:]).ci95 or (0, 0)
+        low, high = numerical_error("mu_pa", answer, [], values[1:]).statistical95 or (0, 0)
         assert low < np.exp(5.0) < high
 
 
 def test_without_numerical_error_the_interval_is_that_of_the_noise():
     answer = Estimate(0.3, 0.01, (0.27, 0.33))
     found = numerical_error("poisson", answer, [0.3, 0.3], [0.3])
-    assert found.ci95 is not None
-    odds = [v / (0.5 - v) for v in (*found.ci95, *answer.ci95)]  # type: ignore[misc]
+    assert found.statistical95 is not None
+    odds = [v / (0.5 - v) for v in (*found.statistical95, *answer.statistical95)]  # type: ignore[misc]
     assert odds[1] / odds[0] == pytest.approx(odds[3] / odds[2])
     assert found.extrapolated == pytest.approx(0.3)
 
@@ -67,7 +67,7 @@ def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
     found = numerical_error("mu_pa", Estimate(100.0, 1.0, (98, 102)), [110.0, 121.0], [])
     assert found.step_order is None
     assert found.extrapolated == pytest.approx(121.0)
-    low, high = found.ci95 or (0, 0)
+    low, high = found.statistical95 or (0, 0)
     assert low < 110
     assert high > 132
 
@@ -75,13 +75,13 @@ def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
 @pytest.mark.parametrize(("value", "half_step"), [(-0.1, -0.11), (0.01, -0.01)])
 def test_a_poisson_ratio_below_zero_has_an_interval(value, half_step):
     estimate = Estimate(value, 0.02, (value - 0.04, value + 0.04))
-    low, high = numerical_error("poisson", estimate, [half_step], []).ci95 or (0, 0)
+    low, high = numerical_error("poisson", estimate, [half_step], []).statistical95 or (0, 0)
     assert low < value + 4 / 3 * (half_step - value) < high
     assert high - low == pytest.approx(0.08, rel=0.1)
 
 
 def test_an_estimate_without_an_interval_gets_none():
-    assert numerical_error("mu_pa", Estimate(100.0), [101.0], [99.0]).ci95 is None
+    assert numerical_error("mu_pa", Estimate(100.0), [101.0], [99.0]).statistical95 is None
 
 
 # On problems
@@ -180,7 +180,7 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
         assert found["value"] == before["parameters"][name]["value"]
         if not found["fixed"] and not found["at_bound"]:
             assert found["numerical_error"] == kept["errors"][name]
-            assert found["ci95"] == kept["errors"][name]["ci95"]
+            assert found["statistical95"] == kept["errors"][name]["statistical95"]
             assert found["ci95_holds"] == ["noise", "step", "mesh"]
             assert found["ci95_noise"] == before["parameters"][name]["ci95_noise"]
             assert before["parameters"][name]["ci95_holds"] == ["noise", "step"]

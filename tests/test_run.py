@@ -112,7 +112,7 @@ def test_a_result_is_read_as_it_was_written(finished):
         (("fit",), [1]),
         (("converged",), "yes"),
         (("parameters", "mu_pa", "value"), "x"),
-        (("parameters", "mu_pa", "ci95"), [1.0]),
+        (("parameters", "mu_pa", "statistical95"), [1.0]),
         (("trust", "concerns"), [{"code": "noise/larger", "grade": "fine", "data": {}}]),
         (("history",), [{"iteration": 1}]),
         (("iterations",), 1.5),
@@ -139,7 +139,7 @@ def test_a_profile_agrees_with_the_error_bar_where_the_loss_is_round(finished):
     solution, uncertainty = finished.solution, finished.uncertainty
     fit = linearised_fit(solution.collocation, solution.z)
     profile = profile_of(solution, fit, uncertainty, "mu_pa")
-    np.testing.assert_allclose(profile.interval, uncertainty.estimates["mu_pa"].ci95, rtol=0.01)
+    np.testing.assert_allclose(profile.interval, uncertainty.estimates["mu_pa"].statistical95, rtol=0.01)
     best = profile.values[np.argmin(profile.losses)]
     assert best == pytest.approx(solution.parameters["mu_pa"])
 
@@ -163,7 +163,7 @@ def test_a_profile_counts_the_prior_of_its_parameter(finished):
     assert lower is not None
     assert np.log(upper / lower) == pytest.approx(4 * 1e-3, rel=0.1)
     assert np.log(upper / lower) < np.log(
-        uncertainty.estimates["mu_pa"].ci95[1] / uncertainty.estimates["mu_pa"].ci95[0]
+        uncertainty.estimates["mu_pa"].statistical95[1] / uncertainty.estimates["mu_pa"].statistical95[0]
     )
 
 

@@ -106,7 +106,7 @@ def test_a_poked_block_tells_its_stiffness_though_nobody_knows_where_it_begins()
     finished = run(problem, seek_causes=False)
     assert finished.solution.status.converged
     assert {each.code for each in finished.trust.concerns} == {"contact/coarse"}
-    low, high = finished.result.parameters["young_pa"].ci95
+    low, high = finished.result.parameters["young_pa"].statistical95
     assert low < 2e4 < high
     assert high - low < 0.05 * 2e4 / np.sqrt(12)  # of one place 5 %
 

@@ -48,7 +48,7 @@ def holds(interval: tuple[float, float] | None, value: float) -> bool:
 def test_the_interval_holds_the_truth_where_the_noises_alone_misses_it():
     coarse = found(3e-4, 1)
     noise = coarse.noise_estimates["mu_pa"]
-    assert not holds(noise.ci95, TRUTH["mu_pa"])
+    assert not holds(noise.statistical95, TRUTH["mu_pa"])
     assert holds(coarse.interval("mu_pa"), TRUTH["mu_pa"])
     assert holds(coarse.interval("young_pa"), 720.0)
     assert coarse.interval_holds == ("noise", "step")
@@ -57,7 +57,7 @@ def test_the_interval_holds_the_truth_where_the_noises_alone_misses_it():
 def test_a_scheme_of_first_order_has_its_error_in_the_interval_too():
     euler = run(replace(twin(3e-4, 4), scheme="backward-euler"), seek_causes=False)
     noise = euler.noise_estimates["gamma_r_s"]
-    assert not holds(noise.ci95, TRUTH["gamma_r_s"])
+    assert not holds(noise.statistical95, TRUTH["gamma_r_s"])
     assert holds(euler.interval("gamma_r_s"), TRUTH["gamma_r_s"])
 
 
@@ -66,7 +66,7 @@ def test_what_was_not_estimated_is_not_said_to_be_held():
     unseen = replace(coarse.problem, rollout=cs.RolloutOptions("scheme"))
     blind = run(unseen, seek_causes=False)
     assert blind.interval_holds == ("noise",)
-    assert blind.interval("mu_pa") == blind.noise_estimates["mu_pa"].ci95
+    assert blind.interval("mu_pa") == blind.noise_estimates["mu_pa"].statistical95
     assert "not the step and the mesh" in blind.table()
 
 
@@ -192,8 +192,8 @@ def test_every_view_has_value_interval_verdict_and_what_the_interval_holds():
         assert "Verdict: check" in said
         assert "intervals cover the noise and the step, not the mesh" in said
     found_mu = coarse.result.parameters["mu_pa"]
-    assert found_mu.ci95 == (low, high)
+    assert found_mu.statistical95 == (low, high)
     assert found_mu.ci95_holds == ("noise", "step")
-    assert found_mu.ci95_noise == coarse.noise_estimates["mu_pa"].ci95
+    assert found_mu.ci95_noise == coarse.noise_estimates["mu_pa"].statistical95
     assert f"[{low:.5g}, {high:.5g}]" in repr(coarse)
     assert ", check: " in repr(coarse)

@@ -216,7 +216,7 @@ def test_error_bars_are_relative_in_the_logarithm():
         estimate = uncertainty.estimates[name]
         assert estimate.value == pytest.approx(TRUTH[name])
         assert estimate.std_error == pytest.approx(TRUTH[name] * np.sqrt(variance))
-        assert np.log(estimate.ci95) - np.log(TRUTH[name]) == pytest.approx(
+        assert np.log(estimate.statistical95) - np.log(TRUTH[name]) == pytest.approx(
             1.96 * np.sqrt(variance) * np.array([-1, 1]), rel=1e-4
         )
     deviations = np.sqrt(np.diag(uncertainty.covariance))
@@ -288,7 +288,7 @@ def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs(
     at_bound = uncertainty.estimates["lambda_pa"]
     assert at_bound.at_bound
     assert at_bound.std_error is None
-    assert at_bound.ci95 is None
+    assert at_bound.statistical95 is None
     np.testing.assert_allclose(uncertainty.covariance[1:, 1:], expected.covariance[1:, 1:])
     assert np.isnan(uncertainty.covariance[0]).all()
     assert np.isnan(uncertainty.correlation[0]).all()
@@ -336,13 +336,13 @@ def test_derived_error_bars_are_those_of_a_fit_in_the_other_convention():
         for name, estimate in derived.derived.items():
             assert estimate.value == pytest.approx(direct.estimates[name].value)
             assert estimate.std_error == pytest.approx(direct.estimates[name].std_error, rel=1e-6)
-    assert lame.derived["young_pa"].ci95 == pytest.approx(young.estimates["young_pa"].ci95)
-    assert young.derived["mu_pa"].ci95 == pytest.approx(lame.estimates["mu_pa"].ci95)
+    assert lame.derived["young_pa"].statistical95 == pytest.approx(young.estimates["young_pa"].statistical95)
+    assert young.derived["mu_pa"].statistical95 == pytest.approx(lame.estimates["mu_pa"].statistical95)
 
 
 def test_the_interval_of_poisson_stays_physical():
     collocation, z = simulated([with_sigma(measured(hung_cube()), 0.03)])
-    low, high = covariance(collocation, z).derived["poisson"].ci95 or (0.0, 0.0)
+    low, high = covariance(collocation, z).derived["poisson"].statistical95 or (0.0, 0.0)
     assert 0 < low < 0.2 < high < 0.5
 
 
@@ -351,8 +351,8 @@ def test_an_interval_too_wide_to_be_of_use_has_no_standard_error():
     uncertainty = covariance(collocation, z)
     estimate = uncertainty.estimates["gamma_m_1_s"]
     assert estimate.std_error is None
-    assert estimate.ci95 is not None
-    assert estimate.ci95[1] > 10 * estimate.ci95[0]
+    assert estimate.statistical95 is not None
+    assert estimate.statistical95[1] > 10 * estimate.statistical95[0]
     assert "factor of 10" in (estimate.reason or "")
     assert any(n.startswith("gamma_m_1_s is not identifiable") for n in uncertainty.notes)
     assert uncertainty.estimates["mu_pa"].std_error is not None
