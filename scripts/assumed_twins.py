@@ -26,7 +26,7 @@ from collocation_sysid import (
     simulate,
     with_markers,
 )
-from collocation_sysid.fem.air import ADDED_MASS_SHARE, DRAG_COEFFICIENT, FACING_SHARE
+from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
 
 Array = NDArray[np.float64]
 SCHEME, AXES = "midpoint", "xyz"
@@ -148,9 +148,7 @@ def _drag(density_kg_m3: float) -> NodeForce:
     return NodeForce.of(drag)
 
 
-def _lift(
-    experiment: Experiment, body: Body, off: Mapping[str, float]
-) -> tuple[Force, ...]:
+def _lift(experiment: Experiment, body: Body, off: Mapping[str, float]) -> tuple[Force, ...]:
     """Return the forces by which buoyancy differs from that of air with the true added mass."""
     more = off.get("buoyancy", 0.0) - off.get("added_mass", 0.0)
     air_kg = experiment.air_density_kg_m3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg

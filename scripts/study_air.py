@@ -39,12 +39,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--all", action="store_true", help="draw every assumption")
     parser.add_argument("--vacuum", action="store_true", help="fit without air")
+    parser.add_argument("--list", action="store_true", help="print every twin")
     arguments = parser.parse_args()
     began = time.perf_counter()
     twins = [
         one_twin((arguments.seed, number), everything=arguments.all, in_vacuum=arguments.vacuum)
         for number in range(arguments.twins)
     ]
+    if arguments.list:
+        for twin in twins:
+            print(twin)
     print(summary([twin for twin in twins if twin is not None], arguments.twins))
     print(f"{time.perf_counter() - began:.0f} s")
 

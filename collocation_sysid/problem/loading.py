@@ -28,7 +28,6 @@ from .reading import read_problem_file
 from .recording import RecordingReader
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 
-
 # The key of `Experiment` that stands in a table of its own, of all experiments.
 AIR_KEY = "air_density_kg_m3"
 

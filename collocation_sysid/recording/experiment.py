@@ -16,10 +16,10 @@ from ..errors import InputError
 from ..section import Vector, tables
 from ..stated import as_given, key, stated
 from .actuator import Actuator
-from .environment import air_density, usual_air_density
 from .arrays import floats, read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
 from .depth import Depth
+from .environment import air_density, usual_air_density
 from .gauge import Gauge
 from .grasp import Grasp, free_motions, held_dofs
 from .loads import Change, Force, PointMass, ramp
@@ -317,7 +317,7 @@ class Experiment:
 
     @property
     def joined(self) -> Joined:
-        """The mesh graph of its body, and the couplings of each actuator, obstacle, air and force."""
+        """The mesh graph of its body, and the couplings of each actuator, obstacle and force."""
         couplings = [each.measure.couplings for each in self.actuators]
         couplings += [each.surface(self.body).points.couplings for each in self.obstacles]
         couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag

@@ -216,6 +216,8 @@ class FittedExperiment:
     wrench_sigma_n, wrench_sigma_nm, reading_sigma
         What is stated of the noise.
     friction : by obstacle, of those that rub
+    air_density_kg_m3 : float
+        Of the air around the body in the model; zero in a vacuum.
     """
 
     rms_m: float
@@ -230,6 +232,7 @@ class FittedExperiment:
     wrench_sigma_nm: float | None = optional()
     reading_sigma: Mapping[str, float] | None = optional()
     friction: Mapping[str, Rubbing] | None = optional()
+    air_density_kg_m3: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -194,6 +194,7 @@ def _fit(answer: Answer) -> FoundFit:
             *(root_mean(each[np.isfinite(each)]) or None for each in both),
             reading_sigma={gauge.name: gauge.sigma for gauge in experiment.readings} or None,
             friction=rubbings(experiment, part.setting.dynamics, part.x) or None,
+            air_density_kg_m3=experiment.air_density_kg_m3,
         )
     pooled = pooled_wrench_rms(solution)
     return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled)
