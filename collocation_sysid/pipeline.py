@@ -197,7 +197,7 @@ def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> S
     solution, stated = answer.solution, answer.problem.uncertainty.assumptions
     changes = assumed(solution.collocation, solution.z, stated.deviations)
     parameters = solution.collocation.parameters
-    return Sources.of(fit, changes, parameters, solution.q, known)
+    return Sources.of(fit, changes, parameters, solution.q, known, stated.means)
 
 
 def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:

@@ -41,6 +41,11 @@ class ReportedEstimate(Estimate):
     systematic : float or None
         Standard deviation of the systematic effects in the coordinate of the estimate, see
         `statistics.budget`.
+    known_effect : float or None
+        Correction for known effects, such as the compliance of a machine, in the coordinate of the
+        estimate; None if there is none.
+    known_correction : float or None
+        The same correction as part of `value`; None if there is none.
     numerical_error : NumericalError or None
         Discretisation error as far as it is known.
     guess : float or None
@@ -53,6 +58,8 @@ class ReportedEstimate(Estimate):
     combined95: tuple[float, float] | None = None
     optimum: float | None = None
     systematic: float | None = None
+    known_effect: float | None = optional()
+    known_correction: float | None = optional()
     numerical_error: NumericalError | None = None
     guess: float | None = optional()
     fixed: bool | None = optional()

@@ -8,7 +8,7 @@ does to the residuals. What changes only what cameras and clocks say is a nuisan
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, make_dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -27,7 +27,7 @@ from ..model.parameters import Parameters
 from ..program.collocation import Part
 from ..program.reaction import forces_on, reactions
 from ..recording.nuisance import ROWS
-from ..section import ByForm
+from ..section import ByForm, Section
 
 # Differences by a scale.
 SMALL = 1e-4
@@ -403,9 +403,28 @@ ASSUMPTIONS = (
 # fmt: on
 
 
+class KnownEffect(Section):
+    """An effect of known sign and size, for which estimates are corrected to first order.
+
+    Attributes
+    ----------
+    mean : float
+        Its size, as measured.
+    deviation : float
+        Standard deviation of its size.
+    """
+
+    mean: Positive
+    deviation: Positive
+
+
 Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
+KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
+# Rows that are never negative, of which a mean may be stated: what gives way does not push.
+OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
 _SAID = """How far off what is assumed may be: standard deviations, or "none" of what is exact.
 
+Of what is known to be there, such as the compliance of a machine, a table of mean and deviation.
 Nuisance parameters of recordings, by their names, count where they are not estimated.
 
 Attributes
@@ -421,7 +440,20 @@ class _Stated(Options):
     @property
     def deviations(self) -> dict[str, float | None]:
         """By name; None of what is known exactly."""
-        return {name: None if s == "none" else s for name, s in vars(self).items()}
+        found: dict[str, float | None] = {}
+        for name, stated in vars(self).items():
+            known = stated.deviation if isinstance(stated, KnownEffect) else stated
+            found[name] = None if known == "none" else known
+        return found
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Sizes of the known effects by name, each over its standard deviation."""
+        return {
+            name: stated.mean / stated.deviation
+            for name, stated in vars(self).items()
+            if isinstance(stated, KnownEffect)
+        }
 
 
 if TYPE_CHECKING:
@@ -430,12 +462,21 @@ if TYPE_CHECKING:
     class Assumptions(_Stated):
         """Made from the tables."""
 
-        def __init__(self, **deviations: float | Literal["none"]) -> None: ...
+        def __init__(
+            self, **deviations: float | Literal["none"] | KnownEffect | Mapping[str, float]
+        ) -> None: ...
 
 else:
     Assumptions = make_dataclass(
         "Assumptions",
-        [(name, Deviation, field(default=sigma or "none")) for name, sigma, _ in _FIELDS],
+        [
+            (
+                name,
+                KnownDeviation if name in OF_KNOWN_SIGN else Deviation,
+                field(default=sigma or "none"),
+            )
+            for name, sigma, _ in _FIELDS
+        ],
         bases=(_Stated,),
         frozen=True,
         kw_only=True,
