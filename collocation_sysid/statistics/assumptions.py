@@ -32,7 +32,7 @@ from ..section import ByForm, Section
 # Differences by a scale.
 SMALL = 1e-4
 # Relative standard deviation of the density of the air: weather and room temperature, at the stated
-# altitude. At 2000 m the density is 20 % lower, and has to be stated.
+# altitude. At 2000 m the density is 18 % lower, and has to be stated.
 AIR_DENSITY_DEVIATION = 0.03
 # Relative standard deviation of the added mass and of the drag coefficient of a given body: they
 # depend on its shape, on edges, on amplitude and on frequency.
