@@ -277,7 +277,8 @@ def drawn(names: Sequence[str]) -> Callable[..., Pair]:
         for row in (row for row in ASSUMPTIONS if row.name in names):
             for name in row.components:
                 way = rng.standard_normal()
-                off[name] = row.sigma * way
+                # No coefficient of the air is below zero.
+                off[name] = max(row.sigma * way, -0.99) if row.name in AIR else row.sigma * way
         values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
         return wrong(experiment, values, off), experiment
 
