@@ -205,7 +205,7 @@ def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
     say("refitting parts of the data, and with assumptions freed")
     solution, options = answer.solution, answer.problem.uncertainty
     at, known = (solution.collocation, solution.z, fit), options.assumptions.deviations
-    return probes(Answered(*at, options, answer.estimates, answer.budget, known))
+    return probes(Answered(*at, options, answer.optimum, answer.budget, known))
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:

@@ -190,7 +190,11 @@ def twins(count: int) -> Iterator[Twin]:
         half = spread * sem(simple) * np.array([0, -1, 1])
         found = told.estimates["young_pa"]
         assert found.statistical95 is not None
-        yield Twin(np.array([found.value, *found.statistical95]), simple.mean() + half, int(sum(off < 1.96)))
+        yield Twin(
+            np.array([found.value, *found.statistical95]),
+            simple.mean() + half,
+            int(sum(off < 1.96)),
+        )
 
 
 def poked(count: int = 100) -> None:

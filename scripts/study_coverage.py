@@ -218,7 +218,7 @@ def scores(uncertainty: Uncertainty, q: Array) -> Array:
 
 def identified(uncertainty: Uncertainty) -> list[bool]:
     estimates = {**uncertainty.estimates, **uncertainty.derived}
-    return [estimates[name].std_error is not None for name in QUANTITIES]
+    return [estimates[name].statistical_std_error is not None for name in QUANTITIES]
 
 
 # Tables ---------------------------------------------------------------------------------------

@@ -167,7 +167,7 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
 
 def relative_errors(found: Uncertainty) -> Array:
     estimates, true = {**found.estimates, **found.derived}, truth()
-    errors = [estimates[name].std_error for name in QUANTITIES]
+    errors = [estimates[name].statistical_std_error for name in QUANTITIES]
     return np.array([np.nan if e is None else e for e in errors]) / [true[n] for n in QUANTITIES]
 
 

@@ -59,7 +59,8 @@ class Tally:
             solution = solve(problem, ReducedSpace())
             known = covariance(solution.collocation, solution.z).estimates
             self.apart += [
-                abs(update.estimates[n].value - known[n].value) / (known[n].std_error or np.inf)
+                abs(update.estimates[n].value - known[n].value)
+                / (known[n].statistical_std_error or np.inf)
                 for n in SOFT
             ]
 

@@ -61,9 +61,9 @@ def main() -> None:
         for name in COUNTED:
             estimate = uncertainty.estimates[name]
             assert estimate.statistical95 is not None
-            assert estimate.std_error is not None
+            assert estimate.statistical_std_error is not None
             held[name] += estimate.statistical95[0] <= TRUTH[name] <= estimate.statistical95[1]
-            errors[name].append(estimate.std_error / TRUTH[name])
+            errors[name].append(estimate.statistical_std_error / TRUTH[name])
         if twin % 20 == 0 or twin == arguments.twins:
             report(held, errors, twin)
 

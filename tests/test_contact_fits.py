@@ -236,7 +236,7 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     seen = measured(pressed_cube(6))
     run = cs.run(cs.Problem([seen], GUESS), seek_causes=False)
     assert run.refinement is None
-    assert run.result.parameters["mu_pa"].ci95_holds == ("noise",)
+    assert run.result.covers == ()
     free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).gripping))
     assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None
 

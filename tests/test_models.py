@@ -470,7 +470,13 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
         model = row_of(name, free, {"a": WAVY.tolist()}, 900)
         model["found"][""]["parameters"] = {"young_pa": young_pa, "c10_pa": young_pa / 7}
         combined95 = (young_pa / 1.04, young_pa * 1.04)
-        line = {"shares": {"noise": 0.8, "mass": 0.2}, "combined95": combined95}
+        line = {
+            "value": young_pa,
+            "shares": {"noise": 0.8, "mass": 0.2},
+            "combined95": combined95,
+            "combined_std_error": young_pa * np.log(1.04) / 1.96,
+            "systematic": 0.01,
+        }
         model["found"][""]["budget"] = {"young_pa": line}
         found[name] = model
     rows = rows_of(found["a"], found["b"])

@@ -74,4 +74,4 @@ def test_a_damping_of_which_nothing_is_known_did_not_end_at_its_bound(guess):
         for n in found.all_notes
     )
     assert not any("ended at its" in said for said in (*found.all_notes, *found.trust.reasons))
-    assert found.estimates["mu_pa"].std_error is not None
+    assert found.estimates["mu_pa"].statistical_std_error is not None

@@ -33,8 +33,8 @@ def probe_section(result: Result) -> Section:
         for p in result.probes
     ]
     read = (
-        "in brackets the changes in half widths of the 95 % and of the whole interval; of parts of "
-        "the data to first order"
+        "in brackets the changes in half widths of the statistical and of the combined interval; "
+        "of parts of the data to first order"
     )
     return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_said(result)))
 

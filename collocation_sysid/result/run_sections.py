@@ -30,7 +30,6 @@ from ..recording.nuisance import in_unit_for_people
 from ..runs.result import Result, SimulatedExperiment
 from ..statistics.budget import largest_first, worded
 from ..statistics.concern import Concern, topics_of
-from ..statistics.remedies import remedy_for
 from ..statistics.trust import Trust
 from ..tree import content
 from .probe_sections import FOREMOST, asks_for_probes, probe_section
@@ -233,9 +232,8 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
     if each.at_bound:
         interval = "at its bound"
     elif each.combined95 is not None and not each.is_determined:
-        interval = f"{interval} not determined"
         source, share = next(iter(result.budget[name].items()))
-        remark = remark or f"mostly {worded(source)} ({share:.0%}): {remedy_for(source)}"
+        remark = remark or f"not determined: mostly {worded(source)} ({share:.0%})"
     elif each.reason:
         interval = "not determined" if each.statistical95 is None else "not identifiable"
     guess = "" if each.guess is None else f"{each.guess:.5g}"
@@ -253,7 +251,7 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
 
 
 def _spread(deviation: float | None) -> str:
-    return "" if deviation is None else f"{deviation:.2g}"
+    return "" if deviation is None else short(deviation)
 
 
 def refinement_table(result: Result) -> Table:

@@ -437,6 +437,11 @@ _FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in RO
 class _Stated(Options):
     """What `Assumptions` does with its fields."""
 
+    @classmethod
+    def exact(cls) -> Assumptions:
+        """Return assumptions of which each is exactly true, as of a simulated recording."""
+        return Assumptions(**{name: "none" for name in vars(Assumptions())})
+
     @property
     def deviations(self) -> dict[str, float | None]:
         """By name; None of what is known exactly."""

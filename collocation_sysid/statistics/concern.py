@@ -164,7 +164,8 @@ TOPICS: Mapping[str, Topic] = {
             "bounds": "{names} ended at their bounds",
             "none": "the data do not determine {names}",
             "combined": "{name} is not determined: its combined 95 % interval, {low:.3g} to "
-            "{high:.3g}, is wider than its value; largest contribution {source} ({share:.0%}): {remedy}",
+            "{high:.3g}, is wider than its value; largest contribution "
+            "{source} ({share:.0%}): {remedy}",
             "at-bound": "{name} is at a bound",
             "not-yet": "{name} is not known yet: {reason}",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
