@@ -1,4 +1,4 @@
-"""Estimates are corrected for systematic effects of known size, such as a machine that gives way."""
+"""Correction of estimates for systematic effects of known size: a machine that gives way."""
 
 from __future__ import annotations
 

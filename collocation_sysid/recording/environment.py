@@ -30,9 +30,10 @@ def air_density(value: Any) -> float:
     if isinstance(value, str) and value == VACUUM:
         return 0.0
     is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not is_number or not np.isfinite(value) or value < 0:
+    density_kg_m3 = float(value) if is_number else np.nan
+    if not 0 <= density_kg_m3 < np.inf:
         raise InputError(
             f"air_density_kg_m3 is {value!r}; expected a density in kg/m³ such as {AIR_KG_M3}, or "
             f'"{VACUUM}" for a vacuum or a recording simulated without air'
         )
-    return float(value)
+    return density_kg_m3

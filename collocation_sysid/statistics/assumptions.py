@@ -440,7 +440,8 @@ class _Stated(Options):
     @classmethod
     def exact(cls) -> Assumptions:
         """Return assumptions of which each is exactly true, as of a simulated recording."""
-        return Assumptions(**{name: "none" for name in vars(Assumptions())})
+        exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
+        return Assumptions(**exact)
 
     @property
     def deviations(self) -> dict[str, float | None]:
