@@ -209,7 +209,8 @@ def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, changes: Chang
     solution, stated = answer.solution, answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
     budgeted = changes.without(name for name, deviation in stated.items() if deviation is None)
-    return Sources.of(fit, budgeted, parameters, solution.q, known)
+    means = answer.problem.uncertainty.assumptions.means
+    return Sources.of(fit, budgeted, parameters, solution.q, known, means)
 
 
 def _probes(

@@ -24,11 +24,11 @@ from collocation_sysid import (
     Unknown,
     simulate,
 )
+from collocation_sysid.fem.air import AIR_KG_M3
 from collocation_sysid.fem.constants import GAMMA_R
 from collocation_sysid.fem.materials import DAMPINGS, Damping
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.assumptions import (
-    AIR_KG_M3,
     ASSUMPTIONS,
     Fitted,
 )
@@ -55,12 +55,16 @@ OFF = {
     "rayleigh_damping": 0.01,
     "buoyancy": 0.3,
     "added_mass": 0.03,
+    "air_drag": 0.03,
 }
 
 
-def swung() -> Experiment:
+OF_AIR = ("buoyancy", "added_mass", "air_drag")
+
+
+def swung(air_density_kg_m3: float = 0.0) -> Experiment:
     """A cube hung from its top face, swayed and turned from rest, and its markers as simulated."""
-    experiment = hung_cube(24)
+    experiment = hung_cube(24, air_density_kg_m3=air_density_kg_m3)
     body = Body(experiment.body.mesh, density_kg_m3=60.0)
     return wrong(replace(experiment, body=body), VALUES, {})
 
@@ -81,7 +85,7 @@ def changed(experiment: Experiment, name: str, scheme: str = "midpoint") -> np.n
 
 @pytest.mark.parametrize("name", OFF)
 def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
-    experiment, off = swung(), OFF[name]
+    experiment, off = swung(AIR_KG_M3 * (name in OF_AIR)), OFF[name]
     tracks = [wrong(experiment, VALUES, {name: way}).markers.positions_m for way in (off, 0.0)]
     simulated = (tracks[0] - tracks[1]) / off
     largest = np.abs(simulated).max()
@@ -155,13 +159,23 @@ def test_planes_of_symmetry_have_no_friction_and_are_no_grip():
     assert not sticking.any()
 
 
+@pytest.mark.parametrize("name", OF_AIR)
+def test_in_a_vacuum_nothing_is_assumed_of_the_air(name):
+    collocation = Collocation([swung()], parameters(), "midpoint")
+    x = np.tile(collocation.experiments[0].body.nodes_m.ravel(), (25, 1))
+    (part,) = collocation.parts(collocation.pack(collocation.guess_p, [x]))
+    assert BY_NAME[name].effect(Fitted(part, collocation.parameters), 0) is None
+
+
 def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
-    experiment = swung()
+    experiment = swung(AIR_KG_M3)
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = experiment.body.nodes_m.ravel()
     z = collocation.pack(collocation.guess_p, [np.tile(x, (len(experiment.t_s), 1))])
     at = Fitted(collocation.parts(z)[0], collocation.parameters)
-    vars(at)["states"] = (x[None], np.tile([0.0, 2.0, 0.0], len(x) // 3)[None])
+    count = len(experiment.t_s)
+    sideways = np.tile([0.0, 2.0, 0.0], len(x) // 3)
+    vars(at)["states"] = (np.tile(x, (count, 1)), np.tile(sideways, (count, 1)))
     force = BY_NAME["air_drag"].effect(at, 0).force_n[0].reshape(-1, 3).sum(axis=0)
     np.testing.assert_allclose(force, [0, -0.5 * AIR_KG_M3 * 1.5 * EDGE_M**2 * 4.0, 0], atol=1e-9)
 

@@ -41,6 +41,7 @@ from collocation_sysid.recording import (
 from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
 from collocation_sysid.result.export.identified import alone
 from collocation_sysid.result.export.solids import Facets, walls
+from collocation_sysid.result.export.target import at_rest
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
@@ -342,6 +343,17 @@ def test_no_number_of_a_deck_is_longer_than_calculix_reads(tmp_path):
 
 
 # What they say
+
+
+@pytest.mark.parametrize("to", ["mujoco", "newton", "calculix", "sofa", "febio"])
+def test_air_that_is_not_exported_is_said_and_is_not_in_our_equilibrium(to, tmp_path):
+    bar = held_bar()
+    in_air = replace(bar, experiment=replace(bar.experiment, air_density_kg_m3=1.2))
+    said = [export_run(each, to, tmp_path / to).limits for each in (bar, in_air)]
+    assert set(said[1]) - set(said[0]) == {
+        "buoyancy, added mass and drag of the air are not exported"
+    }
+    np.testing.assert_array_equal(at_rest(bar)[0], at_rest(in_air)[0])
 
 
 @pytest.mark.parametrize("to", ["mujoco", "newton", "calculix"])

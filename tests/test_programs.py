@@ -100,6 +100,11 @@ def smooth_drag(x, v, at, drag_coefficient):
     return -5.0 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1.0) * v
 
 
+def in_air(experiment: Experiment) -> Experiment:
+    """In a gas of two thirds of the density of the body, so that all that it does is large."""
+    return replace(experiment, air_density_kg_m3=20.0)
+
+
 def whirled(x, v, at, whirl_n_m3):
     """It has no potential."""
     return whirl_n_m3 * at.volume_m3 * ca.vertcat(at.rest_m[1] - x[1], x[0] - at.rest_m[0], 0)
@@ -404,6 +409,10 @@ PROGRAMS: dict[str, Make] = {
     "a user's drag, memory": lambda: in_field(
         smooth_drag, **{"prony_1.share": 0.4, "prony_1.tau_s": cs.Unknown(0.05)}
     ),
+    "air": lambda: program(in_air(bar_loaded(6))),
+    "air, wrench, bdf2": lambda: program(in_air(sensing(loaded_cube())), scheme="bdf2"),
+    "air, density": lambda: program(in_air(DENSE["let go"]()), parameters=free_densities()),
+    "air, static": lambda: program(measured(in_air(block("z", gravity_m_s2=HANGING)))),
     **{f"contact, {scheme}": lambda scheme=scheme: touched(scheme=scheme) for scheme in SCHEMES},
     "contact, friction": lambda: touched("friction"),
     "contact, friction, bdf2": lambda: touched("friction", scheme="bdf2"),

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from ..errors import InputError
+from .air import placed_unit_drag
 from .constants import DENSITY, Constant
 from .discretisation import Discretisation
 from .field import Field
@@ -430,6 +431,11 @@ class Body(Discretisation):
             chosen = self.select(chosen) if isinstance(chosen, Selection) else np.unique(chosen)
             found.append(PlacedForce.on(force, self.nodes, chosen, volume, columns))
         return tuple(found)
+
+    @cached_property
+    def unit_air_drag(self) -> PlacedForce:
+        """Drag on the surface in a fluid of density one, see `air`."""
+        return placed_unit_drag(self.nodes, self.dof_volume_m3[::3])
 
     @property
     def dof_volume_m3(self) -> Array:

@@ -379,7 +379,7 @@ class StencilRow:
             tuple(tables.w[t].tolist()),
             tuple((tables.s[t] / step_s**2).tolist()),
             float(tables.r[t]) / step_s,
-            dynamics.mass.own_kg + dynamics.mass.tied_kg[t],
+            dynamics.mass.row_kg(t),
         )
 
     @cached_property

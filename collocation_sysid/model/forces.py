@@ -23,7 +23,7 @@ from ..fem.pattern import Joined, SymmetricPattern
 from ..recording.experiment import Experiment
 from .contact import Contact, contacts
 from .force_term import ForceTerm, Potential, Slots, States
-from .point_forces import Pointwise, point_forces
+from .point_forces import PointForces, Pointwise, air_drag, point_forces
 from .weight import Mass, Weight
 
 
@@ -71,7 +71,12 @@ class Forces:
             for actuator in experiment.actuators
         )
         touching = contacts(experiment, step_s)
-        further = (*potentials, *touching, *point_forces(experiment.body, times))
+        further = (
+            *potentials,
+            *touching,
+            *air_drag(experiment, times),
+            *point_forces(experiment.body, times),
+        )
         unknown = np.full(len(experiment.body.constants), np.nan)
         still = experiment.static
         found = cls(Weight.of(experiment, times), further, experiment.joined, unknown, still)
@@ -96,7 +101,7 @@ class Forces:
 
     @property
     def mass(self) -> Mass:
-        """What gravity pulls at and γ_m damps."""
+        """What accelerates, what gravity pulls at, and what γ_m damps."""
         return self.weight.mass
 
     @property
@@ -282,6 +287,12 @@ class Forces:
         term, places = self._placed[1 + number]
         assert isinstance(term, Pointwise)
         return term, term.columns(places)
+
+    @property
+    def air_drag(self) -> PointForces | None:
+        """Drag of the air around the body; None in a vacuum and where nothing moves."""
+        terms = (term for term in self.further if isinstance(term, PointForces) and term.of_air)
+        return next(terms, None)
 
     @property
     def carrying(self) -> list[int]:

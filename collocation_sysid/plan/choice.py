@@ -399,7 +399,8 @@ def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[st
         changes = assumed(solution.collocation, solution.z, options.considered)
     except (InputError, SimulationError):
         return {}  # without error bars there is none
-    sources = Sources.of(fit, changes, parameters, solution.q, known)
+    means = options.assumptions.means
+    sources = Sources.of(fit, changes, parameters, solution.q, known, means)
     return {name: asdict(line) for name, line in budget(sources, known, {}, parameters).items()}
 
 

@@ -29,6 +29,9 @@ from .reading import read_problem_file
 from .recording import RecordingReader
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
 
+# The key of `Experiment` that stands in a table of its own, of all experiments.
+AIR_KEY = "air_density_kg_m3"
+
 
 def contents_of(
     path: Path,
@@ -57,7 +60,9 @@ def contents_of(
         parameters.fit([rubbed])
     experiments, notes = [], []
     for section in file.experiment:
-        reader = RecordingReader(section, folder, body, parameters, simulation, code)
+        reader = RecordingReader(
+            section, folder, body, parameters, simulation, code, file.environment.air_density_kg_m3
+        )
         with _in_table(path, f"experiment '{section.name}'", odd):
             experiments.append(reader.read())
         notes += reader.notes
@@ -97,7 +102,9 @@ def _in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]
         yield
     except InputError as error:
         source, where = error.source, error.where
-        if source is None:  # else it speaks of a file of its own
+        if where == AIR_KEY:
+            source, where = path, f"environment.{AIR_KEY}"
+        elif source is None:  # else it speaks of a file of its own
             inner = where if where != table else None
             separator = ": " if " " in table else "."
             source, where = path, separator.join(part for part in (table, inner) if part)

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from ..checked import Count, Finite, Flag, Positive, Text
+from ..checked import Count, Finite, Flag, NotNegative, Positive, Text
 from ..fem.elements import ELEMENTS
 from ..fem.field import Field as MaterialField
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..model.parameters import Unknown
 from ..model.schemes import MOST_STEPS, SCHEMES
+from ..recording.environment import usual_air_density
 from ..recording.selected import Nodes
 from ..section import (
     Among,
@@ -326,6 +327,22 @@ class TranscriptionSection(Section):
     explicit_grasps: Flag = False
 
 
+AirDensity = Annotated[Literal["none"] | NotNegative, ByForm(str)]
+
+
+class EnvironmentSection(Section):
+    """What surrounds the object.
+
+    Attributes
+    ----------
+    air_density_kg_m3 : float or "none"
+        Of the air, which lifts the object, moves along and drags at it, 1.2 by default; or "none"
+        in a vacuum, and for recordings that were simulated without air.
+    """
+
+    air_density_kg_m3: AirDensity = Field(default_factory=usual_air_density)
+
+
 class ProblemFile(Section):
     """A problem file (TOML).
 
@@ -344,6 +361,7 @@ class ProblemFile(Section):
     parameters: Parameters
     experiment_defaults: dict[str, Any] = Field(default_factory=dict)
     experiment: list[ExperimentSection] = Field(min_length=1)
+    environment: EnvironmentSection = Field(default_factory=EnvironmentSection)
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()

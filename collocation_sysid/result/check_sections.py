@@ -113,9 +113,18 @@ def _measurements_section(findings: Glance) -> Table:
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
+    densities = {recording.air_density_kg_m3 for recording in findings.recordings}
+    rows["air"] = ", ".join(map(_air, sorted(densities)))
     for hold in findings.holds[:SHOWN_RECORDINGS]:
         rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
     return labelled("Measurements", rows)
+
+
+def _air(density_kg_m3: float) -> str:
+    """Return what the model contains of the air around a body; a density of zero is a vacuum."""
+    if not density_kg_m3:
+        return "none (as in a vacuum)"
+    return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
 
 
 def _markers_seen(recording: Recording) -> str:

@@ -179,6 +179,12 @@ def _parameters(result: Result) -> Section:
         if (optimum := values[name].optimum) and values[name].statistical95 is not None
     ]:
         parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
+    if known := [
+        f"{symbol_of(name)} {100 * each.known_correction / each.value:+.2g} %"
+        for name, each in values.items()
+        if each.known_correction and each.value
+    ]:
+        parts.append(f"corrected for grip layer and machine as stated: {', '.join(known)}")
     return Section("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
 

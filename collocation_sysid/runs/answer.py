@@ -112,7 +112,16 @@ class Answer:
         error = None if is_mode(name) else self.discretisation_errors.get(name)
         linear, bounds = self.started_from.scale_and_bounds(name)
         systematic = None if line is None else line.systematic
-        combined = combine(name, optimum, error, systematic, linear=linear, bounds=bounds)
+        known_effect = 0.0 if line is None else line.known_effect
+        combined = combine(
+            name,
+            optimum,
+            error,
+            systematic,
+            known_effect=known_effect,
+            linear=linear,
+            bounds=bounds,
+        )
         guess = None if item is None else item.guess
         tied = item is not None and item.tied is not None
         return ReportedEstimate(
@@ -121,6 +130,7 @@ class Answer:
             reason=optimum.reason,
             optimum=optimum.value,
             systematic=systematic,
+            known_effect=known_effect or None,
             numerical_error=error,
             guess=np.nan if item is not None and guess is None else guess,
             fixed=None if item is None else item.fixed or tied,

@@ -43,6 +43,11 @@ class ReportedEstimate(Estimate):
     systematic : float or None
         Standard deviation of the systematic effects in the coordinate of the estimate, see
         `statistics.budget`.
+    known_effect : float or None
+        Correction for known effects, such as the compliance of a machine, in the coordinate of the
+        estimate; None if there is none.
+    known_correction : float or None
+        The same correction as part of `value`; None if there is none.
     numerical_error : NumericalError or None
         Discretisation error as far as it is known.
     guess : float or None
@@ -55,6 +60,8 @@ class ReportedEstimate(Estimate):
     combined95: tuple[float, float] | None = None
     optimum: float | None = None
     systematic: float | None = None
+    known_effect: float | None = optional()
+    known_correction: float | None = optional()
     numerical_error: NumericalError | None = None
     guess: float | None = optional()
     fixed: bool | None = optional()
@@ -219,6 +226,8 @@ class FittedExperiment:
         What is stated of the noise.
     friction : by obstacle, of those that rub
     depth : by depth camera, distances of its points from the fitted surface
+    air_density_kg_m3 : float
+        Of the air around the body in the model; zero in a vacuum.
     """
 
     rms_m: float
@@ -234,6 +243,7 @@ class FittedExperiment:
     reading_sigma: Mapping[str, float] | None = optional()
     friction: Mapping[str, Rubbing] | None = optional()
     depth: Mapping[str, DepthError] | None = optional()
+    air_density_kg_m3: float = 0.0
 
 
 @dataclass(frozen=True)

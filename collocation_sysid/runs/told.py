@@ -201,6 +201,7 @@ def _fit(answer: Answer) -> FoundFit:
             reading_sigma={gauge.name: gauge.sigma for gauge in experiment.readings} or None,
             depth=depths.get(name),
             friction=rubbings(experiment, part.setting.dynamics, part.x) or None,
+            air_density_kg_m3=experiment.air_density_kg_m3,
         )
     pooled = pooled_wrench_rms(solution)
     return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled)

@@ -8,7 +8,7 @@ does to the residuals. What changes only what cameras and clocks say is a nuisan
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -22,17 +22,17 @@ from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import engineering
-from ..fem.node_force import surface_of
 from ..fem.rest_shape import RestShape
 from ..model.contact import Contact, contacts
 from ..model.dynamics import Dynamics
+from ..model.force_term import States
 from ..model.parameters import Parameters
 from ..program.collocation import Part
 from ..program.reaction import forces_on, reactions
 from ..program.touches import on_surface
 from ..recording.grasp import free_motions
 from ..recording.nuisance import ROWS
-from ..section import ByForm
+from ..section import ByForm, Section
 from .shape_error import (
     CORRELATION,
     SURFACE_MODES,
@@ -45,7 +45,12 @@ from .size_effect import obstacle_shifts_m
 
 # Differences by a scale.
 SMALL = 1e-4
-AIR_KG_M3 = 1.2
+# Relative standard deviation of the density of the air: weather and room temperature, at the stated
+# altitude. At 2000 m the density is 18 % lower, and has to be stated.
+AIR_DENSITY_DEVIATION = 0.03
+# Relative standard deviation of the added mass and of the drag coefficient of a given body: they
+# depend on its shape, on edges, on amplitude and on frequency.
+AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
@@ -206,6 +211,27 @@ class Fitted:
         """(N, 3n) what gravity and γ_m do to mass (3n,)."""
         return mass_kg * (self.gravity - self.body.tied_drag(self.theta) * self.states[1])
 
+    @property
+    def buoyancy_n(self) -> Array:
+        """(N, 3n) buoyancy in the model; zero in a vacuum."""
+        lifted = -self.dynamics.mass.displaced_kg * self.gravity
+        return np.broadcast_to(lifted, self.part.x.shape)
+
+    @property
+    def added_mass_kg(self) -> Array:
+        """(3n,) air in the model that moves with the body; zero in a vacuum."""
+        return self.dynamics.mass.added_kg
+
+    @cached_property
+    def air_drag_n(self) -> Array:
+        """(N, 3n) drag of the air in the model; zero in a vacuum and where nothing moves."""
+        term = self.dynamics.forces.air_drag
+        if term is None:
+            return np.zeros_like(self.states[1])
+        drag = term.force(States(*self.states, self.theta))
+        drag[: self.dynamics.first_row] = 0.0
+        return drag
+
     @cached_property
     def grasp_force_n(self) -> Array:
         """(N, g) what the grasps give the grasped dofs."""
@@ -312,7 +338,12 @@ def _size(at: Fitted, _: int) -> Effect:
     for obstacle, shift_m in obstacle_shifts_m(at.part):
         along = np.searchsorted(segment.grasping.dofs, obstacle.dofs)
         moved[:, along] = np.tile(shift_m, len(obstacle.nodes))
-    return Effect(force + heavier + at.weight_of(mass), mass, moved_m=moved)
+    air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
+    return Effect(
+        force + heavier + at.weight_of(mass) + air,
+        mass + 3.0 * at.added_mass_kg,
+        moved_m=moved,
+    )
 
 
 def _mass(at: Fitted, _: int) -> Effect | None:
@@ -365,8 +396,9 @@ def _pace(at: Fitted, _: int) -> Effect | None:
     if at.part.segment.experiment.static:
         return None
     slower, faster = at.internal_n(slower=1 + SMALL), at.internal_n(slower=1 - SMALL)
-    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.kg * at.states[1]
-    return Effect((faster - slower) / (2 * SMALL) - drag, stretched=-1.0)
+    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
+    air = 2.0 * at.air_drag_n
+    return Effect((faster - slower) / (2 * SMALL) - drag + air, stretched=-1.0)
 
 
 def _poisson(at: Fitted, _: int) -> Effect | None:
@@ -460,31 +492,21 @@ def _contact_stiffness(at: Fitted, _: int) -> Effect | None:
     return Effect(at.of_rows(change_n))
 
 
-def _buoyancy(at: Fitted, _: int) -> Effect:
-    """The air that the body displaces."""
-    return Effect(np.broadcast_to(-AIR_KG_M3 * at.body.dof_volume_m3 * at.gravity, at.part.x.shape))
+def _buoyancy(at: Fitted, _: int) -> Effect | None:
+    """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
+    return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
 
 
 def _added_mass(at: Fitted, _: int) -> Effect | None:
-    """Half the air that the body displaces moves with it, as with a sphere."""
-    if at.part.segment.experiment.static:
+    """Return the effect of more added mass, as a share of that in the model; None in a vacuum."""
+    if at.part.segment.experiment.static or not at.added_mass_kg.any():
         return None
-    return Effect(mass_kg=0.5 * AIR_KG_M3 * at.body.dof_volume_m3)
+    return Effect(mass_kg=at.added_mass_kg)
 
 
 def _air_drag(at: Fitted, _: int) -> Effect | None:
-    """−½ ρ c_d a |v| v at the body's surface, c_d being one; a quarter of it faces the way it goes.
-
-    That is what a convex body shows on average (Cauchy).
-    """
-    if at.part.segment.experiment.static:
-        return None
-    area_m2, shape = surface_of(at.body.nodes)[0], at.states[1].shape
-    v = at.states[1].reshape(shape[0], -1, 3)[:, : len(area_m2)]
-    drag = np.zeros((shape[0], shape[1] // 3, 3))
-    speed = np.linalg.norm(v, axis=2, keepdims=True)
-    drag[:, : len(area_m2)] = -0.125 * AIR_KG_M3 * area_m2[:, None] * speed * v
-    return Effect(drag.reshape(shape))
+    """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
+    return Effect(at.air_drag_n) if at.part.segment.experiment.has_air_drag else None
 
 
 def _other_damping(at: Fitted, law: str) -> Effect | None:
@@ -575,16 +597,38 @@ ASSUMPTIONS = (
         "friction of what holds nodes across and lets them slide", _platen_friction),
     Assumption("contact_stiffness", "1", 1.0,
         "softness of contact with obstacles, in that of the pressure law", _contact_stiffness),
-    Assumption("buoyancy", "1", 1.0, "air that the body displaces, in 1.2 kg/m³", _buoyancy),
-    Assumption("added_mass", "1", 1.0, "air that moves with it, in half of that", _added_mass),
-    Assumption("air_drag", "1", 1.0, "drag of the air, in that of a coefficient of one", _air_drag),
+    Assumption("buoyancy", "1", AIR_DENSITY_DEVIATION,
+        "buoyancy over that in the model, by the density of the air", _buoyancy),
+    Assumption("added_mass", "1", AIR_COEFFICIENT_DEVIATION,
+        "air that moves with the body over that in the model", _added_mass),
+    Assumption("air_drag", "1", AIR_COEFFICIENT_DEVIATION,
+        "drag of the air over that in the model", _air_drag),
 )
 # fmt: on
 
 
+class KnownEffect(Section):
+    """An effect of known sign and size, for which estimates are corrected to first order.
+
+    Attributes
+    ----------
+    mean : float
+        Its size, as measured.
+    deviation : float
+        Standard deviation of its size.
+    """
+
+    mean: Positive
+    deviation: Positive
+
+
 Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
+KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
+# Rows that are never negative, of which a mean may be stated: what gives way does not push.
+OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
 _SAID = """How far off what is assumed may be: standard deviations, or "none" of what is exact.
 
+Of what is known to be there, such as the compliance of a machine, a table of mean and deviation.
 Nuisance parameters of recordings, by their names, count where they are not estimated.
 
 Attributes
@@ -600,13 +644,26 @@ class _Stated(Options):
     @classmethod
     def exact(cls) -> Assumptions:
         """Return assumptions of which each is exactly true, as of a simulated recording."""
-        exact: dict[str, Literal["none"]] = {name: "none" for name in vars(Assumptions())}
+        exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
         return Assumptions(**exact)
 
     @property
     def deviations(self) -> dict[str, float | None]:
         """By name; None of what is known exactly."""
-        return {name: None if s == "none" else s for name, s in vars(self).items()}
+        found: dict[str, float | None] = {}
+        for name, stated in vars(self).items():
+            known = stated.deviation if isinstance(stated, KnownEffect) else stated
+            found[name] = None if known == "none" else known
+        return found
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Sizes of the known effects by name, each over its standard deviation."""
+        return {
+            name: stated.mean / stated.deviation
+            for name, stated in vars(self).items()
+            if isinstance(stated, KnownEffect)
+        }
 
 
 if TYPE_CHECKING:
@@ -615,12 +672,21 @@ if TYPE_CHECKING:
     class Assumptions(_Stated):
         """Made from the tables."""
 
-        def __init__(self, **deviations: float | Literal["none"]) -> None: ...
+        def __init__(
+            self, **deviations: float | Literal["none"] | KnownEffect | Mapping[str, float]
+        ) -> None: ...
 
 else:
     Assumptions = make_dataclass(
         "Assumptions",
-        [(name, Deviation, field(default=sigma or "none")) for name, sigma, _ in _FIELDS],
+        [
+            (
+                name,
+                KnownDeviation if name in OF_KNOWN_SIGN else Deviation,
+                field(default=sigma or "none"),
+            )
+            for name, sigma, _ in _FIELDS
+        ],
         bases=(_Stated,),
         frozen=True,
         kw_only=True,

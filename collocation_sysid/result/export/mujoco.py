@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -264,7 +265,8 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
     oscillating = squares[squares > 1e-9 * squares[-1]]
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
-    forces = Forces.of(body.experiment, body.start_s, body.theta)
+    in_vacuum = replace(body.experiment, air_density_kg_m3="none")
+    forces = Forces.of(in_vacuum, body.start_s, body.theta)
     ours = natural_modes(forces, body.nodes_m, dofs, 1).frequencies_hz
     return Comparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
 
