@@ -185,7 +185,20 @@ def _parameters(result: Result) -> Section:
         if each.known_correction and each.value
     ]:
         parts.append(f"corrected for grip layer and machine as stated: {', '.join(known)}")
+    parts += _not_determined(result)
     return Section("Parameters", (*parts, *_largest_contributions(result), *result.basis))
+
+
+def _not_determined(result: Result) -> list[str]:
+    """Name the estimates with intervals wider than their values, and the largest contributions."""
+    sources = []
+    for name, shares in result.budget.items():
+        if name in result.values and not result.values[name].is_determined:
+            source, share = next(iter(shares.items()))
+            sources.append(f"{symbol_of(name)} (mostly {worded(source)}, {share:.0%})")
+    if not sources:
+        return []
+    return [f"not determined, as the interval is wider than the value: {listed(sources)}"]
 
 
 def _covered(result: Result) -> str:
@@ -194,7 +207,8 @@ def _covered(result: Result) -> str:
     kinds = ("step", "mesh") if moving else ("mesh",)
     covered = [f"the {kind}" for kind in kinds if kind in result.covers]
     left = [f"the {kind}" for kind in kinds if kind not in result.covers]
-    said = f"± and intervals combine {listed(['noise', *covered, 'systematic effects'])}"
+    parts = listed(["noise", *covered, "systematic effects"])
+    said = f"± (standard uncertainty) and intervals combine {parts}"
     return said + (f", not {listed(left)}: see refine" if left else "")
 
 
@@ -231,9 +245,6 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
     remark = each.reason or ""
     if each.at_bound:
         interval = "at its bound"
-    elif each.combined95 is not None and not each.is_determined:
-        source, share = next(iter(result.budget[name].items()))
-        remark = remark or f"not determined: mostly {worded(source)} ({share:.0%})"
     elif each.reason:
         interval = "not determined" if each.statistical95 is None else "not identifiable"
     guess = "" if each.guess is None else f"{each.guess:.5g}"
