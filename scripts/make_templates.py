@@ -46,7 +46,8 @@ def swing(folder: Path) -> None:
     places_m = np.array([[25, 0, 60], [0, 25, 105], [25, 0, 150], [-25, 0, 150]]) / 1000
     markers = Markers(t_s, np.zeros((len(t_s), 4, 3)), 1e-3, places_m=places_m)
     grasp = Grasp(Box((-1, -1, -1e-3), (1, 1, 1e-3)), poses)
-    tracks_m = simulate(Experiment(body, t_s, [grasp], markers), SWUNG).markers_m
+    swung = Experiment(body, t_s, [grasp], markers, air_density_kg_m3="none")
+    tracks_m = simulate(swung, SWUNG).markers_m
     tracks_m = tracks_m + np.random.default_rng(SEED).normal(scale=1e-3, size=tracks_m.shape)
     mesh.write(folder / "body.vtu")
     write_poses_csv(folder / "poses.csv", poses)

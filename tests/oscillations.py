@@ -49,7 +49,8 @@ def oscillation(
     An oscillation sampled evenly satisfies a_{k+2} = 2 Re(z) a_{k+1} − |z|² a_k.
     """
     body = experiment.body
-    motion = simulate(experiment, theta, integrator, **options).positions_m - body.nodes_m
+    steps = {} if "timestep_s" in options else {"substeps": 1}
+    motion = simulate(experiment, theta, integrator, **steps, **options).positions_m - body.nodes_m
     weights = body.node_mass[:, None] * modes.shapes[mode]
     a = np.tensordot(motion, weights, axes=2)[
         12:

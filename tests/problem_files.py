@@ -77,7 +77,8 @@ def write_problem(folder: Path, steps: dict[str, int], validation: str = "") -> 
         text += added.replace("grasp", "validation = true\ngrasp") if name == validation else added
     file = folder / "problem.toml"
     file.write_text(text)
-    write_data(Problem.read(file, AT_TRUTH, simulation=True), folder, Recipe("midpoint"))
+    exact = Problem.read(file, [*AT_TRUTH, "transcription.substeps=1"], simulation=True)
+    write_data(exact, folder, Recipe("midpoint"))
     return file
 
 

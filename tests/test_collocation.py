@@ -103,7 +103,7 @@ def test_a_marched_trajectory_satisfies_the_constraints(
     lower, upper = collocation.bounds()
     assert ((z >= lower) & (z <= upper)).all()
     newtons = np.abs(collocation.violations_n(z)[0]).max()
-    assert newtons < 1e-12 * collocation.largest_force_n(z)
+    assert newtons < 3e-12 * collocation.largest_force_n(z)
 
 
 def test_a_marched_trajectory_with_several_grasps_satisfies_the_constraints():

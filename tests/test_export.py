@@ -374,7 +374,7 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
         "data": {},
     }
     result["trust"] = {"concerns": [swings]}
-    result["parameters"]["mu_pa"]["at_bound"] = True
+    result["parameters"]["mu_pa"] |= {"at_bound": True, "value": 300.0}
     (run / "result.json").write_text(json.dumps(result))
     ended = run_command("export", run, "--to", to, "--out", tmp_path / "out")
     assert ended.code == 0, ended.err

@@ -17,12 +17,13 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance import NuisanceMap
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.pipeline import run, solve
-from collocation_sysid.problem import Problem, RolloutOptions
+from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.loads import ramp
 from collocation_sysid.result.run_sections import summary
+from collocation_sysid.statistics.assumptions import Assumptions
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import uncertainty_of
 
@@ -145,7 +146,8 @@ def test_a_time_taken_as_exact_biases_the_damping_and_the_run_says_so():
         precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 2e-4))
         tracks[k] = with_noise(replace(cube, markers=precise), 1)
     made = RolloutOptions("scheme")  # by which the tracks are made
-    problems = [Problem([cube], GUESS, rollout=made) for cube in tracks]
+    exact = UncertaintyOptions(assumptions=Assumptions.exact())
+    problems = [Problem([cube], GUESS, rollout=made, uncertainty=exact) for cube in tracks]
     misled, right = (run(problem, seek_causes=False) for problem in problems)
     assert misled.interval("gamma_r_s")[1] < TRUTH["gamma_r_s"]
     assert misled.trust.verdict != "good"

@@ -171,9 +171,11 @@ def test_slopes_of_a_fit_are_those_of_brute_force_differences(described):
     values = TRUTH | {"young_pa": 2.5e5}
 
     def tracks(young_pa: float) -> np.ndarray:
-        return simulate(described, values | {"young_pa": young_pa}, "midpoint").markers_m
+        return simulate(
+            described, values | {"young_pa": young_pa}, "midpoint", substeps=1
+        ).markers_m
 
-    x = simulate(described, values, "midpoint").positions_m
+    x = simulate(described, values, "midpoint", substeps=1).positions_m
     q = problem.parameters.with_guess(
         {name: values[name] for name in ("young_pa", "gamma_r_s")}
     ).guess_q
@@ -255,7 +257,7 @@ def changes_of(experiment: cs.Experiment, **deviations) -> dict[str, np.ndarray]
     problem = problem_of(experiment, **ONE_STEP)
     parameters = problem.parameters.with_guess({n: TRUTH[n] for n in ("young_pa", "gamma_r_s")})
     collocation = Collocation([experiment], parameters)
-    x = simulate(experiment, TRUTH, "midpoint").positions_m
+    x = simulate(experiment, TRUTH, "midpoint", substeps=1).positions_m
     z = collocation.pack(parameters.guess_q, [x.reshape(len(x), -1)])
     found = assumed(collocation, z, Assumptions(**deviations).deviations)
     return {name: found.blocks[0][..., k] for k, name in enumerate(found.names)}
@@ -263,7 +265,7 @@ def changes_of(experiment: cs.Experiment, **deviations) -> dict[str, np.ndarray]
 
 def simulated_on(mesh: TetMesh, mass_kg: float) -> np.ndarray:
     body = cs.Body(mesh, mass_kg=mass_kg, rest_shape="stress_free")
-    return simulate(recorded(body, np.pi / 2), TRUTH, "midpoint").markers_m
+    return simulate(recorded(body, np.pi / 2), TRUTH, "midpoint", substeps=1).markers_m
 
 
 def test_the_row_of_the_rest_shape_is_the_deflection_in_each_pose():
@@ -279,7 +281,7 @@ def test_the_row_of_the_rest_shape_is_the_deflection_in_each_pose():
     scan = cs.UnderGravity(Indices(clamped_nodes(copy)), np.multiply(SCAN_GRAVITY_M_S2, small))
     described = cs.Body(copy, mass_kg=bar.mass_kg, rest_shape=scan)
     ends = [
-        simulate(recorded(body, np.pi / 2), TRUTH, "midpoint").markers_m
+        simulate(recorded(body, np.pi / 2), TRUTH, "midpoint", substeps=1).markers_m
         for body in (described, unstated)
     ]
     expected = (ends[0] - ends[1]) / small / experiment.markers.sigma_m[:, None]

@@ -129,7 +129,12 @@ def test_tare_clock_lag_and_tool_are_found():
 
 def test_a_run_tells_of_the_wrench(tmp_path: Path):
     experiment = swung(1, Nuisance.none(tare=10.0, sensor_time_s=0.002), 20)
-    problem = Problem([experiment], UNKNOWN, rollout=cs.RolloutOptions(integrator="scheme"))
+    problem = Problem(
+        [experiment],
+        UNKNOWN,
+        rollout=cs.RolloutOptions(integrator="scheme"),
+        uncertainty=cs.UncertaintyOptions(assumptions=cs.Assumptions.exact()),
+    )
     run = cs.run(problem, method="reduced-space", seek_causes=False)
     assert run.trust.verdict == "good", run.trust.reasons
     folder = run.save(tmp_path / "run", frames=False)

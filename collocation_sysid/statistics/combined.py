@@ -87,13 +87,14 @@ def combine(
     """
     if estimate.at_bound:
         return CombinedEstimate(estimate.value, None, None)
+    is_corrected = error is not None or known_effect != 0.0
     known = (estimate.value, *(estimate.statistical95 or ()))
     corrections = () if error is None else (error.extrapolated, *(error.interval95 or ()))
     at = Coordinate.of(name, (*known, *corrections), linear)
     optimum = at.at(estimate.value)
     centre = optimum if error is None else at.at(error.extrapolated)
     centre += known_effect
-    value = _within(bounds, at.value(centre))
+    value = _within(bounds, at.value(centre)) if is_corrected else estimate.value
     correction = at.value(centre) - at.value(centre - known_effect) if known_effect else None
     spread = estimate.statistical_std_error
     if spread is not None:
@@ -102,6 +103,9 @@ def combine(
         return CombinedEstimate(value, spread, None, known_correction=correction)
     low, high = (at.at(end) + centre - optimum for end in estimate.statistical95)
     statistical95 = _interval(at, low, high, bounds)
+    if not is_corrected:
+        least, most = estimate.statistical95
+        statistical95 = _within(bounds, least), _within(bounds, most)
     if systematic is None:
         return CombinedEstimate(value, spread, statistical95, known_correction=correction)
     if error is not None and error.interval95 is not None:
