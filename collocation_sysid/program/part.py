@@ -81,8 +81,13 @@ class Part:
     @property
     def sights(self) -> list[tuple[DepthReading, Array]]:
         """What depth cameras see, and of each what it looks at."""
-        depths = self.segment.depths
-        return [*zip(depths, self.looked[len(self.looked) - len(depths) :], strict=True)]
+        return self.surface_sights[: len(self.segment.depths)]
+
+    @property
+    def surface_sights(self) -> list[tuple[DepthReading, Array]]:
+        """Readings of depth cameras, those of outlines behind, and of each what it looks at."""
+        readings = (*self.segment.depths, *self.segment.outlines)
+        return [*zip(readings, self.looked[len(self.looked) - len(readings) :], strict=True)]
 
     @property
     def loss(self) -> float:
