@@ -159,6 +159,15 @@ class DepthReading(Reading):
         shapes = self.shapes(x, phi)
         return self.sighting.missed_m(shapes[0], phi) / self.sighting.view.depth.sigma_m
 
+    @property
+    def loss_of_far_points(self) -> float:
+        """Loss of the points beyond the gate, each counted as if it were at the gate stated."""
+        depth = self.sighting.view.depth
+        deviations = depth.gate_m / depth.sigma_m
+        if self.huber is not None and deviations > self.huber:
+            return self.sighting.left_out["far"] * (2 * self.huber * deviations - self.huber**2)
+        return self.sighting.left_out["far"] * deviations**2
+
     # In statistics ----------------------------------------------------------------------------
 
     @cached_property

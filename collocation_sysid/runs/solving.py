@@ -23,6 +23,7 @@ from ..program.collocation import Collocation
 from ..statistics.fields import fields_by_information
 from ..statistics.linearised import values_of
 from .check.cost import require_memory
+from .several_starts import best_start
 from .warm_start import Earlier
 
 # How a search ends that went astray; another start may help.
@@ -119,6 +120,7 @@ def _solved(
     problem = problem if earlier is None else earlier.started(problem)
     try:
         whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
+        started_from: list[str] = []
         require_memory(problem, collocation, solver)
         collocation, scan = started(collocation, whole)
         collocation, variables = placed_at_guess(collocation), None
@@ -126,7 +128,16 @@ def _solved(
             collocation = earlier.placed(collocation)
             variables = earlier.variables(collocation)
         solver = shared(solver, workers)
-        solution = read_where_found(solver, collocation, watch, variables)
+        solution = None
+        if scan is not None:
+            begun = best_start(
+                solver, collocation, scan, watch, lambda by, of: read_where_found(by, of, watch)
+            )
+            collocation, scan = placed_at_guess(begun.collocation), begun.scan
+            solution = begun.solution
+            started_from = [begun.note] if begun.note else []
+        if solution is None:
+            solution = read_where_found(solver, collocation, watch, variables)
         if scan is None and solution.status in LOST:
             scan, solution = _again(solver, solution, watch)
         if solution.status.converged and earlier is None and solution.method == ReducedSpace.name:
@@ -136,7 +147,8 @@ def _solved(
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
-    notes = (*([] if scan is None else [scan.sentence]), *solution.notes, *_seen(solution))
+    said = [] if scan is None else [scan.sentence]
+    notes = (*said, *started_from, *solution.notes, *_seen(solution))
     return replace(solution, scan=scan or solution.scan, notes=notes)
 
 
