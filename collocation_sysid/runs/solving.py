@@ -20,6 +20,7 @@ from ..methods.workers import Workers, workers_of
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
+from ..statistics.cameras import require_depth_units
 from ..statistics.fields import fields_by_information
 from ..statistics.linearised import values_of
 from .check.cost import require_memory
@@ -121,6 +122,8 @@ def _solved(
     try:
         whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
         started_from: list[str] = []
+        for experiment in collocation.experiments:
+            require_depth_units(experiment)
         require_memory(problem, collocation, solver)
         collocation, scan = started(collocation, whole)
         collocation, variables = placed_at_guess(collocation), None

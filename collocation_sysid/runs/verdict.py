@@ -12,13 +12,14 @@ from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.stability import instabilities
 from ..program.touches import touched
-from ..recording.nuisance import TIME
+from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN, TIME
 from ..recording.turning import TOO_FAST
 from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.plausible import odd_material, oddities
 from ..statistics.scale import scale_concerns
 from ..statistics.trust import (
+    camera_pose_concerns,
     clock_concerns,
     contact_concerns,
     fit_concerns,
@@ -67,6 +68,9 @@ def concerns(
         # A lag and a tool may well be none.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(nuisance.names, part.phi, low, high)
+        for camera in range(len(part.segment.experiment.depths)):
+            pose = nuisance.places(DEPTH_TURN, DEPTH_SHIFT, of=camera)
+            yield from camera_pose_concerns([nuisance.names[k] for k in pose], part.phi[pose])
         for k in nuisance.places(TIME):
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
