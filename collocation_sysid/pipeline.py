@@ -187,7 +187,7 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
-    error = step_error(problem, solution, fit, rollouts, answer.noise_estimates)
+    error = step_error(problem, solution, fit, rollouts, answer.optimum)
     return replace(answer, refinement=error), fit
 
 
@@ -205,7 +205,7 @@ def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
     say("refitting parts of the data, and with assumptions freed")
     solution, options = answer.solution, answer.problem.uncertainty
     at, known = (solution.collocation, solution.z, fit), options.assumptions.deviations
-    return probes(Answered(*at, options, answer.estimates, answer.budget, known))
+    return probes(Answered(*at, options, answer.optimum, answer.budget, known))
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
@@ -233,11 +233,11 @@ def _fine_enough(
     if coarse.refinement is None:
         return coarse, fit
     first, problem = coarse.solution, coarse.problem
-    substeps = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
+    substeps = coarse.refinement.substeps(coarse.optimum, as_scheme(problem.scheme).order)
     if substeps == 1:
         return coarse, fit
     say(f"solving again with {substeps} steps a sample")
-    worst, many = coarse.refinement.worst(coarse.noise_estimates)
+    worst, many = coarse.refinement.worst(coarse.optimum)
     why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)

@@ -189,8 +189,12 @@ def twins(count: int) -> Iterator[Twin]:
         simple = np.array([hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n])
         half = spread * sem(simple) * np.array([0, -1, 1])
         found = told.estimates["young_pa"]
-        assert found.ci95 is not None
-        yield Twin(np.array([found.value, *found.ci95]), simple.mean() + half, int(sum(off < 1.96)))
+        assert found.statistical95 is not None
+        yield Twin(
+            np.array([found.value, *found.statistical95]),
+            simple.mean() + half,
+            int(sum(off < 1.96)),
+        )
 
 
 def poked(count: int = 100) -> None:

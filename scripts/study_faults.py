@@ -143,7 +143,7 @@ def identified(
     sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
     lines, true = budget(sources, found, {}), truth()
     whole = [
-        float(lines[n].whole95[0] <= true[n] <= lines[n].whole95[1]) if n in lines else np.nan
+        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
         for n in QUANTITIES
     ]
     return found, np.array(whole), solution.status.converged
@@ -151,7 +151,7 @@ def identified(
 
 def relative_errors(found: Uncertainty) -> Array:
     estimates, true = {**found.estimates, **found.derived}, truth()
-    errors = [estimates[name].std_error for name in QUANTITIES]
+    errors = [estimates[name].statistical_std_error for name in QUANTITIES]
     return np.array([np.nan if e is None else e for e in errors]) / [true[n] for n in QUANTITIES]
 
 

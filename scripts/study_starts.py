@@ -264,7 +264,7 @@ def study(
     found = uncertainty_of(
         fit, best.collocation.parameters, best.q, ErrorModel("given", "independent")
     )
-    std_errors = [found.estimates[name].std_error or np.nan for name in case.truth]
+    std_errors = [found.estimates[name].statistical_std_error or np.nan for name in case.truth]
     outcomes = []
     for number, guess in enumerate(starts):
         if not only or number in only:

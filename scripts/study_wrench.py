@@ -60,10 +60,10 @@ def main() -> None:
         uncertainty = fitted(noisy(exact, rng))
         for name in COUNTED:
             estimate = uncertainty.estimates[name]
-            assert estimate.ci95 is not None
-            assert estimate.std_error is not None
-            held[name] += estimate.ci95[0] <= TRUTH[name] <= estimate.ci95[1]
-            errors[name].append(estimate.std_error / TRUTH[name])
+            assert estimate.statistical95 is not None
+            assert estimate.statistical_std_error is not None
+            held[name] += estimate.statistical95[0] <= TRUTH[name] <= estimate.statistical95[1]
+            errors[name].append(estimate.statistical_std_error / TRUTH[name])
         if twin % 20 == 0 or twin == arguments.twins:
             report(held, errors, twin)
 

@@ -1,4 +1,4 @@
-"""The whole interval holds what is assumed, and its budget says what each assumption is worth."""
+"""Combined intervals, their budget by source, and parameters that are not determined."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from problems_small import GUESS, TRUTH, cube_with_nuisance, hung_cube, measured
 
 from collocation_sysid import (
     Problem,
+    RolloutOptions,
     Run,
     UncertaintyOptions,
     run,
@@ -25,9 +26,12 @@ from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.result import Result
 from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumptions
 from collocation_sysid.statistics.budget import Sources, worded
+from collocation_sysid.statistics.combined import combine
 from collocation_sysid.statistics.considered import assumed, considered
+from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.numerical import shifts
+from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
 from collocation_sysid.statistics.uncertainty import covariance
 
 NOTHING = {name: "none" for name in Assumptions().deviations}
@@ -51,26 +55,23 @@ def test_the_shares_of_a_budget_sum_to_one_largest_first(finished):
         assert shares == sorted(shares, reverse=True)
 
 
-def test_the_whole_interval_holds_the_other(finished):
+def test_the_combined_interval_contains_the_statistical_one(finished):
     for name, line in finished.budget.items():
-        low, high = finished.estimates[name].ci95
-        assert line.whole95[0] < low < high < line.whole95[1]
-        assert finished.estimates[name].whole95 == line.whole95
+        low, high = finished.estimates[name].statistical95
+        assert line.combined95[0] < low < high < line.combined95[1]
+        assert finished.estimates[name].combined95 == line.combined95
 
 
-def test_where_nothing_is_assumed_both_are_the_same():
-    exact = run(problem(**NOTHING), seek_causes=False)
+def test_without_systematic_effects_and_discretisation_error_both_intervals_agree():
+    exact = run(replace(problem(**NOTHING), rollout=RolloutOptions("scheme")), seek_causes=False)
     for name, line in exact.budget.items():
-        assert line.whole95 == pytest.approx(exact.estimates[name].ci95)
+        assert line.combined95 == pytest.approx(exact.estimates[name].statistical95)
         assert set(line.shares) <= {"noise", "nuisance parameters", "step and mesh"}
 
 
 def assumed_deviation(solved: Run, name: str) -> float:
-    """How much wider the whole interval is upwards, as a deviation of the logarithm."""
-    least, most = solved.estimates[name].ci95
-    half = np.log(most / least) / 2
-    above = np.log(solved.budget[name].whole95[1] / least) - half
-    return float(np.sqrt(above**2 - half**2)) / 1.96
+    """Standard deviation of the systematic effects on the logarithm."""
+    return solved.budget[name].systematic
 
 
 def test_one_assumption_alone_has_its_own_variance(finished):
@@ -80,16 +81,38 @@ def test_one_assumption_alone_has_its_own_variance(finished):
     assert max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get) == "mass"
 
 
-def test_what_is_as_large_as_an_estimate_adds_to_it_as_well_as_multiplies_it():
+def test_a_large_systematic_effect_stays_on_the_logarithmic_scale_of_its_parameter():
     airy = run(problem(**NOTHING | {"air_drag": 20.0}), seek_causes=False)
-    deviation = assumed_deviation(airy, "gamma_m_1_s")
-    assert deviation > 0.3
-    # All of what is seen may be the air's.
-    least, most = airy.estimates["gamma_m_1_s"].ci95
-    middle = np.sqrt(least * most)
-    lowest = middle - np.hypot(1.96 * deviation * middle, middle - least)
-    assert airy.budget["gamma_m_1_s"].whole95[0] == pytest.approx(max(0.0, lowest))
-    assert lowest < middle * np.exp(-1.96 * deviation)
+    assert airy.budget["gamma_m_1_s"].systematic > 0.3
+    low, high = airy.estimates["gamma_m_1_s"].combined95
+    assert 0 < low < high
+
+
+def test_a_parameter_with_an_interval_wider_than_its_value_is_not_determined():
+    airy = run(problem(**NOTHING | {"air_drag": 60.0}), seek_causes=False)
+    assert not airy.estimates["gamma_m_1_s"].is_determined
+    assert airy.estimates["mu_pa"].is_determined
+    assert airy.trust.verdict == "check"
+    found = [c for c in airy.trust.concerns if c.code == "information/combined"]
+    (concern,) = [c for c in found if c.data["name"] == "gamma_m_1_s"]
+    assert "gamma_m_1_s is not determined" in concern.sentence
+    assert "air drag" in concern.sentence
+    assert REMEDIES["air_drag"] in concern.sentence
+    assert "not determined: mostly air drag" in airy.table()
+
+
+def test_intervals_respect_the_bounds_of_their_parameter():
+    estimate = Estimate(0.05, 0.1, (0.0, 0.25))
+    combined = combine("x_friction", estimate, None, 0.1, linear=True, bounds=(0.0, 0.2))
+    assert combined.statistical95 == (0.0, 0.2)
+    assert combined.combined95 == (0.0, 0.2)
+    ratio = combine("poisson", Estimate(0.4, 0.02, (0.36, 0.44)), None, 2.0, bounds=(0.001, 0.495))
+    assert 0.001 < ratio.combined95[0] < 0.4 < ratio.combined95[1] <= 0.495
+
+
+def test_every_assumption_has_a_remedy():
+    assert {row.name for row in ASSUMPTIONS} <= set(REMEDIES)
+    assert "measure gravity_rad" in remedy_for("gravity_rad")
 
 
 @pytest.mark.parametrize("huber", [None, 1.0])
@@ -157,20 +180,19 @@ def swings(*gamma_r_s: float) -> Problem:
     return Problem(recordings, GUESS, substeps=1, uncertainty=options)
 
 
-def test_what_recordings_disagree_on_is_in_the_whole_interval():
+def test_what_recordings_disagree_on_is_in_the_combined_interval():
     truths = (4e-3, 9e-3, 14e-3)
     unlike = run(swings(*truths), seek_causes=False)
     line = unlike.budget["gamma_r_s"]
     assert next(iter(line.shares)) == "between recordings"
-    assert line.whole95[0] < truths[0]
-    assert line.whole95[1] > truths[-1]
+    assert line.combined95[0] < truths[0]
+    assert line.combined95[1] > truths[-1]
 
 
 def test_recordings_that_agree_add_nothing():
     alike = run(swings(9e-3, 9e-3, 9e-3), seek_causes=False)
     for name, line in alike.budget.items():
-        low, high = alike.estimates[name].ci95
-        assert np.log(line.whole95[1] / line.whole95[0]) < 1.3 * np.log(high / low)
+        assert line.shares.get("between recordings", 0.0) < 0.4, name
 
 
 def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
@@ -180,7 +202,7 @@ def test_terminal_page_and_pictures_show_the_budget(finished, tmp_path):
     told = Result.read(folder)
     assert set(told.budget["mu_pa"]) == set(finished.budget["mu_pa"].shares)
     short, whole = (plain_text(summary(told, folder, budget=b)) for b in (False, True))
-    assert "whole interval" in short
+    assert "± syst" in short
     assert "% of the variance" not in short
     assert "% of the variance" in whole
     assert run_command("report", folder).code == 0

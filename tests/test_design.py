@@ -253,11 +253,17 @@ def test_error_bars_are_those_that_a_run_reports():
     collocation, z = at_answer([hung_cube(8)])
     run = covariance(collocation, z, ErrorModel("given", "independent"))
     found = errors_at(collocation, z)
-    known = {n: e for n, e in {**run.estimates, **run.derived}.items() if e.std_error is not None}
+    known = {
+        n: e
+        for n, e in {**run.estimates, **run.derived}.items()
+        if e.statistical_std_error is not None
+    }
     assert {"lambda_pa", "mu_pa", "young_pa", "poisson"} <= known.keys()
     for name, estimate in known.items():
-        assert estimate.std_error is not None
-        assert found.relative[name] == pytest.approx(estimate.std_error / estimate.value, rel=1e-3)
+        assert estimate.statistical_std_error is not None
+        assert found.relative[name] == pytest.approx(
+            estimate.statistical_std_error / estimate.value, rel=1e-3
+        )
 
 
 def test_criteria_are_what_they_say_of_the_covariance():

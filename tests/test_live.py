@@ -151,8 +151,10 @@ def test_when_frames_end_the_estimate_settles_where_the_batch_ends(problem):
     assert update is not None
     for name, estimate in update.estimates.items():
         known = batch.estimates[name]
-        assert abs(estimate.value - known.value) < 1e-4 * known.std_error
-        assert estimate.std_error == pytest.approx(known.std_error, rel=1e-4)
+        assert abs(estimate.value - known.value) < 1e-4 * known.statistical_std_error
+        assert estimate.statistical_std_error == pytest.approx(
+            known.statistical_std_error, rel=1e-4
+        )
     assert update.trust.verdict == batch.trust.verdict
     assert update.marker_rms_m == pytest.approx(batch.solution.rms_m)
     assert update.relinearised > 0
@@ -223,7 +225,7 @@ def test_two_rows_passed_again_a_frame_follow_the_batch(scheme):
     solution = cs.solve(problem, ReducedSpace())
     batch = covariance(solution.collocation, solution.z).estimates
     for name, estimate in update.estimates.items():
-        assert abs(estimate.value - batch[name].value) < 0.5 * batch[name].std_error
+        assert abs(estimate.value - batch[name].value) < 0.5 * batch[name].statistical_std_error
 
 
 def test_rows_are_begun_that_end_in_time():
@@ -394,7 +396,7 @@ def test_doubled_late_unordered_and_dropped_frames_are_told_and_change_little():
     assert any("late" in note for note in notes)
     assert live.track.rows == whole.track.rows
     for name, estimate in live._estimates_at(live.track.information, live.p).items():
-        error = expected.estimates[name].std_error
+        error = expected.estimates[name].statistical_std_error
         if error is not None:
             assert abs(estimate.value - expected.estimates[name].value) < 2 * error
 
@@ -482,8 +484,8 @@ def test_frames_at_rest_tell_nothing_of_damping_and_the_verdict_says_so():
         tracks = first.tracks_m + noise.normal(scale=NOISE_M, size=first.tracks_m.shape)
         update = live.take(replace(first, t_s=0.01 * k, tracks_m=tracks))
     damping = update.estimates["gamma_r_s"]
-    assert damping.std_error is None
-    assert damping.ci95[1] > 100 * damping.ci95[0]
+    assert damping.statistical_std_error is None
+    assert damping.statistical95[1] > 100 * damping.statistical95[0]
     assert update.trust.verdict != "good"
     assert any("gamma_r_s is not known yet" in reason for reason in update.trust.reasons)
 
@@ -620,8 +622,8 @@ def test_truth_and_what_a_chip_does_not_know_of_itself_are_found_from_frames():
     for frame in frames_of(problem, live):
         without = alone.take(replace(frame, told=()))
     for name, estimate in update.estimates.items():
-        assert abs(estimate.value - TRUTH[name]) < 4 * estimate.std_error
-        assert estimate.std_error < without.estimates[name].std_error
+        assert abs(estimate.value - TRUTH[name]) < 4 * estimate.statistical_std_error
+        assert estimate.statistical_std_error < without.estimates[name].statistical_std_error
     bias = live.p[live.model.collocation.nq :] * live.model.segment.nuisance.scales
     assert bias[0] == pytest.approx(0.3, abs=0.05)
     settled, batch = live.settle(), cs.run(problem, seek_causes=False)

@@ -469,8 +469,14 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
     for name, free, young_pa in (("a", 3, 70e3), ("b", 4, 100e3)):
         model = row_of(name, free, {"a": WAVY.tolist()}, 900)
         model["found"][""]["parameters"] = {"young_pa": young_pa, "c10_pa": young_pa / 7}
-        whole95 = (young_pa / 1.04, young_pa * 1.04)
-        line = {"shares": {"noise": 0.8, "mass": 0.2}, "whole95": whole95}
+        combined95 = (young_pa / 1.04, young_pa * 1.04)
+        line = {
+            "value": young_pa,
+            "shares": {"noise": 0.8, "mass": 0.2},
+            "combined95": combined95,
+            "combined_std_error": young_pa * np.log(1.04) / 1.96,
+            "systematic": 0.01,
+        }
         model["found"][""]["budget"] = {"young_pa": line}
         found[name] = model
     rows = rows_of(found["a"], found["b"])
@@ -478,8 +484,8 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
     assert told.values == {"a": 70e3, "b": 100e3}
     apart, known = np.log(100 / 70) / np.sqrt(2), np.log(1.04) / 1.96
     assert told.share == pytest.approx(apart**2 / (apart**2 + known**2))
-    assert told.whole95[1] == pytest.approx(70e3 * np.exp(1.96 * np.hypot(apart, known)))
-    assert told.whole95[0] < 70e3 < 100e3 < told.whole95[1]
+    assert told.combined95[1] == pytest.approx(70e3 * np.exp(1.96 * np.hypot(apart, known)))
+    assert told.combined95[0] < 70e3 < 100e3 < told.combined95[1]
     assert "with the law (99% of the variance), 6.73e+04 to 7.28e+04 without" in advice(rows)
     table = law_table([told])
     assert table.rows[0][:4] == ("E Pa", "7e+04", "1e+05", "43 %")

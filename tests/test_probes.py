@@ -125,11 +125,11 @@ def test_each_of_several_recordings_says_what_it_has_alone():
 
 def test_shares_of_both_intervals_stand_beside_every_change():
     solved = probed("density_gradient z", -0.1)
-    low, high = solved.estimates["young_pa"].ci95
-    least, most = solved.estimates["young_pa"].whole95
+    low, high = solved.optimum["young_pa"].statistical95
+    least, most = solved.estimates["young_pa"].combined95
     move = named(solved, "density_gradient z").moves["young_pa"]
-    assert move.of_ci95 == pytest.approx(2 * move.change / (high - low))
-    assert move.of_whole95 == pytest.approx(2 * move.change / (most - least))
+    assert move.of_statistical95 == pytest.approx(2 * move.change / (high - low))
+    assert move.of_combined95 == pytest.approx(2 * move.change / (most - least))
 
 
 def test_terminal_page_and_file_have_the_probes(tmp_path):

@@ -223,8 +223,8 @@ def test_a_step_too_coarse_for_the_error_bars_is_not_good(substeps, good):
     problem = replace(Problem.read(FOAM_CYLINDER), substeps=substeps)
     found = run(problem, "reduced-space")
     bar = found.estimates["young_pa"]
-    assert bar.std_error is not None
-    off = abs(bar.value - FOAM_YOUNG_PA) / bar.std_error
+    assert bar.statistical_std_error is not None
+    off = abs(bar.value - FOAM_YOUNG_PA) / bar.statistical_std_error
     assert (off < 3, found.trust.verdict == "good") == (good, good)
 
 

@@ -400,9 +400,7 @@ def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[st
     except (InputError, SimulationError):
         return {}  # without error bars there is none
     sources = Sources.of(fit, changes, parameters, solution.q, known)
-    return {
-        name: asdict(line) for name, line in budget(sources, known, {}, parameters.linear).items()
-    }
+    return {name: asdict(line) for name, line in budget(sources, known, {}, parameters).items()}
 
 
 def without(problem: Problem, name: str) -> tuple[Problem, float]:

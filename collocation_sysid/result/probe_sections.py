@@ -33,7 +33,7 @@ def probe_section(result: Result) -> Section:
         for p in result.probes
     ]
     read = (
-        "in brackets the changes in half widths of the 95 % and of the whole interval; of parts of "
+        "in brackets the changes in half widths of the statistical and of the combined interval; of parts of "
         "the data to first order"
     )
     return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_said(result)))
@@ -42,9 +42,9 @@ def probe_section(result: Result) -> Section:
 def asks_for_probes(result: Result) -> bool:
     """Whether a verdict, or a budget, is asked to look harder."""
     wide = any(
-        each.ci95
-        and each.whole95
-        and each.whole95[1] - each.whole95[0] > 2 * (each.ci95[1] - each.ci95[0])
+        each.combined_std_error
+        and each.statistical_std_error
+        and each.combined_std_error > 2 * each.statistical_std_error
         for each in result.values.values()
     )
     asked = any(concern.topic in ASKING for concern in result.trust.concerns)
@@ -53,7 +53,7 @@ def asks_for_probes(result: Result) -> bool:
 
 def _shown(result: Result) -> list[str]:
     """The estimates of the table."""
-    known = [n for n, each in result.values.items() if each.ci95]
+    known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in FOREMOST[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][:SHOWN]
 
@@ -61,7 +61,9 @@ def _shown(result: Result) -> list[str]:
 def _moved(move: Move | None, value: float) -> str:
     if move is None:
         return "–"
-    shares = ", ".join(f"{x:+.1f}" for x in (move.of_ci95, move.of_whole95) if x is not None)
+    shares = ", ".join(
+        f"{x:+.1f}" for x in (move.of_statistical95, move.of_combined95) if x is not None
+    )
     return f"{_change(move, value)} ({shares})"
 
 

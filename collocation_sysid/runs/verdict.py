@@ -8,15 +8,18 @@ import numpy as np
 
 from ..errors import SimulationError
 from ..methods.solution import Solution, Status, pooled_wrench_rms
+from ..model.parameters import Parameters
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.stability import instabilities
 from ..program.touches import touched
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN, TIME
 from ..recording.turning import TOO_FAST
+from ..statistics.budget import worded
 from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.plausible import odd_material, oddities
+from ..statistics.remedies import remedy_for
 from ..statistics.scale import scale_concerns
 from ..statistics.trust import (
     camera_pose_concerns,
@@ -35,6 +38,7 @@ from ..statistics.trust import (
 from ..statistics.uncertainty import Uncertainty
 from .check.motion import Motion, motion_of
 from .forward_simulation import Rollout
+from .result import ReportedEstimate
 
 # Noise of cameras over a body's size is less.
 NO_CAMERA = 0.01
@@ -89,6 +93,35 @@ def concerns(
                 motion.first.numerical_damping_ratio,
                 motion.first.period_error,
             )
+
+
+def combined_concerns(
+    parameters: Parameters,
+    estimates: Mapping[str, ReportedEstimate],
+    shares: Mapping[str, Mapping[str, float]],
+) -> list[Concern]:
+    """Return a concern for each estimated parameter with a combined interval wider than its value.
+
+    Derived moduli give none: λ of a nearly incompressible material is rarely determined.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    estimates : mapping of name to ReportedEstimate
+    shares : mapping of name to the shares of its budget, largest first
+    """
+    return [
+        _undetermined(item.name, estimates[item.name], shares[item.name])
+        for item in parameters.free
+        if item.name in shares and not estimates[item.name].is_determined
+    ]
+
+
+def _undetermined(name: str, estimate: ReportedEstimate, shares: Mapping[str, float]) -> Concern:
+    source, share = next(iter(shares.items()))
+    low, high = estimate.combined95 or (np.nan, np.nan)
+    data = {"name": name, "low": low, "high": high, "source": worded(source), "share": share}
+    return Concern("information/combined", "check", {**data, "remedy": remedy_for(source)})
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:

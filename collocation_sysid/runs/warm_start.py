@@ -58,7 +58,11 @@ class Earlier:
             If it is damaged.
         """
         both = {**result.parameters, **result.derived}
-        values = {name: each.value for name, each in both.items()}
+        # The optimum solves the equations of the trajectory in the folder, not the corrected value.
+        values = {
+            name: each.value if each.optimum is None else each.optimum
+            for name, each in both.items()
+        }
         nuisance = {
             f"{experiment}: {name}": each.value
             for experiment, named in result.nuisance.items()

@@ -155,14 +155,17 @@ TOPICS: Mapping[str, Topic] = {
         },
     ),
     "information": Topic(
-        "What the data do not tell",
-        "trust",
+        "What the data do not determine",
+        "budget",
         "Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
         "motion that it matters to.",
         {
             "bound": "{names} ended at its bound",
             "bounds": "{names} ended at their bounds",
-            "none": "these data do not tell {names}",
+            "none": "the data do not determine {names}",
+            "combined": "{name} is not determined: its combined 95 % interval, {low:.3g} to "
+            "{high:.3g}, is wider than its value; largest contribution "
+            "{source} ({share:.0%}): {remedy}",
             "at-bound": "{name} is at a bound",
             "not-yet": "{name} is not known yet: {reason}",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
@@ -210,8 +213,9 @@ TOPICS: Mapping[str, Topic] = {
         "Raise transcription.substeps, or take the midpoint scheme, which damps least. "
         "refine RUN measures what is left.",
         {
-            "step": "the step moves {name} by {percent:+.2g} %, {errors:.2g} standard errors: its "
-            "interval allows for that; raise transcription.substeps, or run refine to measure it",
+            "step": "the estimated time-step error dominates the uncertainty of {name}: it was "
+            "corrected by {percent:+.2g} %, {errors:.2g} standard uncertainties; raise "
+            "transcription.substeps, or run refine to measure the error",
             "damping": "the scheme adds a damping ratio of {added:.2g} to the {damping:.2g} of the "
             "first mode of '{experiment}'",
             "period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
@@ -260,8 +264,8 @@ TOPICS: Mapping[str, Topic] = {
         'Refine it, and take element = "tet10", or "tet10-p0" from ν = 0.45 on. '
         "refine RUN measures what is left.",
         {
-            "refined": "step and mesh move {name} by {percent:+.2g} %, {errors:.2g} standard "
-            "errors: its interval allows for that",
+            "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
+            "{percent:+.2g} %, {errors:.2g} standard uncertainties",
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",

@@ -107,9 +107,9 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
 
 def _factor(estimate: Estimate) -> float | None:
     """Half width of the interval as a factor."""
-    if estimate.ci95 is None or not estimate.ci95[0] > 0:
+    if estimate.statistical95 is None or not estimate.statistical95[0] > 0:
         return None
-    factor = float(np.sqrt(estimate.ci95[1] / estimate.ci95[0]))
+    factor = float(np.sqrt(estimate.statistical95[1] / estimate.statistical95[0]))
     return factor if factor < HOPELESS else None
 
 

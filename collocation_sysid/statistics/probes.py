@@ -46,15 +46,15 @@ class Move:
     value, std_error : float
         Of the refit.
     change : float
-    of_ci95, of_whole95 : float or None
+    of_statistical95, of_combined95 : float or None
         The same over the half widths of its intervals.
     """
 
     value: float
     std_error: float
     change: float
-    of_ci95: float | None
-    of_whole95: float | None
+    of_statistical95: float | None
+    of_combined95: float | None
 
 
 @dataclass(frozen=True)
@@ -120,11 +120,11 @@ class Answered:
         """How far estimates went that a refit tells."""
         went = {}
         for name, each in {**found.estimates, **found.derived}.items():
-            error, joint = each.std_error, self.estimates[name]
+            error, joint = each.statistical_std_error, self.estimates[name]
             if error and error < TELLING * abs(each.value):
                 change = each.value - joint.value
-                whole95 = self.budget[name].whole95 if name in self.budget else None
-                of = _share(change, joint.ci95), _share(change, whole95)
+                combined95 = self.budget[name].combined95 if name in self.budget else None
+                of = _share(change, joint.statistical95), _share(change, combined95)
                 went[name] = Move(each.value, error, change, *of)
         return went
 

@@ -58,7 +58,8 @@ PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
 E_FOLDINGS, GROSS_E_FOLDINGS = 1.0, 7.0
 # A contact of fewer faces is as wide as the mesh makes it.
 FEWEST_FACES = 4.0
-# Standard errors that step and mesh may move a parameter: the half width of its interval.
+# Combined standard uncertainties by which step and mesh may change a parameter: the half width of
+# its 95 % interval.
 MOVED = 2.0
 # What is said of the numerical error: estimated, and measured.
 NUMERICAL = "scheme/step", "mesh/refined"
@@ -173,7 +174,11 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
     bounded = [name for name, found in estimates.items() if found.at_bound]
-    vague = [n for n, found in estimates.items() if not found.at_bound and found.std_error is None]
+    vague = [
+        name
+        for name, found in estimates.items()
+        if not found.at_bound and found.statistical_std_error is None
+    ]
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
     return [
@@ -183,16 +188,36 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def numerical_concerns(
-    estimates: Mapping[str, Estimate], refinement: Refinement | None
+    optimum: Mapping[str, Estimate],
+    combined_std_errors: Mapping[str, float | None],
+    refinement: Refinement | None,
 ) -> list[Concern]:
-    """Where step or mesh matter more than the noise; what is unknown gives no concern."""
-    worst, many = ("", 0.0) if refinement is None else refinement.worst(estimates)
-    if refinement is None or many <= MOVED:
+    """Return a concern if step or mesh dominate the uncertainty of a parameter.
+
+    Parameters
+    ----------
+    optimum : mapping of name to Estimate
+        Estimates before the correction of the discretisation error.
+    combined_std_errors : mapping of name to float or None
+        Combined standard uncertainties; None if unknown.
+    refinement : Refinement or None
+        Discretisation errors; None if they are unknown, which is no concern.
+    """
+    if refinement is None:
         return []
-    value = estimates[worst].value
-    percent = 100 * (value - refinement.errors[worst].extrapolated) / abs(value)
+    corrections = {
+        name: abs(error.extrapolated - optimum[name].value) / uncertainty
+        for name, error in refinement.errors.items()
+        if (uncertainty := combined_std_errors.get(name))
+    }
+    # Moduli with the same relative correction differ by rounding: the first is the parameter.
+    worst, largest = max(corrections.items(), key=lambda item: round(item[1], 6), default=("", 0.0))
+    if largest <= MOVED:
+        return []
+    value = optimum[worst].value
+    percent = 100 * (refinement.errors[worst].extrapolated - value) / abs(value)
     code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
-    return [Concern(code, data={"name": worst, "percent": percent, "errors": many})]
+    return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
 
 
 def marker_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
