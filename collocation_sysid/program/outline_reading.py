@@ -27,6 +27,7 @@ class OutlineReading(DepthReading):
     """Distances of the points of a body's outline from the edges in a camera's images [pixels]."""
 
     stated = "outline_sigma_px of depth"
+    noise_at_least_stated = True
 
     @classmethod
     def from_depth(cls, depth: DepthReading) -> OutlineReading:
@@ -69,6 +70,18 @@ class OutlineReading(DepthReading):
         outside_m = super().expression(looked, phi, data[:count])
         inside_px = self.nuisance.by_row(phi, self.own[0]).get(DEPTH_EDGE, 0)
         return outside_m / data[count] - inside_px
+
+    def apart_px(self, values: Array, phi: Array) -> Array:
+        """Return how many pixels (s, E) outline points are outside of their edges, NaN without one.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Positions of the surface's nodes at the times of the channel [m].
+        phi : (k,) array
+            Nuisance parameters in units of their priors.
+        """
+        return self.apart_m(values, phi)
 
     def roughly(self, x: Array, phi: Array) -> Array:
         """Return no residual: before anything is fitted, distances to the points suffice."""

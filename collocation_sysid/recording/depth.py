@@ -176,7 +176,8 @@ class Depth:
         else. A measured depth well behind the body shows in either case that the body is not there.
     outline_sigma_px : float
         Standard deviation [pixels] of the distance between the body's outline and the edge of what
-        an image shows of the body, at points of the outline that are `spacing_m` apart.
+        an image shows of the body, at points of the outline that are `spacing_m` apart. Rounding to
+        pixels alone gives 0.3.
     images_m : sequence of (rows, columns) arrays or None
         The depth images that the clouds were made from, NaN or 0 without depth, one for each time;
         None where the outline of the body is not compared with that sample. Empty for clouds, whose
@@ -199,7 +200,7 @@ class Depth:
     gate_m: float = key(Positive, default=0.01)
     faces: Selection | None = key(Nodes | None, converter=_faces, read=selection, default=None)
     background: Background = key(Background, default="auto")
-    outline_sigma_px: float = key(Positive, default=1.0)
+    outline_sigma_px: float = key(Positive, default=0.5)
     images_m: Sequence[Any] = ()
 
     def __post_init__(self) -> None:

@@ -171,6 +171,13 @@ def _seen(solution: Solution) -> Iterator[str]:
                 f"experiment '{part.segment.experiment.name}': {seen.used.sum()} points of "
                 f"'{seen.view.depth.name}' {off}; left out: {said or 'none'}"
             )
+        for outline, apart_px in part.outline_distances_px:
+            if len(apart_px):
+                yield (
+                    f"experiment '{part.segment.experiment.name}': {len(apart_px)} points of the "
+                    f"body's outline are off the edges in '{outline.sighting.view.depth.name}' by "
+                    f"{np.sqrt(np.mean(apart_px**2)):.2g} pixels (RMS)"
+                )
 
 
 def shared(solver: Method, workers: Workers | None) -> Method:

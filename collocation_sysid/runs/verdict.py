@@ -29,6 +29,7 @@ from ..statistics.trust import (
     marker_concerns,
     noise_rms_m,
     nuisance_concerns,
+    outline_concerns,
     parameter_concerns,
     rollout_concerns,
     scheme_concerns,
@@ -75,6 +76,9 @@ def concerns(
         for camera in range(len(part.segment.experiment.depths)):
             pose = nuisance.places(DEPTH_TURN, DEPTH_SHIFT, of=camera)
             yield from camera_pose_concerns([nuisance.names[k] for k in pose], part.phi[pose])
+        for reading, apart_px in part.outline_distances_px:
+            camera = f"'{reading.sighting.view.depth.name}' of '{part.segment.experiment.name}'"
+            yield from outline_concerns(camera, apart_px)
         for k in nuisance.places(TIME):
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)

@@ -48,6 +48,9 @@ PREDICTION, GROSS_PREDICTION = 3.0, 10.0
 FAR, ABSURD = 3.0, 6.0
 # Deviations of its prior that the pose of a depth camera may be off: it trades for the shape.
 CAMERA_FAR = 2.0
+# Points of an outline may be so many pixels off the edge in the image, but for this share of them:
+# edges of pixels scatter by 0.3, lenses and wrong depths at edges by one.
+OUTLINE_FAR_PX, OUTLINE_SHARE = 3.0, 0.1
 LATE = 1.8
 # Share of the samples beyond Huber's threshold, of all.
 WILD, HARDLY_TAME = MOST_WILD, 0.2
@@ -261,6 +264,27 @@ def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> l
     away = abs(float(deviations[worst]))
     return concerned(
         away > CAMERA_FAR, False, "nuisance/camera", name=names[worst], deviations=away
+    )
+
+
+def outline_concerns(camera: str, apart_px: Array) -> list[Concern]:
+    """Return a concern if the outline of the body is elsewhere than a camera's images show.
+
+    Parameters
+    ----------
+    camera : str
+        Name of the depth camera, and of its experiment.
+    apart_px : (n,) array
+        Distances of outline points from the edges in the images [pixels].
+    """
+    share = float(np.mean(np.abs(apart_px) > OUTLINE_FAR_PX)) if len(apart_px) else 0.0
+    return concerned(
+        share > OUTLINE_SHARE,
+        False,
+        "residuals/outline",
+        camera=camera,
+        pixels=OUTLINE_FAR_PX,
+        percent=100 * share,
     )
 
 
