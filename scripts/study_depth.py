@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.program.skin import Skin
-from collocation_sysid.runs.several_starts import robust_loss
+from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 from collocation_sysid.statistics.uncertainty import covariance
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
@@ -140,8 +140,8 @@ class SoftTwin:
 
     @property
     def is_better_optimum(self) -> bool:
-        """Whether no start is known that leads to a noticeably lower loss."""
-        return self.loss < self.loss_from_truth + 3.0
+        """Whether the start from the truth does not lead to a noticeably lower loss."""
+        return self.loss < self.loss_from_truth + SAME_LOSS
 
 
 SOFT_TRUTH = {**TRUTH, "young_pa": 2.5e4}

@@ -41,8 +41,8 @@ LOOSE = NewtonOptions(tolerance=1e-4)
 LOST, WORSE = 2, 3.0
 # Beyond an end a stiffness is tried as long as the last one fitted better by this share.
 BETTER = 0.01
-# Other starts that are followed where there are local minima, and by which factor their misfit may be
-# larger than the best: each costs a solve, and the right one was next to the best in every twin.
+# Other starts that are followed where there are local minima, and by which factor their misfit may
+# be larger than the best: each costs a solve, and the right one was next to the best in all twins.
 MORE_STARTS = 2
 ALIKE = 4.0
 NO_GUESS = "no guess"

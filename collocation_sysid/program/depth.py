@@ -24,8 +24,8 @@ from ..recording.nuisance import DEPTH_TIME
 from ..recording.placement import Placement
 from .channel import Points
 from .charts import Chart
-from .reading import GROUP, Instrument, Pooled, Reading, Window, lagrange_weights, times_around
 from .outline import Outline
+from .reading import GROUP, Instrument, Pooled, Reading, Window, lagrange_weights, times_around
 from .sighting import Sighting
 
 # Times around a sample.

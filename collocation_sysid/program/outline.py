@@ -344,7 +344,9 @@ def _planes(
     Depths (P,) [m] tell how wide a pixel is, and where the point of each plane is chosen.
     """
     along = np.column_stack([-outwards[:, 1], outwards[:, 0]])
-    at, before, after, outside = _rays(camera, [edges, edges - along, edges + along, edges + outwards])
+    at, before, after, outside = _rays(
+        camera, [edges, edges - along, edges + along, edges + outwards]
+    )
     normals = np.cross(before, after)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     pixel = np.sum(normals * (outside - at), axis=1)

@@ -16,8 +16,9 @@ from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.start import placed_at_guess
 from ..program.collocation import Collocation
 
-# Losses that differ by less than this are of the same minimum, reached with other correspondences.
-SAME_LOSS = 3.0
+# Losses that differ by less than this are of the same minimum, reached with other correspondences:
+# from two starts next to it twins differ by up to 5.
+SAME_LOSS = 10.0
 Solve = Callable[[Method, Collocation], Solution]
 
 

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..arrays import Array
+from ..errors import InputError
 from ..program.camera_alignment import thinned
 from ..program.sighting import wide_m
 from ..program.skin import Skin
-from ..errors import InputError
 from ..recording.depth import Depth, points_of
 from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis

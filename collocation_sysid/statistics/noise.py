@@ -200,9 +200,7 @@ def projected(information: Information, errors: Sequence[Array]) -> tuple[Array,
 
 def _besides(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
     """Covariance (r, r) of the score, and (G, K) sums of squares of each marker."""
-    seen = [
-        block.present.any(axis=0) & (not block.noise_at_least_stated) for block in fit.blocks
-    ]
+    seen = [block.present.any(axis=0) & (not block.noise_at_least_stated) for block in fit.blocks]
     if not len((samples := drawn(fit))[0]):
         return np.zeros_like(information.prior), np.zeros((int(np.concatenate(seen).sum()), 1))
     scores, left = projected(information, samples)
