@@ -142,7 +142,7 @@ def test_slopes_of_outline_residuals_agree_with_differences():
 
 @pytest.mark.long
 def test_silhouettes_that_are_smaller_all_around_do_not_make_the_body_stiffer(rng):
-    """As those of sensors that lose depths at edges: two pixels are a third of a millimetre of sag."""
+    """As those of sensors that lose depths at the edges of things."""
     image = image_m() + NOISE_M * rng.normal(size=SHAPE)
     image[~binary_erosion(np.isfinite(image_m()), iterations=2)] = np.nan
     unknown = {**TRUTH, "young_pa": cs.Unknown(1.2 * TRUTH["young_pa"])}
@@ -188,7 +188,7 @@ def test_starts_are_the_best_stiffness_its_neighbours_and_other_minima():
 def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
     """Its scan is best at 13.9 kPa, from where the search ended at 16 kPa instead of 25."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-    from study_depth import SOFT_TRUTH, soft_problem
+    from study_depth import SOFT_TRUTH, soft_problem  # pyright: ignore[reportMissingImports]
 
     solution = cs.solve(soft_problem(0))
     known = cs.solve(soft_problem(0, SOFT_TRUTH["young_pa"]))
@@ -196,6 +196,7 @@ def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
     assert solution.parameters["young_pa"] == pytest.approx(SOFT_TRUTH["young_pa"], rel=0.2)
     (said,) = (note for note in solution.notes if "starts of the scan" in note)
     assert "local minima" in said
+    assert solution.scan is not None
     assert solution.scan.young_pa[solution.scan.best] == pytest.approx(3.16e4, rel=0.01)
 
 

@@ -1,7 +1,7 @@
-"""Outline of a body in a depth image: where it ends there, and where the image says that it ends.
+"""Outline of a body in a depth image, compared with the edge of what the image shows of the body.
 
-Distances along the normals of the surface do not tell how far the surface reaches: a body may extend
-beyond everything that was measured without any point being off its surface. Here points of the
+Distances along the normals of the surface do not tell how far the surface reaches: a body may
+extend beyond everything that was measured without any point being off its surface. Here points of the
 body's outline, as the camera sees it, are compared with the edge of what the image shows of it.
 
 A pixel is evidence that the body is not there where it shows something farther away than the body,
@@ -311,14 +311,16 @@ def _shown(
 def _nearest_other(
     nothing: NDArray[np.bool_], pixels: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the edge nearest to pixels (P, 2) where nothing is, the way there, and if there is one.
+    """Return the edges nearest to pixels (P, 2) where nothing is, the ways there, and whether found.
 
     The edge lies half a pixel from the middle of the nearest other pixel; the way (P, 2) is a unit
     vector from the edge to the pixel.
     """
     if nothing.all():
         return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
-    _, places = distance_transform_edt(nothing, return_indices=True)
+    places: Array = np.asarray(
+        distance_transform_edt(nothing, return_distances=False, return_indices=True)
+    )
     column, row = np.round(pixels).astype(np.int64).T
     nearest = places[::-1, row, column].T.astype(float)
     way = pixels - nearest

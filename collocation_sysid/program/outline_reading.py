@@ -3,8 +3,8 @@
     r = (n · (Σ_i ℓ_i(τ) Σ_a N_a x_{a,i} − T (R(a) ((1 + s) p − c) + c + e)) / h − w) / σ,
 
 with n the normal of a plane through the camera and an edge in its image (see `outline`), p a point
-of that plane, h the width of a pixel there [m], w how many pixels inside the outline of the body its
-silhouette ends all around, and the other symbols as in `depth`. σ is in pixels.
+of that plane, h the width of a pixel there [m], w how many pixels inside the outline of the body
+its silhouette ends all around, and the other symbols as in `depth`. σ is in pixels.
 """
 
 from __future__ import annotations

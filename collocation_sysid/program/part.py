@@ -92,7 +92,7 @@ class Part:
 
     @property
     def outline_distances_px(self) -> list[tuple[OutlineReading, Array]]:
-        """Readings of outlines, and the distances (n,) of outline points from the edges [pixels]."""
+        """Readings of outlines, and distances (n,) of outline points from their edges [pixels]."""
         found = []
         for reading, looked in self.surface_sights[len(self.segment.depths) :]:
             assert isinstance(reading, OutlineReading)

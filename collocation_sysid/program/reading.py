@@ -206,8 +206,8 @@ class Reading(ABC):
     has_fixed_windows : bool
         Whether its windows do not depend on φ.
     noise_at_least_stated : bool
-        Whether error bars never take its noise for smaller than σ, and its residuals do not tell the
-        noise of others: for measurements with rounding errors, which may happen to be small.
+        Whether error bars never take its noise for smaller than σ, and its residuals do not tell
+        the noise of others: for measurements with rounding errors, which may happen to be small.
     """
 
     channel: Channel

@@ -75,7 +75,9 @@ def concerns(
         yield from nuisance_concerns(nuisance.names, part.phi, low, high)
         for camera in range(len(part.segment.experiment.depths)):
             pose = nuisance.places(DEPTH_TURN, DEPTH_SHIFT, of=camera)
-            yield from camera_pose_concerns([nuisance.names[k] for k in pose], part.phi[pose])
+            yield from camera_pose_concerns(
+                [nuisance.names[k] for k in pose], part.phi[pose].tolist()
+            )
         for reading, apart_px in part.outline_distances_px:
             camera = f"'{reading.sighting.view.depth.name}' of '{part.segment.experiment.name}'"
             yield from outline_concerns(camera, apart_px)

@@ -38,8 +38,8 @@ EXPECTED = "state that of one with x to the right, y down, z forward"
 MILLI = 1e-3
 # Units that are wrong by powers of ten up to this one are looked for.
 LARGEST_POWER = 4
-# A cloud of fewer points is all within a few of the cubes that it was thinned by, as where its unit is
-# too small.
+# A cloud of fewer points is all within a few of the cubes that it was thinned by, as where its unit
+# is too small.
 COLLAPSED = 50
 
 
@@ -133,9 +133,9 @@ def require_depth_units(experiment: Experiment) -> None:
         if shares[factor] < (HARDLY if view.collapsed else WELL):
             continue
         raise InputError(
-            f"the points of the depth camera '{depth.name}' of '{experiment.name}' are {view.points_m:.3g} m "
-            f"away (median), the body {view.body_m:.3g} m, a factor of {1 / factor:g}: their unit is "
-            f"wrong; expected metres: multiply count_m by {factor:g} (integer images such as .png, "
+            f"the points of the depth camera '{depth.name}' of '{experiment.name}' are "
+            f"{view.points_m:.3g} m away (median), the body {view.body_m:.3g} m, a factor of "
+            f"{1 / factor:g}: their unit is wrong; expected metres: multiply count_m by {factor:g} (integer images such as .png, "
             "0.001 where it is not stated; in an .npz its own count_m), give depth_m in metres, or "
             "state length_unit of a cloud",
             where="experiment.depth",
