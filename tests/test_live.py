@@ -48,10 +48,12 @@ TWENTY = 20 * "9"
 
 
 @cache
-def swing(steps: int = 36, nuisance: Nuisance = IDEAL, seed: int = 1) -> cs.Problem:
+def swing(
+    steps: int = 36, nuisance: Nuisance = IDEAL, seed: int = 1, air_density_kg_m3: float = 0.0
+) -> cs.Problem:
     """A cube swung by its top, seen with noise, described rightly."""
-    hung = hung_cube(steps, nuisance=nuisance)
-    tracks = cs.simulate(hung, TRUTH, integrator="midpoint").markers_m
+    hung = hung_cube(steps, nuisance=nuisance, air_density_kg_m3=air_density_kg_m3)
+    tracks = cs.simulate(hung, TRUTH, integrator="midpoint", substeps=1).markers_m
     noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
     seen = cs.with_markers(hung, tracks + noise)
     seen = replace(seen, markers=replace(seen.markers, sigma_m=NOISE_M))
@@ -103,13 +105,13 @@ OF_THE_USER = Nuisance.none(
 
 
 @pytest.mark.parametrize(
-    "nuisance",
-    [IDEAL, Nuisance(), OF_THE_USER],
-    ids=["ideal", "as in a laboratory", "a user's own"],
+    ("nuisance", "air_density_kg_m3"),
+    [(IDEAL, 0.0), (IDEAL, 10.0), (Nuisance(), 0.0), (OF_THE_USER, 0.0)],
+    ids=["ideal", "in dense air", "as in a laboratory", "a user's own"],
 )
-def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
+def test_frames_one_by_one_say_what_the_batch_says(nuisance, air_density_kg_m3, monkeypatch):
     monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
-    problem, count = swing(nuisance=nuisance), 30
+    problem, count = swing(nuisance=nuisance, air_density_kg_m3=air_density_kg_m3), 30
     live = streamed(problem, count)
     collocation = problem.collocation()
     horizon, p = Horizon(collocation, [count], prior=model.WEAK), collocation.guess_p
@@ -584,7 +586,7 @@ def felt(bias_m_s2: float = 0.3) -> cs.Problem:
     seen = replace(seen, markers=replace(seen.markers, sigma_m=1e-3))
     inner = np.linspace(seen.t_s[0] + 1e-3, seen.t_s[-1], 2 * len(seen.t_s))
     made = instrumented(seen, accelerometer(inner), strain_gauge(seen.t_s))
-    accelerations, strains = cs.simulate(made, TRUTH, "midpoint").readings
+    accelerations, strains = cs.simulate(made, TRUTH, "midpoint", substeps=1).readings
     rng = np.random.default_rng(2)
     accelerations = accelerations + [0, 0, bias_m_s2] + 0.05 * rng.normal(size=(len(inner), 3))
     accelerations[5, 1] = accelerations[7] = np.nan

@@ -25,7 +25,6 @@ from collocation_sysid.statistics.trust import numerical_concerns
 FREE = ("mu_pa", "gamma_r_s")
 # Lower bounds of `write_problem`.
 LOWER = {"lambda_pa": 10.0, "mu_pa": 10.0, "gamma_r_s": 1e-5, "gamma_m_1_s": 1e-3}
-EXACT = dict.fromkeys(Assumptions().deviations, "none")
 
 
 def errors_of(x, order, levels=3, **options):
@@ -98,7 +97,7 @@ def coarse() -> Problem:
     experiment = measured(hung_cube(16, divisions=(1, 1, 2)), substeps=4)
     sigma_m = np.full(len(experiment.markers.names), 1e-5)
     seen = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m))
-    exact = UncertaintyOptions(assumptions=Assumptions(**EXACT))
+    exact = UncertaintyOptions(assumptions=Assumptions.exact())
     return Problem([seen], Parameters(tuple(items)), substeps=1, uncertainty=exact)
 
 
@@ -165,7 +164,7 @@ def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
     assert numerical_concerns(optimum, combined, None) == []
     (found,) = concerns(97.77)
     assert (found.code, found.grade) == ("scheme/step", "check")
-    assert "corrected by -2.9 %, 2.9 standard uncertainties" in found.sentence
+    assert "corrected by -3 %, 3 standard uncertainties" in found.sentence
 
 
 def test_other_numbers_of_levels_are_refused(answer):

@@ -49,7 +49,7 @@ def relative_errors(result: dict, truth: dict) -> np.ndarray:
 def test_foam_cylinder_errors_are_consistent_with_the_noise(method: str, tmp_path: Path):
     result = solved(PROBLEMS / "foam_cylinder" / "problem.toml", tmp_path / "run", method)
     assert result["status"] == "converged"
-    deviations = np.array([result["parameters"][name]["std_error"] for name in FOAM])
+    deviations = np.array([result["parameters"][name]["statistical_std_error"] for name in FOAM])
     errors = relative_errors(result, FOAM) * list(FOAM.values())
     assert np.abs(errors / deviations).max() < 3.5
     # 0.5 mm a coordinate, three coordinates

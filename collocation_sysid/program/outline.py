@@ -1,8 +1,8 @@
 """Outline of a body in a depth image, compared with the edge of what the image shows of the body.
 
 Distances along the normals of the surface do not tell how far the surface reaches: a body may
-extend beyond everything that was measured without any point being off its surface. Here points of the
-body's outline, as the camera sees it, are compared with the edge of what the image shows of it.
+extend beyond everything that was measured without any point being off its surface. Here points of
+the body's outline, as the camera sees it, are compared with the edge of what the image shows of it.
 
 A pixel is evidence that the body is not there where it shows something farther away than the body,
 or nothing at all in images whose background gives no depth (see `Depth.background`). It is no
@@ -311,7 +311,7 @@ def _shown(
 def _nearest_other(
     nothing: NDArray[np.bool_], pixels: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the edges nearest to pixels (P, 2) where nothing is, the ways there, and whether found.
+    """Return the edges nearest to pixels (P, 2) where nothing is, the ways there, and if any.
 
     The edge lies half a pixel from the middle of the nearest other pixel; the way (P, 2) is a unit
     vector from the edge to the pixel.

@@ -130,7 +130,15 @@ def _corrected(
 ) -> ReportedEstimate:
     """Correct an estimate for its measured discretisation error."""
     linear, bounds = parameters.scale_and_bounds(name)
-    combined = combine(name, optimum, error, before.systematic, linear=linear, bounds=bounds)
+    combined = combine(
+        name,
+        optimum,
+        error,
+        before.systematic,
+        known_effect=before.known_effect or 0.0,
+        linear=linear,
+        bounds=bounds,
+    )
     return replace(before, **vars(combined), numerical_error=error)
 
 

@@ -124,8 +124,14 @@ def _solved(
         started_from: list[str] = []
         for experiment in collocation.experiments:
             require_depth_units(experiment)
-        require_memory(problem, collocation, solver)
+        if earlier is not None and problem.substeps == "auto":
+            collocation = replace(collocation, substeps=earlier.substeps)
+        has_guesses = not collocation.parameters.unguessed
+        if has_guesses:
+            require_memory(problem, collocation, solver)
         collocation, scan = started(collocation, whole)
+        if not has_guesses:  # the estimate evaluates the program at a guess
+            require_memory(problem, collocation, solver)
         collocation, variables = placed_at_guess(collocation), None
         if earlier is not None and not scan:
             collocation = earlier.placed(collocation)

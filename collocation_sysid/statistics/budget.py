@@ -11,7 +11,7 @@ decides intervals are Student's with their degrees of freedom (Welch & Satterthw
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -45,6 +45,8 @@ class BudgetLine:
     systematic : float
         Standard deviation of the systematic effects and of the differences between recordings, in
         the coordinate of the estimate, see `Coordinate`.
+    known_effect : float
+        Correction for the known effects, in the same coordinate; `value` contains it.
     """
 
     value: float
@@ -52,6 +54,7 @@ class BudgetLine:
     combined95: Interval
     combined_std_error: float
     systematic: float
+    known_effect: float = 0.0
 
     def widened(self, source: str, deviation: float, at: Coordinate) -> BudgetLine:
         """Add a source with a standard deviation in the coordinate `at` of the estimate."""
@@ -69,6 +72,7 @@ class BudgetLine:
             (at.value(centre - below), at.value(centre + above)),
             (below + above) / 2 / NORMAL_95 / at.slope(self.value),
             float(np.hypot(self.systematic, deviation)),
+            self.known_effect,
         )
 
 
@@ -87,6 +91,8 @@ class Sources:
     between : (nq, b) how q follows what parameters differ by between recordings
     freedom : int
         How many recordings tell that, less one.
+    means : mapping of assumption to the size of a known effect over its deviation
+        Estimates are to be corrected for these effects.
     """
 
     names: tuple[str, ...]
@@ -97,6 +103,7 @@ class Sources:
     wider: Array
     between: Array
     freedom: int = 0
+    means: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -106,8 +113,9 @@ class Sources:
         parameters: Parameters,
         q: Array,
         uncertainty: Uncertainty,
+        means: Mapping[str, float] | None = None,
     ) -> Sources:
-        """Those of a fit near its answer q (nq,)."""
+        """Those of a fit near its answer q (nq,), with known effects `means` if there are any."""
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared]
         all_free, known = (np.zeros((fit.shared, fit.shared)) for _ in range(2))
@@ -121,7 +129,10 @@ class Sources:
         if scatter is not None:
             between, freedom = scatter.between[: fit.shared], len(scatter.recordings) - 1
         wider = uncertainty.wider
-        return cls(assumed.names, moved, all_free, known, by_q, wider, between, freedom)
+        known_effects = dict(means or {})
+        return cls(
+            assumed.names, moved, all_free, known, by_q, wider, between, freedom, known_effects
+        )
 
     def of_noise(self, by_q: Array) -> tuple[float, float]:
         """Of a variance by noise, the shares if nuisances were known and recordings agreed."""
@@ -145,6 +156,11 @@ class Sources:
             return 0.0
         freedom = self.freedom * ((others + more) / more) ** 2
         return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
+
+    def known_effect(self, by_q: Array) -> float:
+        """Return the correction for known effects of what has the derivative `by_q` (nq,)."""
+        sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
+        return float(by_q @ self.moved @ sizes)
 
     def of_assumed(self, by_q: Array) -> dict[str, float]:
         """Variances by each assumption, of what has this derivative."""
@@ -210,7 +226,16 @@ def _line(
     systematic = float(np.sqrt(sum(by_assumption.values()) + between))
     variances = parts | {BETWEEN: excess + between} | by_assumption
     total = sum(variances.values())
-    combined = combine(name, estimate, error, systematic, linear=linear, bounds=bounds)
+    known_effect = sources.known_effect(by_coordinate)
+    combined = combine(
+        name,
+        estimate,
+        error,
+        systematic,
+        known_effect=known_effect,
+        linear=linear,
+        bounds=bounds,
+    )
     assert combined.combined95 is not None
     assert combined.combined_std_error is not None
     return BudgetLine(
@@ -219,6 +244,7 @@ def _line(
         combined.combined95,
         combined.combined_std_error,
         systematic,
+        known_effect,
     )
 
 

@@ -135,7 +135,8 @@ def require_depth_units(experiment: Experiment) -> None:
         raise InputError(
             f"the points of the depth camera '{depth.name}' of '{experiment.name}' are "
             f"{view.points_m:.3g} m away (median), the body {view.body_m:.3g} m, a factor of "
-            f"{1 / factor:g}: their unit is wrong; expected metres: multiply count_m by {factor:g} (integer images such as .png, "
+            f"{1 / factor:g}: their unit is wrong; expected metres: multiply "
+            f"count_m by {factor:g} (integer images such as .png, "
             "0.001 where it is not stated; in an .npz its own count_m), give depth_m in metres, or "
             "state length_unit of a cloud",
             where="experiment.depth",

@@ -39,6 +39,8 @@ class CombinedEstimate:
         Standard uncertainty due to all contributions; None if unknown.
     combined95 : (lower, upper) or None
         95 % interval due to all contributions; None if unknown.
+    known_correction : float or None
+        Part of `value` that corrects for known effects; None if there are none.
     """
 
     value: float
@@ -46,6 +48,7 @@ class CombinedEstimate:
     statistical95: Interval | None
     combined_std_error: float | None = None
     combined95: Interval | None = None
+    known_correction: float | None = None
 
 
 def combine(
@@ -54,6 +57,7 @@ def combine(
     error: NumericalError | None,
     systematic: float | None,
     *,
+    known_effect: float = 0.0,
     linear: bool = False,
     bounds: Interval = (-np.inf, np.inf),
 ) -> CombinedEstimate:
@@ -70,6 +74,8 @@ def combine(
     systematic : float or None
         Standard deviation of all systematic effects together, in the coordinate of the estimate;
         None if they were not evaluated, which leaves the combined interval unknown.
+    known_effect : float
+        Correction for systematic effects of known size, in the coordinate of the estimate.
     linear : bool
         Whether the parameter itself is its coordinate, rather than its logarithm.
     bounds : (lower, upper)
@@ -86,23 +92,26 @@ def combine(
     at = Coordinate.of(name, (*known, *corrections), linear)
     optimum = at.at(estimate.value)
     centre = optimum if error is None else at.at(error.extrapolated)
+    centre += known_effect
     value = _within(bounds, at.value(centre))
+    correction = at.value(centre) - at.value(centre - known_effect) if known_effect else None
     spread = estimate.statistical_std_error
     if spread is not None:
         spread *= at.slope(estimate.value) / at.slope(at.value(centre))
     if estimate.statistical95 is None:
-        return CombinedEstimate(value, spread, None)
+        return CombinedEstimate(value, spread, None, known_correction=correction)
     low, high = (at.at(end) + centre - optimum for end in estimate.statistical95)
     statistical95 = _interval(at, low, high, bounds)
     if systematic is None:
-        return CombinedEstimate(value, spread, statistical95)
+        return CombinedEstimate(value, spread, statistical95, known_correction=correction)
     if error is not None and error.interval95 is not None:
         low, high = map(at.at, error.interval95)
+        low, high = low + known_effect, high + known_effect
     below = float(np.hypot(centre - low, NORMAL_95 * systematic))
     above = float(np.hypot(high - centre, NORMAL_95 * systematic))
     combined95 = _interval(at, centre - below, centre + above, bounds)
     deviation = (below + above) / 2 / NORMAL_95 / at.slope(at.value(centre))
-    return CombinedEstimate(value, spread, statistical95, deviation, combined95)
+    return CombinedEstimate(value, spread, statistical95, deviation, combined95, correction)
 
 
 def _within(bounds: Interval, value: float) -> float:

@@ -1205,6 +1205,9 @@ poisson     = { guess = 0.3, lower = 0.02, upper = 0.48 }
 gamma_r_s   = { guess = 0.01, lower = 1e-5, upper = 1.0 }
 gamma_m_1_s = { guess = 1.0, lower = 1e-3, upper = 100.0 }
 
+[environment]
+air_density_kg_m3 = "none"            # simulated without air
+
 [[experiment]]
 name = "swing"
 nuisance = "none"                     # simulated: clock, gravity, grasp and places are exact
