@@ -218,8 +218,8 @@ TOPICS: Mapping[str, Topic] = {
             "limit": "{name} ended at the largest value allowed",
             "far": "{name} is {deviations:.1f} deviations of its prior away from zero",
             "camera": "{name} is {deviations:.1f} deviations of its prior away from the pose "
-            "stated: a body of another stiffness may fit as well with the camera elsewhere; measure "
-            "the pose, or state how well it is known (nuisance.depth_pose)",
+            "stated: a body of another stiffness may fit as well with the camera elsewhere; "
+            "measure the pose, or state how well it is known (nuisance.depth_pose)",
             "clock": "the markers of '{experiment}' were seen {shift_ms:.2g} ms {when} than their "
             "times say: the estimates allow for it; better find out why",
         },
