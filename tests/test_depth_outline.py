@@ -232,6 +232,7 @@ def test_depth_in_a_wrong_unit_is_refused_with_the_power_of_ten(factor):
         cs.solve(problem)
 
 
+@pytest.mark.long
 def test_a_wrong_count_m_of_a_png_ends_with_one_message(tmp_path):
     bar().mesh.write(tmp_path / "bar.vtu")
     counts = np.nan_to_num(1e4 * image_m()).astype(np.uint16)  # tenths of a millimetre
