@@ -57,10 +57,8 @@ def test_the_interval_holds_the_truth_beside_what_the_step_does(run):
     assert low < MADE["young_pa"] < high
     # Steps of a whole sample make it stiffer, and the run says by how much.
     error = run.result.numerical_errors["young_pa"]
-    off = [
-        each / MADE["young_pa"] - 1
-        for each in (run.solution.parameters["young_pa"], error.extrapolated)
-    ]
+    found = run.solution.parameters["young_pa"], error.extrapolated
+    off = [each / MADE["young_pa"] - 1 for each in found]
     assert off[0] > 0.003
     assert abs(off[1]) < 0.5 * off[0]
 

@@ -13,8 +13,8 @@ The same scan is the rescue where a guess cannot be simulated, or fits worse tha
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
 
@@ -41,6 +41,10 @@ LOOSE = NewtonOptions(tolerance=1e-4)
 LOST, WORSE = 2, 3.0
 # Beyond an end a stiffness is tried as long as the last one fitted better by this share.
 BETTER = 0.01
+# Other starts that are followed where there are local minima, and by which factor their misfit may
+# be larger than the best: each costs a solve, and the right one was next to the best in all twins.
+MORE_STARTS = 2
+ALIKE = 4.0
 NO_GUESS = "no guess"
 
 
@@ -64,6 +68,11 @@ class Scan:
     samples : int
         How many first samples were compared, over all experiments.
     time_s : float
+    starts : mapping of int to Parameters
+        By the position of a stiffness the guesses to start from, of the best and the others.
+    others : tuple of int
+        Positions of other stiffnesses that may lead to a better answer where there are local
+        minima: those next to the best, and other minima of the misfit, the least misfit first.
     """
 
     reason: str
@@ -73,6 +82,8 @@ class Scan:
     parameters: Parameters
     samples: int
     time_s: float
+    starts: Mapping[int, Parameters] = field(default_factory=dict)
+    others: tuple[int, ...] = ()
 
     @property
     def sentence(self) -> str:
@@ -173,8 +184,37 @@ def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) 
         )
     best = int(np.flatnonzero(young_pa == chosen[0])[0])
     start = usual_parameters(collocation.parameters, chosen[0])
-    samples, time_s = sum(trial.samples), time.perf_counter() - began
-    return Scan(reason, young_pa, misfit, best, start, samples, time_s)
+    others = _other_starts(misfit, best) if not whole else ()
+    starts = {k: usual_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
+    return Scan(
+        reason,
+        young_pa,
+        misfit,
+        best,
+        start,
+        samples=sum(trial.samples),
+        time_s=time.perf_counter() - began,
+        starts=starts,
+        others=others,
+    )
+
+
+def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
+    """Return positions of the next best starts, see `Scan.others`.
+
+    Parameters
+    ----------
+    misfit : (k,) array
+        By ascending stiffness, NaN where the body cannot be simulated.
+    best : int
+        Position of the stiffness that is chosen.
+    """
+    known = np.where(np.isfinite(misfit), misfit, np.inf)
+    beside = np.concatenate([[np.inf], known, [np.inf]])
+    is_minimum = (known < beside[:-2]) & (known <= beside[2:])
+    candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {best}
+    possible = [k for k in candidates if 0 <= k < len(known) and known[k] <= ALIKE * known[best]]
+    return tuple(sorted(possible, key=lambda k: known[k])[:MORE_STARTS])
 
 
 def usual_parameters(parameters: Parameters, young_pa: float) -> Parameters:

@@ -33,6 +33,7 @@ from ..recording.grasp import Grasp, held_nodes
 from ..recording.loads import Change, Force, PointMass
 from ..recording.nuisance import (
     DEPTH_BIAS,
+    DEPTH_EDGE,
     DEPTH_SCALE,
     GAUGE,
     GRASP_SHIFT,
@@ -459,6 +460,8 @@ def _axes(
         if not (obstacle.shape.flat if row == OBSTACLE_TILT else len(obstacle.poses.t_s) > 1):
             return []
     if row in (DEPTH_BIAS, DEPTH_SCALE) and experiment.depths[number].camera.matrix is None:
+        return []
+    if row == DEPTH_EDGE and not len(experiment.depths[number].images_m):
         return []
     found = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
     return [each for each in found if row != ZERO or each[1] in experiment.grasps[number].zero]

@@ -35,7 +35,7 @@ from ..recording import (
 )
 from ..recording.arrays import triple
 from ..recording.clock import TIME_TOLERANCE_S
-from ..recording.depth import points_of
+from ..recording.depth import outlined_samples, points_of
 from ..recording.formats.depth_files import DepthFile, read_depth
 from ..recording.formats.logs import stored_files
 from ..recording.formats.units import METRES_PER_UNIT
@@ -271,13 +271,15 @@ class RecordingReader:
             )
         with located(where=where):
             inside = within(at_s, t_s, section.file, self._static)
-            clouds = seen.clouds_m or [
-                points_of(image, camera) if here else np.zeros((0, 3))
-                for image, here in zip(seen.images_m, inside, strict=True)
-            ]
-            clouds = [cloud for cloud, here in zip(clouds, inside, strict=True) if here]
+            used = np.flatnonzero(inside).tolist()
+            clouds = [seen.clouds_m[k] for k in used] if seen.clouds_m else []
+            images, outlined = [], outlined_samples(len(used))
+            for number, sample in enumerate(used if len(seen.images_m) else ()):
+                image = seen.images_m[sample]
+                clouds.append(points_of(image, camera))
+                images.append(image if number in outlined else None)
             told = {"name": section.name, **stated_in(section, Depth, where)}
-            depth = Depth(t_s=at_s[inside], clouds=clouds, camera=camera, **told)
+            depth = Depth(t_s=at_s[inside], clouds=clouds, camera=camera, images_m=images, **told)
         self._note(f"{section.file}: {len(clouds)} of {len(at_s)} images are used")
         return depth
 

@@ -24,6 +24,7 @@ from ..recording.nuisance import DEPTH_TIME
 from ..recording.placement import Placement
 from .channel import Points
 from .charts import Chart
+from .outline import Outline
 from .reading import GROUP, Instrument, Pooled, Reading, Window, lagrange_weights, times_around
 from .sighting import Sighting
 
@@ -83,6 +84,11 @@ class DepthReading(Reading):
     def _instruments(self) -> dict[tuple[int, int], Instrument]:
         return self.sighting.view.instruments
 
+    @property
+    def pairs(self) -> Sighting | Outline:
+        """Points of the surface, and the planes of the image that each is compared with."""
+        return self.sighting
+
     @cached_property
     def _times(self) -> NDArray[np.int64]:
         """(S, k) times of the channel that each sample is read from: at it, or around."""
@@ -96,9 +102,9 @@ class DepthReading(Reading):
 
     @cached_property
     def _window(self) -> Window:
-        seen, times = self.sighting, self._times
+        seen, times = self.pairs, self._times
         samples, points = seen.used.shape
-        rotations, translations = seen.view.motion
+        rotations, translations = self.sighting.view.motion
         in_camera = np.einsum("sji,sej->sei", rotations, seen.normals)
         beyond = np.einsum("sei,si->se", seen.normals, translations)[..., None]
         around = np.broadcast_to(
@@ -138,7 +144,7 @@ class DepthReading(Reading):
 
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """How far a point is behind the surface."""
-        view, nodes = self.sighting.view, self.sighting.nodes.shape[2]
+        view, nodes = self.sighting.view, self.pairs.nodes.shape[2]
         sizes = np.cumsum([0, self._times.shape[1], nodes, 3, 3, 1, 3, 3]).tolist()
         around, weights, normal, in_camera, beyond, point, ray = ca.vertsplit(data, sizes)
         values = self.nuisance.by_row(phi, self.own[0])
@@ -153,6 +159,15 @@ class DepthReading(Reading):
         shapes = self.shapes(x, phi)
         return self.sighting.missed_m(shapes[0], phi) / self.sighting.view.depth.sigma_m
 
+    @property
+    def loss_of_far_points(self) -> float:
+        """Loss of the points beyond the gate, each counted as if it were at the gate stated."""
+        depth = self.sighting.view.depth
+        deviations = depth.gate_m / depth.sigma_m
+        if self.huber is not None and deviations > self.huber:
+            return self.sighting.left_out["far"] * (2 * self.huber * deviations - self.huber**2)
+        return self.sighting.left_out["far"] * deviations**2
+
     # In statistics ----------------------------------------------------------------------------
 
     @cached_property
@@ -161,8 +176,8 @@ class DepthReading(Reading):
 
         Neighbouring points are not independent; means over patches nearly are.
         """
-        seen, patches = self.sighting, np.full(self.sighting.used.shape, -1)
-        places, edge_m = seen.places_m[seen.used], 2 * seen.view.depth.spacing_m
+        seen, patches = self.pairs, np.full(self.pairs.used.shape, -1)
+        places, edge_m = seen.places_m[seen.used], 2 * self.sighting.view.depth.spacing_m
         while True:
             cubes, number = np.unique(np.floor(places / edge_m), axis=0, return_inverse=True)
             if len(cubes) <= PATCHES:
@@ -189,14 +204,13 @@ class DepthReading(Reading):
     def pool(self) -> Pooled:
         """Patches, three together."""
         means, counts = self._pooling
-        name, seen = self.sighting.view.depth.name, self.sighting
-        count = counts.shape[1] // GROUP
-        of_points = seen.places_m.reshape(-1, 3)
+        name, count = self.names[0], counts.shape[1] // GROUP
+        of_points = self.pairs.places_m.reshape(-1, 3)
         sums = (means @ of_points).reshape(*counts.shape, 3) * np.sqrt(counts)[..., None]
         places = sums.sum(axis=0) / np.maximum(counts.sum(axis=0), 1)[:, None]
         return Pooled(
             tuple(f"{name} {k + 1}" for k in range(count)),
-            np.full(count, seen.view.depth.sigma_m),
+            np.full(count, self.sigmas[0]),
             (counts > 0).reshape(len(counts), count, GROUP),
             places,
         )
@@ -213,7 +227,7 @@ class DepthReading(Reading):
     def apart_m(self, values: Array, phi: Array) -> Array:
         """(s, E) how far points are behind the surface, NaN where they do not count."""
         apart = self.predicted(values, phi)[..., 0]
-        return np.where(self.sighting.used[: len(apart)], apart, np.nan)
+        return np.where(self.pairs.used[: len(apart)], apart, np.nan)
 
     def shapes(self, x: Array, phi: Array) -> Array:
         """(s, n, 3) of the surface at the samples that the first rows x (rows, 3n) suffice for."""

@@ -14,6 +14,7 @@ from ..model.histories import AnyHistory
 from ..model.setting import Setting
 from .channel import Motion
 from .depth import DepthReading
+from .outline_reading import OutlineReading
 from .segment import Segment
 from .sensing import Sensing
 
@@ -81,8 +82,23 @@ class Part:
     @property
     def sights(self) -> list[tuple[DepthReading, Array]]:
         """What depth cameras see, and of each what it looks at."""
-        depths = self.segment.depths
-        return [*zip(depths, self.looked[len(self.looked) - len(depths) :], strict=True)]
+        return self.surface_sights[: len(self.segment.depths)]
+
+    @property
+    def surface_sights(self) -> list[tuple[DepthReading, Array]]:
+        """Readings of depth cameras, those of outlines behind, and of each what it looks at."""
+        readings = (*self.segment.depths, *self.segment.outlines)
+        return [*zip(readings, self.looked[len(self.looked) - len(readings) :], strict=True)]
+
+    @property
+    def outline_distances_px(self) -> list[tuple[OutlineReading, Array]]:
+        """Readings of outlines, and distances (n,) of outline points from their edges [pixels]."""
+        found = []
+        for reading, looked in self.surface_sights[len(self.segment.depths) :]:
+            assert isinstance(reading, OutlineReading)
+            apart_px = reading.apart_px(looked, self.phi)
+            found.append((reading, apart_px[np.isfinite(apart_px)]))
+        return found
 
     @property
     def loss(self) -> float:

@@ -205,6 +205,9 @@ class Reading(ABC):
         How many numbers the loss takes together, g; three, as those of a place.
     has_fixed_windows : bool
         Whether its windows do not depend on φ.
+    noise_at_least_stated : bool
+        Whether error bars never take its noise for smaller than σ, and its residuals do not tell
+        the noise of others: for measurements with rounding errors, which may happen to be small.
     """
 
     channel: Channel
@@ -221,6 +224,7 @@ class Reading(ABC):
     stated: ClassVar[str] = "sigma_m"
     has_offsets: ClassVar[bool] = False
     has_fixed_windows: ClassVar[bool] = True
+    noise_at_least_stated: ClassVar[bool] = False
 
     @property
     def begins_s(self) -> float:

@@ -34,6 +34,7 @@ from .gauge import GaugeReading, gauge_readings
 from .local_loss import LocalLoss
 from .markers import MarkerReading
 from .motion_rows import MotionRows, ahead
+from .outline_reading import OutlineReading
 from .reading import Reading
 from .sharing import Local
 from .view import View
@@ -45,7 +46,7 @@ T = TypeVar("T", bound=np.generic)
 Factors = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 Weighed = tuple[AnyHistory, Array]
 
-CHARTED = ("markers", "depths", "readings", "local_loss", "_loss_scale")
+CHARTED = ("markers", "depths", "outlines", "readings", "local_loss", "_loss_scale")
 
 
 @dataclass(frozen=True)
@@ -163,6 +164,12 @@ class Segment:
         return tuple(DepthReading.of(replace(each, view=view), *how) for each, view in seen)
 
     @cached_property
+    def outlines(self) -> tuple[OutlineReading, ...]:
+        """Those of depth cameras with images, in the order of the cameras."""
+        seen = (depth for depth in self.depths if len(depth.sighting.view.depth.images_m))
+        return tuple(OutlineReading.from_depth(depth) for depth in seen)
+
+    @cached_property
     def views(self) -> tuple[View, ...]:
         """Of depth cameras."""
         numbers = range(len(self.experiment.depths))
@@ -171,7 +178,7 @@ class Segment:
     @cached_property
     def readings(self) -> tuple[Reading, ...]:
         """All that is measured, the markers first."""
-        return self.markers, *self.sensors, *self.gauges, *self.depths
+        return self.markers, *self.sensors, *self.gauges, *self.depths, *self.outlines
 
     @cached_property
     def local_loss(self) -> LocalLoss:

@@ -20,6 +20,7 @@ from ..fem.body import Body
 from ..model.nuisance import NuisanceMap
 from ..recording.experiment import Experiment
 from .camera_alignment import alignment, thinned
+from .outline import Outline
 from .skin import GRAZING, Skin
 from .view import View
 
@@ -65,6 +66,8 @@ class Sighting:
     settled : bool
         Whether shapes had hardly moved before: what these hide from the camera does not count. From
         shapes that are still sought too much would seem hidden, and all of the rest fit.
+    outline : Outline
+        Of the body in these shapes, and the edges in the images; no point of it without images.
     """
 
     view: View
@@ -82,6 +85,7 @@ class Sighting:
     shapes_m: Array
     start: Mapping[str, float]
     settled: bool
+    outline: Outline
 
     @classmethod
     def of(
@@ -111,6 +115,9 @@ class Sighting:
         total = np.sum([each["reasons"] for each in seen], axis=0).tolist()
         own: dict[str, Any] = {"left_out": dict(zip(LEFT_OUT, total, strict=True))}
         own |= {"start": view.told(phi), "gate_m": gate_m, "shapes_m": shapes_m, "settled": settled}
+        own["outline"] = Outline.from_shapes(
+            view, skin, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
+        )
         return cls(view, body, skin, **own, **arrays)
 
     @classmethod
@@ -124,7 +131,7 @@ class Sighting:
         gate_m = max(wide_m(body.nodes_m), view.depth.gate_m)
         phi = phi if far else moved
         some = tuple(map(thinned, view.depth.clouds))
-        rough = View(replace(view.depth, clouds=some), view.number, view.nuisance, view.pivot_m)
+        rough = replace(view, depth=replace(view.depth, clouds=some, images_m=()))
         gate_m = cls.of(rough, body, shapes_m, phi, gate_m).next_gate_m(shapes_m, phi)
         return cls.of(view, body, shapes_m, phi, gate_m)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,18 @@ class Skin:
     def flat(self) -> Index:
         """(F·k, 3) flat triangles, those of a face after each other."""
         return self.faces[:, FLAT[self.faces.shape[1]]].reshape(-1, 3)
+
+    @cached_property
+    def edges(self) -> tuple[Index, Index]:
+        """Edges (K, 2) between two flat triangles, by their nodes, and (K, 2) these triangles."""
+        flat = self.flat
+        ends = np.sort(flat[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        unique, number, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+        order = np.argsort(number.ravel(), kind="stable")
+        first = np.cumsum(counts) - counts
+        paired = counts == 2
+        beside = np.stack([order[first[paired]], order[first[paired] + 1]], axis=1) // 3
+        return unique[paired], beside
 
     def at(self, triangles: Index, shares: Array) -> tuple[Index, Array]:
         """Faces (P,), and places (P, 3) on them, of places on flat triangles (P,)."""

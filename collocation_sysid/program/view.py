@@ -17,6 +17,7 @@ from ..recording.depth import Depth
 from ..recording.experiment import Experiment
 from ..recording.nuisance import (
     DEPTH_BIAS,
+    DEPTH_EDGE,
     DEPTH_SCALE,
     DEPTH_SHIFT,
     DEPTH_TIME,
@@ -25,7 +26,7 @@ from ..recording.nuisance import (
     rotation,
 )
 
-OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME)
+OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME, DEPTH_EDGE)
 # One over the deviation of what counts as exact.
 EXACT = 1e6
 
@@ -41,12 +42,15 @@ class View:
         Among those of the experiment.
     nuisance : NuisanceMap
     pivot_m : (3,) in its frame: its turn is about the middle of the body
+    size_m : float
+        Diagonal of the undeformed body [m].
     """
 
     depth: Depth
     number: int
     nuisance: NuisanceMap
     pivot_m: Array
+    size_m: float
 
     @classmethod
     def of(cls, experiment: Experiment, number: int, nuisance: NuisanceMap) -> View:
@@ -54,11 +58,17 @@ class View:
         depth = experiment.depths[number]
         rotations, translations = depth.camera.motion(depth.times[:1])
         pivot_m = (experiment.body.nodes_m.mean(axis=0) - translations[0]) @ rotations[0]
-        return cls(depth, number, nuisance, pivot_m)
+        size_m = float(np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0)))
+        return cls(depth, number, nuisance, pivot_m, size_m)
 
     @cached_property
     def instruments(self) -> dict[tuple[int, int], Any]:
         """Of its readings, whose derivatives are generated once."""
+        return {}
+
+    @cached_property
+    def outline_instruments(self) -> dict[tuple[int, int], Any]:
+        """Of the readings of its outlines, whose derivatives are generated once."""
         return {}
 
     @cached_property
@@ -102,6 +112,12 @@ class View:
         seen = self._corrected.value(phi[self.own], np.vstack([points.T, rays.T])).T
         rotations, translations = self.motion
         return seen @ rotations[sample].T + translations[sample]
+
+    def middle_m(self, sample: int) -> Array:
+        """Middle (3,) of the undeformed body in the camera's frame as stated, at a sample [m]."""
+        rotations, translations = self.motion
+        middle_m = rotations[0] @ self.pivot_m + translations[0]
+        return (middle_m - translations[sample]) @ rotations[sample]
 
     def own_m(self, phi: Array, points_m: Array, sample: int) -> Array:
         """(P, 3) points (P, 3) of the world in its frame: what `world` says of it, but for bias."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,6 +30,11 @@ Pose = tuple[Row, Row, Row, Row]
 JUMP = 0.02
 # Of distortion: fixed-point iterations, of which each gains two digits for usual lenses.
 UNDISTORTING = 12
+# Images of a recording whose outlines are compared, at most: each is kept whole in memory, and one
+# of 640 x 480 pixels takes 1.2 MB.
+MOST_OUTLINED = 40
+
+Background = Literal["auto", "empty", "unknown"]
 
 
 def _poses(poses: Any) -> PoseSequence:
@@ -113,6 +118,24 @@ class DepthCamera:
             plain = (seen[:, :2] - np.column_stack([across, down])) / radial[:, None]
         return np.column_stack([plain, np.ones(len(plain))])
 
+    def distorted_pixels(self, points_m: Array) -> Array:
+        """Pixels (P, 2), u and v, of points (P, 3) of the camera's frame, through its lens.
+
+        The inverse of `rays`. Points must be in front of the camera, z > 0.
+        """
+        x, y = (points_m[:, :2] / points_m[:, 2:]).T
+        k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
+        r2 = x**2 + y**2
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        bent = np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+                y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+                np.ones_like(x),
+            ]
+        )
+        return (self.matrix @ bent)[:2].T
+
     def pixels(self, points_m: Array) -> Array:
         """Where (P, 2) points (P, 3) of its frame are seen, without distortion."""
         projected = points_m @ self.matrix.T
@@ -146,6 +169,19 @@ class Depth:
         Farther from the surface a point is of something else.
     faces : Selection, optional
         Faces that may be seen: those with all corners there. All by default.
+    background : {"auto", "empty", "unknown"}
+        What a pixel without a depth shows. "empty": nothing, so that the body cannot be there.
+        "unknown": anything, as where the sensor gets no echo from dark or steep surfaces. "auto":
+        "empty" in images where hardly any pixel shows something far behind the body, "unknown"
+        else. A measured depth well behind the body shows in either case that the body is not there.
+    outline_sigma_px : float
+        Standard deviation [pixels] of the distance between the body's outline and the edge of what
+        an image shows of the body, at points of the outline that are `spacing_m` apart. Rounding to
+        pixels alone gives 0.3.
+    images_m : sequence of (rows, columns) arrays or None
+        The depth images that the clouds were made from, NaN or 0 without depth, one for each time;
+        None where the outline of the body is not compared with that sample. Empty for clouds, whose
+        outlines are unknown.
 
     Raises
     ------
@@ -163,6 +199,9 @@ class Depth:
     spacing_m: float = key(Positive, default=0.004)
     gate_m: float = key(Positive, default=0.01)
     faces: Selection | None = key(Nodes | None, converter=_faces, read=selection, default=None)
+    background: Background = key(Background, default="auto")
+    outline_sigma_px: float = key(Positive, default=0.5)
+    images_m: Sequence[Any] = ()
 
     def __post_init__(self) -> None:
         where = f"the depth camera '{self.name}'"
@@ -177,7 +216,38 @@ class Depth:
         clouds = tuple(self._thinned(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
         if not any(len(cloud) for cloud in clouds):
             raise InputError(f"{where} has no point; check its file and the unit of its depth")
-        vars(self).update(t_s=times, clouds=clouds)
+        vars(self).update(t_s=times, clouds=clouds, images_m=self._checked_images(len(times)))
+
+    def _checked_images(self, count: int) -> tuple[Array | None, ...]:
+        """`images_m`, single precision, NaN without depth; one of so many times, or none at all.
+
+        Raises
+        ------
+        InputError
+            If there are as many neither as times nor as none, one is not an image, or the camera
+            has no matrix.
+        """
+        where = f"the depth camera '{self.name}'"
+        if not len(self.images_m):
+            return ()
+        if len(self.images_m) != count or self.camera.matrix is None:
+            raise InputError(
+                f"{where} has {len(self.images_m)} images for {count} times; expected as many, or "
+                "none, and the matrix of the camera with them"
+            )
+        images = []
+        for image in self.images_m:
+            if image is None:
+                images.append(None)
+                continue
+            depth = np.array(image, dtype=np.float32)
+            if depth.ndim != 2:
+                raise InputError(
+                    f"an image of {where} has the shape {depth.shape}; expected (rows, columns)"
+                )
+            depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+            images.append(depth)
+        return tuple(images)
 
     @classmethod
     def of_images(
@@ -193,6 +263,8 @@ class Depth:
         images = np.asarray(images_m, dtype=float)
         images = images[None] if images.ndim == 2 else images
         clouds = [points_of(image, camera) for image in images]
+        kept = outlined_samples(len(images))
+        options["images_m"] = [image if k in kept else None for k, image in enumerate(images)]
         return cls(name, t_s, clouds, sigma_m, camera, **options)
 
     def _thinned(self, cloud: Array) -> Array:
@@ -230,12 +302,18 @@ class Depth:
         count = int(np.searchsorted(self.times, end_s, side="right"))
         if not any(map(len, self.clouds[:count])):
             return None
-        return replace(self, t_s=self.times[:count], clouds=self.clouds[:count])
+        images_m = self.images_m[:count]
+        return replace(self, t_s=self.times[:count], clouds=self.clouds[:count], images_m=images_m)
 
     @property
     def first(self) -> int:
         """The first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
+
+
+def outlined_samples(count: int) -> set[int]:
+    """Indices of so many samples whose images are kept for their outlines, evenly spread."""
+    return set(np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINED)).astype(int)).tolist())
 
 
 def begun(depths: Sequence[Depth], t_s: Array, count: int, fewest: int) -> tuple[int, list[Depth]]:

@@ -175,6 +175,10 @@ def _is_seen(experiment: Any) -> bool:
     return bool(experiment.depths)
 
 
+def _has_outlines(experiment: Any) -> bool:
+    return any(len(depth.images_m) for depth in experiment.depths)
+
+
 def _viewed(experiment: Any) -> dict[str, Any]:
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
     return {"body": id(experiment.body), "pose of its cameras": places}
@@ -336,6 +340,11 @@ DEPTH_TIME = NuisanceRow("depth_time_s", "s", 5e-3, key="depth_time", of="depth"
     low=-3.0, high=3.0, by="worst",
     label="time shift of {which}", told="a depth camera is late by {size}",
     said="how much later than its times say a depth camera saw; three deviations at most")
+DEPTH_EDGE = NuisanceRow("depth_edge_px", "px", 2.0, key="depth_edge", of="depth",
+    changes=("depth",), applies=_has_outlines, low=-4.0, high=4.0, reach=FREELY, by="worst",
+    label="edge of {which}", told="silhouettes end {size} inside the body",
+    said="how many pixels inside the outline of the body its silhouette ends in the images of each "
+         "depth camera, all around")
 # fmt: on
 
 # In the order of φ; neighbours of one component stand together.

@@ -262,7 +262,7 @@ def _of_gauges(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
 
 def _of_depths(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
     """The same of depth cameras, of each (S, M, 3), at the points that they see as fitted."""
-    if not (sights := part.sights):
+    if not (sights := part.surface_sights):
         return []
     known_s, rows_s = part.segment.experiment.t_s, part.segment.dynamics.t_s
     fitted = part.x[part.segment.markers.grid_rows]

@@ -20,9 +20,11 @@ from ..methods.workers import Workers, workers_of
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
+from ..statistics.cameras import require_depth_units
 from ..statistics.fields import fields_by_information
 from ..statistics.linearised import values_of
 from .check.cost import require_memory
+from .several_starts import best_start
 from .warm_start import Earlier
 
 # How a search ends that went astray; another start may help.
@@ -119,6 +121,9 @@ def _solved(
     problem = problem if earlier is None else earlier.started(problem)
     try:
         whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
+        started_from: list[str] = []
+        for experiment in collocation.experiments:
+            require_depth_units(experiment)
         if earlier is not None and problem.substeps == "auto":
             collocation = replace(collocation, substeps=earlier.substeps)
         has_guesses = not collocation.parameters.unguessed
@@ -132,7 +137,16 @@ def _solved(
             collocation = earlier.placed(collocation)
             variables = earlier.variables(collocation)
         solver = shared(solver, workers)
-        solution = read_where_found(solver, collocation, watch, variables)
+        solution = None
+        if scan is not None:
+            begun = best_start(
+                solver, collocation, scan, watch, lambda by, of: read_where_found(by, of, watch)
+            )
+            collocation, scan = placed_at_guess(begun.collocation), begun.scan
+            solution = begun.solution
+            started_from = [begun.note] if begun.note else []
+        if solution is None:
+            solution = read_where_found(solver, collocation, watch, variables)
         if scan is None and solution.status in LOST:
             scan, solution = _again(solver, solution, watch)
         if solution.status.converged and earlier is None and solution.method == ReducedSpace.name:
@@ -142,7 +156,8 @@ def _solved(
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
-    notes = (*([] if scan is None else [scan.sentence]), *solution.notes, *_seen(solution))
+    said = [] if scan is None else [scan.sentence]
+    notes = (*said, *started_from, *solution.notes, *_seen(solution))
     return replace(solution, scan=scan or solution.scan, notes=notes)
 
 
@@ -162,6 +177,13 @@ def _seen(solution: Solution) -> Iterator[str]:
                 f"experiment '{part.segment.experiment.name}': {seen.used.sum()} points of "
                 f"'{seen.view.depth.name}' {off}; left out: {said or 'none'}"
             )
+        for outline, apart_px in part.outline_distances_px:
+            if len(apart_px):
+                yield (
+                    f"experiment '{part.segment.experiment.name}': {len(apart_px)} points of the "
+                    f"body's outline are off the edges in '{outline.sighting.view.depth.name}' by "
+                    f"{np.sqrt(np.mean(apart_px**2)):.2g} pixels (RMS)"
+                )
 
 
 def shared(solver: Method, workers: Workers | None) -> Method:

@@ -15,7 +15,7 @@ from ..problem import Problem
 from ..program.depth_comparison import DepthError, SurfaceComparison
 from ..program.stability import instabilities
 from ..program.touches import touched
-from ..recording.nuisance import TIME
+from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN, TIME
 from ..recording.turning import TOO_FAST
 from ..statistics.budget import worded
 from ..statistics.concern import Concern
@@ -24,12 +24,14 @@ from ..statistics.plausible import odd_material, oddities
 from ..statistics.remedies import remedy_for
 from ..statistics.scale import scale_concerns
 from ..statistics.trust import (
+    camera_pose_concerns,
     clock_concerns,
     contact_concerns,
     fit_concerns,
     marker_concerns,
     noise_rms_m,
     nuisance_concerns,
+    outline_concerns,
     parameter_concerns,
     prediction_concerns,
     rollout_concerns,
@@ -74,6 +76,14 @@ def concerns(
         # A lag and a tool may well be none.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(nuisance.names, part.phi, low, high)
+        for camera in range(len(part.segment.experiment.depths)):
+            pose = nuisance.places(DEPTH_TURN, DEPTH_SHIFT, of=camera)
+            yield from camera_pose_concerns(
+                [nuisance.names[k] for k in pose], part.phi[pose].tolist()
+            )
+        for reading, apart_px in part.outline_distances_px:
+            camera = f"'{reading.sighting.view.depth.name}' of '{part.segment.experiment.name}'"
+            yield from outline_concerns(camera, apart_px)
         for k in nuisance.places(TIME):
             scale, name = float(nuisance.scales[k]), part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)

@@ -266,7 +266,8 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
     if fit.chi_squared <= ROUNDING**2 * fit.measurements:
         return Dependence(0.0, np.inf, 1.0)
     pairs = zip(fit.blocks, information.slopes, strict=True)
-    over_space = [found for each in pairs if (found := spatial_errors(*each))]
+    tested = (each for each in pairs if not each[0].noise_at_least_stated)
+    over_space = [found for each in tested if (found := spatial_errors(*each))]
     space_p = min((len(over_space) * found.p for found in over_space), default=1.0)
     found = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
@@ -358,8 +359,11 @@ def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> Erro
     channels *= autocovariance[0] * weight.sum() / level if level > 0 else 0.0
     if over_space is not None and len(residual) <= residual.shape[1]:
         # Samples are too few to tell a covariance by themselves.
-        samples = np.inf, len(residual) * over_space.freedom
-        return ErrorProcess(along, over_space.covariance, len(coefficients), *samples)
+        covariance, freedom = over_space.covariance, len(residual) * over_space.freedom
+        if block.noise_at_least_stated and np.trace(covariance) < len(covariance):
+            covariance, freedom = np.eye(len(covariance)), np.inf
+        samples = np.inf, freedom
+        return ErrorProcess(along, covariance, len(coefficients), *samples)
     fitted = float(np.sum(slope**2))
     memory = 1 + 2 * float(np.sum(along[1:] ** 2))
     independent = _samples(present) * _effective_channels(channels)

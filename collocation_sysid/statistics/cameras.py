@@ -15,10 +15,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..arrays import Array
+from ..errors import InputError
 from ..program.camera_alignment import thinned
 from ..program.sighting import wide_m
 from ..program.skin import Skin
-from ..recording.depth import Depth
+from ..recording.depth import Depth, points_of
 from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
@@ -35,6 +36,11 @@ FRAMES = {
 }
 EXPECTED = "state that of one with x to the right, y down, z forward"
 MILLI = 1e-3
+# Units that are wrong by powers of ten up to this one are looked for.
+LARGEST_POWER = 4
+# A cloud of fewer points is all within a few of the cubes that it was thinned by, as where its unit
+# is too small.
+COLLAPSED = 50
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,10 @@ def _turned(seeing: Seeing, turn: list[list[int]]) -> Seeing:
     pose = seeing.pose.copy()
     pose[:3, :3] = pose[:3, :3] @ np.array(turn, dtype=float)
     return replace(seeing, pose=pose)
+
+
+def _with_factor(seeing: Seeing, factor: float) -> Seeing:
+    return replace(seeing, factor=factor)
 
 
 Undo = Callable[[Seeing], Seeing]
@@ -94,6 +104,44 @@ MISTAKES: tuple[dict[str, Undo], ...] = (
     {"camera.pose were in mm (state it in m)": partial(_scaled, by=MILLI)},
 )
 
+# Wrong units by other powers of ten than a thousand: looked for alone, as they are rare.
+POWERS: dict[str, Undo] = {
+    f"its points were {10.0**power:g} times as far away (state count_m or length_unit)": partial(
+        _with_factor, factor=10.0**power
+    )
+    for power in range(-LARGEST_POWER, LARGEST_POWER + 1)
+    if abs(power) not in (0, 3)
+}
+
+
+def require_depth_units(experiment: Experiment) -> None:
+    """Refuse depth whose unit is wrong by a power of ten: no point would be near the body.
+
+    Raises
+    ------
+    InputError
+        Where hardly any of the body has points of a camera nearby, and most of it would have if all
+        distances were a power of ten times as large.
+    """
+    for depth in experiment.depths:
+        view = _OneCamera(experiment, depth)
+        if view.share(view.stated) >= HARDLY:
+            continue
+        factors = [10.0**k for k in range(-LARGEST_POWER, LARGEST_POWER + 1) if k]
+        shares = {factor: view.share(_with_factor(view.stated, factor)) for factor in factors}
+        factor = max(factors, key=lambda each: shares[each])
+        if shares[factor] < (HARDLY if view.collapsed else WELL):
+            continue
+        raise InputError(
+            f"the points of the depth camera '{depth.name}' of '{experiment.name}' are "
+            f"{view.points_m:.3g} m away (median), the body {view.body_m:.3g} m, a factor of "
+            f"{1 / factor:g}: their unit is wrong; expected metres: multiply "
+            f"count_m by {factor:g} (integer images such as .png, "
+            "0.001 where it is not stated; in an .npz its own count_m), give depth_m in metres, or "
+            "state length_unit of a cloud",
+            where="experiment.depth",
+        )
+
 
 def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
     """That depth cameras are described wrongly which see hardly anything of the body."""
@@ -119,22 +167,37 @@ class _OneCamera:
     stated : Seeing
     within_m : float
         So near to the undeformed body points may be of it.
+    points_m, body_m : float
+        Median distances of its points and of the undeformed body from the camera [m].
+    collapsed : bool
+        Whether too few points are left to be near much of the body.
     """
 
     stated: Seeing
     within_m: float
+    points_m: float
+    body_m: float
+    collapsed: bool
 
     def __init__(self, experiment: Experiment, depth: Depth) -> None:
         camera = depth.camera
         self.skin, self.pinhole = Skin.of(experiment.body, depth), camera.matrix is not None
         self.shape_m = self.skin.first_m(experiment, depth)
-        self.tree = KDTree(thinned(depth.points_m[depth.first]))
+        points_m = depth.points_m[depth.first]
+        image_m = depth.images_m[depth.first] if len(depth.images_m) else None
+        if len(points_m) < COLLAPSED and image_m is not None:
+            points_m = points_of(image_m, camera)
+        self.tree = KDTree(thinned(points_m))
+        self.collapsed = len(points_m) < COLLAPSED
         carrier = np.eye(4)
         if camera.poses is not None:
             rotations, translations = camera.poses.at(depth.times[[depth.first]])
             carrier[:3, :3], carrier[:3, 3] = rotations[0], translations[0]
         self.stated = Seeing(carrier, camera.pose)
         self.within_m = wide_m(self.shape_m)
+        eye_m = (carrier @ camera.pose)[:3, 3]
+        self.points_m = float(np.median(np.linalg.norm(points_m, axis=1)))
+        self.body_m = float(np.median(np.linalg.norm(self.shape_m - eye_m, axis=1)))
 
     def share(self, seeing: Seeing) -> float:
         """Of the surface that is turned to the camera what has points nearby."""
@@ -154,9 +217,10 @@ class _OneCamera:
         A body that looks alike from two sides does not tell which of two it is.
         """
         for count in (1, 2):
+            alone = (POWERS,) if count == 1 else ()
             shares = {
                 names: self.share(self._without(names))
-                for kinds in combinations(MISTAKES, count)
+                for kinds in combinations((*MISTAKES, *alone), count)
                 for names in product(*kinds)
             }
             least = max(WELL, max(shares.values()) - ALIKE)
@@ -165,5 +229,5 @@ class _OneCamera:
         return []
 
     def _without(self, mistakes: tuple[str, ...]) -> Seeing:
-        undo = dict(chain.from_iterable(kind.items() for kind in MISTAKES))
+        undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
         return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.stated)

@@ -143,6 +143,10 @@ TOPICS: Mapping[str, Topic] = {
         "beginning a wrong time of release, an oscillation a wrong stiffness or damping. "
         "compare --materials tells whether another model predicts better.",
         {
+            "outline": "at {percent:.0f} % of its points the outline of the body is more than "
+            "{pixels:.0f} pixels off the edge of what {camera} shows of it: the body may be held "
+            "or hidden elsewhere, or have another stiffness; where depths are missing on the body "
+            'itself, state background = "unknown"',
             "outlier": f"{SAMPLE}leave it out, or set solver.huber",
             "first": f"{SAMPLE}the body counts as relaxed at the first sample; let the recording "
             "begin before the load does, or leave the sample out",
@@ -213,6 +217,9 @@ TOPICS: Mapping[str, Topic] = {
         {
             "limit": "{name} ended at the largest value allowed",
             "far": "{name} is {deviations:.1f} deviations of its prior away from zero",
+            "camera": "{name} is {deviations:.1f} deviations of its prior away from the pose "
+            "stated: a body of another stiffness may fit as well with the camera elsewhere; "
+            "measure the pose, or state how well it is known (nuisance.depth_pose)",
             "clock": "the markers of '{experiment}' were seen {shift_ms:.2g} ms {when} than their "
             "times say: the estimates allow for it; better find out why",
         },

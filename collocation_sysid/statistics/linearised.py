@@ -111,6 +111,8 @@ class FitBlock:
         Where channels are on the undeformed body.
     disturbances : (K, T, M, 3), optional
         Samples of what the residuals have besides their noise, in units of σ.
+    noise_at_least_stated : bool
+        See `Reading`.
     """
 
     name: str
@@ -127,6 +129,7 @@ class FitBlock:
     relaxed_first: bool = False
     places_m: Array | None = None
     disturbances: Array | None = None
+    noise_at_least_stated: bool = False
 
     @cached_property
     def seen(self) -> Mask:
@@ -285,6 +288,7 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                     static=experiment.static,
                     relaxed_first=relaxed,
                     places_m=reading.pool.places_m,
+                    noise_at_least_stated=reading.noise_at_least_stated,
                 )
             )
     prior_residual, prior_slope = collocation.prior(p)

@@ -133,7 +133,11 @@ def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
         Of the fit.
     """
     names, squares, counts, shares = [], [], [], []
+    stated = np.zeros_like(information.prior)
     for block, slope in zip(fit.blocks, information.slopes, strict=True):
+        if block.noise_at_least_stated:
+            stated += _stated_noise(block, slope)
+            continue
         by_marker = slope.reshape(*block.present.shape, 3, slope.shape[2])
         for m in np.flatnonzero(block.present.any(axis=0)).tolist():
             rows = by_marker[:, m].reshape(3 * len(block.t_s), slope.shape[2])
@@ -148,12 +152,30 @@ def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
         np.array(counts, dtype=float),
         besides,
         np.array(shares).reshape(len(names), *information.prior.shape),
-        information.prior,
-        of_score,
+        information.prior + stated,
+        of_score + stated,
     )
-    stated = [block.stated for block in fit.blocks if block.present.any()]
+    said = [b.stated for b in fit.blocks if b.present.any() and not b.noise_at_least_stated]
     # That of places stands for all.
-    return replace(level, stated=min(stated, key="sigma_m".__ne__, default="sigma_m"))
+    return replace(level, stated=min(said, key="sigma_m".__ne__, default="sigma_m"))
+
+
+def _stated_noise(block: FitBlock, slope: Array) -> Array:
+    """Return the covariance (r, r) of the score by the noise of a block that is known as stated.
+
+    Residuals that are larger than stated make it larger.
+
+    Parameters
+    ----------
+    block : FitBlock
+    slope : (T, 3M, r) array
+        In units of what is known.
+    """
+    rows = slope.reshape(-1, slope.shape[2])
+    share = rows.T @ rows
+    left = max(1.0, block.measurements - float(np.trace(share)))
+    factor = max(1.0, float(np.sum(block.residual**2)) / shortened(block) / left)
+    return factor * share
 
 
 def drawn(fit: LinearisedFit) -> list[Array]:
@@ -178,7 +200,7 @@ def projected(information: Information, errors: Sequence[Array]) -> tuple[Array,
 
 def _besides(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
     """Covariance (r, r) of the score, and (G, K) sums of squares of each marker."""
-    seen = [block.present.any(axis=0) for block in fit.blocks]
+    seen = [block.present.any(axis=0) & (not block.noise_at_least_stated) for block in fit.blocks]
     if not len((samples := drawn(fit))[0]):
         return np.zeros_like(information.prior), np.zeros((int(np.concatenate(seen).sum()), 1))
     scores, left = projected(information, samples)

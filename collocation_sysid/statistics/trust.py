@@ -7,7 +7,7 @@ markers and nuisance parameters there are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
@@ -55,6 +55,11 @@ ROLLOUT, GROSS_ROLLOUT = 0.35, 2.0
 PREDICTION, GROSS_PREDICTION = 3.0, 10.0
 # Nuisance parameters this many deviations of their priors away.
 FAR, ABSURD = 3.0, 6.0
+# Deviations of its prior that the pose of a depth camera may be off: it trades for the shape.
+CAMERA_FAR = 2.0
+# Points of an outline may be so many pixels off the edge in the image, but for this share of them:
+# edges of pixels scatter by 0.3, lenses and wrong depths at edges by one.
+OUTLINE_FAR_PX, OUTLINE_SHARE = 3.0, 0.1
 LATE = 1.8
 # Share of the samples beyond Huber's threshold, of all.
 WILD, HARDLY_TAME = MOST_WILD, 0.2
@@ -133,7 +138,8 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     larger = factor > MISFIT and level.larger_p < RARE
     # Of single samples nothing tells that it is noise.
     no_noise = persistent or shared or not np.isfinite(found.lag1_deviation)
-    smaller = not larger and factor < 1 / MISFIT and level.smaller_p < RARE and not matters
+    # Residuals of exactly zero are those of no measurement at all.
+    smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not matters
     stated = level.stated
     return [
         *(outlier.concern for outlier in uncertainty.outliers),
@@ -147,7 +153,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
         *concerned(
             larger, factor > GROSS_MISFIT and no_noise, "noise/larger", factor=factor, stated=stated
         ),
-        *concerned(smaller, False, "noise/smaller", factor=1 / factor, stated=stated),
+        *concerned(smaller, False, "noise/smaller", factor=1 / (factor or 1.0), stated=stated),
         *_uneven_concerns(level),
         *_scatter_concerns(uncertainty),
     ]
@@ -294,6 +300,48 @@ def nuisance_concerns(
             away > far and not limited, away > ABSURD, "nuisance/far", name=name, deviations=away
         )
     return concerns
+
+
+def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> list[Concern]:
+    """Return a concern if a depth camera is farther from its stated pose than expected.
+
+    A wrong shape of the body often fits with a camera that is turned and shifted to match.
+
+    Parameters
+    ----------
+    names : (k,) sequence of str
+        Of the turns and shifts of one camera.
+    deviations : (k,) sequence of float
+        Their values in standard deviations of their priors.
+    """
+    if not len(names):
+        return []
+    worst = int(np.argmax(np.abs(deviations)))
+    away = abs(float(deviations[worst]))
+    return concerned(
+        away > CAMERA_FAR, False, "nuisance/camera", name=names[worst], deviations=away
+    )
+
+
+def outline_concerns(camera: str, apart_px: Array) -> list[Concern]:
+    """Return a concern if the outline of the body is elsewhere than a camera's images show.
+
+    Parameters
+    ----------
+    camera : str
+        Name of the depth camera, and of its experiment.
+    apart_px : (n,) array
+        Distances of outline points from the edges in the images [pixels].
+    """
+    share = float(np.mean(np.abs(apart_px) > OUTLINE_FAR_PX)) if len(apart_px) else 0.0
+    return concerned(
+        share > OUTLINE_SHARE,
+        False,
+        "residuals/outline",
+        camera=camera,
+        pixels=OUTLINE_FAR_PX,
+        percent=100 * share,
+    )
 
 
 def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:

@@ -1,0 +1,367 @@
+"""Outline of a body in a depth image, compared with the edge of what the image shows of the body.
+
+Distances along the normals of the surface do not tell how far the surface reaches: a body may
+extend beyond everything that was measured without any point being off its surface. Here points of
+the body's outline, as the camera sees it, are compared with the edge of what the image shows of it.
+
+A pixel is evidence that the body is not there where it shows something farther away than the body,
+or nothing at all in images whose background gives no depth (see `Depth.background`). It is no
+evidence where something nearer hides the body, or where a depth is missing for unknown reasons. The
+edge is looked for along the normal of the outline (Harris & Stennett 1990); where the body reaches
+farther into pixels that show nothing than that search, the nearest other pixel counts.
+
+Each pair of an outline point and an edge is a plane through the camera: its distance from the
+outline point, in pixels, is the residual (see `outline_reading`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+
+from ..arrays import Array, Index
+from ..fem.body import Body
+from ..recording.depth import DepthCamera
+from .skin import Skin
+from .view import View
+
+# The edge is looked for so many pixels to either side of the outline, in such steps: farther away
+# it may be the edge of another part of the body.
+SEARCH_PX = 6.0
+STEP_PX = 0.25
+# Pixels so far outside of an outline are not covered by the body itself.
+OUTSIDE_PX = 1.5
+# Where as many pixels show something far behind the body as have no depth, times this share, the
+# sensor sees its background, and missing depths are failures.
+SEEN_BACKGROUND = 0.1
+# What pixels show, compared with a point of the outline.
+BODY, UNKNOWN, EMPTY = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Points of a body's outline and planes through the camera that they should lie in.
+
+    Arrays have S samples of E points at most; those beyond are not `used`.
+
+    Attributes
+    ----------
+    nodes, weights : (S, E, v) of the surface's nodes in each outline point
+    normals : (S, E, 3) of the planes, in the world, outwards from the body
+    points, rays : (S, E, 3) a point of each plane in the camera's frame, and zeros
+    pixel_m : (S, E) width of a pixel at the outline point, along the plane's normal [m]
+    places_m : (S, E, 3) outline points on the undeformed body
+    used : (S, E) outline points whose edge is known
+    """
+
+    nodes: Index
+    weights: Array
+    normals: Array
+    points: Array
+    rays: Array
+    pixel_m: Array
+    places_m: Array
+    used: NDArray[np.bool_]
+
+    @classmethod
+    def from_shapes(
+        cls, view: View, skin: Skin, body: Body, *, shapes_m: Array, phi: Array, gate_m: float
+    ) -> Outline:
+        """Associate the outlines of shapes with the edges in the images of a camera.
+
+        Parameters
+        ----------
+        view : View
+        skin : Skin
+        body : Body
+        shapes_m : (S, n, 3) array
+            Positions of the surface's nodes at the times of the images [m].
+        phi : (k,) array
+            Nuisance parameters, with the pose of the camera.
+        gate_m : float
+            Pixels whose depth differs by less from that of the outline point may show the body [m].
+        """
+        corners = skin.faces.shape[1]
+        found = []
+        for sample, shape_m in enumerate(shapes_m):
+            image_m = view.depth.images_m[sample] if len(view.depth.images_m) else None
+            points = None
+            if image_m is not None:
+                points = _outline_points(view, skin, shape_m, phi=phi, sample=sample)
+            if image_m is None or points is None:
+                found.append(_no_edges(corners))
+                continue
+            found.append(_edges(view, points, image_m, phi=phi, gate_m=gate_m, sample=sample))
+        most = max(1, *(len(each["used"]) for each in found))
+
+        def together(name: str) -> NDArray:
+            return np.stack([_padded(each[name], most) for each in found])
+
+        of_points = {name: together(name) for name in found[0] if name not in ("faces",)}
+        faces = together("faces")
+        nodes = skin.faces[faces]
+        rest_m = body.nodes_m[skin.nodes][nodes]
+        return cls(
+            nodes=nodes,
+            places_m=np.einsum("sea,seai->sei", of_points["weights"], rest_m),
+            rays=np.zeros_like(of_points["points"]),
+            **of_points,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _OutlinePoints:
+    """Points (P) where the body ends in the view of a camera.
+
+    Attributes
+    ----------
+    faces : (P,) of the surface
+    weights : (P, v) of its nodes
+    depth_m : (P,) along the optical axis
+    pixels : (P, 2) u and v
+    outwards : (P, 2) unit normals of the outline in the image, away from the body
+    """
+
+    faces: Index
+    weights: Array
+    depth_m: Array
+    pixels: Array
+    outwards: Array
+
+
+def _padded(values: NDArray, count: int) -> NDArray:
+    return np.pad(values, [(0, count - len(values)), *[(0, 0)] * (values.ndim - 1)])
+
+
+def _no_edges(corners: int) -> dict[str, NDArray]:
+    """What `_edges` returns of no points."""
+    return {
+        "faces": np.zeros(0, dtype=np.int64),
+        "weights": np.zeros((0, corners)),
+        "normals": np.zeros((0, 3)),
+        "points": np.zeros((0, 3)),
+        "pixel_m": np.zeros(0),
+        "used": np.zeros(0, dtype=bool),
+    }
+
+
+def no_depth_is_empty(view: View, image_m: Array, *, sample: int, size_m: float) -> bool:
+    """Return whether pixels without depth show that nothing is there.
+
+    Parameters
+    ----------
+    view : View
+    image_m : (rows, columns) array
+        Depths [m], NaN where missing.
+    sample : int
+        Index of the image.
+    size_m : float
+        Diagonal of the body [m]; what is farther behind its middle is background.
+    """
+    if view.depth.background != "auto":
+        return view.depth.background == "empty"
+    # The middle of the body as stated, which may move with the camera: a coarse measure suffices.
+    middle_m = float(view.middle_m(sample)[2])
+    background = np.count_nonzero(image_m > middle_m + size_m)
+    return bool(background < SEEN_BACKGROUND * np.count_nonzero(np.isnan(image_m)))
+
+
+def _outline_points(
+    view: View, skin: Skin, shape_m: Array, *, phi: Array, sample: int
+) -> _OutlinePoints | None:
+    """Return the points where a shape (n, 3) ends in a camera's view; None where there are none.
+
+    They lie `spacing_m` apart on edges between a flat triangle that faces the camera and one that
+    does not, and are not in front of or behind another part of the body.
+    """
+    eye_m = view.eye_m(phi, sample)
+    camera = view.depth.camera
+    own_m = view.own_m(phi, shape_m, sample)
+    if eye_m is None or (own_m[:, 2] <= 0).any():
+        return None
+    facing = skin.facing(shape_m, eye_m)
+    ends, beside = skin.edges
+    front = facing[beside]
+    first, second = beside.T
+    seen = np.where(front[:, 0], first, second)
+    parts = len(skin.flat) // len(skin.faces)
+    outer = np.flatnonzero((front[:, 0] != front[:, 1]) & skin.chosen[seen // parts])
+    if not len(outer):
+        return None
+    ends, seen = ends[outer], seen[outer]
+    corners = skin.flat[seen]
+    lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
+    counts = np.maximum(1, np.ceil(lengths_m / view.depth.spacing_m).astype(int))
+    edge = np.repeat(np.arange(len(outer)), counts)
+    number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = (number + 0.5) / counts[edge]
+    # Barycentric coordinates in the triangle that faces the camera.
+    at_first = corners[edge] == ends[edge, :1]
+    at_second = corners[edge] == ends[edge, 1:]
+    shares = at_first * (1 - share)[:, None] + at_second * share[:, None]
+    faces, places = skin.at(seen[edge], shares)
+    weights, points_m, _ = skin.points(shape_m, faces, places)
+    pixels = camera.distorted_pixels(own_m)
+    along = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
+    length_px = np.linalg.norm(along, axis=1)
+    normals = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length_px, 1e-9)[:, None]
+    centres = pixels[corners[edge]].mean(axis=1)
+    at_m = view.own_m(phi, points_m, sample)
+    places_px = camera.distorted_pixels(at_m)
+    inwards = np.sum(normals * (places_px - centres), axis=1) < 0
+    outwards = np.where(inwards[:, None], -normals, normals)
+    apart = _first_of_each_cube(points_m, view.depth.spacing_m)
+    alone = ~_covered(places_px + OUTSIDE_PX * outwards, pixels[skin.flat[facing]])
+    kept = apart[(alone & (length_px > 1e-6))[apart]]
+    if not len(kept):
+        return None
+    return _OutlinePoints(
+        faces=faces[kept],
+        weights=weights[kept],
+        depth_m=at_m[kept, 2],
+        pixels=places_px[kept],
+        outwards=outwards[kept],
+    )
+
+
+def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
+    """Indices of the first of the points (P, 3) in each cube of a grid with edges [m]."""
+    _, first = np.unique(np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True)
+    return np.sort(first)
+
+
+def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
+    """Return whether points (P, 2) of an image lie within any of its triangles (T, 3, 2)."""
+    covered = np.zeros(len(points), dtype=bool)
+    if not len(triangles):
+        return covered
+    middles = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - middles[:, None], axis=2).max()
+    near = KDTree(middles).query_ball_point(points, reach)
+    point = np.repeat(np.arange(len(points)), [len(each) for each in near])
+    a, b, c = triangles[np.concatenate([*near, []]).astype(int)].transpose(1, 0, 2)
+
+    def side(start: Array, end: Array) -> Array:
+        way, to = end - start, points[point] - start
+        return way[:, 0] * to[:, 1] - way[:, 1] * to[:, 0]
+
+    sides = np.stack([side(a, b), side(b, c), side(c, a)])
+    covered[point[(sides >= 0).all(axis=0) | (sides <= 0).all(axis=0)]] = True
+    return covered
+
+
+def _edges(
+    view: View,
+    points: _OutlinePoints,
+    image_m: Array,
+    *,
+    phi: Array,
+    gate_m: float,
+    sample: int,
+) -> dict[str, NDArray]:
+    """Return the planes through the edges in an image that belong to points of an outline."""
+    camera = view.depth.camera
+    empty = no_depth_is_empty(view, image_m, sample=sample, size_m=view.size_m)
+    offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
+    across = points.pixels[:, None] + offsets[:, None] * points.outwards[:, None]
+    shown = _shown(image_m, across, points.depth_m[:, None], gate_m=gate_m, empty=empty)
+    ends = (shown[:, :-1] == BODY) & (shown[:, 1:] == EMPTY)
+    middles = (offsets[:-1] + offsets[1:]) / 2
+    nearest = np.where(ends, np.abs(middles), np.inf).argmin(axis=1)
+    has_edge = ends.any(axis=1)
+    outwards = points.outwards.copy()
+    edges = points.pixels + middles[nearest, None] * outwards
+    here = _shown(image_m, points.pixels, points.depth_m, gate_m=gate_m, empty=empty)
+    beyond = ~has_edge & (here == EMPTY)
+    if beyond.any():
+        nothing = (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
+        edges[beyond], outwards[beyond], found = _nearest_other(nothing, points.pixels[beyond])
+        beyond[beyond] = found
+    return {
+        "faces": points.faces,
+        "weights": points.weights,
+        "used": has_edge | beyond,
+        **_planes(view, camera, edges, outwards, points.depth_m, phi=phi, sample=sample),
+    }
+
+
+def _shown(
+    image_m: Array, pixels: Array, depth_m: Array, *, gate_m: float, empty: bool
+) -> NDArray[np.int64]:
+    """Return what an image shows at pixels (…, 2) beside a body at depths: BODY, UNKNOWN or EMPTY.
+
+    Outside of the image nothing is known. `empty` says what a missing depth (NaN) shows.
+    """
+    column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
+    inside = (column >= 0) & (column < image_m.shape[1]) & (row >= 0) & (row < image_m.shape[0])
+    found_m = image_m[np.where(inside, row, 0), np.where(inside, column, 0)]
+    behind_m = found_m - depth_m
+    shown = np.full(found_m.shape, UNKNOWN)
+    shown[np.abs(behind_m) <= gate_m] = BODY
+    shown[(behind_m > gate_m) | (np.isnan(found_m) & empty)] = EMPTY
+    shown[~inside] = UNKNOWN
+    return shown
+
+
+def _nearest_other(
+    nothing: NDArray[np.bool_], pixels: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the edges nearest to pixels (P, 2) where nothing is, the ways there, and if any.
+
+    The edge lies half a pixel from the middle of the nearest other pixel; the way (P, 2) is a unit
+    vector from the edge to the pixel.
+    """
+    if nothing.all():
+        return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
+    places: Array = np.asarray(
+        distance_transform_edt(nothing, return_distances=False, return_indices=True)
+    )
+    column, row = np.round(pixels).astype(np.int64).T
+    nearest = places[::-1, row, column].T.astype(float)
+    way = pixels - nearest
+    length = np.linalg.norm(way, axis=1)
+    found = length > 0
+    way[found] /= length[found, None]
+    way[~found] = [1.0, 0.0]
+    return nearest + 0.5 * way, way, found
+
+
+def _planes(
+    view: View,
+    camera: DepthCamera,
+    edges: Array,
+    outwards: Array,
+    depth_m: Array,
+    *,
+    phi: Array,
+    sample: int,
+) -> dict[str, NDArray]:
+    """Return planes through the camera and edges (P, 2) in its image, with normals outwards (P, 2).
+
+    Depths (P,) [m] tell how wide a pixel is, and where the point of each plane is chosen.
+    """
+    along = np.column_stack([-outwards[:, 1], outwards[:, 0]])
+    at, before, after, outside = _rays(
+        camera, [edges, edges - along, edges + along, edges + outwards]
+    )
+    normals = np.cross(before, after)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    pixel = np.sum(normals * (outside - at), axis=1)
+    normals *= np.sign(pixel)[:, None]
+    corner = view.corrected_at(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)
+    ways = view.corrected_at(phi, normals, np.zeros_like(normals), sample) - corner
+    return {
+        "normals": ways / np.linalg.norm(ways, axis=1)[:, None],
+        "points": depth_m[:, None] * at,
+        "pixel_m": np.abs(pixel) * depth_m,
+    }
+
+
+def _rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
+    """Rays of several sets of pixels (P, 2), found together."""
+    return np.split(camera.rays(np.concatenate(pixels)), len(pixels))

@@ -1,0 +1,88 @@
+"""Outline of a body in depth images as a measurement: how many pixels the body reaches too far.
+
+    r = (n · (Σ_i ℓ_i(τ) Σ_a N_a x_{a,i} − T (R(a) ((1 + s) p − c) + c + e)) / h − w) / σ,
+
+with n the normal of a plane through the camera and an edge in its image (see `outline`), p a point
+of that plane, h the width of a pixel there [m], w how many pixels inside the outline of the body
+its silhouette ends all around, and the other symbols as in `depth`. σ is in pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from ..arrays import Array
+from ..recording.nuisance import DEPTH_EDGE
+from .depth import DepthReading
+from .outline import Outline
+from .reading import Instrument, Window
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineReading(DepthReading):
+    """Distances of the points of a body's outline from the edges in a camera's images [pixels]."""
+
+    stated = "outline_sigma_px of depth"
+    noise_at_least_stated = True
+
+    @classmethod
+    def from_depth(cls, depth: DepthReading) -> OutlineReading:
+        """Return the reading of the outline that belongs to a reading of depth."""
+        used = depth.sighting.outline.used
+        samples, points = used.shape
+        view = depth.sighting.view
+        return cls(
+            channel=depth.channel,
+            nuisance=depth.nuisance,
+            huber=depth.huber,
+            names=(f"{view.depth.name} outline",) * points,
+            t_s=depth.t_s,
+            sigmas=np.full(points, view.depth.outline_sigma_px),
+            measured=np.zeros((samples, points, 1)),
+            components=used[..., None],
+            own=np.tile(view.own, (points, 1)),
+            sighting=depth.sighting,
+            at_s=depth.at_s,
+        )
+
+    @property
+    def pairs(self) -> Outline:
+        """Points of the outline, and planes through the edges in the images."""
+        return self.sighting.outline
+
+    @property
+    def _instruments(self) -> dict[tuple[int, int], Instrument]:
+        return self.sighting.view.outline_instruments
+
+    @cached_property
+    def _window(self) -> Window:
+        places, data = super()._window
+        width_m = np.where(self.pairs.used, self.pairs.pixel_m, 1.0)
+        return Window(places, np.concatenate([data, width_m[None]]))
+
+    def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return how many pixels an outline point is outside of its edge."""
+        count = data.numel() - 1
+        outside_m = super().expression(looked, phi, data[:count])
+        inside_px = self.nuisance.by_row(phi, self.own[0]).get(DEPTH_EDGE, 0)
+        return outside_m / data[count] - inside_px
+
+    def apart_px(self, values: Array, phi: Array) -> Array:
+        """Return how many pixels (s, E) outline points are outside of their edges, NaN without one.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Positions of the surface's nodes at the times of the channel [m].
+        phi : (k,) array
+            Nuisance parameters in units of their priors.
+        """
+        return self.apart_m(values, phi)
+
+    def roughly(self, x: Array, phi: Array) -> Array:
+        """Return no residual: before anything is fitted, distances to the points suffice."""
+        return np.zeros(0)
