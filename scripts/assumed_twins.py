@@ -27,6 +27,9 @@ from collocation_sysid import (
     with_markers,
 )
 from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
+from collocation_sysid.fem.constants import GAMMA_R
+from collocation_sysid.fem.materials import DAMPINGS, Damping, rayleigh
+from collocation_sysid.statistics.assumptions import OBJECTIVE_DAMPINGS
 
 Array = NDArray[np.float64]
 SCHEME, AXES = "midpoint", "xyz"
@@ -71,7 +74,7 @@ def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Arr
     """(T, M, 3) of a body whose stiffness drifts, one piece of the recording after another."""
     values = _lame(truth, values)
     if not drift:
-        return simulate(truth, values, SCHEME).markers_m
+        return simulate(truth, values, SCHEME, substeps=1).markers_m
     t_s, markers = truth.t_s, truth.markers
     moduli = [name for name in values if name.endswith("_pa")]
     tracks, start, velocity = [markers.positions_m[:0]], {}, 0.0
@@ -82,7 +85,7 @@ def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Arr
         now = {n: v * (1 + drift * since) if n in moduli else v for n, v in values.items()}
         seen = replace(markers, t_s=t_s[here], positions_m=markers.positions_m[here], located=None)
         piece = replace(truth, t_s=t_s[here], markers=seen, **start)
-        moved = simulate(piece, now, SCHEME)
+        moved = simulate(piece, now, SCHEME, substeps=1)
         for way in np.diff(moved.positions_m, axis=0):  # as the midpoint rule has it
             velocity = 2 * way / truth.timestep_s - velocity
         start = {
@@ -110,7 +113,7 @@ def _body(experiment: Experiment, values: Mapping[str, float], off: Mapping[str,
     larger = 1 + off.get("body_scale", 0.0)
     mesh = TetMesh(pivot_m + larger * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra)
     stiffer = [off.get(f"anisotropy {axis}", 0.0) for axis in AXES]
-    own: dict[str, Any] = {"damping": old.parts[0].damping}
+    own: dict[str, Any] = {"damping": _damping(old.parts[0].damping, off)}
     if any(stiffer):
         own |= {"material": _stiffer_along(stiffer), "evaluator": "casadi"}
     more_drag = off.get("air_drag", 0.0) - off.get("added_mass", 0.0)
@@ -136,6 +139,35 @@ def _stiffer_along(shares: Sequence[float]) -> Material:
         return isotropic + 0.5 * young_pa * sum(s * green[k, k] ** 2 for k, s in enumerate(shares))
 
     return Material.of(energy)
+
+
+def _damping(stated: Damping, off: Mapping[str, float]) -> Damping:
+    """The stated law, which is a stress, with a share of the differences of others from it."""
+    shares = {
+        law: off.get(key, 0.0)
+        for law, key in (
+            *((law, f"damping_law {law}") for law in OBJECTIVE_DAMPINGS),
+            ("rayleigh", "rayleigh_damping"),
+        )
+    }
+    if not any(shares.values()):
+        return stated
+    own = 1 - sum(shares.values())
+
+    def stress(psi, f, rate, gamma_r_s):
+        terms = [(own, stated), *((shares[law], DAMPINGS[law]) for law in OBJECTIVE_DAMPINGS)]
+        stresses = ca.SX(9, 1)
+        slopes = ca.SX(9, 9)
+        for share, law in terms:
+            stress, slope = law.stress(psi, f, rate, gamma_r_s)
+            stresses += share * stress
+            slopes += share * slope
+        return stresses, slopes
+
+    def potential(psi, f, rate, gamma_r_s):
+        return shares["rayleigh"] * rayleigh(psi, f, rate, gamma_r_s)
+
+    return Damping("between", (GAMMA_R,), potential, stress)
 
 
 def _drag(density_kg_m3: float) -> NodeForce:

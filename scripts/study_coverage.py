@@ -161,7 +161,7 @@ def reference(sigma_m: float) -> tuple[Experiment, Array]:
         grasps=(Grasp(grasp.nodes, poses),),
         markers=replace(experiment.markers, sigma_m=sigmas_m),
     )
-    positions_m = simulate(experiment, TRUTH, SCHEME).positions_m
+    positions_m = simulate(experiment, TRUTH, SCHEME, substeps=1).positions_m
     return experiment, positions_m.reshape(len(positions_m), -1)
 
 

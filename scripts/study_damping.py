@@ -55,7 +55,7 @@ def swung(speed_rad_s: float, seed: int) -> Experiment:
     experiment = Experiment(
         body, t_s, [Grasp(held, poses)], markers, name="swing", nuisance=Nuisance.none()
     )
-    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
+    tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
     return with_markers(experiment, tracks + noise)
 

@@ -228,7 +228,7 @@ def off_in_gripper(experiment: Experiment, rng: Generator) -> Pair:
 
 
 def simulated(experiment: Experiment) -> Experiment:
-    return with_markers(experiment, simulate(experiment, TRUTH, SCHEME).markers_m)
+    return with_markers(experiment, simulate(experiment, TRUTH, SCHEME, substeps=1).markers_m)
 
 
 def claiming(factor: float) -> Callable[..., Pair]:

@@ -83,7 +83,7 @@ def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
     true = Body(mesh, density_kg_m3=1000.0, regions=regions)
     values = {"young_pa": YOUNG_PA, "stiff.young_pa": twin.ratio * YOUNG_PA, **BESIDE}
     known = {n: v for n, v in values.items() if regions or not n.startswith("stiff")}
-    made = cs.simulate(hung(true, twin.markers, twin.steps), known, "midpoint")
+    made = cs.simulate(hung(true, twin.markers, twin.steps), known, "midpoint", substeps=1)
     field = cs.Field(twin.length_m, modes=twin.modes, amplitude=twin.amplitude)
     sought = hung(Body(mesh, density_kg_m3=1000.0, field=field), twin.markers, twin.steps)
     noise = np.random.default_rng(seed).normal(size=made.markers_m.shape)

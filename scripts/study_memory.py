@@ -113,7 +113,7 @@ def recording(branches: int) -> Experiment:
     experiment = Experiment(
         body, t_s, [Grasp(held, poses)], markers, name="block", nuisance=Nuisance.none()
     )
-    tracks = simulate(experiment, truth(branches), "midpoint").markers_m
+    tracks = simulate(experiment, truth(branches), "midpoint", substeps=1).markers_m
     return replace(experiment, markers=with_markers(experiment, tracks).markers)
 
 

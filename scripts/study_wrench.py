@@ -115,7 +115,7 @@ def recording() -> Experiment:
     values = {name: value for name, value in TRUTH.items() if name in body.constants} | {
         name: TRUTH[name] for name in ("young_pa", "poisson")
     }
-    found = simulate(experiment, values, "midpoint")
+    found = simulate(experiment, values, "midpoint", substeps=1)
     return with_wrenches(with_markers(experiment, found.markers_m), found.wrenches)
 
 

@@ -10,10 +10,18 @@ from problem_files import pictures_drawn, run_command, write_problem
 from problems_small import GUESS, TRUTH, cube_with_nuisance, hung_cube, measured
 
 from collocation_sysid import (
+    Body,
+    Experiment,
+    Grasp,
+    Markers,
+    Nuisance,
+    PoseSequence,
     Problem,
     RolloutOptions,
     Run,
     UncertaintyOptions,
+    Unknown,
+    box_mesh,
     run,
     simulate,
     solve,
@@ -174,7 +182,7 @@ def swings(*gamma_r_s: float) -> Problem:
     rng, recordings = np.random.default_rng(5), []
     for k, damping in enumerate(gamma_r_s):
         swing = replace(hung_cube(25), name=f"swing {k}")
-        markers = simulate(swing, TRUTH | {"gamma_r_s": damping}, "midpoint").markers_m
+        markers = simulate(swing, TRUTH | {"gamma_r_s": damping}, "midpoint", substeps=1).markers_m
         noise_m = swing.markers.sigma_m[:, None] * rng.standard_normal(markers.shape)
         recordings.append(with_markers(swing, markers + noise_m))
     options = UncertaintyOptions(assumptions=Assumptions(**NOTHING), numerical=False)
@@ -226,3 +234,70 @@ def test_what_cannot_be_assumed_is_one_message(tmp_path, key, value, said):
     outcome = run_command("check", file)
     assert outcome.code == 2
     assert said in " ".join(outcome.err.split())
+
+
+# The law of damping
+
+
+def fast_block(damping: str, sigma_m: float = 3e-4) -> Experiment:
+    """A block of 400 kg/m³ that is swung 12 cm at 2 Hz, so that it is strained by some 10 %."""
+    t_s = np.linspace(0.0, 0.5, 26)
+    way_m = np.outer(0.06 * (1 - np.cos(4 * np.pi * t_s)), [1, 0, 0.5])
+    body = Body(box_mesh((0.05, 0.05, 0.15), (1, 1, 3)), density_kg_m3=400.0, damping=damping)
+    top = np.flatnonzero(body.nodes_m[:, 2] > 0.149)
+    low = body.nodes_m[body.nodes_m[:, 2] < 0.06][::4]
+    swing = PoseSequence(t_s, way_m, np.tile([0, 0, 0, 1.0], (len(t_s), 1)))
+    markers = Markers(t_s, np.zeros((len(t_s), len(low), 3)), sigma_m, places_m=low)
+    return Experiment(body, t_s, [Grasp(top, swing)], markers, nuisance=Nuisance.none())
+
+
+BLOCK = {"young_pa": 20e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 0.2}
+
+
+def fitted_block(made_with: str, fitted_with: str, **stated):
+    """The run of a twin made with one law of damping and fitted with another."""
+    twin = simulate(fast_block(made_with), BLOCK, "midpoint").markers_m
+    twin = twin + np.random.default_rng(0).normal(scale=3e-4, size=twin.shape)
+    unknown = {"young_pa": Unknown(15e3), "gamma_r_s": Unknown(4e-3)}
+    described = Problem(
+        [with_markers(fast_block(fitted_with), twin)],
+        BLOCK | unknown,
+        uncertainty=UncertaintyOptions(assumptions=Assumptions(**(NOTHING | stated))),
+    )
+    return run(described, seek_causes=False)
+
+
+@pytest.mark.parametrize(
+    ("made_with", "fitted_with"),
+    [
+        ("material", "kelvin-voigt"),
+        pytest.param("kelvin-voigt", "material", marks=pytest.mark.long),
+        pytest.param("rayleigh", "kelvin-voigt", marks=pytest.mark.long),
+    ],
+)
+def test_a_wrong_law_of_damping_is_covered_by_the_budget_not_by_the_noise(made_with, fitted_with):
+    wrong = fitted_block(made_with, fitted_with, damping_law=1.0)
+    truth = BLOCK["gamma_r_s"]
+    low, high = wrong.estimates["gamma_r_s"].statistical95
+    assert not low < truth < high
+    line = wrong.budget["gamma_r_s"]
+    assert line.combined95[0] < truth < line.combined95[1]
+    assert next(iter(line.shares)) == "damping_law"
+    assert wrong.budget["young_pa"].combined95[0] < BLOCK["young_pa"]
+    assert wrong.budget["young_pa"].combined95[1] > BLOCK["young_pa"]
+
+
+@pytest.mark.long
+def test_a_law_of_damping_that_is_known_is_no_source():
+    """With the right law stated as known the statistical interval holds the truth."""
+    right = fitted_block("material", "material")
+    low, high = right.estimates["gamma_r_s"].statistical95
+    assert low < BLOCK["gamma_r_s"] < high
+    assert "damping_law" not in right.budget["gamma_r_s"].shares
+
+
+def test_other_laws_of_damping_count_unless_the_law_is_known_and_rayleighs_only_if_stated():
+    default = Assumptions().deviations
+    assert default["damping_law"] == 1.0
+    assert default["rayleigh_damping"] is None
+    assert Assumptions(damping_law="none").deviations["damping_law"] is None

@@ -525,7 +525,7 @@ def test_the_same_from_python(tiny):
     solution = cs.solve(problem, cs.InteriorPoint(tolerance=1e-10))
     assert solution.status.converged
     assert solution.parameters == pytest.approx(TRUTH, rel=1e-5)
-    trajectory = cs.simulate(problem.experiments[0], solution.parameters, "midpoint")
+    trajectory = cs.simulate(problem.experiments[0], solution.parameters, "midpoint", substeps=1)
     measured = problem.experiments[0].markers.positions_m
     np.testing.assert_allclose(trajectory.markers_m, measured, atol=1e-8)
 

@@ -161,7 +161,7 @@ def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
     known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4)})
     problem = cs.Problem([replace(stated, grasps=[held, measured])], known)
     run = cs.run(problem, seek_causes=False)
-    low, high = run.result.parameters["young_pa"].statistical95
+    low, high = run.result.parameters["young_pa"].combined95
     assert low < TRUTH["young_pa"] < high
     assert run.trust is not None
     assert run.trust.verdict == "doubtful"

@@ -217,7 +217,9 @@ def test_more_cameras_per_marker_than_there_are_is_refused():
 
 def at_answer(experiments) -> tuple[Collocation, np.ndarray]:
     """The experiments with exact tracks of the scheme, and their optimum."""
-    exact = [with_markers(e, simulate(e, TRUTH, "midpoint").markers_m) for e in experiments]
+    exact = [
+        with_markers(e, simulate(e, TRUTH, "midpoint", substeps=1).markers_m) for e in experiments
+    ]
     found = Collocation(exact, AT)
     rows = [
         march(s.experiment, s.dynamics.with_theta(s.constants.theta(AT.guess_q)))
@@ -422,7 +424,7 @@ def test_a_motion_is_judged_over_all_draws():
 
 def test_recordings_there_are_count_where_they_are_to_be_completed():
     experiment = hung_cube(8)
-    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
+    tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     recorded = Problem([with_markers(experiment, tracks)], AT)
     found = design(recorded, LIMITS, 0.08, options=FEW, add=True)
     alone = shared_information(linearised_fit(*at_answer([experiment])))
@@ -508,7 +510,7 @@ def test_the_folder_holds_a_problem_that_simulates_the_motion(tiny, tmp_path):
     designed = Problem.read(folder / PROBLEM_FILE)
     (experiment,) = designed.experiments
     assert experiment.duration_s == pytest.approx(0.08)
-    again = simulate(experiment, designed.parameters, designed.scheme).markers_m
+    again = simulate(experiment, designed.parameters, designed.scheme, substeps=1).markers_m
     assert np.abs(again - experiment.markers.positions_m).max() < 1e-6
     content = json.loads((folder / "design.json").read_text())
     assert content["after"]["lambda_pa"]["value"] == pytest.approx(TRUTH["lambda_pa"])

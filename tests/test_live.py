@@ -53,7 +53,7 @@ def swing(
 ) -> cs.Problem:
     """A cube swung by its top, seen with noise, described rightly."""
     hung = hung_cube(steps, nuisance=nuisance, air_density_kg_m3=air_density_kg_m3)
-    tracks = cs.simulate(hung, TRUTH, integrator="midpoint").markers_m
+    tracks = cs.simulate(hung, TRUTH, integrator="midpoint", substeps=1).markers_m
     noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
     seen = cs.with_markers(hung, tracks + noise)
     seen = replace(seen, markers=replace(seen.markers, sigma_m=NOISE_M))
@@ -586,7 +586,7 @@ def felt(bias_m_s2: float = 0.3) -> cs.Problem:
     seen = replace(seen, markers=replace(seen.markers, sigma_m=1e-3))
     inner = np.linspace(seen.t_s[0] + 1e-3, seen.t_s[-1], 2 * len(seen.t_s))
     made = instrumented(seen, accelerometer(inner), strain_gauge(seen.t_s))
-    accelerations, strains = cs.simulate(made, TRUTH, "midpoint").readings
+    accelerations, strains = cs.simulate(made, TRUTH, "midpoint", substeps=1).readings
     rng = np.random.default_rng(2)
     accelerations = accelerations + [0, 0, bias_m_s2] + 0.05 * rng.normal(size=(len(inner), 3))
     accelerations[5, 1] = accelerations[7] = np.nan

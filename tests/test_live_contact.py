@@ -42,7 +42,7 @@ def touching(name: str, nuisance: cs.Nuisance) -> cs.Problem:
         body, t_s, [held, touched], markers, start="undeformed", nuisance=nuisance, name="touching"
     )
     own, sought = ({**RUBBING}, {**FRICTION}) if name == "table" else ({}, {})
-    exact, rng = cs.simulate(still, {**TRUTH, **own}, "bdf2"), np.random.default_rng(0)
+    exact, rng = cs.simulate(still, {**TRUTH, **own}, "bdf2", substeps=1), np.random.default_rng(0)
     tracks = exact.markers_m + rng.normal(scale=SIGMA_M, size=exact.markers_m.shape)
     seen_there = cs.with_markers(still, tracks)
     if name == "table":

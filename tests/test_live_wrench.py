@@ -39,7 +39,7 @@ def weighed(scheme: str = "midpoint", frame: str = "grasp", **unknown: float) ->
     inner = seen.t_s[0] + np.linspace(0.0, 0.355, 83)
     clamp = cs.Gauge("clamp", CLAMPED["expression"], inner[::3], None, 2e-3, grasp=0)
     made = instrumented(sensing(seen, inner, frame=frame), clamp)
-    told, rng = cs.simulate(made, TRUTH, scheme), np.random.default_rng(3)
+    told, rng = cs.simulate(made, TRUTH, scheme, substeps=1), np.random.default_rng(3)
     (wrench,), (force,) = told.wrenches, told.readings
     wrench = wrench + rng.normal(size=wrench.shape) * np.repeat([SIGMA_N, SIGMA_NM], 3)
     wrench[9], wrench[7, 2] = np.nan, np.nan

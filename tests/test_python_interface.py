@@ -219,7 +219,7 @@ def two_specimens() -> cs.Problem:
     for name, body in (("cube", box()), ("bar", bar), ("again", bar)):
         values = {key: truth[key] for key in body.used_names(list(truth))}
         swing = swung(body, name=name, validation=name == "again")
-        tracks = cs.simulate(swing, values, "midpoint").markers_m
+        tracks = cs.simulate(swing, values, "midpoint", substeps=1).markers_m
         made.append(cs.with_markers(swing, tracks))
     return cs.Problem(made, shared, rollout=cs.RolloutOptions("scheme"))
 
@@ -273,7 +273,7 @@ THETA_RULE = cs.Scheme(
 
 def test_a_scheme_of_ones_own_runs(tmp_path):
     cube = hung_cube()
-    cube = cs.with_markers(cube, cs.simulate(cube, TRUTH, THETA_RULE).markers_m)
+    cube = cs.with_markers(cube, cs.simulate(cube, TRUTH, THETA_RULE, substeps=1).markers_m)
     rollout = cs.RolloutOptions("scheme")
     run = cs.run(cs.Problem([cube], UNKNOWN, scheme=THETA_RULE, rollout=rollout), seek_causes=False)
     assert run.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
@@ -322,7 +322,7 @@ def test_a_function_is_a_material():
 
     body = cs.Body(box_mesh((EDGE_M,) * 3, (1, 1, 2)), material=fung, density_kg_m3=30.0)
     swing = swung(body)
-    swing = cs.with_markers(swing, cs.simulate(swing, TRUTH, "midpoint").markers_m)
+    swing = cs.with_markers(swing, cs.simulate(swing, TRUTH, "midpoint", substeps=1).markers_m)
     run = cs.run(cs.Problem([swing], UNKNOWN), seek_causes=False)
     assert run.solution.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-4)
 

@@ -257,7 +257,7 @@ def test_a_static_problem_tells_nothing_of_damping_before_and_after():
     )
     found = run(problem, seek_causes=False)
     assert found.estimates["gamma_r_s"].statistical_std_error is None
-    assert "these data do not tell gamma_r_s and gamma_m_1_s" in found.trust.reasons
+    assert "the data do not determine gamma_r_s and gamma_m_1_s" in found.trust.reasons
     assert isinstance(found.rollouts["block"], Rollout)
     assert found.rollouts["block"].rms_m == pytest.approx(found.solution.rms_m, rel=1e-6)
 

@@ -23,6 +23,8 @@ from collocation_sysid.statistics.assumptions import Assumptions
 from collocation_sysid.statistics.concern import TOPICS, Concern
 from collocation_sysid.statistics.hypothesis import Hypothesis
 from collocation_sysid.statistics.trust import (
+    GROSS_MISFIT,
+    MISFIT,
     Trust,
     fit_concerns,
     noise_rms_m,
@@ -41,6 +43,7 @@ from wrong_twins import FAULTS
 
 RNG = np.random.default_rng
 PACKAGE = Path(__file__).parents[1] / "collocation_sysid"
+VERDICT_PAGE = Path(__file__).parents[1] / "docs" / "howto" / "verdict.md"
 FOAM_CYLINDER = Path(__file__).parents[1] / "problems" / "foam_cylinder" / "problem.toml"
 # Of λ = 800 Pa and μ = 600 Pa, with which its tracks were made.
 EXACT = UncertaintyOptions(assumptions=Assumptions.exact())
@@ -119,6 +122,20 @@ def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():
         assert "persist" in found.reasons[0]
         assert verdict_of_fit(5 * errors).verdict == "doubtful"
         assert verdict_of_fit(0.02 * errors).verdict != "doubtful"
+
+
+def test_the_page_states_the_threshold_of_doubtful_residuals_that_the_code_uses():
+    words = re.sub(r"\s+", " ", VERDICT_PAGE.read_text(encoding="utf-8"))
+    (check, doubtful) = re.findall(r"more than ([\d.]+) times `sigma_m`", words)
+    assert (float(check), float(doubtful)) == (MISFIT, GROSS_MISFIT)
+    for seed in range(3):
+        errors = autoregressive(RNG(seed), 80, 3, 0.97)
+        (larger,) = (c for c in verdict_of_fit(20 * errors).concerns if c.code == "noise/larger")
+        unit = float(doubtful) / (larger.data["factor"] / 20)
+        below, above = (verdict_of_fit(f * unit * errors) for f in (0.9, 1.1))
+        assert (below.verdict, above.verdict) == ("check", "doubtful")
+        (persistent,) = (c for c in below.concerns if c.code == "residuals/persist")
+        assert persistent.data["autocorrelation"] > 0.9
 
 
 def test_gross_residuals_of_single_samples_are_doubtful():
@@ -237,7 +254,7 @@ def test_the_verdict_is_shown_stored_and_fed():
     assert content(found.result)["trust"] == {"verdict": "good", "reasons": [], "concerns": []}
     lines = plain_text(summary(found.result, Path("runs"))).splitlines()
     assert lines[1] == "Verdict: good"
-    assert "γ_r belongs to the damping law rayleigh, which also brakes rotation" in lines
+    assert "γ_r refers to the damping law rayleigh, which also brakes rotation" in lines
     (markers,) = [line for line in lines if line.startswith("markers: ")]
     assert "mm from noise alone" in markers
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])

@@ -37,7 +37,7 @@ def swung(seed: int = 0, nuisance: Nuisance | None = None, steps: int = 40) -> E
     """The cube swung for a while, seen and felt with noise, all by the midpoint rule."""
     rng = np.random.default_rng(seed)
     cube = sensing(replace(hung_cube(steps), nuisance=nuisance or Nuisance.none()), frame="grasp")
-    found = simulate(cube, TRUTH, "midpoint")
+    found = simulate(cube, TRUTH, "midpoint", substeps=1)
     tracks = found.markers_m + NOISE_M * rng.normal(size=found.markers_m.shape)
     noise = np.repeat([SIGMA_N, SIGMA_NM], 3)
     wrenches = [values + noise * rng.normal(size=values.shape) for values in found.wrenches]
@@ -113,7 +113,7 @@ def test_tare_clock_lag_and_tool_are_found():
     true[["mass of the tool" in name for name in names]] = 0.012
     true[["centre of the tool" in name for name in names]] = (0.0, 0.01, -0.005)
     phi = true / scales
-    made = simulate(swung(0, wanted, 60), TRUTH, "midpoint")
+    made = simulate(swung(0, wanted, 60), TRUTH, "midpoint", substeps=1)
     grid, forced = made.reactions
     (sensor,) = segment.sensors
     read = sensor.on(grid).of_forced(forced, phi)

@@ -108,7 +108,10 @@ class Dynamics:
         dofs = experiment.body.pattern.size
         lags = tables.p @ np.arange(tables.p.shape[1])
         evaluated_s = t_s - lags * experiment.timestep_s / substeps
-        forces = Forces.of(experiment, evaluated_s)
+        averaged_s = 0.0
+        if not experiment.static and table.is_midpoint:
+            averaged_s = experiment.timestep_s / substeps
+        forces = Forces.of(experiment, evaluated_s, step_s=averaged_s)
         goals = experiment.grasped(t_s)[1].reshape(rows, -1)
         taken = ~np.isnan(goals)
         taken[:, experiment.held_dofs] = False

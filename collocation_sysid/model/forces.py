@@ -55,15 +55,22 @@ class Forces:
 
     @classmethod
     def of(
-        cls, experiment: Experiment, t_s: ArrayLike, theta: Sequence[float] | Array | None = None
+        cls,
+        experiment: Experiment,
+        t_s: ArrayLike,
+        theta: Sequence[float] | Array | None = None,
+        step_s: float = 0.0,
     ) -> Forces:
-        """Those of an experiment at the times `t_s` (T,)."""
+        """Those of an experiment at the times `t_s` (T,).
+
+        Contact pressures are means over time steps of `step_s`; where it is 0, those at each state.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
             Potential(actuator.measure, actuator.amplitude(times)[:, None])
             for actuator in experiment.actuators
         )
-        touching = contacts(experiment)
+        touching = contacts(experiment, step_s)
         further = (
             *potentials,
             *touching,

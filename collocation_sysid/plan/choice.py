@@ -396,7 +396,7 @@ def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[st
     options, parameters = problem.uncertainty, solution.collocation.parameters
     try:
         known = uncertainty_of(fit, parameters, solution.q, options)
-        changes = assumed(solution.collocation, solution.z, options.assumptions.deviations)
+        changes = assumed(solution.collocation, solution.z, options.considered)
     except (InputError, SimulationError):
         return {}  # without error bars there is none
     means = options.assumptions.means

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ..errors import InputError
 from ..fem.body import Body
@@ -14,6 +14,7 @@ from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.field import Field
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
+from ..fem.rest_shape import UnderGravity
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
@@ -160,8 +161,16 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
         prony=branches(None),
         forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
         field=field(section.field, "field"),
+        rest_shape=_rest_shape(section),
         evaluator=section.evaluator,
     )
+
+
+def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"] | None:
+    """Return what is stated of the stress-free shape; None where nothing is."""
+    if section.scan is not None:
+        return UnderGravity(selection(section.scan.nodes), section.scan.gravity_m_s2)
+    return "stress_free" if section.rest_shape is not None else None
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:

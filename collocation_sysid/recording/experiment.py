@@ -131,7 +131,7 @@ class Experiment:
 
     def __post_init__(self) -> None:
         loads = ("masses", "forces", "tendons", "pressures")
-        vars(self)["body"] = with_frames_of(self.body, self.obstacles)
+        vars(self)["body"] = with_frames_of(self.body, self.obstacles, static=self.static)
         framed = zip(self.obstacles, self.body.frames, strict=True)
         vars(self).update(
             grasps=(

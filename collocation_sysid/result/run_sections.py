@@ -26,13 +26,15 @@ from ..display import (
 from ..errors import listed
 from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import is_own
+from ..program.depth_comparison import DepthError
 from ..recording.nuisance import in_unit_for_people
+from ..runs.prediction import PredictionError
 from ..runs.result import Result, SimulatedExperiment
 from ..statistics.budget import largest_first, worded
 from ..statistics.concern import Concern, topics_of
 from ..statistics.trust import Trust
 from ..tree import content
-from .probe_sections import FOREMOST, asks_for_probes, probe_section
+from .probe_sections import DEEPER, FOREMOST, is_deeper_check_worthwhile, probe_lines, probe_section
 from .replay import LARGEST, read_arrays, reading_run
 
 MEANINGS = {
@@ -78,8 +80,7 @@ def summary(result: Result, folder: Path, budget: bool = False) -> list[Shown]:
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (_ended(result), *answer(result), _fit(result), _notes(result))
     tables = [budget_table(result)] if budget and result.budget else []
-    probed = flat([probe_section(result)])
-    return [*flat(sections), *tables, *probed, *ended, f"written to {folder}"]
+    return [*flat(sections), *tables, *probe_lines(result), *ended, f"written to {folder}"]
 
 
 def answer(result: Result) -> list[Shown]:
@@ -148,9 +149,8 @@ def verdict_of(trust: Trust, linked: bool = False, most: int | None = None) -> S
 
 
 def _harder(result: Result) -> list[Line]:
-    """Whether to look harder."""
-    said = "look harder: solve --probe refits parts of the data, and with each assumption freed"
-    return [Line(said, "quiet")] if asks_for_probes(result) else []
+    """Return the recommendation of a deeper check, where it is worthwhile."""
+    return [Line(DEEPER, "quiet")] if is_deeper_check_worthwhile(result) else []
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:
@@ -185,7 +185,20 @@ def _parameters(result: Result) -> Section:
         if each.known_correction and each.value
     ]:
         parts.append(f"corrected for grip layer and machine as stated: {', '.join(known)}")
+    parts += _not_determined(result)
     return Section("Parameters", (*parts, *_largest_contributions(result), *result.basis))
+
+
+def _not_determined(result: Result) -> list[str]:
+    """Name the estimates with intervals wider than their values, and the largest contributions."""
+    sources = []
+    for name, shares in result.budget.items():
+        if name in result.values and not result.values[name].is_determined:
+            source, share = next(iter(shares.items()))
+            sources.append(f"{symbol_of(name)} (mostly {worded(source)}, {share:.0%})")
+    if not sources:
+        return []
+    return [f"not determined, as the interval is wider than the value: {listed(sources)}"]
 
 
 def _covered(result: Result) -> str:
@@ -194,7 +207,8 @@ def _covered(result: Result) -> str:
     kinds = ("step", "mesh") if moving else ("mesh",)
     covered = [f"the {kind}" for kind in kinds if kind in result.covers]
     left = [f"the {kind}" for kind in kinds if kind not in result.covers]
-    said = f"± and intervals combine {listed(['noise', *covered, 'systematic effects'])}"
+    parts = listed(["noise", *covered, "systematic effects"])
+    said = f"± (standard uncertainty) and intervals combine {parts}"
     return said + (f", not {listed(left)}: see refine" if left else "")
 
 
@@ -231,9 +245,6 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
     remark = each.reason or ""
     if each.at_bound:
         interval = "at its bound"
-    elif each.combined95 is not None and not each.is_determined:
-        source, share = next(iter(result.budget[name].items()))
-        remark = remark or f"not determined: mostly {worded(source)} ({share:.0%})"
     elif each.reason:
         interval = "not determined" if each.statistical95 is None else "not identifiable"
     guess = "" if each.guess is None else f"{each.guess:.5g}"
@@ -298,7 +309,10 @@ def _fit(result: Result) -> Section:
                 f"friction of {obstacle} in '{name}': at most {rubbed.used:.0%} of its limit, "
                 f"slips {rubbed.slipping:.0%} of the time, takes {short(rubbed.dissipated_j)} J"
             )
-    lines += [_simulated(name, each) for name, each in result.rollout.experiments.items()]
+        for camera, error in (each.depth or {}).items():
+            lines.append(f"depth of {camera} in '{name}': {_depth(error)}")
+    for name, each in result.rollout.experiments.items():
+        lines += _simulated(name, each)
     lines.append(
         f"{result.iterations} iterations in {timing.total:.1f} s "
         f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"
@@ -309,18 +323,56 @@ def _fit(result: Result) -> Section:
     return Section("Fit", tuple(lines))
 
 
-def _simulated(name: str, simulated: SimulatedExperiment) -> str:
-    """How far a forward simulation is from the measurements."""
+def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
+    """Yield how far a forward simulation is from the measurements, beside its yardsticks."""
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:
-        return f"{kind} '{name}': failed: {simulated.failed}"
-    forces = _forces(simulated.wrench_rms_n, simulated.wrench_rms_nm)
-    said = [f"{forces} RMS"] if forces else []
-    if simulated.rms_m:  # none without markers
-        most_mm = 1e3 * (simulated.max_m or 0.0)
-        said.insert(0, f"{_mm(simulated.rms_m)} mm RMS, at most {most_mm:.2f} mm")
-    said += [f"{reading} {rms:.2g} RMS" for reading, rms in (simulated.reading_rms or {}).items()]
-    return f"{kind} '{name}': {'; '.join(said) or 'compared with nothing but depth images'}"
+        yield f"{kind} '{name}': failed: {simulated.failed}"
+        return
+    own = PredictionError(
+        rms_m=simulated.rms_m,
+        max_m=simulated.max_m,
+        wrench_rms_n=simulated.wrench_rms_n,
+        wrench_rms_nm=simulated.wrench_rms_nm,
+        reading_rms=simulated.reading_rms,
+        depth=simulated.depth,
+    )
+    yield f"{kind} '{name}': {_errors(own) or 'compared with nothing'}"
+    if simulated.fitted:
+        return
+    if simulated.blind is not None:
+        blind = _errors(simulated.blind)
+        yield f"  with the nuisance parameters of the fitted recordings (blind): {blind}"
+    if simulated.copied is not None:
+        copied = simulated.copied
+        yield f"  the measurements of '{copied.copied}' copied: {_errors(copied.error)}"
+    elif simulated.not_copied:
+        yield f"  no copy as a yardstick: {simulated.not_copied}"
+
+
+def _errors(error: PredictionError) -> str:
+    """Return the errors of a prediction in words; "" if nothing is compared."""
+    said = []
+    if error.rms_m:  # none without markers
+        said.append(f"{_mm(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
+    if forces := _forces(error.wrench_rms_n, error.wrench_rms_nm):
+        said.append(f"{forces} RMS")
+    said += [f"{reading} {rms:.2g} RMS" for reading, rms in (error.reading_rms or {}).items()]
+    said += [f"depth of {camera} {_depth(each)}" for camera, each in (error.depth or {}).items()]
+    return "; ".join(said)
+
+
+def _depth(error: DepthError) -> str:
+    """Return the distances of a depth camera's points from the surface, in words."""
+    if error.rms_m is None:
+        return "has no point near the body"
+    said = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
+    if not error.share_beyond_gate:
+        return f"{said}, all within the gate of {1e3 * error.gate_m:.3g} mm"
+    beyond = f"{said}, {error.share_beyond_gate:.0%} beyond the gate of {1e3 * error.gate_m:.3g} mm"
+    if error.rms_within_gate_m is None:
+        return beyond
+    return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
 
 
 def _mm(metres: float) -> str:

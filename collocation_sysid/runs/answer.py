@@ -25,9 +25,9 @@ from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
 from ..statistics.numerical import NumericalError, Refinement
-from ..statistics.probes import Probe
 from ..statistics.profile import Profile
-from ..statistics.trust import Trust, cause_concerns, numerical_concerns
+from ..statistics.relaxation import Probe
+from ..statistics.trust import Trust, cause_concerns, numerical_concerns, probe_concerns
 from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout
@@ -59,7 +59,8 @@ class Answer:
     sources : Sources or None
         What moves the estimates beside the noise, where there are error bars.
     probes : tuple of Probe
-        Refits of parts of the data and with assumptions freed, where these were asked for.
+        Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
+        of parts of the data, where these were asked for. Empty without error bars.
     """
 
     problem: Problem
@@ -174,9 +175,20 @@ class Answer:
         vague = combined_concerns(self.started_from, self.estimates, shares)
         of_fields = [concern for field in self.fields.values() for concern in field.concerns]
         if not self.missing:
-            return Trust.of((*cause_concerns(self.causes), *of_fit, *of_fields, *numerical, *vague))
+            probed = probe_concerns(self.probes, self._discretisation_corrections)
+            causes = cause_concerns(self.causes)
+            return Trust.of((*causes, *of_fit, *of_fields, *probed, *numerical, *vague))
         interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.missing})
         return Trust.of((interrupted, *(of_fit if self.uncertainty is not None else ())))
+
+    @property
+    def _discretisation_corrections(self) -> dict[str, float]:
+        """Factors from optimum to reported value of the estimated parameters, without fields."""
+        return {
+            item.name: each.value / each.optimum if each.optimum else 1.0
+            for item in self.started_from.free
+            if not is_mode(item.name) and (each := self.estimates[item.name])
+        }
 
     @cached_property
     def motions(self) -> dict[str, Motion]:

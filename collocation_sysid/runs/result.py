@@ -13,14 +13,16 @@ from ..fem.constants import is_mode, symbol_of, unit_of
 from ..fem.field import FieldShapes
 from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
+from ..program.depth_comparison import DepthError
 from ..program.touches import Rubbing
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Coordinate, Estimate
 from ..statistics.numerical import NumericalError
-from ..statistics.probes import Probe
+from ..statistics.relaxation import Probe
 from ..statistics.trust import Trust
 from ..statistics.uncertainty import Place
 from ..tree import optional, read
+from .prediction import CopyError, PredictionError
 
 
 @dataclass(frozen=True)
@@ -223,6 +225,7 @@ class FittedExperiment:
     wrench_sigma_n, wrench_sigma_nm, reading_sigma
         What is stated of the noise.
     friction : by obstacle, of those that rub
+    depth : by depth camera, distances of its points from the fitted surface
     air_density_kg_m3 : float
         Of the air around the body in the model; zero in a vacuum.
     """
@@ -239,6 +242,7 @@ class FittedExperiment:
     wrench_sigma_nm: float | None = optional()
     reading_sigma: Mapping[str, float] | None = optional()
     friction: Mapping[str, Rubbing] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
     air_density_kg_m3: float = 0.0
 
 
@@ -255,7 +259,20 @@ class FoundFit:
 
 @dataclass(frozen=True)
 class SimulatedExperiment:
-    """An experiment simulated with the answer; of one that `failed` all else is missing."""
+    """An experiment simulated with the answer; of one that `failed` all else is missing.
+
+    Attributes
+    ----------
+    depth : by depth camera, distances of its points from the simulated surface
+    blind : PredictionError, optional
+        Of an experiment for validation, with the nuisance parameters of the fitted recordings in
+        place of its own.
+    copied : CopyError, optional
+        Of an experiment for validation, with the measurements of the nearest fitted recording as
+        the prediction.
+    not_copied : str, optional
+        Why there is no such copy.
+    """
 
     fitted: bool
     failed: str | None = optional()
@@ -266,6 +283,10 @@ class SimulatedExperiment:
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
     reading_rms: Mapping[str, float] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
+    blind: PredictionError | None = optional()  # noqa: RUF009, it returns a field
+    copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
+    not_copied: str | None = optional()
 
 
 @dataclass(frozen=True)
@@ -318,7 +339,8 @@ class Result:
     """The content of ``result.json``, whose names are its keys.
 
     `basis` says what the values rest on: the law of the damping, and what sets the scale; `budget`
-    has each source's share of an estimate's variance; `probes` are there where they were asked for.
+    has each source's share of an estimate's variance; `probes` are
+    refits with an assumption relaxed and, where that was asked for, of parts of the data.
     """
 
     schema: int

@@ -154,6 +154,19 @@ TOPICS: Mapping[str, Topic] = {
             "far": "{percent:.0f} % of the markers' samples lie far from where they can be",
         },
     ),
+    "assumption": Topic(
+        "Assumptions that the data contradict",
+        "budget",
+        "Find out whether the assumption is wrong, for instance by repeating the first recording "
+        "at the end, or whether the model lacks something that looks alike, such as memory, which "
+        "looks like a drift. solve --probe follows the effect beyond one linear step and relaxes "
+        "the other assumptions.",
+        {
+            "contradicted": "the data contradict the assumption that {assumption}: with "
+            "{name} = {size} ± {size_error} χ² falls by {chi_squared:.3g}, and the estimates are "
+            "{estimates}{instead}",
+        },
+    ),
     "information": Topic(
         "What the data do not determine",
         "budget",
@@ -285,6 +298,19 @@ TOPICS: Mapping[str, Topic] = {
             "by {fit_mm:.2g} mm",
             "predicted": "'{experiment}' is predicted {times:.2g} times worse than the others are "
             "fitted",
+        },
+    ),
+    "prediction": Topic(
+        "The prediction",
+        "trust",
+        "The parameters are stated, not estimated: make sure that they belong to this body, and "
+        "that sigma is the sensor's noise. Then look for what the model lacks, or estimate a "
+        "parameter.",
+        {
+            "misses": "the prediction of '{experiment}' misses {what} by {size}{sigmas:.2g} times "
+            "{stated}",
+            "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
+            "'{experiment}'",
         },
     ),
     "memory": Topic(

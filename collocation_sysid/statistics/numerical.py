@@ -255,10 +255,13 @@ def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     changes : of each block (T, M, 3, a), in units of σ
     """
     free, count = np.flatnonzero(~fit.at_bound), changes[0].shape[-1] if changes else 0
+    if not free.size:
+        return np.zeros((len(fit.names), count))
     known = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
     score = np.zeros((len(free), count))
     for block, change in zip(fit.blocks, changes, strict=True):
-        slope = block.slope[..., free].reshape(-1, len(free))
+        slope = block.slope[..., free]
+        slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
         known = known.add(np.zeros(len(slope)), slope)
         apart = change * block.weight[..., None] * block.seen[..., None]
         score += slope.T @ apart.reshape(len(slope), count)

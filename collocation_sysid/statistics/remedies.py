@@ -16,6 +16,9 @@ REMEDIES: Mapping[str, str] = {
     BETWEEN: "find out what differs between the recordings, such as temperature or clamping",
     LAW: "record larger strains, which distinguish the material laws",
     "body_scale": "measure two lengths of the real body and scale the mesh to them",
+    "rest_shape": "state object.rest_shape: whether the mesh is free of stress, or the shape in "
+    "which the body hung or stood during its scan",
+    "surface": "measure the thickness of the real body at several places",
     "mass": "weigh the body",
     "density_gradient": "weigh two halves of a specimen",
     "anisotropy": "record a second motion with the body held the other way round, or press a cube "
@@ -23,9 +26,14 @@ REMEDIES: Mapping[str, str] = {
     "stiffness_drift": "repeat the first recording at the end",
     "time_scale": "compare the clocks with a reference",
     "poisson": "measure Poisson's ratio in a tension test, or estimate it",
+    "damping_law": "compare the laws with compare --damping on faster and slower motions, or state "
+    'damping_law = "none" where the law is known',
+    "rayleigh_damping": "compare the laws with compare --damping on motions that rotate the body",
     "grip_layer_m": "glue the body to a stiff plate, or put markers beside the grip",
     "machine_compliance_m_n": "press the platens on each other and state the slope",
     "platen_friction": "lubricate the platens, or glue the specimen to them",
+    "contact_stiffness": "refine the mesh at the contact, or state a larger stiffness_pa_m and a "
+    "smaller width_m of the obstacle",
     "buoyancy": "state the density of the air",
     "added_mass": "repeat the motion more slowly, or with a heavier specimen",
     "air_drag": "repeat the motion more slowly, or with a heavier specimen",

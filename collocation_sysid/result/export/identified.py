@@ -156,6 +156,14 @@ class Identified:
         )
         if problem.parameters.free:
             problem = answer.started(problem)  # which may state no guess itself
+        if any(body.scan is not None for body in problem.bodies):
+            raise InputError(
+                "the mesh was made under gravity, and targets take meshes as free of stress; "
+                "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
+                'solve with that and rest_shape = "stress_free"',
+                folder,
+                "object.rest_shape",
+            )
         collocation = problem.collocation()
         names = [segment.experiment.name for segment in collocation.segments]
         if experiment is not None and experiment not in names:

@@ -39,10 +39,11 @@ HOLDS = Holds(
     {"st-venant-kirchhoff": "flex"},
     "a flex is St. Venant and Kirchhoff's; {material} has the same E and ν at small strain, "
     "another stress from its second order on",
-    "the damping of a flex is γ_r times the rate of its second Piola–Kirchhoff stress, which is "
-    "that of {damping} at small strain",
+    'the damping of a flex is the law "material", γ_r (λ tr(Ė) I + 2 μ Ė); {damping} is the same '
+    "at small strain",
     "damping by mass, γ_m = {gamma_m_1_s:.4g} 1/s, is not known, and MuJoCo refuses dampers on the "
     "nodes of a flex",
+    damping="material",
     motion=True,
     roundings=False,
     faces=False,
