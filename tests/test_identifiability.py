@@ -53,7 +53,7 @@ def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
     (sentence,) = verdicts(uncertainty(spread([0.2, 0.01, 0.02, 0.05])))
     assert sentence == (
         "the data determine mu_pa to ±2 %, gamma_r_s to ±4 % and gamma_m_1_s to ±10 %; "
-        "lambda_pa only to ±48 % (95 %)"
+        "lambda_pa only to ±48 % (95 %, statistical)"
     )
 
 

@@ -49,7 +49,7 @@ def _one_by_one(uncertainty: Uncertainty) -> list[str]:
     well = [f"{name} to {_spread(f)}" for name, f in factors.items() if f <= WELL_FIXED]
     badly = [f"{name} only to {_spread(f)}" for name, f in factors.items() if f > WELL_FIXED]
     parts = [listed(part) for part in (well, badly) if part]
-    return [f"the data determine {'; '.join(parts)} (95 %)"] if parts else []
+    return [f"the data determine {'; '.join(parts)} (95 %, statistical)"] if parts else []
 
 
 def _combinations(uncertainty: Uncertainty) -> list[str]:
