@@ -158,7 +158,7 @@ def recorded(drag: float, stated: float | str) -> Problem:
 
     force = cs.NodeForce.of(more_drag)
     body = cs.Body(hung.body.mesh, density_kg_m3=DENSITY_KG_M3, forces=[force])
-    tracks = simulate(replace(hung, body=body), TRUTH, "midpoint").markers_m
+    tracks = simulate(replace(hung, body=body), TRUTH, "midpoint", substeps=1).markers_m
     noise = NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     seen = with_markers(replace(hung, air_density_kg_m3=stated), tracks + noise)
     markers = replace(seen.markers, sigma_m=np.full(tracks.shape[1], NOISE_M))

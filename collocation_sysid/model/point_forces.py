@@ -140,8 +140,10 @@ class Pointwise(ForceTerm):
         at.force[:] += self.share * points.summed(value, here.chosen)
         by_x, by_v, by_c = (slopes[:, part] for part in (here.y, here.v, here.c))
         at_x, add = (places.entries, by_x, here.chosen), points.add_entries
-        add(at.by_position, *at_x)
-        if self.turns and at.by_position_skew.size:
+        depends_on_place = bool(self.law.depends[here.y].any())
+        if depends_on_place:
+            add(at.by_position, *at_x)
+        if depends_on_place and self.turns and at.by_position_skew.size:
             add(at.by_position_skew, *at_x, skew=True)
         at_v = places.entries, by_v, here.chosen
         if self.by_velocity:
@@ -157,11 +159,14 @@ class Pointwise(ForceTerm):
         w, x, v = self._weights(here, weights), here.y, here.v
         whole = self.law.curvature(here.u, here.data, w)
         add, chosen = points.add_entries, here.chosen
-        add(at.position_position, entries, whole[x, x], chosen)
-        if self.by_velocity:
+        depends_on_place = bool(self.law.depends[x].any())
+        if depends_on_place:
+            add(at.position_position, entries, whole[x, x], chosen)
+        if self.by_velocity and depends_on_place:
             add(at.position_velocity, entries, whole[x, v], chosen)
             if at.position_velocity_skew.size:
                 add(at.position_velocity_skew, entries, whole[x, v], chosen, skew=True)
+        if self.by_velocity:
             add(at.velocity_velocity, entries, whole[v, v], chosen)
         _, slopes = self.law.slopes(here.u, here.data)
         columns = list(enumerate(self.columns(places), here.c.start))
