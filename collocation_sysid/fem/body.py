@@ -440,7 +440,9 @@ class Body(Discretisation):
         by_velocity[:, self.pattern.diagonal] -= drag
         by_theta = by_theta.reshape(len(x), size, -1)
         for number, own in self._of_fields("linearisation", rows):
-            self.spreads[number].nodal(own["by_theta"], by_theta[:, :, self.mode_places[number]])
+            here, spread = self.mode_places[number], self.spreads[number]
+            slopes = spread.field.slopes(np.asarray(theta)[here])
+            spread.nodal(own["by_theta"], slopes, by_theta[:, :, here])
         for column, slope in self._drag_slopes(theta, tied_kg):
             by_theta[:, :, column] = -slope * v
         self._spread_stiffening(by_theta, carried)
@@ -504,16 +506,19 @@ class Body(Discretisation):
         theta_theta = theta_theta.reshape(len(x), k, k)
         for number, own in self._of_fields("curvature", rows):
             here, spread = self.mode_places[number], self.spreads[number]
-            spread.nodal(own["position_theta"], x_theta[:, :, here])
-            spread.nodal(own["velocity_theta"], v_theta[:, :, here])
-            by_theta[:, here] = own["gradient_theta"] @ spread.shapes
+            coefficients = np.asarray(theta)[here]
+            slopes = spread.field.slopes(coefficients)
+            spread.nodal(own["position_theta"], slopes, x_theta[:, :, here])
+            spread.nodal(own["velocity_theta"], slopes, v_theta[:, :, here])
+            by_theta[:, here] = own["gradient_theta"] @ slopes
             first, points = self.starts[number], self.parts[number].of_points
-            twice = own["theta_theta"].reshape(len(x), len(spread.shapes), -1)
-            mixed = np.einsum("tek,em->tkm", twice[:, :, :points], spread.shapes)
+            twice = own["theta_theta"].reshape(len(x), len(slopes), -1)
+            mixed = np.einsum("tek,em->tkm", twice[:, :, :points], slopes)
             theta_theta[:, first : first + points, here] = mixed
             theta_theta[:, here, first : first + points] = mixed.swapaxes(1, 2)
-            bent = twice[:, :, points, None] * spread.shapes
-            theta_theta[:, here, here] = spread.shapes.T @ bent
+            bent = twice[:, :, points, None] * slopes
+            by_coefficients = spread.field.curvature(coefficients, own["gradient_theta"])
+            theta_theta[:, here, here] = slopes.T @ bent + by_coefficients
         for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
             self._spread_stiffening(values, carried)
         if carried is not None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -39,6 +39,10 @@ from .mesh import TetMesh
 ALL_MODULI = YOUNG.name
 # Random signs that tell a trace.
 PROBES = 50
+# Prior standard deviation of the logarithm of the contrast of two phases: a factor of e.
+TWO_PHASE_AMPLITUDE = 1.0
+TWO_PHASE: Literal["two-phase"] = "two-phase"
+Prior = Literal["smooth", "two-phase"]
 Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))]
 
 
@@ -58,13 +62,21 @@ class Field:
         How many shapes make up the field; one more costs what one more right-hand side does.
     amplitude : float, optional
         How much it differs: the prior standard deviation of the logarithm, 0.5 by default; of a
-        density that over its stated value, 0.3 by default.
+        density that over its stated value, 0.3 by default. With prior = "two-phase", the prior
+        standard deviation of the logarithm of the contrast, 1 by default.
+    prior : {"smooth", "two-phase"}
+        "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
+        between them; the parameter contrast is their ratio.
+    width_m : float, optional
+        Of "two-phase": width of the boundary; the size of an element by default.
     """
 
     length_m: float | tuple[float, ...] = key(Lengths)
     parameter: str = key(Text, default=ALL_MODULI)
     modes: int = key(AtLeastOne, default=40)
     amplitude: float | None = key(Positive | None, default=None)
+    prior: Prior = key(Prior, default="smooth")
+    width_m: float | None = key(Positive | None, default=None)
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
@@ -74,6 +86,8 @@ class Field:
     @property
     def deviation(self) -> float:
         """The amplitude or its default: a density, unlike a logarithm, could fall below zero."""
+        if self.prior == TWO_PHASE:
+            return self.amplitude or TWO_PHASE_AMPLITUDE
         return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
 
 
@@ -127,18 +141,29 @@ class Laplacian:
         vectors = (root @ basis[:, 1:])[own].mean(axis=1).T
         return cls(np.maximum(values[1:], 0.0), vectors, matrix, basis)
 
-    def weights(self, length_m: float) -> Array:
-        """(m,) deviation of the share of each v."""
-        return 1 / (1 / length_m**2 + self.values)
+    def weights(self, length_m: float, power: int = 1) -> Array:
+        """Return the deviation (m,) of the coefficient of each v: (1/l² + λ)⁻ᵖ, p = `power`."""
+        return (1 / length_m**2 + self.values) ** -float(power)
 
-    def share(self, length_m: float) -> float:
-        """What of the variance these shapes have, of all but that which is the same everywhere."""
-        size, own = len(self.basis), (self.weights(length_m) ** 2).sum()
+    def share(self, length_m: float, power: int = 1) -> float:
+        """Return the share of these shapes in the variance of all shapes but the constant one.
+
+        Parameters
+        ----------
+        length_m : float
+            Correlation length l.
+        power : int
+            The p of `weights`; the smoothness of the field is 2p − 3/2.
+        """
+        size = len(self.basis)
+        own = (self.weights(length_m, power) ** 2).sum()
         # The trace of a square is how far random signs are stretched on average.
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(size, PROBES))
         finer = signs - self.basis @ (self.basis.T @ signs)
-        operator = (self.matrix + sp.eye_array(size) / length_m**2).tocsc()
-        return float(own / (own + (splu(operator).solve(finer) ** 2).sum() / PROBES))
+        operator = splu((self.matrix + sp.eye_array(size) / length_m**2).tocsc())
+        for _ in range(power):
+            finer = operator.solve(finer)
+        return float(own / (own + (finer**2).sum() / PROBES))
 
 
 @dataclass(frozen=True)
@@ -204,6 +229,24 @@ class FieldModes:
         laplacian = Laplacian.of(mesh, cells, field.modes)
         return cls(field, laplacian, tuple(scaled), field.lengths_m[0], mesh.volumes_m3[cells])
 
+    def logarithms(self, coefficients: Array) -> Array:
+        """Return ln c − ln c̄ (E,) in every cell, from the coefficients (k,) of `constants`."""
+        return self.shapes @ coefficients
+
+    def slopes(self, coefficients: Array) -> Array:
+        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,)."""
+        return self.shapes
+
+    def curvature(self, coefficients: Array, weights: Array) -> Array:
+        """Return Σ weights · ∂² of `logarithms` by the coefficients, (T, k, k).
+
+        Parameters
+        ----------
+        coefficients : (k,)
+        weights : (T, E) of the cells
+        """
+        return np.zeros((len(weights), len(coefficients), len(coefficients)))
+
     @cached_property
     def share(self) -> float:
         """What of the variance these shapes have."""
@@ -247,17 +290,17 @@ class FieldModes:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Adds up over cells what changes with the logarithm in each, mode by mode.
+    """Sums over cells of what changes with the logarithm of the constant in each cell.
 
     Attributes
     ----------
-    shapes : (E, m)
+    field : FieldModes
     dofs : (E, d) of the nodes of each cell
     size : int
         Number of dofs of all.
     """
 
-    shapes: Array
+    field: FieldModes
     dofs: Index
     size: int
 
@@ -269,10 +312,17 @@ class Spread:
         numbers = np.arange(1, rows.size + 1)
         return sp.csr_array((numbers, (rows, columns)), shape=(self.size, cells))
 
-    def nodal(self, values: Array, out: Array) -> None:
-        """(T, size, m) of (T, E · d)."""
+    def nodal(self, values: Array, slopes: Array, out: Array) -> None:
+        """Write derivatives of nodal values by the coefficients of the field to `out`.
+
+        Parameters
+        ----------
+        values : (T, E · d) derivatives by the logarithm in each cell
+        slopes : (E, k) derivatives of these logarithms by the coefficients
+        out : (T, size, k)
+        """
         known = self._incidence
         order = known.data - 1
         for value, own in zip(values, out, strict=True):
             matrix = sp.csr_array((value[order], known.indices, known.indptr), known.shape)
-            own[:] = matrix @ self.shapes
+            own[:] = matrix @ slopes

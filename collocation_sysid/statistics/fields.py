@@ -176,10 +176,10 @@ def fields_of(
             continue
         here = body.mode_places[number]
         mean, slopes = _mean(constants, number, modes).slopes(q, NOTHING)
-        local, stated = mean[0] + modes.shapes @ theta[here], None
+        local, stated = mean[0] + modes.logarithms(theta[here]), None
         if part.stress_field is None:
             stated = part.density_kg_m3
-        gradient = slopes + modes.shapes @ by_q[here]
+        gradient = slopes + modes.slopes(theta[here]) @ by_q[here]
         # What is at a bound has no variance: it is taken for known.
         used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
         own = gradient[:, used]
