@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from .constants import DENSITY, Constant
 from .discretisation import Discretisation
-from .field import Field
+from .field import Field, FieldModes
 from .materials import Damping, Energy, Material, Prony
 from .memory import Past
 from .mesh import TetMesh
@@ -38,6 +38,7 @@ from .pattern import Joined, SymmetricPattern
 from .regions import BodyPart, Model, Region, Theta, parts_of
 from .selection import Selection
 from .stress import Stresses
+from .two_phase import PhaseSamples, TwoPhaseModes
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +207,28 @@ class Body(Discretisation):
         fields = (part.field and part.field.at(lengths_m[part.field_name]) for part in self.parts)
         return self.with_parts(
             tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
+        )
+
+    @property
+    def phase_samples(self) -> tuple[PhaseSamples, ...]:
+        """Draws of the phases of its two-phase fields, where there is an answer."""
+        fields = (part.field for part in self.parts)
+        return tuple(
+            field.samples
+            for field in fields
+            if isinstance(field, TwoPhaseModes) and field.samples is not None
+        )
+
+    def with_fields(self, fields: Mapping[str, FieldModes]) -> Body:
+        """Return the same body with other fields, by the names of their constants.
+
+        Fields that are not named stay.
+        """
+        return self.with_parts(
+            tuple(
+                replace(part, field=fields.get(part.field_name, part.field))
+                for part in self.parts
+            )
         )
 
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:

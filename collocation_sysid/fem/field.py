@@ -41,6 +41,7 @@ ALL_MODULI = YOUNG.name
 PROBES = 50
 # Prior standard deviation of the logarithm of the contrast of two phases: a factor of e.
 TWO_PHASE_AMPLITUDE = 1.0
+SMOOTH: Literal["smooth"] = "smooth"
 TWO_PHASE: Literal["two-phase"] = "two-phase"
 Prior = Literal["smooth", "two-phase"]
 Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))]
@@ -66,17 +67,14 @@ class Field:
         standard deviation of the logarithm of the contrast, 1 by default.
     prior : {"smooth", "two-phase"}
         "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
-        between them; the parameter contrast is their ratio.
-    width_m : float, optional
-        Of "two-phase": width of the boundary; the size of an element by default.
+        between them; the parameter contrast is the ratio of inclusions to surroundings.
     """
 
     length_m: float | tuple[float, ...] = key(Lengths)
     parameter: str = key(Text, default=ALL_MODULI)
     modes: int = key(AtLeastOne, default=40)
     amplitude: float | None = key(Positive | None, default=None)
-    prior: Prior = key(Prior, default="smooth")
-    width_m: float | None = key(Positive | None, default=None)
+    prior: Prior = key(Prior, default=SMOOTH)
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
@@ -141,29 +139,18 @@ class Laplacian:
         vectors = (root @ basis[:, 1:])[own].mean(axis=1).T
         return cls(np.maximum(values[1:], 0.0), vectors, matrix, basis)
 
-    def weights(self, length_m: float, power: int = 1) -> Array:
-        """Return the deviation (m,) of the coefficient of each v: (1/l² + λ)⁻ᵖ, p = `power`."""
-        return (1 / length_m**2 + self.values) ** -float(power)
+    def weights(self, length_m: float) -> Array:
+        """(m,) deviation of the share of each v."""
+        return 1 / (1 / length_m**2 + self.values)
 
-    def share(self, length_m: float, power: int = 1) -> float:
-        """Return the share of these shapes in the variance of all shapes but the constant one.
-
-        Parameters
-        ----------
-        length_m : float
-            Correlation length l.
-        power : int
-            The p of `weights`; the smoothness of the field is 2p − 3/2.
-        """
-        size = len(self.basis)
-        own = (self.weights(length_m, power) ** 2).sum()
+    def share(self, length_m: float) -> float:
+        """What of the variance these shapes have, of all but that which is the same everywhere."""
+        size, own = len(self.basis), (self.weights(length_m) ** 2).sum()
         # The trace of a square is how far random signs are stretched on average.
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(size, PROBES))
         finer = signs - self.basis @ (self.basis.T @ signs)
-        operator = splu((self.matrix + sp.eye_array(size) / length_m**2).tocsc())
-        for _ in range(power):
-            finer = operator.solve(finer)
-        return float(own / (own + (finer**2).sum() / PROBES))
+        operator = (self.matrix + sp.eye_array(size) / length_m**2).tocsc()
+        return float(own / (own + (splu(operator).solve(finer) ** 2).sum() / PROBES))
 
 
 @dataclass(frozen=True)

@@ -1,45 +1,68 @@
-"""Two materials with a sharp boundary: a level set of a normal field tells which of them is where.
+"""Two materials with a sharp boundary: every element is of the surroundings or of an inclusion.
 
 In a part of a body whose field has `prior = "two-phase"` a constant c has one value in the
-surroundings and another in inclusions,
-
-    ln c(X) = ln c_0 + ln r · H(φ(X)),   φ(X) = a_0 + Σ a_i φ_i(X),   H(φ) = ½ (1 + tanh(φ/ε)),
-
-with the contrast r = c_1/c_0 and coefficients a ~ N(0, I). φ has the deviation 1 about a_0 and
-smoother shapes than the field of `field`: φ_i ∝ v_i/(1/l² + λ_i)². The step H is known: where φ has
-the root mean square of its prior's slopes, H rises from 0.12 to 0.88 over `width_m`. Elements cut
-by the boundary have a value between.
+surroundings and another in inclusions, ln c_e = ln c_0 + ln r · h_e, with the contrast r = c_1/c_0,
+which is a parameter, and h_e ∈ {0, 1}, the phase of element e. Phases are no parameters: for a
+solver they are given, and `statistics.phases` finds them from derivatives by `ElementLogarithms`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
 from .constants import CONTRAST, DENSITY, Constant, mode
-from .field import Field, FieldModes
+from .field import SMOOTH, Field, FieldModes
 from .mesh import TetMesh
 
-# Exponent p of the spectrum of φ, (1/l² + λ)⁻ᵖ: a smoothness of 5/2, so that φ has slopes and its
-# level sets are surfaces. With p = 1 the boundary would be as rough as the shapes allow.
-POWER = 2
+
+@dataclass(frozen=True, eq=False)
+class PhaseSamples:
+    """Draws from the posterior of the phases, with what goes with each of them.
+
+    Attributes
+    ----------
+    logarithms : (K, E) of the constant in every element
+    contrasts : (K,) logarithm of the contrast
+    volumes_m3 : (K,) of the inclusions
+    names : (p,) of parameters
+    deviations : (p, p)
+        Covariance of the means of these parameters, in the solver's coordinates, given each draw
+        of the phases: what not knowing the phases adds to their covariance.
+    misfit : float
+        χ² per measurement of the answer, with the standard deviations given.
+    smooth_misfit : float
+        χ² per measurement of the smooth field with which the search for the phases started.
+    """
+
+    logarithms: Array
+    contrasts: Array
+    volumes_m3: Array
+    names: tuple[str, ...]
+    deviations: Array
+    misfit: float
+    smooth_misfit: float
 
 
 @dataclass(frozen=True, eq=False)
 class TwoPhaseModes(FieldModes):
-    """A two-phase field as the body evaluates it; its coefficients are a_0, …, a_m and r.
+    """A two-phase field as the body evaluates it; its only coefficient is the contrast r.
 
     Attributes
     ----------
-    width_m : float
-        Over which distance the step H rises from 0.12 to 0.88.
+    phase : (E,)
+        0 in the surroundings, 1 in inclusions; 0 everywhere until phases are known.
+    samples : PhaseSamples or None
+        Draws from the posterior of the phases; None before there is an answer.
     """
 
-    width_m: float = 0.0
+    phase: Array = field(default_factory=lambda: np.zeros(0))
+    samples: PhaseSamples | None = None
 
     @classmethod
     def of(
@@ -63,72 +86,89 @@ class TwoPhaseModes(FieldModes):
                 "lengths to choose from are for prior = 'smooth'"
             )
         found = super().of(field, mesh, cells, law)
-        # The edge of a regular tetrahedron of the mean volume.
-        edge_m = (6 * np.sqrt(2) * float(found.volumes_m3.mean())) ** (1 / 3)
-        return replace(found, width_m=field.width_m or edge_m)
-
-    @cached_property
-    def share(self) -> float:
-        """Share of the shapes in the variance of φ about a_0."""
-        return self.laplacian.share(self.length_m, POWER)
+        return replace(found, phase=np.zeros(len(cells)))
 
     @property
-    def left_out(self) -> float:
-        """Deviation of φ by shapes that are finer than these."""
-        return float(np.sqrt(1 - self.share))
+    def has_phases(self) -> bool:
+        """Whether phases are known."""
+        return bool(self.phase.any())
 
-    @cached_property
+    @property
+    def smooth(self) -> FieldModes:
+        """Smooth field with which the search for the phases starts."""
+        field = replace(self.field, prior=SMOOTH, amplitude=None)
+        return FieldModes(field, self.laplacian, self.scaled, self.length_m, self.volumes_m3)
+
+    @property
+    def share(self) -> float:
+        """Share of the variance that the smooth field of the start has."""
+        return self.smooth.share
+
+    @property
     def shapes(self) -> Array:
-        """φ_0 = 1, φ_1, … (E, m + 1) in the cells."""
-        weighed = self.laplacian.weights(self.length_m, POWER)[:, None] * self.laplacian.vectors
-        own = np.sqrt(self.share) * weighed / np.linalg.norm(weighed, axis=0)
-        return np.column_stack([np.ones(own.shape[1]), own.T])
-
-    @cached_property
-    def step(self) -> float:
-        """Half the rise ε of φ over the width of the boundary."""
-        squares = self.volumes_m3 @ self.shapes[:, 1:] ** 2 / self.volumes_m3.sum()
-        return float(np.sqrt(squares @ self.laplacian.values)) * self.width_m / 2
+        """Derivative (E, 1) of `logarithms` by ln r."""
+        return self.phase[:, None]
 
     @property
     def constants(self) -> tuple[Constant, ...]:
-        """Constants a_0, …, a_m and r."""
-        return (*(mode(k - 1) for k in range(self.field.modes + 1)), CONTRAST)
+        """The contrast r."""
+        return (CONTRAST,)
 
-    def phase(self, coefficients: Array) -> Array:
-        """Return H(φ) (E,) in every cell: 0 in the surroundings, 1 in inclusions."""
-        return self.step_of(self.shapes @ coefficients[:-1])
-
-    def step_of(self, level: Array) -> Array:
-        """Return H at values of φ of any shape."""
-        return (1 + np.tanh(level / self.step)) / 2
+    def split_in_eight(self) -> TwoPhaseModes:
+        """Return the same field of a mesh whose cells are cut in eight."""
+        finer = super().split_in_eight()
+        assert isinstance(finer, TwoPhaseModes)
+        samples = self.samples
+        if samples is not None:
+            samples = replace(samples, logarithms=np.repeat(samples.logarithms, 8, axis=1))
+        return replace(finer, phase=np.repeat(self.phase, 8), samples=samples)
 
     def logarithms(self, coefficients: Array) -> Array:
-        """Return ln r · H(φ) (E,) in every cell."""
-        return np.log(coefficients[-1]) * self.phase(coefficients)
+        """Return ln r · h (E,) in every cell, from the contrast (1,)."""
+        return np.log(coefficients[0]) * self.phase
 
     def slopes(self, coefficients: Array) -> Array:
-        """Return the derivatives (E, m + 2) of `logarithms` by a_0, …, a_m and r."""
-        contrast = coefficients[-1]
-        phase = self.phase(coefficients)
-        by_level = np.log(contrast) * self._step_slope(phase)
-        return np.column_stack([by_level[:, None] * self.shapes, phase / contrast])
+        """Return the derivatives (E, 1) of `logarithms` by the contrast."""
+        return self.phase[:, None] / coefficients[0]
 
     def curvature(self, coefficients: Array, weights: Array) -> Array:
-        """Return Σ weights (T, E) · ∂² of `logarithms` by a_0, …, a_m and r, (T, m + 2, m + 2)."""
-        contrast = coefficients[-1]
-        phase = self.phase(coefficients)
-        slope = self._step_slope(phase)
-        bend = np.log(contrast) * 2 * (1 - 2 * phase) / self.step * slope
-        found = np.empty((len(weights), len(coefficients), len(coefficients)))
-        for weight, own in zip(weights, found, strict=True):
-            own[:-1, :-1] = self.shapes.T @ ((weight * bend)[:, None] * self.shapes)
-            mixed = self.shapes.T @ (weight * slope) / contrast
-            own[:-1, -1] = mixed
-            own[-1, :-1] = mixed
-            own[-1, -1] = -(weight @ phase) / contrast**2
-        return found
+        """Return Σ weights (T, E) · ∂² of `logarithms` by the contrast, (T, 1, 1)."""
+        return -(weights @ self.phase)[:, None, None] / coefficients[0] ** 2
 
-    def _step_slope(self, phase: Array) -> Array:
-        """Return H'(φ) from H(φ)."""
-        return 2 * phase * (1 - phase) / self.step
+
+@dataclass(frozen=True, eq=False)
+class ElementLogarithms(FieldModes):
+    """A field with one coefficient per element, about given logarithms: for derivatives by each.
+
+    Attributes
+    ----------
+    base : (E,) logarithm of the constant over its mean in every cell where coefficients are zero
+    """
+
+    base: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def about(cls, modes: FieldModes, base: Array) -> ElementLogarithms:
+        """Return one for the cells of a field."""
+        field = replace(modes.field, prior=SMOOTH, modes=len(base))
+        volumes_m3 = modes.volumes_m3
+        return cls(field, modes.laplacian, modes.scaled, modes.length_m, volumes_m3, base)
+
+    @cached_property
+    def shapes(self) -> Array:
+        """Identity (E, E)."""
+        return np.eye(len(self.base))
+
+    @property
+    def constants(self) -> tuple[Constant, ...]:
+        """One coefficient per element."""
+        return tuple(mode(k) for k in range(len(self.base)))
+
+    def logarithms(self, coefficients: Array) -> Array:
+        """Return the base plus the coefficients, (E,)."""
+        return self.base + coefficients
+
+
+def inclusion(phase: Array) -> NDArray[np.bool_]:
+    """Return which elements (E,) are of an inclusion, by phases (E,) between 0 and 1."""
+    return phase > 0.5
