@@ -10,17 +10,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import CONTRAST
-from ..fem.field import FieldModes
+from ..fem.constants import CONTRAST, mode
 from ..fem.two_phase import ElementLogarithms, PhaseSamples, TwoPhaseModes, inclusion
 from ..methods.solution import Solution
 from ..problem import Problem
@@ -28,7 +27,7 @@ from ..program.charts import Chart
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
 from ..statistics.fields import mean_logarithm
-from ..statistics.linearised import LinearisedFit, linearised_fit
+from ..statistics.linearised import LinearisedFit, information, linearised_fit
 from ..statistics.phases import ElementInformation, Faces, PhaseDraws, draw_phases, start_phases
 from .warm_start import Earlier
 
@@ -57,12 +56,42 @@ class _Search:
     modes : TwoPhaseModes
     number : int
         Index of the part in the body.
+    elements : tuple of str
+        Names of the coefficients of `ElementLogarithms`.
     """
 
     name: str
     contrast: str
     modes: TwoPhaseModes
     number: int
+    elements: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _SmoothFit:
+    """Fit of the smooth field.
+
+    Attributes
+    ----------
+    chi_squared : float
+    misfit : float
+        χ² per measurement.
+    determined : float
+        Number of parameters and shapes that the data determine; one that a prior determines counts
+        in part.
+    """
+
+    chi_squared: float
+    misfit: float
+    determined: float
+
+    def lack_of_fit(self, chi_squared: float) -> float:
+        """Return T of `statistics.phases`, at least one, of an answer with this χ²."""
+        return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
+
+
+def _smooth_fit(fit: LinearisedFit) -> _SmoothFit:
+    return _SmoothFit(fit.chi_squared, _misfit(fit), information(fit).fitted)
 
 
 def solve_two_phases(
@@ -88,41 +117,60 @@ def solve_two_phases(
     solution = solved(problem.with_fields({search.name: search.modes.smooth}), start)
     if not solution.status.converged:
         return solution
-    smooth_misfit = _misfit(linearised_fit(solution.collocation, solution.z))
-    phase: Array | None = None
-    accepted: list[float] = []
+    smooth = _smooth_fit(linearised_fit(solution.collocation, solution.z))
+    _, data, faces = _linearised(problem, search, solution, temperature=1.0)
+    phase = start_phases(data, faces, search.modes.volumes_m3)
+    best: Solution | None = None
+    least = np.inf
+    rounds = 0
     for _ in range(ROUNDS):
-        draws, samples = _draws(problem, search, solution, phase, smooth_misfit)
-        accepted.append(draws.accepted)
-        if phase is not None:
-            solution = _with_samples(solution, search, samples)
-        likelier = inclusion(draws.probability).astype(float)
-        if likelier.sum() < FEWEST_ELEMENTS or likelier.sum() > len(likelier) - FEWEST_ELEMENTS:
-            likelier = _likeliest_elements(draws.probability)
-        if phase is not None:
-            volumes_m3 = search.modes.volumes_m3
-            changed = volumes_m3 @ np.abs(likelier - phase) / (volumes_m3 @ phase)
-            if changed < SETTLED:
-                break
-        following = problem.with_fields({search.name: replace(search.modes, phase=likelier)})
-        guess = {search.contrast: float(np.exp(np.median(draws.contrasts)))}
-        earlier = Earlier.of(solution)
-        known = {k: v for k, v in earlier.values.items() if k != search.contrast}
-        phase = likelier
-        solution = solved(following, replace(earlier, values=known | guess))
-        if not solution.status.converged:
-            return solution
-    else:
-        draws, samples = _draws(problem, search, solution, phase, smooth_misfit)
-        accepted.append(draws.accepted)
-        solution = _with_samples(solution, search, samples)
-    assert phase is not None
+        candidate = _solved_with(problem, search, phase, Earlier.of(best or solution), solved)
+        if not candidate.status.converged:
+            return best or candidate
+        rounds += 1
+        chi_squared = linearised_fit(candidate.collocation, candidate.z).chi_squared
+        if chi_squared >= least:
+            break
+        least = chi_squared
+        temperature = smooth.lack_of_fit(chi_squared)
+        fit, data, faces = _linearised(problem, search, candidate, temperature=temperature)
+        draws = draw_phases(data, faces, phase)
+        samples = _samples(draws, fit, search, candidate)
+        best = _with_samples(candidate, replace(samples, smooth_misfit=smooth.misfit))
+        following = _likelier(draws.probability)
+        volumes_m3 = search.modes.volumes_m3
+        if volumes_m3 @ np.abs(following - phase) < SETTLED * (volumes_m3 @ phase):
+            break
+        phase = following
+    assert best is not None
+    final = np.round(_phase_of(best, search))
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
-        f"{smooth_misfit:.3g}), then {len(accepted)} rounds of phases; the inclusion has "
-        f"{int(phase.sum())} of {len(phase)} elements; the sampler accepted {accepted[-1]:.0%}"
+        f"{smooth.misfit:.3g}), {rounds} rounds of phases and parameters; the inclusion has "
+        f"{int(final.sum())} of {len(final)} elements; samples are of a posterior tempered by "
+        f"{smooth.lack_of_fit(least):.3g}, the lack of fit per shape of the smooth field"
     )
-    return replace(solution, notes=(note, *solution.notes))
+    return replace(best, notes=(note, *best.notes))
+
+
+def _phase_of(solution: Solution, search: _Search) -> Array:
+    """Return the phases (E,) of a solution."""
+    modes = _body_of(solution, search).parts[search.number].field
+    assert isinstance(modes, TwoPhaseModes)
+    return modes.phase
+
+
+def _body_of(solution: Solution, search: _Search) -> Body:
+    segments = solution.collocation.segments
+    return next(s.body for s in segments if search.name in s.body.lengths_m)
+
+
+def _solved_with(
+    problem: Problem, search: _Search, phase: Array, earlier: Earlier, solved: Solved
+) -> Solution:
+    """Solve with given phases, from the parameters of an earlier answer."""
+    own = replace(search.modes, phase=phase)
+    return solved(problem.with_fields({search.name: own}), earlier)
 
 
 def _search_of(problem: Problem) -> _Search:
@@ -140,64 +188,80 @@ def _search_of(problem: Problem) -> _Search:
         )
     parts = next(body.parts for body in problem.bodies if name in body.lengths_m)
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
-    return _Search(name, parts[number].full_name(CONTRAST.name), modes, number)
+    part = parts[number]
+    elements = tuple(part.full_name(mode(k).name) for k in range(len(modes.phase)))
+    return _Search(name, part.full_name(CONTRAST.name), modes, number, elements)
 
 
-def _likeliest_elements(probability: Array) -> Array:
-    """Return phases (E,) of the few likeliest elements, where one class would be empty."""
-    found = np.zeros(len(probability))
-    found[np.argsort(probability)[-FEWEST_ELEMENTS:]] = 1.0
+def _likelier(probability: Array) -> Array:
+    """Return the likelier phase (E,) of every element; neither phase is left empty."""
+    found = inclusion(probability).astype(float)
+    order = np.argsort(probability)
+    if found.sum() < FEWEST_ELEMENTS:
+        found[order[-FEWEST_ELEMENTS:]] = 1.0
+    elif found.sum() > len(found) - FEWEST_ELEMENTS:
+        found[order[:FEWEST_ELEMENTS]] = 0.0
     return found
 
 
-def _draws(
-    problem: Problem,
-    search: _Search,
-    solution: Solution,
-    phase: Array | None,
-    smooth_misfit: float,
-) -> tuple[PhaseDraws, PhaseSamples]:
-    """Return draws of the phases by the measurements linearised at a solution, and as samples."""
-    body = next(s.body for s in solution.collocation.segments if search.name in s.body.lengths_m)
+def _linearised(
+    problem: Problem, search: _Search, solution: Solution, *, temperature: float
+) -> tuple[LinearisedFit, ElementInformation, Faces]:
+    """Return the measurements linearised at a solution in the logarithm of every element."""
+    body = _body_of(solution, search)
     part = body.parts[search.number]
     assert part.field is not None
     theta = body.theta(solution.parameters)
     base = part.field.logarithms(theta[body.mode_places[search.number]])
     elements = ElementLogarithms.about(search.modes, base)
-    names = [part.full_name(constant.name) for constant in elements.constants]
-    fit = _by_elements(problem.with_fields({search.name: elements}), solution, set(names))
-    of_z = np.array([fit.names.index(name) for name in names])
-    data = _information(fit, of_z, base, search.modes.field.deviation)
-    faces = Faces.of(body.mesh, part.cells)
-    first = start_phases(data, faces, search.modes.volumes_m3) if phase is None else phase
-    draws = draw_phases(data, faces, first)
-    others = np.delete(np.arange(len(fit.names)), of_z)
+    fit = _by_elements(problem.with_fields({search.name: elements}), solution, search)
+    data = _information(
+        fit,
+        _columns(fit, search),
+        base=base,
+        deviation=search.modes.field.deviation,
+        temperature=temperature,
+    )
+    return fit, data, Faces.of(body.mesh, part.cells)
+
+
+def _columns(fit: LinearisedFit, search: _Search) -> Index:
+    """Return the columns of the elements' logarithms in a fit."""
+    places = {name: k for k, name in enumerate(fit.names)}
+    return np.array([places[name] for name in search.elements])
+
+
+def _samples(
+    draws: PhaseDraws, fit: LinearisedFit, search: _Search, solution: Solution
+) -> PhaseSamples:
+    """Return draws of the phases as samples of the logarithms in the elements."""
+    others = np.delete(np.arange(len(fit.names)), _columns(fit, search))
     shared = [int(k) for k in others if k < fit.shared]
-    own_names = tuple(fit.names[k] for k in shared)
-    # Mean of ln c in the surroundings, by the parameters.
+    names = tuple(fit.names[k] for k in shared)
     mean, slopes = mean_logarithm(
-        body, solution.collocation.parameters, solution.q, number=search.number, names=own_names
+        _body_of(solution, search),
+        solution.collocation.parameters,
+        solution.q,
+        number=search.number,
+        names=names,
     )
     by_parameters = draws.changes[:, : len(shared)] @ slopes
-    logarithms = mean + by_parameters[:, None] + draws.contrasts[:, None] * draws.phases
-    both = np.column_stack([draws.means[:, : len(shared)], draws.means[:, -1]])
-    return draws, PhaseSamples(
-        logarithms=logarithms,
+    means = np.column_stack([draws.means[:, : len(shared)], draws.means[:, -1]])
+    return PhaseSamples(
+        logarithms=mean + by_parameters[:, None] + draws.contrasts[:, None] * draws.phases,
         contrasts=draws.contrasts,
         volumes_m3=draws.phases @ search.modes.volumes_m3,
-        names=(*own_names, search.contrast),
-        deviations=np.atleast_2d(np.cov(both, rowvar=False)),
+        names=(*names, search.contrast),
+        deviations=np.atleast_2d(np.cov(means, rowvar=False)),
         misfit=_misfit(fit),
-        smooth_misfit=smooth_misfit,
+        smooth_misfit=np.nan,
     )
 
 
-def _by_elements(problem: Problem, solution: Solution, names: Collection[str]) -> LinearisedFit:
-    """Return the fit at a solution, linearised in the logarithm of every element.
-
-    `names` are those of the elements' coefficients, which are zero there.
-    """
+def _by_elements(problem: Problem, solution: Solution, search: _Search) -> LinearisedFit:
+    """Return the fit at a solution, by the coefficients of the elements too, which are zero."""
     found = solution.collocation
+    elements = set(search.elements)
     collocation = replace(
         found,
         experiments=problem.experiments,
@@ -208,7 +272,7 @@ def _by_elements(problem: Problem, solution: Solution, names: Collection[str]) -
     p, positions = found.unpack(solution.z)
     values = dict(zip((item.name for item in found.parameters.free), p, strict=False))
     q = [
-        0.0 if item.name in names else values[item.name] for item in collocation.parameters.free
+        0.0 if item.name in elements else values[item.name] for item in collocation.parameters.free
     ]
     both = np.concatenate([q, p[found.nq :]])
     return linearised_fit(collocation, collocation.pack(both, positions))
@@ -220,7 +284,7 @@ def _misfit(fit: LinearisedFit) -> float:
 
 
 def _information(
-    fit: LinearisedFit, of_z: Array, base: Array, deviation: float
+    fit: LinearisedFit, of_z: Array, *, base: Array, deviation: float, temperature: float
 ) -> ElementInformation:
     """Return the normal equations, with the columns `of_z` those of the elements."""
     size = len(fit.names)
@@ -231,7 +295,6 @@ def _information(
         flat = slope.reshape(residual.size, size)
         normal += flat.T @ flat
         score += flat.T @ residual.ravel()
-    temperature = max(1.0, _misfit(fit))
     normal /= temperature
     score /= temperature
     of_p = np.delete(np.arange(size), of_z)
@@ -247,23 +310,25 @@ def _information(
     )
 
 
-def _with_samples(solution: Solution, search: _Search, samples: PhaseSamples) -> Solution:
+def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
     """Return the solution whose body has the samples of the phases."""
     collocation = solution.collocation
-    found: dict[int, Body] = {}
-
-    def sampled(modes: FieldModes | None) -> FieldModes | None:
-        return replace(modes, samples=samples) if isinstance(modes, TwoPhaseModes) else modes
-
-    for segment in collocation.segments:
-        body = segment.body
-        if id(body) not in found:
-            fields = {p.field_name: sampled(p.field) for p in body.parts if p.field}
-            found[id(body)] = body.with_fields({n: f for n, f in fields.items() if f is not None})
-    experiments = [replace(e, body=found[id(e.body)]) for e in collocation.experiments]
+    bodies: dict[int, Body] = {}
+    for body in dict.fromkeys(segment.body for segment in collocation.segments):
+        fields = {
+            part.field_name: replace(part.field, samples=samples)
+            for part in body.parts
+            if isinstance(part.field, TwoPhaseModes)
+        }
+        bodies[id(body)] = body.with_fields(fields)
+    experiments = [
+        replace(each, body=bodies.get(id(each.body), each.body))
+        for each in collocation.experiments
+    ]
     charts = _charts(collocation, experiments)
-    sampled_collocation = replace(collocation, experiments=experiments, charts=charts)
-    return replace(solution, collocation=sampled_collocation)
+    return replace(
+        solution, collocation=replace(collocation, experiments=experiments, charts=charts)
+    )
 
 
 def _charts(collocation: Collocation, experiments: Sequence[Experiment]) -> dict[str, Chart]:
