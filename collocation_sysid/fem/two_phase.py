@@ -49,6 +49,30 @@ class PhaseSamples:
     smooth_misfit: float
 
 
+@dataclass(frozen=True)
+class PhaseFinding:
+    """What is found of two phases.
+
+    Attributes
+    ----------
+    contrast : (lower, median, upper)
+        Ratio of the inclusion to the surroundings, with the 95 % interval of its statistical error
+        and of the phases.
+    volume_m3 : (lower, median, upper) of the inclusion, likewise
+    deviation : float
+        Standard deviation of the logarithm in an element of which nothing but the two values is
+        known: each phase as likely.
+    misfit, smooth_misfit : float
+        χ² per measurement of the answer, and of the smooth field before it.
+    """
+
+    contrast: tuple[float, float, float]
+    volume_m3: tuple[float, float, float]
+    deviation: float
+    misfit: float
+    smooth_misfit: float
+
+
 @dataclass(frozen=True, eq=False)
 class TwoPhaseModes(FieldModes):
     """A two-phase field as the body evaluates it; its only coefficient is the contrast r.

@@ -28,7 +28,14 @@ from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
 from ..statistics.fields import mean_logarithm
 from ..statistics.linearised import LinearisedFit, information, linearised_fit
-from ..statistics.phases import ElementInformation, Faces, PhaseDraws, draw_phases, start_phases
+from ..statistics.phases import (
+    USUAL,
+    ElementInformation,
+    Faces,
+    PhaseDraws,
+    draw_phases,
+    start_phases,
+)
 from .warm_start import Earlier
 
 Solved = Callable[[Problem, str | Path | Earlier | None], Solution]
@@ -36,7 +43,7 @@ Solved = Callable[[Problem, str | Path | Earlier | None], Solution]
 # Elements of a two-phase field: the sampler has two dense matrices of their square.
 MOST_ELEMENTS = 4000
 # Rounds of phases and parameters at most.
-ROUNDS = 4
+ROUNDS = 6
 # Phases are final where less than this share of the inclusion's volume changes in a round.
 SETTLED = 0.02
 # An inclusion of fewer elements is noise of a single element.
@@ -118,37 +125,43 @@ def solve_two_phases(
     if not solution.status.converged:
         return solution
     smooth = _smooth_fit(linearised_fit(solution.collocation, solution.z))
-    _, data, faces = _linearised(problem, search, solution, temperature=1.0)
-    phase = start_phases(data, faces, search.modes.volumes_m3)
+    at_smooth = _linearised(problem, search, solution)
+    phase = start_phases(at_smooth.data(1.0), at_smooth.faces, search.modes.volumes_m3)
     best: Solution | None = None
-    least = np.inf
+    at_best = at_smooth
     rounds = 0
     for _ in range(ROUNDS):
         candidate = _solved_with(problem, search, phase, Earlier.of(best or solution), solved)
-        if not candidate.status.converged:
-            return best or candidate
+        if not candidate.status.converged and best is None:
+            return candidate
         rounds += 1
-        chi_squared = linearised_fit(candidate.collocation, candidate.z).chi_squared
-        if chi_squared >= least:
+        if not candidate.status.converged:
             break
-        least = chi_squared
-        temperature = smooth.lack_of_fit(chi_squared)
-        fit, data, faces = _linearised(problem, search, candidate, temperature=temperature)
-        draws = draw_phases(data, faces, phase)
-        samples = _samples(draws, fit, search, candidate)
-        best = _with_samples(candidate, replace(samples, smooth_misfit=smooth.misfit))
+        at_candidate = _linearised(problem, search, candidate)
+        if best is not None and at_candidate.fit.chi_squared >= at_best.fit.chi_squared:
+            break
+        best = candidate
+        at_best = at_candidate
+        draws = draw_phases(at_best.data(1.0), at_best.faces, phase)
         following = _likelier(draws.probability)
         volumes_m3 = search.modes.volumes_m3
         if volumes_m3 @ np.abs(following - phase) < SETTLED * (volumes_m3 @ phase):
             break
         phase = following
     assert best is not None
-    final = np.round(_phase_of(best, search))
+    final = _phase_of(best, search)
+    temperature = smooth.lack_of_fit(at_best.fit.chi_squared)
+    # The whole posterior is tempered, its prior too: with the data alone tempered the prior would
+    # shrink inclusions.
+    settings = replace(USUAL, face_nats=USUAL.face_nats / temperature)
+    draws = draw_phases(at_best.data(temperature), at_best.faces, final, settings)
+    samples = _samples(draws, at_best.fit, search, best)
+    best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
     note = (
         f"two phases of {search.name}: started from a smooth field (χ² per measurement "
         f"{smooth.misfit:.3g}), {rounds} rounds of phases and parameters; the inclusion has "
         f"{int(final.sum())} of {len(final)} elements; samples are of a posterior tempered by "
-        f"{smooth.lack_of_fit(least):.3g}, the lack of fit per shape of the smooth field"
+        f"{temperature:.3g}, the lack of fit per shape of the smooth field"
     )
     return replace(best, notes=(note, *best.notes))
 
@@ -204,9 +217,38 @@ def _likelier(probability: Array) -> Array:
     return found
 
 
-def _linearised(
-    problem: Problem, search: _Search, solution: Solution, *, temperature: float
-) -> tuple[LinearisedFit, ElementInformation, Faces]:
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Measurements linearised in the logarithm of every element.
+
+    Attributes
+    ----------
+    fit : LinearisedFit
+    columns : (E,) of the elements in the fit
+    base : (E,) logarithms over the mean where they are linearised
+    faces : Faces
+    deviation : float
+        Prior standard deviation of the logarithm of the contrast.
+    """
+
+    fit: LinearisedFit
+    columns: Index
+    base: Array
+    faces: Faces
+    deviation: float
+
+    def data(self, temperature: float) -> ElementInformation:
+        """Return the normal equations, with the measurements' over the temperature T."""
+        return _information(
+            self.fit,
+            self.columns,
+            base=self.base,
+            deviation=self.deviation,
+            temperature=temperature,
+        )
+
+
+def _linearised(problem: Problem, search: _Search, solution: Solution) -> _Linearised:
     """Return the measurements linearised at a solution in the logarithm of every element."""
     body = _body_of(solution, search)
     part = body.parts[search.number]
@@ -215,14 +257,13 @@ def _linearised(
     base = part.field.logarithms(theta[body.mode_places[search.number]])
     elements = ElementLogarithms.about(search.modes, base)
     fit = _by_elements(problem.with_fields({search.name: elements}), solution, search)
-    data = _information(
-        fit,
-        _columns(fit, search),
+    return _Linearised(
+        fit=fit,
+        columns=_columns(fit, search),
         base=base,
+        faces=Faces.of(body.mesh, part.cells),
         deviation=search.modes.field.deviation,
-        temperature=temperature,
     )
-    return fit, data, Faces.of(body.mesh, part.cells)
 
 
 def _columns(fit: LinearisedFit, search: _Search) -> Index:

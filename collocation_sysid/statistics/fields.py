@@ -27,7 +27,7 @@ from ..arrays import Array, Index
 from ..fem.body import Body
 from ..fem.field import ALL_MODULI, FieldModes
 from ..fem.moduli import engineering
-from ..fem.two_phase import TwoPhaseModes
+from ..fem.two_phase import PhaseFinding, TwoPhaseModes
 from ..model.generated import Generated
 from ..model.parameters import NOTHING, Parameters, ThetaMap
 from ..program.collocation import Collocation
@@ -50,46 +50,24 @@ ENDS = (0.025, 0.975)
 AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
-@dataclass(frozen=True)
-class PhaseFinding:
-    """What is found of two phases.
+def phase_concerns(phases: PhaseFinding, name: str) -> list[Concern]:
+    """Return what speaks against two phases: no contrast, or a smooth field that fits better.
 
-    Attributes
+    Parameters
     ----------
-    contrast : (lower, median, upper)
-        Ratio of the inclusion to the surroundings, with the 95 % interval of its statistical error
-        and of the phases.
-    volume_m3 : (lower, median, upper) of the inclusion, likewise
-    deviation : float
-        Standard deviation of the logarithm in an element of which nothing but the two values is
-        known: each phase as likely.
-    misfit, smooth_misfit : float
-        χ² per measurement of the answer, and of the smooth field before it.
+    phases : PhaseFinding
+    name : str
+        The constant, with its region in front.
     """
-
-    contrast: tuple[float, float, float]
-    volume_m3: tuple[float, float, float]
-    deviation: float
-    misfit: float
-    smooth_misfit: float
-
-    def concerns(self, name: str) -> list[Concern]:
-        """Return what speaks against two phases: no contrast, or a smooth field that fits better.
-
-        Parameters
-        ----------
-        name : str
-            The constant, with its region in front.
-        """
-        found: list[Concern] = []
-        lower, median, upper = self.contrast
-        if lower <= 1 <= upper:
-            ends = {"name": name, "lower": lower, "median": median, "upper": upper}
-            found.append(Concern("field/one-phase", data=ends))
-        if self.misfit > WORSE * max(1.0, self.smooth_misfit):
-            both = {"name": name, "misfit": self.misfit, "smooth": self.smooth_misfit}
-            found.append(Concern("field/phases", data=both))
-        return found
+    found: list[Concern] = []
+    lower, median, upper = phases.contrast
+    if lower <= 1 <= upper:
+        ends = {"name": name, "lower": lower, "median": median, "upper": upper}
+        found.append(Concern("field/one-phase", data=ends))
+    if phases.misfit > WORSE * max(1.0, phases.smooth_misfit):
+        both = {"name": name, "misfit": phases.misfit, "smooth": phases.smooth_misfit}
+        found.append(Concern("field/phases", data=both))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +181,7 @@ class FieldEstimate:
     def concerns(self) -> list[Concern]:
         """A density that none has; an amplitude too small, or a length too long, by the data."""
         if self.phases is not None:
-            return self.phases.concerns(self.name)
+            return phase_concerns(self.phases, self.name)
         amplitude, said = self.modes.field.deviation, dict[str, dict[str, float]]()
         best = max(AMPLITUDES, key=lambda factor: self.likelier(factor=factor))
         if best > 1 and self.likelier(factor=best) > LIKELIER:
