@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .fem.two_phase import TwoPhaseModes
 from .display import plain_text
 from .errors import InputError, SimulationError
+from .fem.two_phase import TwoPhaseModes
 from .methods.solution import Method, Solution, Status, Watch
 from .methods.start import marched
 from .methods.workers import workers_of

@@ -128,32 +128,31 @@ def test_unknown_phases_widen_the_interval_of_the_contrast():
     assert after[place, place] - before[place, place] == pytest.approx(0.04, rel=1e-6)
 
 
-def test_slopes_by_the_contrast_and_by_elements_are_those_of_differences(rng):
+@pytest.mark.parametrize("by_elements", [False, True])
+def test_slopes_by_the_contrast_and_by_elements_are_those_of_differences(by_elements: bool, rng):
     body = bar(TWO_PHASES)
-    two = replace(body.parts[0].field, phase=lower_half().astype(float))
-    base = rng.normal(size=len(two.phase))
-    for field in (two, ElementLogarithms.about(two, base)):
-        count = len(field.constants)
-        own = body.with_fields({"young_pa": field})
-        x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
-        v, w = rng.normal(size=(2, *x.shape))
-        names = [name for name in own.constants][-count:]
-        coefficients = dict(zip(names, 1 + 0.3 * rng.normal(size=count), strict=True))
-        theta = own.theta({**KNOWN, "young_pa": YOUNG_PA})
-        theta[-count:] = list(coefficients.values())
-        steps = 0.1 * (np.arange(len(theta)) >= len(theta) - count)
-        by_theta = own.linearise(x, v, theta).by_theta[0]
-        by_both = own.curvature(x, v, w, theta).theta_theta[0]
-        assert_derivative(
-            lambda at: own.force(x, v, at)[0], lambda d: by_theta @ d, theta, rng, scale=steps
-        )
-        assert_derivative(
-            lambda at: own.curvature(x, v, w, at).theta[0],
-            lambda d: by_both @ d,
-            theta,
-            rng,
-            scale=steps,
-        )
+    field = replace(body.parts[0].field, phase=lower_half().astype(float))
+    if by_elements:
+        field = ElementLogarithms.about(field, rng.normal(size=len(field.phase)))
+    own = body.with_fields({"young_pa": field})
+    count = len(field.constants)
+    x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
+    v = rng.normal(size=x.shape)
+    w = rng.normal(size=x.shape)
+    theta = own.theta({**KNOWN, "young_pa": YOUNG_PA})
+    theta[-count:] = 1 + 0.3 * rng.normal(size=count)
+    steps = 0.1 * (np.arange(len(theta)) >= len(theta) - count)
+    by_theta = own.linearise(x, v, theta).by_theta[0]
+    by_both = own.curvature(x, v, w, theta).theta_theta[0]
+
+    def force(at: np.ndarray) -> np.ndarray:
+        return own.force(x, v, at)[0]
+
+    def slope(at: np.ndarray) -> np.ndarray:
+        return own.curvature(x, v, w, at).theta[0]
+
+    assert_derivative(force, lambda d: by_theta @ d, theta, rng, scale=steps)
+    assert_derivative(slope, lambda d: by_both @ d, theta, rng, scale=steps)
 
 
 def small_posterior(rng) -> tuple[ElementInformation, Faces]:
@@ -245,7 +244,7 @@ def test_two_fields_of_two_phases_are_refused():
     core = cs.Region("core", np.arange(12), field=few)
     body = Body(bar().mesh, density_kg_m3=100.0, field=TWO_PHASES, regions=[core])
     both = cs.Problem([swung(body)], {**KNOWN, "young_pa": cs.Unknown(YOUNG_PA)}, substeps=1)
-    with pytest.raises(cs.InputError, match="2 two-phase fields .young_pa, core.young_pa."):
+    with pytest.raises(cs.InputError, match=r"2 two-phase fields \(young_pa, core.young_pa\)"):
         solve_two_phases(both, None, lambda *_: pytest.fail("solved"))
 
 

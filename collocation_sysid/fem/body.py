@@ -226,8 +226,7 @@ class Body(Discretisation):
         """
         return self.with_parts(
             tuple(
-                replace(part, field=fields.get(part.field_name, part.field))
-                for part in self.parts
+                replace(part, field=fields.get(part.field_name, part.field)) for part in self.parts
             )
         )
 

@@ -166,6 +166,7 @@ class Parameter:
         """Derivative of the value by q."""
         return value if self.scale == "log" else self.unit
 
+
 # Where the search for the contrast of two phases starts if nothing is known of it: where it is 1,
 # the loss does not depend on where the phases are.
 FIRST_CONTRAST = 2.0
@@ -270,9 +271,7 @@ class Parameters:
         bodies = tuple(bodies)
         names = dict.fromkeys(name for body in bodies for name in body.mode_names)
         priors = {
-            name: (1.0, deviation)
-            for body in bodies
-            for name, deviation in body.contrasts.items()
+            name: (1.0, deviation) for body in bodies for name, deviation in body.contrasts.items()
         }
         own = (
             replace(item, prior=priors[item.name])

@@ -363,8 +363,7 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
         }
         bodies[id(body)] = body.with_fields(fields)
     experiments = [
-        replace(each, body=bodies.get(id(each.body), each.body))
-        for each in collocation.experiments
+        replace(each, body=bodies.get(id(each.body), each.body)) for each in collocation.experiments
     ]
     charts = _charts(collocation, experiments)
     return replace(

@@ -300,8 +300,9 @@ TOPICS: Mapping[str, Topic] = {
         {
             "amplitude": "{name} differs more from place to place than its field allows for: the "
             "data want an amplitude of about {likely:.2g}, not {stated:.2g}",
-            "one-phase": "the data do not show two materials: the contrast of {name} is {median:.3g} "
-            "({lower:.3g} to {upper:.3g}), which contains 1; take prior = 'smooth' or no field",
+            "one-phase": "the data do not show two materials: the contrast of {name} is "
+            "{median:.3g} ({lower:.3g} to {upper:.3g}), which contains 1; take prior = 'smooth' or "
+            "no field",
             "phases": "two phases of {name} do not describe the body: χ² per measurement is "
             "{misfit:.3g}, with a smooth field {smooth:.3g}; more than two materials, or one that "
             "changes gradually: take prior = 'smooth', or regions",

@@ -244,9 +244,7 @@ def fields_of(
     return found
 
 
-def _with_phases(
-    estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float
-) -> FieldEstimate:
+def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float) -> FieldEstimate:
     """Return the estimate of a two-phase field with the intervals of its samples.
 
     Quantiles of the samples, so that an element at the boundary has an interval from one phase to

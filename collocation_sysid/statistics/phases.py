@@ -3,7 +3,7 @@
 With the residuals linear in parameters p and in the logarithm z_e of a constant in every element,
 and z_e = s h_e for phases h ∈ {0, 1}ᴱ and the logarithm s of the contrast, the posterior is
 
-    −2 ln π(h, s, p) = ‖r + S_p δp + S_z (s h − z₀)‖² / T + s²/A² + priors of p + 2 J Σ_f w_f |Δh|_f.
+    −2 ln π(h, s, p) = ‖r + S_p δp + S_z (s h − z₀)‖²/T + s²/A² + priors of p + 2 J Σ_f w_f |Δh|_f.
 
 The last sum is over the faces f between two elements, w_f is the face's area over the mean area and
 |Δh|_f is one where the phases differ: the prior of Ising and Potts, a total variation of h. T is
