@@ -9,6 +9,7 @@ from .fem.materials import Material, Prony
 from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
 from .fem.regions import Region
+from .fem.rest_shape import UnderGravity
 from .fem.selection import Ball, Box, Indices, Named
 from .fem.structured import box_mesh, cylinder_mesh
 from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
@@ -112,6 +113,7 @@ __all__ = [
     "Tied",
     "Trajectory",
     "UncertaintyOptions",
+    "UnderGravity",
     "Unknown",
     "Wrench",
     "box_mesh",

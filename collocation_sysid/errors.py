@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 def hint_at(name: str, known: Iterable[str]) -> str:
@@ -115,15 +116,32 @@ class SimulationError(RuntimeError):
         Time of the step that failed.
     element : int or None
         The element that is worst deformed there, where one is to blame.
+    state_m : (3n,) array, optional
+        Positions where a static path ended; None where a time step failed.
+
+    Attributes
+    ----------
+    lost_stability : LostStability or None
+        The mode in which the body lost its stability, if that was why, see
+        `program.lost_stability`. It is not kept where an error is handed to another process.
     """
 
-    def __init__(self, message: str, time_s: float, element: int | None = None) -> None:
+    lost_stability: Any = None
+
+    def __init__(
+        self,
+        message: str,
+        time_s: float,
+        element: int | None = None,
+        state_m: Any = None,
+    ) -> None:
+        self.state_m = state_m
         self.message = message
         self.time_s = time_s
         self.element = element
         at = f"t = {time_s:.6g} s" + (f", element {element}" if element is not None else "")
         super().__init__(f"{message} ({at})")
 
-    def __reduce__(self) -> tuple[type[SimulationError], tuple[str, float, int | None]]:
+    def __reduce__(self) -> tuple[type[SimulationError], tuple[str, float, int | None, Any]]:
         # Else a process would hand on the text alone, from which the other cannot build it anew.
-        return type(self), (self.message, self.time_s, self.element)
+        return type(self), (self.message, self.time_s, self.element, self.state_m)

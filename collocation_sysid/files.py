@@ -35,7 +35,7 @@ DAMAGE = (
 LONGEST_REASON = 200
 RESULT_FILE = "result.json"
 # The form of result.json and summary.json.
-SCHEMA = 3
+SCHEMA = 4
 AGAIN = "; run what wrote it again"
 
 

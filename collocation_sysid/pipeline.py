@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from .display import plain_text
 from .errors import InputError, SimulationError
 from .fem.two_phase import TwoPhaseModes
@@ -26,13 +28,15 @@ from .runs.told import result_of
 from .runs.warm_start import Earlier
 from .statistics.budget import Sources
 from .statistics.causes import likely_causes
-from .statistics.considered import assumed
+from .statistics.considered import Changes, assumed
 from .statistics.diagnostics import diagnose
 from .statistics.linearised import LinearisedFit, linearised_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes import Answered, Probe, probes
+from .statistics.probes import probes, probes_of_every_solve
 from .statistics.profile import Profile, profile_of
+from .statistics.relaxation import Answered, Probe, probed_changes
+from .statistics.routine_probes import probed_deviations
 from .statistics.trust import turn_concerns
 from .statistics.uncertainty import Uncertainty, uncertainty_of
 
@@ -154,9 +158,10 @@ def run(
         answer = replace(answer, notes=(*turns, *answer.notes))
         if answer.uncertainty is not None and fit is not None:
             profiles = _profiles(answer, fit, say)
-            sources = _sources(answer, fit, answer.uncertainty, say)
+            changes = _changes(answer, say)
+            sources = _sources(answer, fit, answer.uncertainty, changes)
             answer = replace(answer, profiles=profiles, sources=sources)
-            answer = replace(answer, probes=_probes(answer, fit, say)) if probe else answer
+            answer = replace(answer, probes=_probes(answer, fit, changes, say, deep=probe))
         if not seek_causes or answer.solution.status is Status.INTERRUPTED:
             return answer
         say("looking for causes of the misfit")
@@ -191,25 +196,48 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
-    error = step_error(problem, solution, fit, rollouts, answer.noise_estimates)
+    error = step_error(problem, solution, fit, rollouts, answer.optimum)
     return replace(answer, refinement=error), fit
 
 
-def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, say: Log) -> Sources:
-    """What moves the estimates beside the noise."""
+def _changes(answer: Run, say: Log) -> Changes:
+    """Return how the residuals change by what is assumed, and by what every solve probes."""
     say("finding what is assumed is worth")
-    solution, stated = answer.solution, answer.problem.uncertainty.assumptions
-    changes = assumed(solution.collocation, solution.z, stated.deviations)
+    solution = answer.solution
+    deviations = probed_deviations(answer.problem.uncertainty.considered)
+    return assumed(solution.collocation, solution.z, deviations)
+
+
+def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, changes: Changes) -> Sources:
+    """Return what moves the estimates beside the noise; what is stated as exact does not."""
+    solution, stated = answer.solution, answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
-    return Sources.of(fit, changes, parameters, solution.q, known)
+    budgeted = changes.without(name for name, deviation in stated.items() if deviation is None)
+    means = answer.problem.uncertainty.assumptions.means
+    return Sources.of(fit, budgeted, parameters, solution.q, known, means)
 
 
-def _probes(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Probe, ...]:
-    """Refits of parts of the data, and with assumptions freed."""
-    say("refitting parts of the data, and with assumptions freed")
+def _probes(
+    answer: Run, fit: LinearisedFit, changes: Changes, say: Log, deep: bool
+) -> tuple[Probe, ...]:
+    """Return the probes of every solve; of a deep check those of parts and assumptions instead."""
     solution, options = answer.solution, answer.problem.uncertainty
-    at, known = (solution.collocation, solution.z, fit), options.assumptions.deviations
-    return probes(Answered(*at, options, answer.estimates, answer.budget, known))
+    deviations = probed_deviations(options.considered)
+    collocation, z = solution.collocation, solution.z
+    answered = Answered(
+        collocation=collocation,
+        z=z,
+        fit=fit,
+        errors=options,
+        statistical=answer.optimum,
+        budget=answer.budget,
+        deviations=deviations,
+        changes=probed_changes(collocation, z, deviations, changes),
+    )
+    if not deep:
+        return probes_of_every_solve(answered)
+    say("refitting parts of the data, and with assumptions relaxed")
+    return probes(answered)
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
@@ -233,18 +261,30 @@ def _fine_enough(
     say: Log,
     scheduler: str | None,
 ) -> tuple[Run, LinearisedFit | None]:
-    """The run again from its answer, with as many substeps as its error bars ask for."""
-    if coarse.refinement is None:
+    """Return the run solved again from its answer, with as many substeps as its error bars ask for.
+
+    The answer may have several steps a sample already, where it was started from such a run. A
+    parameter that ended at a bound has no error bar, and coarse steps may have driven it there: it
+    starts from its guess again. Where all of them ended so, the most substeps are taken.
+    """
+    if coarse.refinement is None or fit is None:
         return coarse, fit
     first, problem = coarse.solution, coarse.problem
-    substeps = coarse.refinement.substeps(coarse.noise_estimates, as_scheme(problem.scheme).order)
-    if substeps == 1:
+    before = first.collocation.substeps
+    factor = coarse.refinement.substeps(coarse.optimum, as_scheme(problem.scheme).order)
+    substeps = min(before * factor, MOST_SUBSTEPS)
+    steps = "one step" if before == 1 else f"{before} steps"
+    worst, many = coarse.refinement.worst(coarse.optimum)
+    why = f"with {steps} a sample, the step moves {worst} by {many:.2g} standard errors"
+    if fit.at_bound[: fit.shared].all():
+        substeps = MOST_SUBSTEPS
+        why = f"with {steps} a sample, every parameter ends at a bound"
+    if substeps <= before:
         return coarse, fit
     say(f"solving again with {substeps} steps a sample")
-    worst, many = coarse.refinement.worst(coarse.noise_estimates)
-    why = f"with one step a sample, the step moves {worst} by {many:.2g} standard errors"
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
+    p = np.where(fit.at_bound, again.guess_p, p)
     try:
         require_memory(problem, again, solver)
         positions, failure = marched(again, p)

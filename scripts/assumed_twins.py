@@ -21,13 +21,15 @@ from collocation_sysid import (
     Grasp,
     Material,
     NodeForce,
-    PointMass,
     PoseSequence,
     TetMesh,
     simulate,
     with_markers,
 )
-from collocation_sysid.statistics.assumptions import AIR_KG_M3
+from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
+from collocation_sysid.fem.constants import GAMMA_R
+from collocation_sysid.fem.materials import DAMPINGS, Damping, rayleigh
+from collocation_sysid.statistics.assumptions import OBJECTIVE_DAMPINGS
 
 Array = NDArray[np.float64]
 SCHEME, AXES = "midpoint", "xyz"
@@ -45,22 +47,24 @@ def wrong(
     experiment : Experiment
         With markers at nodes.
     values : mapping of parameter to its truth, by E and ν
-    off : mapping of assumption to how far it is off, in its unit
+    off : mapping of assumption to how far it is off, in its unit; those of the air are shares of
+        what the air around the experiment does in the model
     """
     body = _body(experiment, values, off)
     (grasp,) = experiment.grasps
     slower = 1 - off.get("time_scale", 0.0)
     poses = grasp.poses
     slowed = PoseSequence(slower * poses.t_s, poses.positions_m, poses.quaternions_xyzw)
-    masses, forces = _in_air(body, off)
+    # Added mass is that of denser air, and what else this air does is taken back.
+    denser = 1 + off.get("added_mass", 0.0)
     truth = replace(
         experiment,
         body=body,
         t_s=slower * experiment.t_s,
         grasps=(Grasp(grasp.nodes, slowed),),
         markers=replace(experiment.markers, t_s=slower * experiment.t_s, located=None),
-        masses=masses,
-        forces=forces,
+        forces=_lift(experiment, body, off),
+        air_density_kg_m3=denser * experiment.air_density_kg_m3,
     )
     values = dict(values, poisson=values["poisson"] + off.get("poisson", 0.0))
     return with_markers(experiment, _tracks(truth, values, off.get("stiffness_drift", 0.0)))
@@ -70,7 +74,7 @@ def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Arr
     """(T, M, 3) of a body whose stiffness drifts, one piece of the recording after another."""
     values = _lame(truth, values)
     if not drift:
-        return simulate(truth, values, SCHEME).markers_m
+        return simulate(truth, values, SCHEME, substeps=1).markers_m
     t_s, markers = truth.t_s, truth.markers
     moduli = [name for name in values if name.endswith("_pa")]
     tracks, start, velocity = [markers.positions_m[:0]], {}, 0.0
@@ -81,7 +85,7 @@ def _tracks(truth: Experiment, values: Mapping[str, float], drift: float) -> Arr
         now = {n: v * (1 + drift * since) if n in moduli else v for n, v in values.items()}
         seen = replace(markers, t_s=t_s[here], positions_m=markers.positions_m[here], located=None)
         piece = replace(truth, t_s=t_s[here], markers=seen, **start)
-        moved = simulate(piece, now, SCHEME)
+        moved = simulate(piece, now, SCHEME, substeps=1)
         for way in np.diff(moved.positions_m, axis=0):  # as the midpoint rule has it
             velocity = 2 * way / truth.timestep_s - velocity
         start = {
@@ -109,11 +113,12 @@ def _body(experiment: Experiment, values: Mapping[str, float], off: Mapping[str,
     larger = 1 + off.get("body_scale", 0.0)
     mesh = TetMesh(pivot_m + larger * (old.mesh.points_m - pivot_m), old.mesh.tetrahedra)
     stiffer = [off.get(f"anisotropy {axis}", 0.0) for axis in AXES]
-    own: dict[str, Any] = {"damping": old.parts[0].damping}
+    own: dict[str, Any] = {"damping": _damping(old.parts[0].damping, off)}
     if any(stiffer):
         own |= {"material": _stiffer_along(stiffer), "evaluator": "casadi"}
-    if off.get("air_drag"):
-        own["forces"] = [_drag(off["air_drag"])]
+    more_drag = off.get("air_drag", 0.0) - off.get("added_mass", 0.0)
+    if more_drag:
+        own["forces"] = [_drag(more_drag * experiment.air_density_kg_m3)]
     density = old.mass_kg / old.mesh.volume_m3 * (1 + off.get("mass", 0.0))
     body = Body(mesh, density_kg_m3=density, **own)
     factor = np.ones(len(body.nodes_m))
@@ -136,21 +141,47 @@ def _stiffer_along(shares: Sequence[float]) -> Material:
     return Material.of(energy)
 
 
-def _drag(coefficient: float) -> NodeForce:
-    """−½ ρ c_d a |v| v of each node, a being what its surface shows on average: a quarter."""
+def _damping(stated: Damping, off: Mapping[str, float]) -> Damping:
+    """The stated law, which is a stress, with a share of the differences of others from it."""
+    shares = {
+        law: off.get(key, 0.0)
+        for law, key in (
+            *((law, f"damping_law {law}") for law in OBJECTIVE_DAMPINGS),
+            ("rayleigh", "rayleigh_damping"),
+        )
+    }
+    if not any(shares.values()):
+        return stated
+    own = 1 - sum(shares.values())
+
+    def stress(psi, f, rate, gamma_r_s):
+        terms = [(own, stated), *((shares[law], DAMPINGS[law]) for law in OBJECTIVE_DAMPINGS)]
+        stresses = ca.SX(9, 1)
+        slopes = ca.SX(9, 9)
+        for share, law in terms:
+            stress, slope = law.stress(psi, f, rate, gamma_r_s)
+            stresses += share * stress
+            slopes += share * slope
+        return stresses, slopes
+
+    def potential(psi, f, rate, gamma_r_s):
+        return shares["rayleigh"] * rayleigh(psi, f, rate, gamma_r_s)
+
+    return Damping("between", (GAMMA_R,), potential, stress)
+
+
+def _drag(density_kg_m3: float) -> NodeForce:
+    """Return −½ ρ c_d a |v| v of each node, where a is the share of its surface that faces v."""
+    per_area = 0.5 * density_kg_m3 * DRAG_COEFFICIENT * FACING_SHARE
 
     def drag(x, v, at):
-        return -0.125 * AIR_KG_M3 * coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
+        return -per_area * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
 
     return NodeForce.of(drag)
 
 
-def _in_air(
-    body: Body, off: Mapping[str, float]
-) -> tuple[tuple[PointMass, ...], tuple[Force, ...]]:
-    """What the air that the body displaces lifts, and what of it moves along."""
-    air_kg = AIR_KG_M3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg
-    buoyant, moving = off.get("buoyancy", 0.0), 0.5 * off.get("added_mass", 0.0)
-    lift_n = 9.81 * air_kg * (buoyant + moving)
-    forces = tuple(Force([k], [0, 0, n]) for k, n in enumerate(lift_n) if n)
-    return tuple(PointMass([k], moving * m) for k, m in enumerate(air_kg) if moving), forces
+def _lift(experiment: Experiment, body: Body, off: Mapping[str, float]) -> tuple[Force, ...]:
+    """Return the forces by which buoyancy differs from that of air with the true added mass."""
+    more = off.get("buoyancy", 0.0) - off.get("added_mass", 0.0)
+    air_kg = experiment.air_density_kg_m3 * body.node_mass * body.mesh.volume_m3 / body.mass_kg
+    return tuple(Force([k], [0, 0, 9.81 * more * m]) for k, m in enumerate(air_kg) if more * m)

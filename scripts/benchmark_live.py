@@ -94,11 +94,11 @@ def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame])
     for key, true in TRUTH[name].items():
         found, known = update.estimates[key], batch[key]
         apart, at_last = (
-            abs(each.value - known.value) / (known.std_error or np.nan)
+            abs(each.value - known.value) / (known.statistical_std_error or np.nan)
             for each in (found, settled.estimates[key])
         )
         off = 100 * (early.estimates[key].value / true - 1)
-        error = known.std_error or np.nan
+        error = known.statistical_std_error or np.nan
         print(
             f"    {key}: {found.value:.5g}, batch {known.value:.5g} ± {error:.2g}: "
             f"{apart:.3f} standard errors apart, settled {at_last:.3f}; "

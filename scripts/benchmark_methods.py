@@ -96,7 +96,7 @@ def experiment_of(mesh: str, steps: int, seed: int = 0, noise_m: float = 0.0) ->
     """A hung and swung cylinder with tracks from the midpoint scheme."""
     body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh")
     experiment = swung(body, steps)
-    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
+    tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     tracks = tracks + noise_m * np.random.default_rng(seed).normal(size=tracks.shape)
     return with_markers(experiment, tracks)
 
@@ -132,7 +132,7 @@ def measure(mesh: str, steps: int, method: str) -> Row:
     """One identification from the guess; kernels are warm, the process is fresh."""
     experiment = experiment_of(mesh, steps)
     began = time.perf_counter()
-    simulate(experiment, TRUTH, "midpoint")
+    simulate(experiment, TRUTH, "midpoint", substeps=1)
     simulation_s = time.perf_counter() - began
     began = time.perf_counter()
     collocation = Collocation([experiment], PARAMETERS)
@@ -185,7 +185,7 @@ def problem_of(mesh: str, steps: int, case: str, ideal: bool) -> Problem:
         sensor = Wrench(experiment.t_s, np.zeros((steps, 6)), *WRENCH_SIGMAS)
         grasps = [replace(grasp, wrench=sensor) for grasp in experiment.grasps]
         experiment = replace(experiment, grasps=grasps)
-    made, markers = simulate(experiment, TRUTH | memory, "midpoint"), experiment.markers
+    made, markers = simulate(experiment, TRUTH | memory, "midpoint", substeps=1), experiment.markers
     sigmas = np.repeat(WRENCH_SIGMAS, 3)
     felt = [wrench + sigmas * noise(size=wrench.shape) for wrench in made.wrenches]
     placement = None if case == "places as well" and not ideal else markers.placement

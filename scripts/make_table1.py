@@ -31,7 +31,7 @@ def main() -> None:
     experiment = unmeasured(FOLDER / "problem.toml", "poses.csv", SWING.poses(STEP_S))
     tracks = {
         "newmark": measure(experiment, SWING.poses(FINE_S), TRUTH, noise_m=0.0, seed=0),
-        "scheme": simulate(experiment, TRUTH, "backward-euler").markers_m,
+        "scheme": simulate(experiment, TRUTH, "backward-euler", substeps=1).markers_m,
     }
     for data, positions in tracks.items():
         write_markers_csv(

@@ -97,8 +97,9 @@ def pressed(
     x = seen.positions_m.reshape(1, -1)
     place = term.points.vectors(x)[:, 0]
     gap_m = term.contact.distance.value(place[:, None], np.zeros((0, 1, place.shape[1])))[0, 0]
-    near, within = np.maximum(term.contact.width_m - gap_m, 0), np.maximum(-gap_m, 0)
-    push = term.contact.surface.area_m2 * (near**2 - within**2)
+    law = term.contact
+    near, within = np.maximum(law.widths_m - gap_m, 0), np.maximum(-gap_m, 0)
+    push = law.surface.area_m2 * law.data[3] * (near**2 - within**2) / law.widths_m
     x_m, y_m, _ = place[:3] + term.contact.body.frame_m[0][:, None]
     r2_m2 = x_m**2 + (y_m**2 if isinstance(shape, cs.Sphere) else 0.0)
     return -float(seen.wrenches[0][0, 2]), float((push * r2_m2).sum() / push.sum())
@@ -189,8 +190,12 @@ def twins(count: int) -> Iterator[Twin]:
         simple = np.array([hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n])
         half = spread * sem(simple) * np.array([0, -1, 1])
         found = told.estimates["young_pa"]
-        assert found.ci95 is not None
-        yield Twin(np.array([found.value, *found.ci95]), simple.mean() + half, int(sum(off < 1.96)))
+        assert found.statistical95 is not None
+        yield Twin(
+            np.array([found.value, *found.statistical95]),
+            simple.mean() + half,
+            int(sum(off < 1.96)),
+        )
 
 
 def poked(count: int = 100) -> None:

@@ -161,7 +161,7 @@ def reference(sigma_m: float) -> tuple[Experiment, Array]:
         grasps=(Grasp(grasp.nodes, poses),),
         markers=replace(experiment.markers, sigma_m=sigmas_m),
     )
-    positions_m = simulate(experiment, TRUTH, SCHEME).positions_m
+    positions_m = simulate(experiment, TRUTH, SCHEME, substeps=1).positions_m
     return experiment, positions_m.reshape(len(positions_m), -1)
 
 
@@ -199,7 +199,7 @@ def held(uncertainty: Uncertainty) -> list[float]:
     """One where an interval holds the truth, zero where not, NaN where there is none."""
     estimates, found = {**uncertainty.estimates, **uncertainty.derived}, []
     for name, value in truth().items():
-        interval = estimates[name].ci95
+        interval = estimates[name].statistical95
         found.append(np.nan if interval is None else float(interval[0] <= value <= interval[1]))
     return found
 
@@ -218,7 +218,7 @@ def scores(uncertainty: Uncertainty, q: Array) -> Array:
 
 def identified(uncertainty: Uncertainty) -> list[bool]:
     estimates = {**uncertainty.estimates, **uncertainty.derived}
-    return [estimates[name].std_error is not None for name in QUANTITIES]
+    return [estimates[name].statistical_std_error is not None for name in QUANTITIES]
 
 
 # Tables ---------------------------------------------------------------------------------------

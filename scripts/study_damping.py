@@ -55,7 +55,7 @@ def swung(speed_rad_s: float, seed: int) -> Experiment:
     experiment = Experiment(
         body, t_s, [Grasp(held, poses)], markers, name="swing", nuisance=Nuisance.none()
     )
-    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
+    tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
     return with_markers(experiment, tracks + noise)
 
@@ -74,8 +74,8 @@ def fitted(measured: Experiment, law: str) -> str:
     for name, truth in TRUTH.items():
         estimate = found.estimates[name]
         said.append(f"{name} {100 * (estimate.value / truth - 1):+.1f} %")
-        if estimate.std_error:
-            said[-1] += f" ({(estimate.value - truth) / estimate.std_error:+.1f} σ)"
+        if estimate.statistical_std_error:
+            said[-1] += f" ({(estimate.value - truth) / estimate.statistical_std_error:+.1f} σ)"
     lines = [", ".join(said), f"verdict {found.trust.verdict}", *found.trust.reasons]
     return "\n    ".join([*lines, *found.all_notes])
 

@@ -90,7 +90,7 @@ def fitted(
     unknown = {**TRUTH, "young_pa": cs.Unknown()}
     solution = cs.solve(cs.Problem([bar(depth)], cs.Parameters.of(unknown)))
     bars = covariance(solution.collocation, solution.z).estimates["young_pa"]
-    low, high = bars.ci95 or (0.0, np.inf)
+    low, high = bars.statistical95 or (0.0, np.inf)
     (part,) = solution.collocation.parts(solution.z)
     (reading,) = part.segment.depths
     rms_mm = 1e3 * np.sqrt(np.nanmean(reading.apart_m(part.looked[-1], part.phi) ** 2))

@@ -15,7 +15,7 @@ import argparse
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -35,7 +35,7 @@ from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
 from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumption
-from collocation_sysid.statistics.budget import Sources, budget
+from collocation_sysid.statistics.budget import BudgetLine, Sources, budget
 from collocation_sysid.statistics.considered import changed_residuals
 from collocation_sysid.statistics.linearised import linearised_fit
 from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
@@ -69,6 +69,15 @@ class Outcome:
     relative: Array
     without: Array
     correlated: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Error bars and budget of one twin's fit, and whether the fit converged."""
+
+    uncertainty: Uncertainty
+    lines: Mapping[str, BudgetLine]
+    converged: bool
 
 
 def main() -> None:
@@ -134,6 +143,17 @@ def identified(
     experiment: Experiment, assumed: Sequence[Assumption] = ()
 ) -> tuple[Uncertainty, Array, bool]:
     """With every option left to its default, from the truth."""
+    fit, true = fitted(experiment, assumed), truth()
+    lines = fit.lines
+    whole = [
+        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
+        for n in QUANTITIES
+    ]
+    return fit.uncertainty, np.array(whole), fit.converged
+
+
+def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
+    """Return the fit of an experiment from the truth, with a budget of some assumptions."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
     collocation, z = solution.collocation, solution.z
@@ -141,17 +161,13 @@ def identified(
     changes = changed_residuals(collocation, z, [(row, row.sigma) for row in assumed])
     fit = linearised_fit(collocation, z)
     sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
-    lines, true = budget(sources, found, {}), truth()
-    whole = [
-        float(lines[n].whole95[0] <= true[n] <= lines[n].whole95[1]) if n in lines else np.nan
-        for n in QUANTITIES
-    ]
-    return found, np.array(whole), solution.status.converged
+    lines = budget(sources, found, {}, problem.parameters)
+    return Fit(found, lines, solution.status.converged)
 
 
 def relative_errors(found: Uncertainty) -> Array:
     estimates, true = {**found.estimates, **found.derived}, truth()
-    errors = [estimates[name].std_error for name in QUANTITIES]
+    errors = [estimates[name].statistical_std_error for name in QUANTITIES]
     return np.array([np.nan if e is None else e for e in errors]) / [true[n] for n in QUANTITIES]
 
 
@@ -212,7 +228,7 @@ def off_in_gripper(experiment: Experiment, rng: Generator) -> Pair:
 
 
 def simulated(experiment: Experiment) -> Experiment:
-    return with_markers(experiment, simulate(experiment, TRUTH, SCHEME).markers_m)
+    return with_markers(experiment, simulate(experiment, TRUTH, SCHEME, substeps=1).markers_m)
 
 
 def claiming(factor: float) -> Callable[..., Pair]:
@@ -254,14 +270,15 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
 
 
 def drawn(names: Sequence[str]) -> Callable[..., Pair]:
-    """What is assumed is off, each drawn from its deviation; air never drives a body."""
+    """What is assumed is off, each drawn from its deviation."""
 
     def fault(experiment: Experiment, rng: Generator) -> Pair:
         off = {}
         for row in (row for row in ASSUMPTIONS if row.name in names):
             for name in row.components:
                 way = rng.standard_normal()
-                off[name] = row.sigma * (abs(way) if row.name in AIR else way)
+                # No coefficient of the air is below zero.
+                off[name] = max(row.sigma * way, -0.99) if row.name in AIR else row.sigma * way
         values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
         return wrong(experiment, values, off), experiment
 
@@ -274,7 +291,8 @@ SINGLE = (
     *AIR,
 )
 # What a budget has of each fault.
-ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE} | {"assumed: all of these": SINGLE}
+ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE}
+ASSUMED |= {"assumed: air": AIR, "assumed: all of these": SINGLE}
 ROWS = {f: tuple(r for r in ASSUMPTIONS if r.name in names) for f, names in ASSUMED.items()}
 
 FAULTS: dict[str, Callable[[Experiment, Generator], Pair]] = {

@@ -84,7 +84,7 @@ def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
     true = Body(mesh, density_kg_m3=1000.0, regions=regions)
     values = {"young_pa": YOUNG_PA, "stiff.young_pa": twin.ratio * YOUNG_PA, **BESIDE}
     known = {n: v for n, v in values.items() if regions or not n.startswith("stiff")}
-    made = cs.simulate(hung(true, twin.markers, twin.steps), known, "midpoint")
+    made = cs.simulate(hung(true, twin.markers, twin.steps), known, "midpoint", substeps=1)
     amplitude = twin.amplitude if twin.prior == "smooth" else None
     field = cs.Field(twin.length_m, modes=twin.modes, amplitude=amplitude, prior=twin.prior)
     sought = hung(Body(mesh, density_kg_m3=1000.0, field=field), twin.markers, twin.steps)
@@ -134,7 +134,7 @@ def found_of(twin: Twin, seed: int) -> Found:
     body = collocation.segments[0].body
     (field,) = fields_of(body, collocation.parameters, solution.q, known)
     estimate = known.estimates.get("contrast")
-    return Found(field, truth, body.mesh, took_s, estimate and estimate.ci95)
+    return Found(field, truth, body.mesh, took_s, estimate and estimate.statistical95)
 
 
 def told(twin: Twin, seeds: range) -> str:

@@ -59,15 +59,16 @@ class Tally:
             solution = solve(problem, ReducedSpace())
             known = covariance(solution.collocation, solution.z).estimates
             self.apart += [
-                abs(update.estimates[n].value - known[n].value) / (known[n].std_error or np.inf)
+                abs(update.estimates[n].value - known[n].value)
+                / (known[n].statistical_std_error or np.inf)
                 for n in SOFT
             ]
 
     def _count(self, at_s: float, update: Update) -> None:
         self.verdicts[at_s, update.trust.verdict] += 1
         for name, estimate in update.estimates.items():
-            if estimate.ci95 is not None:
-                low, high = estimate.ci95
+            if estimate.statistical95 is not None:
+                low, high = estimate.statistical95
                 self.told[at_s, name] += 1
                 self.held[at_s, name] += low <= SOFT[name] <= high
 

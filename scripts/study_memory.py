@@ -74,8 +74,8 @@ def report(branches: int, twins: int, seed: int) -> None:
         fit = linearised_fit(collocation, found.z)
         uncertainty = uncertainty_of(fit, parameters, found.q)
         for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
-            if name in true and estimate.ci95 is not None:
-                held[name] += estimate.ci95[0] <= true[name] <= estimate.ci95[1]
+            if name in true and estimate.statistical95 is not None:
+                held[name] += estimate.statistical95[0] <= true[name] <= estimate.statistical95[1]
                 wide[name] += 1
     low, high = binom.interval(0.95, twins, 0.95)
     print(f"  {twins} twins; by chance {100 * low / twins:.1f} to {100 * high / twins:.1f} %")
@@ -113,7 +113,7 @@ def recording(branches: int) -> Experiment:
     experiment = Experiment(
         body, t_s, [Grasp(held, poses)], markers, name="block", nuisance=Nuisance.none()
     )
-    tracks = simulate(experiment, truth(branches), "midpoint").markers_m
+    tracks = simulate(experiment, truth(branches), "midpoint", substeps=1).markers_m
     return replace(experiment, markers=with_markers(experiment, tracks).markers)
 
 

@@ -30,6 +30,8 @@ WITHIN = 0.01
 RADIUS_M, HEIGHT_M = 0.04, 0.16
 
 LM = {"inner": "levenberg-marquardt"}
+# Not from a coarse solution by reduced space.
+ALONE = {"initial": "simulation"}
 SHOOT = {"stage.method": "shooting"}
 VARIANTS = (
     Variant("reduced-space", "reduced-space"),
@@ -40,7 +42,7 @@ VARIANTS = (
         "augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}, share=0.5
     ),
     Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian", share=0.5),
-    Variant("interior-point", "interior-point", share=0.25),
+    Variant("interior-point", "interior-point", ALONE, share=0.25),
     Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.25),
 )
 

@@ -84,12 +84,18 @@ def main(twins: int = 20, first: int = 0) -> None:
             refined = refinement_of(problem, Earlier.of(solution), found.estimates)
             for key in held:
                 estimate, error = found.estimates[key], refined.errors.get(key)
-                if estimate.ci95 is None or error is None or error.ci95 is None:
+                if estimate.statistical95 is None or error is None or error.interval95 is None:
                     print(name, seed, key, estimate.reason, flush=True)
                     continue
-                both = tuple(low <= truth[key] <= high for low, high in (estimate.ci95, error.ci95))
+                both = tuple(
+                    low <= truth[key] <= high
+                    for low, high in (estimate.statistical95, error.interval95)
+                )
                 held[key].append((both[0], both[1]))
-                intervals = [[f"{v:.5g}" for v in pair] for pair in (estimate.ci95, error.ci95)]
+                intervals = [
+                    [f"{v:.5g}" for v in pair]
+                    for pair in (estimate.statistical95, error.interval95)
+                ]
                 changes = [f"{way:+.3g}" for way in (error.step or 0.0, error.mesh or 0.0)]
                 told = f"{truth[key]:.5g}", f"{estimate.value:.5g}", *changes, *intervals
                 print(name, seed, key, *told, *map(bool, both), flush=True)

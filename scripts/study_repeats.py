@@ -21,7 +21,7 @@ import numpy as np
 from collocation_sysid import Problem, run
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.constants import symbol_of
-from collocation_sysid.runs.result import FoundValue
+from collocation_sysid.runs.result import ReportedEstimate
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 SILICONES = ("EF10", "EF30", "EF50")
@@ -46,7 +46,7 @@ def main() -> None:
     print("| repeats | number | values | scatter % | 95 % ± % | whole ± % | held | held by whole |")
     print("|---|---|---|---|---|---|---|---|")
     for repeats in _all(only):
-        values: dict[str, list[FoundValue]] = {}
+        values: dict[str, list[ReportedEstimate]] = {}
         for names in repeats.groups.values():
             for name, estimate in _alone(repeats.problem, names).items():
                 values.setdefault(name, []).append(estimate)
@@ -82,7 +82,7 @@ def _cylinders(silicone: str) -> Problem:
         return Problem.read(problem)
 
 
-def _alone(problem: Problem, names: Sequence[str]) -> dict[str, FoundValue]:
+def _alone(problem: Problem, names: Sequence[str]) -> dict[str, ReportedEstimate]:
     """What some recordings tell by themselves."""
     own = [replace(e, validation=False) for e in problem.experiments if e.name in names]
     try:
@@ -90,15 +90,15 @@ def _alone(problem: Problem, names: Sequence[str]) -> dict[str, FoundValue]:
     except InputError:
         return {}
     known = found.estimates
-    return {n: known[n] for n in NAMES if n in known and known[n].std_error}
+    return {n: known[n] for n in NAMES if n in known and known[n].statistical_std_error}
 
 
-def _line(repeats: str, name: str, estimates: Sequence[FoundValue]) -> str:
+def _line(repeats: str, name: str, estimates: Sequence[ReportedEstimate]) -> str:
     # Where intervals are, with what the step does to all repeats alike.
-    logs = np.array([np.log(e.ci95 or (e.value, e.value)).mean() for e in estimates])
+    logs = np.array([np.log(e.statistical95 or (e.value, e.value)).mean() for e in estimates])
     mean, count = logs.mean(), len(logs)
     scatter = 100 * float(logs.std(ddof=1)) if count > 1 else np.nan
-    told = [(e.ci95, e.whole95) for e in estimates]
+    told = [(e.statistical95, e.combined95) for e in estimates]
     halves, held = [], []
     for intervals in zip(*told, strict=True):
         ends = [np.log(np.maximum(interval, 1e-12)) for interval in intervals if interval]

@@ -192,7 +192,7 @@ def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[
 
 def report(label: str, found: Fit) -> None:
     young = found.uncertainty.estimates["young_pa"]
-    low, high = young.ci95 or (np.nan, np.nan)
+    low, high = young.statistical95 or (np.nan, np.nan)
     values = found.solution.parameters
     print(
         f"{label:34}{1e-3 * young.value:8.1f}  {1e-3 * low:.1f} to {1e-3 * high:.1f}"
@@ -203,9 +203,9 @@ def report(label: str, found: Fit) -> None:
 
 
 def interval(estimate: Estimate) -> str:
-    if estimate.ci95 is None:
+    if estimate.statistical95 is None:
         return estimate.reason or "fixed"
-    low, high = estimate.ci95
+    low, high = estimate.statistical95
     reason = f" ({estimate.reason})" if estimate.reason else ""
     return f"{low:.4g} to {high:.4g}{reason}"
 

@@ -186,7 +186,7 @@ def measured(
     markers = Markers(poses.t_s, nowhere, noise_m, places_m=body.nodes_m[marked])
     grasp, ideal = Grasp(held, poses), Nuisance.none()
     experiment = Experiment(body, poses.t_s, [grasp], markers, name="swing", nuisance=ideal)
-    tracks = simulate(experiment, truth, "midpoint").markers_m
+    tracks = simulate(experiment, truth, "midpoint", substeps=1).markers_m
     return Case(with_markers(experiment, tracks), truth, noise_m=noise_m)
 
 
@@ -235,7 +235,7 @@ def hanging_cylinder(layers: int, steps: int, scheme: str, rings: int = 1) -> Ex
     grasp = Grasp(np.flatnonzero(heights < 1e-9), poses)
     ideal = Nuisance.none()
     experiment = Experiment(body, t_s, [grasp], markers, name="swing", nuisance=ideal)
-    return with_markers(experiment, simulate(experiment, TRUTH, scheme).markers_m)
+    return with_markers(experiment, simulate(experiment, TRUTH, scheme, substeps=1).markers_m)
 
 
 # Starts -------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ def study(
     found = uncertainty_of(
         fit, best.collocation.parameters, best.q, ErrorModel("given", "independent")
     )
-    std_errors = [found.estimates[name].std_error or np.nan for name in case.truth]
+    std_errors = [found.estimates[name].statistical_std_error or np.nan for name in case.truth]
     outcomes = []
     for number, guess in enumerate(starts):
         if not only or number in only:

@@ -33,7 +33,8 @@ VARIANTS = (
         {"schedule": "constant", "rho": 1e6, "inner_iterations": 10000},
     ),
     Variant("penalty, LM", "penalty", LM),
-    Variant("interior-point", "interior-point"),
+    # Not from a coarse solution by reduced space.
+    Variant("interior-point", "interior-point", {"initial": "simulation"}),
 )
 PAPER = (
     *("paper, penalty and CG", "734.3", "182.8", "0.021", "0.91"),

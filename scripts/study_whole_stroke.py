@@ -21,7 +21,7 @@ from make_phantom_mesh import SECTIONS_MM, turned
 from collocation_sysid import Problem, run
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.methods.solution import pooled_wrench_rms
-from collocation_sysid.runs.result import FoundValue
+from collocation_sysid.runs.result import ReportedEstimate
 
 FILE = Path(__file__).parents[1] / "problems" / "phantom_compression" / "whole_stroke.toml"
 PLATEN = "experiment.A1.obstacle.platen"
@@ -76,10 +76,10 @@ def _line(name: str, specimen: str, changes: Sequence[str]) -> str:
     return f"| {name} | {young} | {friction} | {misfit} |"
 
 
-def _told(estimate: FoundValue, factor: float, form: str) -> str:
+def _told(estimate: ReportedEstimate, factor: float, form: str) -> str:
     """A value and its two intervals."""
     cells = [form.format(factor * estimate.value)]
-    for interval in (estimate.ci95, estimate.whole95):
+    for interval in (estimate.statistical95, estimate.combined95):
         ends = (form.format(factor * end) for end in interval or ())
         cells.append(" to ".join(ends) or "—")
     return " | ".join(cells)

@@ -60,10 +60,10 @@ def main() -> None:
         uncertainty = fitted(noisy(exact, rng))
         for name in COUNTED:
             estimate = uncertainty.estimates[name]
-            assert estimate.ci95 is not None
-            assert estimate.std_error is not None
-            held[name] += estimate.ci95[0] <= TRUTH[name] <= estimate.ci95[1]
-            errors[name].append(estimate.std_error / TRUTH[name])
+            assert estimate.statistical95 is not None
+            assert estimate.statistical_std_error is not None
+            held[name] += estimate.statistical95[0] <= TRUTH[name] <= estimate.statistical95[1]
+            errors[name].append(estimate.statistical_std_error / TRUTH[name])
         if twin % 20 == 0 or twin == arguments.twins:
             report(held, errors, twin)
 
@@ -115,7 +115,7 @@ def recording() -> Experiment:
     values = {name: value for name, value in TRUTH.items() if name in body.constants} | {
         name: TRUTH[name] for name in ("young_pa", "poisson")
     }
-    found = simulate(experiment, values, "midpoint")
+    found = simulate(experiment, values, "midpoint", substeps=1)
     return with_wrenches(with_markers(experiment, found.markers_m), found.wrenches)
 
 

@@ -15,9 +15,9 @@ from collocation_sysid.runs.result import (
     FoundFit,
     FoundRollout,
     FoundUncertainty,
-    FoundValue,
     ProgramSize,
     Provenance,
+    ReportedEstimate,
     Result,
 )
 from collocation_sysid.statistics.trust import Trust
@@ -26,9 +26,17 @@ FIT = FoundFit(1e-3, 1e-3, {})
 ROLLOUT = FoundRollout(0.8e-3, 2e-3, {})
 
 
-def value(number: float = 100.0, std_error: float | None = 1.0) -> FoundValue:
+def value(number: float = 100.0, std_error: float | None = 1.0) -> ReportedEstimate:
     interval = None if std_error is None else (number - 2 * std_error, number + 2 * std_error)
-    return FoundValue(number, std_error, interval, guess=number, fixed=False)
+    return ReportedEstimate(
+        number,
+        std_error,
+        interval,
+        combined_std_error=std_error,
+        combined95=interval,
+        guess=number,
+        fixed=False,
+    )
 
 
 def uncertainty(names: Sequence[str], covariance: np.ndarray) -> FoundUncertainty:
@@ -51,7 +59,7 @@ def uncertainty(names: Sequence[str], covariance: np.ndarray) -> FoundUncertaint
     )
 
 
-def a_result(parameters: Mapping[str, FoundValue] | None = None, **changes: Any) -> Result:
+def a_result(parameters: Mapping[str, ReportedEstimate] | None = None, **changes: Any) -> Result:
     """A converged run of these parameters, with other entries as they are given."""
     whole = Result(
         schema=SCHEMA,

@@ -19,13 +19,16 @@ from collocation_sysid import (
     Force,
     Grasp,
     NodeForce,
+    Nuisance,
     Tied,
     Unknown,
     simulate,
 )
+from collocation_sysid.fem.air import AIR_KG_M3
+from collocation_sysid.fem.constants import GAMMA_R
+from collocation_sysid.fem.materials import DAMPINGS, Damping
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.assumptions import (
-    AIR_KG_M3,
     ASSUMPTIONS,
     Fitted,
 )
@@ -48,14 +51,20 @@ OFF = {
     "stiffness_drift": 1e-3,
     "time_scale": 1e-3,
     "poisson": 1e-3,
+    "damping_law material": 0.1,
+    "rayleigh_damping": 0.01,
     "buoyancy": 0.3,
     "added_mass": 0.03,
+    "air_drag": 0.03,
 }
 
 
-def swung() -> Experiment:
+OF_AIR = ("buoyancy", "added_mass", "air_drag")
+
+
+def swung(air_density_kg_m3: float = 0.0) -> Experiment:
     """A cube hung from its top face, swayed and turned from rest, and its markers as simulated."""
-    experiment = hung_cube(24)
+    experiment = hung_cube(24, air_density_kg_m3=air_density_kg_m3)
     body = Body(experiment.body.mesh, density_kg_m3=60.0)
     return wrong(replace(experiment, body=body), VALUES, {})
 
@@ -68,7 +77,7 @@ def changed(experiment: Experiment, name: str, scheme: str = "midpoint") -> np.n
     """Markers (T, M, 3) where an assumption is off by one of its unit, to first order [m]."""
     row = name.partition(" ")[0]
     collocation = Collocation([experiment], parameters(), scheme)
-    positions = simulate(experiment, VALUES, scheme).positions_m
+    positions = simulate(experiment, VALUES, scheme, substeps=1).positions_m
     z = collocation.pack(collocation.guess_p, [positions.reshape(len(positions), -1)])
     names, found = changed_residuals(collocation, z, [(BY_NAME[row], 1.0)])
     return found[0][..., names.index(name)] * experiment.markers.sigma_m[:, None]
@@ -76,7 +85,7 @@ def changed(experiment: Experiment, name: str, scheme: str = "midpoint") -> np.n
 
 @pytest.mark.parametrize("name", OFF)
 def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
-    experiment, off = swung(), OFF[name]
+    experiment, off = swung(AIR_KG_M3 * (name in OF_AIR)), OFF[name]
     tracks = [wrong(experiment, VALUES, {name: way}).markers.positions_m for way in (off, 0.0)]
     simulated = (tracks[0] - tracks[1]) / off
     largest = np.abs(simulated).max()
@@ -99,7 +108,9 @@ def test_a_grip_that_gives_way_is_a_body_on_springs():
     gripped = replace(hung, body=body, grasps=(Grasp(nodes, poses),))
     on_springs = replace(hung, body=loose, grasps=())
     # Under the midpoint rule springs as stiff as these would ring.
-    tracks = [simulate(each, VALUES, "bdf2").markers_m for each in (on_springs, gripped)]
+    tracks = [
+        simulate(each, VALUES, "bdf2", substeps=1).markers_m for each in (on_springs, gripped)
+    ]
     simulated = (tracks[0] - tracks[1]) / layer_m
     expected = changed(gripped, "grip_layer_m", "bdf2")
     np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
@@ -148,13 +159,23 @@ def test_planes_of_symmetry_have_no_friction_and_are_no_grip():
     assert not sticking.any()
 
 
+@pytest.mark.parametrize("name", OF_AIR)
+def test_in_a_vacuum_nothing_is_assumed_of_the_air(name):
+    collocation = Collocation([swung()], parameters(), "midpoint")
+    x = np.tile(collocation.experiments[0].body.nodes_m.ravel(), (25, 1))
+    (part,) = collocation.parts(collocation.pack(collocation.guess_p, [x]))
+    assert BY_NAME[name].effect(Fitted(part, collocation.parameters), 0) is None
+
+
 def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
-    experiment = swung()
+    experiment = swung(AIR_KG_M3)
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = experiment.body.nodes_m.ravel()
     z = collocation.pack(collocation.guess_p, [np.tile(x, (len(experiment.t_s), 1))])
     at = Fitted(collocation.parts(z)[0], collocation.parameters)
-    vars(at)["states"] = (x[None], np.tile([0.0, 2.0, 0.0], len(x) // 3)[None])
+    count = len(experiment.t_s)
+    sideways = np.tile([0.0, 2.0, 0.0], len(x) // 3)
+    vars(at)["states"] = (np.tile(x, (count, 1)), np.tile(sideways, (count, 1)))
     force = BY_NAME["air_drag"].effect(at, 0).force_n[0].reshape(-1, 3).sum(axis=0)
     np.testing.assert_allclose(force, [0, -0.5 * AIR_KG_M3 * 1.5 * EDGE_M**2 * 4.0, 0], atol=1e-9)
 
@@ -167,3 +188,41 @@ def test_a_ratio_tied_to_one_that_is_estimated_is_not_stated():
     (part,) = collocation.parts(collocation.pack(collocation.guess_p, [x]))
     assert BY_NAME["poisson"].effect(Fitted(part, estimated), 0) is None
     assert BY_NAME["poisson"].effect(Fitted(part, parameters()), 0) is not None
+
+
+@pytest.mark.parametrize("law", ["material", "kelvin-voigt"])
+def test_the_stated_law_of_damping_is_no_alternative_to_itself(law):
+    experiment = swung()
+    body = Body(experiment.body.mesh, density_kg_m3=60.0, damping=law)
+    described = replace(experiment, body=body)
+    assert not changed(described, f"damping_law {law}").any()
+    (other,) = {"material", "kelvin-voigt"} - {law}
+    assert changed(described, f"damping_law {other}").any()
+
+
+@pytest.mark.parametrize("changes", [{"gamma_r_s": 0.0}, {"kind": "static"}])
+def test_without_damping_its_law_is_no_matter(changes):
+    experiment = swung()
+    values = VALUES
+    if "kind" in changes:
+        experiment = replace(experiment, kind="static", nuisance=Nuisance.none())
+    else:
+        values = VALUES | changes
+    collocation = Collocation([experiment], Parameters.of(values), "midpoint")
+    rows = len(experiment.t_s)
+    rest = np.tile(experiment.body.nodes_m.ravel(), (rows, 1))
+    z = collocation.pack(collocation.guess_p, [rest])
+    at = Fitted(next(iter(collocation.parts(z))), collocation.parameters)
+    for name in ("damping_law", "rayleigh_damping"):
+        row = BY_NAME[name]
+        assert all(row.effect(at, axis) is None for axis in range(len(row.components)))
+
+
+def test_a_law_of_a_users_own_stays_as_it_is():
+    def stress(psi, F, rate, gamma_r_s):
+        return DAMPINGS["material"].stress(psi, F, rate, gamma_r_s)
+
+    experiment = swung()
+    own = Damping("own", (GAMMA_R,), stress=stress)
+    body = Body(experiment.body.mesh, density_kg_m3=60.0, damping=own)
+    assert not changed(replace(experiment, body=body), "damping_law kelvin-voigt").any()

@@ -684,7 +684,7 @@ def test_a_damaged_run_cannot_be_drawn(tiny):
     (tiny / "result.json").write_text('{"history": [')
     np.savez(tiny / "trajectory.npz", t_s=np.zeros(3))
     assert_refused(tiny, ("damaged", "run what wrote it again"), "plot", ".")
-    (tiny / "result.json").write_text('{"schema": 3}')
+    (tiny / "result.json").write_text('{"schema": 4}')
     assert_refused(tiny, ("damaged", "solve the problem again"), "plot", ".")
 
 

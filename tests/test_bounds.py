@@ -48,9 +48,9 @@ def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
     )
     assert found["gamma_m_1_s"].at_bound
     truth = TRUTH["gamma_r_s"]
-    low, high = wrong["gamma_r_s"].ci95 or (0, 0)
+    low, high = wrong["gamma_r_s"].statistical95 or (0, 0)
     assert high < 1.2 * low
     assert not low < truth < high
-    low, high = found["gamma_r_s"].ci95 or (0, 0)
+    low, high = found["gamma_r_s"].statistical95 or (0, 0)
     assert low < truth < high
     assert high > 2 * low

@@ -94,7 +94,7 @@ def test_motions_are_those_of_the_same_equations_solved_by_another_hand():
 @pytest.mark.parametrize("method", [m for m in METHODS if not m.startswith("casadi:")])
 def test_every_method_finds_its_constants(method: str):
     made = tied(20)
-    made = with_markers(made, simulate(made, STATED, "midpoint").markers_m)
+    made = with_markers(made, simulate(made, STATED, "midpoint", substeps=1).markers_m)
     own = {"spring_n_m": cs.Unknown(2.0), "creep_s": cs.Unknown(0.04)}
     problem = cs.Problem([made], cs.Parameters.of(STATED | own), method=METHODS[method]())
     found = cs.solve(problem).parameters
@@ -144,7 +144,9 @@ def test_a_strut_from_a_file_is_the_one_from_python(strutted):
     force = cs.NodeForce.of(maxwell, nodes=[0], carries=6)
     body = cs.Body(experiment.body.mesh, density_kg_m3=30.0, forces=[force])
     made = replace(experiment, body=body)
-    found, same = (simulate(each, STATED, "midpoint").markers_m for each in (experiment, made))
+    found, same = (
+        simulate(each, STATED, "midpoint", substeps=1).markers_m for each in (experiment, made)
+    )
     np.testing.assert_array_equal(found, same)
     assert np.abs(found - experiment.markers.positions_m).max() > 1e-3, "it does nothing"
     recorded = replace(read, experiments=[with_markers(experiment, found)])

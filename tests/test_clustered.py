@@ -79,10 +79,14 @@ def test_a_run_on_workers_is_that_on_threads(there):
     )
     assert_alike(found.solution, known.solution)
     assert found.solution.timing.linear_algebra > 0
-    errors = {n: e.std_error for n, e in known.estimates.items() if e.std_error is not None}
+    errors = {
+        n: e.statistical_std_error
+        for n, e in known.estimates.items()
+        if e.statistical_std_error is not None
+    }
     assert errors.keys() >= {"lambda_pa", "mu_pa", "gamma_r_s"}
     for name, error in errors.items():
-        assert found.estimates[name].std_error == pytest.approx(error, rel=1e-9)
+        assert found.estimates[name].statistical_std_error == pytest.approx(error, rel=1e-9)
 
 
 def test_markers_without_places_are_read_in_the_same_elements(there):

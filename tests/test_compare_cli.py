@@ -40,7 +40,9 @@ record = {
     },
 }
 record["result"]["parameters"] = {
-    name: like | {"value": guess, "std_error": 0.1 * guess, "ci95": [0.8 * guess, 1.2 * guess]}
+    name: like | {
+        "value": guess, "combined_std_error": 0.1 * guess, "combined95": [0.8 * guess, 1.2 * guess]
+    }
     for like in record["result"]["parameters"].values() for name, guess in planned["guess"].items()
 }
 with open(out, "w") as file:

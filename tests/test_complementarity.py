@@ -79,7 +79,7 @@ def stiffer(experiment: Experiment, factor: float) -> Experiment:
 
 def seen(experiment: Experiment) -> Experiment:
     """With what its instruments read."""
-    motion = cs.simulate(experiment, TRUTH, "bdf2")
+    motion = cs.simulate(experiment, TRUTH, "bdf2", substeps=1)
     ours = experiment.obstacles[0]
     if ours.wrench is None:
         return cs.with_markers(experiment, motion.markers_m)
@@ -107,7 +107,7 @@ def test_it_is_what_an_ever_stiffer_energy_tends_to(name: str):
     own = slice(len(experiment.body.mesh.points_m))
     apart_m = []
     for factor in STIFFER:
-        motion = cs.simulate(stiffer(experiment, factor), TRUTH, "bdf2")
+        motion = cs.simulate(stiffer(experiment, factor), TRUTH, "bdf2", substeps=1)
         apart_m.append(np.abs(motion.positions_m - hard)[:, own].max())
     assert apart_m[-1] < 1e-5
     assert observed_order(1 / STIFFER, apart_m) == pytest.approx(1.0, abs=0.1)

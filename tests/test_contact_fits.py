@@ -96,7 +96,7 @@ def test_a_ball_that_rubs_may_come_deep_into_a_block_from_one_sample_to_the_next
 @pytest.mark.parametrize("off_m", [0.0, 3e-4])
 def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(off_m: float):
     finished = answer(poked(off_m))
-    low, high = finished.result.parameters["young_pa"].ci95
+    low, high = finished.result.parameters["young_pa"].statistical95
     assert low < TRUTH["young_pa"] < high
     assert high - low < 0.1 * TRUTH["young_pa"]
     part = finished.solution.collocation.parts(finished.solution.z)[0]
@@ -109,7 +109,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     held = 0
     for seed in range(20):
         run = answer(poked(), seed)
-        low, high = run.result.parameters["young_pa"].ci95
+        low, high = run.result.parameters["young_pa"].statistical95
         held += low < TRUTH["young_pa"] < high
     assert held >= 17
 
@@ -161,7 +161,7 @@ def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
     known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4)})
     problem = cs.Problem([replace(stated, grasps=[held, measured])], known)
     run = cs.run(problem, seek_causes=False)
-    low, high = run.result.parameters["young_pa"].ci95
+    low, high = run.result.parameters["young_pa"].combined95
     assert low < TRUTH["young_pa"] < high
     assert run.trust is not None
     assert run.trust.verdict == "doubtful"
@@ -236,7 +236,7 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     seen = measured(pressed_cube(6))
     run = cs.run(cs.Problem([seen], GUESS), seek_causes=False)
     assert run.refinement is None
-    assert run.result.parameters["mu_pa"].ci95_holds == ("noise",)
+    assert run.result.covers == ()
     free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).gripping))
     assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None
 

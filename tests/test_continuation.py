@@ -103,11 +103,12 @@ def test_the_true_parameters_are_recovered(experiment: str, method: str):
 
 def test_interior_point_goes_on_from_the_positions_of_the_stage_before():
     collocation = cube()
-    solution = Continuation()(collocation)
+    alone = {"initial": "simulation"}
+    solution = Continuation(stage=alone)(collocation)
     assert solution.status.converged
     assert np.abs(relative_errors(solution)).max() < 1e-4
     assert solution.max_violation_relative < 1e-6
-    cold = InteriorPoint()(collocation)
+    cold = InteriorPoint(**alone)(collocation)
     assert solution.notes[-1].startswith("100 % of the samples by interior-point: converged")
     last_stage = int(solution.notes[-1].split("after ")[1].split()[0])
     assert last_stage < cold.iterations

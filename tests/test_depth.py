@@ -109,7 +109,7 @@ def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     apart = reading.apart_m(part.looked[-1], part.phi)
     assert np.sqrt(np.nanmean(apart**2)) < 2e-4
     bars = covariance(solution.collocation, solution.z).estimates["young_pa"]
-    low, high = bars.ci95
+    low, high = bars.statistical95
     assert low < TRUTH["young_pa"] < high < 1.2 * low
 
 
@@ -311,7 +311,7 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
         experiment = cs.Experiment(bar(), t_s, [held], kind="static", depths=[depth], nuisance=kept)
         unknown = {**TRUTH, "young_pa": cs.Unknown(1.6e5)}
         solution = cs.solve(cs.Problem([experiment], cs.Parameters.of(unknown)))
-        low, high = covariance(solution.collocation, solution.z).estimates["young_pa"].ci95
+        low, high = covariance(solution.collocation, solution.z).estimates["young_pa"].statistical95
         widths.append(np.log(high / low))
     assert 2 < widths[1] / widths[0] < 4.4
 

@@ -26,6 +26,7 @@ from test_depth import (
 
 import collocation_sysid as cs
 from collocation_sysid.pipeline import run
+from collocation_sysid.program.depth_comparison import SurfaceComparison
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.skin import Skin
 from collocation_sysid.recording.depth import points_of
@@ -33,7 +34,7 @@ from collocation_sysid.result.animation import Film
 from collocation_sysid.result.pictures.album import album
 from collocation_sysid.result.pictures.depth import depth_picture
 from collocation_sysid.result.replay import Replay
-from collocation_sysid.result.seen import save_overlays, seen_as_fitted, seen_before
+from collocation_sysid.result.seen import compared_rows, save_overlays, seen_before
 from collocation_sysid.statistics.cameras import camera_mistakes
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
@@ -206,7 +207,8 @@ def found():
 def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(found):
     (part,) = found.collocation.parts(found.z)
     ((reading, looked),) = part.sights
-    rows = seen_as_fitted(part, reading, looked)
+    surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
+    rows = compared_rows(surface, part.segment.experiment.up)
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     used = np.isfinite(points[:, 4])
     assert used.sum() == reading.sighting.used.sum()
@@ -229,7 +231,8 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(f
 def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found):
     (part,) = found.collocation.parts(found.z)
     ((reading, looked),) = part.sights
-    rows = seen_as_fitted(part, reading, looked)
+    surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
+    rows = compared_rows(surface, part.segment.experiment.up)
     experiment = part.segment.experiment
     x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)
     replay = Replay.of(experiment, (x[:1], np.zeros((1, 0, 3))))

@@ -217,7 +217,9 @@ def test_more_cameras_per_marker_than_there_are_is_refused():
 
 def at_answer(experiments) -> tuple[Collocation, np.ndarray]:
     """The experiments with exact tracks of the scheme, and their optimum."""
-    exact = [with_markers(e, simulate(e, TRUTH, "midpoint").markers_m) for e in experiments]
+    exact = [
+        with_markers(e, simulate(e, TRUTH, "midpoint", substeps=1).markers_m) for e in experiments
+    ]
     found = Collocation(exact, AT)
     rows = [
         march(s.experiment, s.dynamics.with_theta(s.constants.theta(AT.guess_q)))
@@ -253,11 +255,17 @@ def test_error_bars_are_those_that_a_run_reports():
     collocation, z = at_answer([hung_cube(8)])
     run = covariance(collocation, z, ErrorModel("given", "independent"))
     found = errors_at(collocation, z)
-    known = {n: e for n, e in {**run.estimates, **run.derived}.items() if e.std_error is not None}
+    known = {
+        n: e
+        for n, e in {**run.estimates, **run.derived}.items()
+        if e.statistical_std_error is not None
+    }
     assert {"lambda_pa", "mu_pa", "young_pa", "poisson"} <= known.keys()
     for name, estimate in known.items():
-        assert estimate.std_error is not None
-        assert found.relative[name] == pytest.approx(estimate.std_error / estimate.value, rel=1e-3)
+        assert estimate.statistical_std_error is not None
+        assert found.relative[name] == pytest.approx(
+            estimate.statistical_std_error / estimate.value, rel=1e-3
+        )
 
 
 def test_criteria_are_what_they_say_of_the_covariance():
@@ -416,7 +424,7 @@ def test_a_motion_is_judged_over_all_draws():
 
 def test_recordings_there_are_count_where_they_are_to_be_completed():
     experiment = hung_cube(8)
-    tracks = simulate(experiment, TRUTH, "midpoint").markers_m
+    tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     recorded = Problem([with_markers(experiment, tracks)], AT)
     found = design(recorded, LIMITS, 0.08, options=FEW, add=True)
     alone = shared_information(linearised_fit(*at_answer([experiment])))
@@ -502,7 +510,7 @@ def test_the_folder_holds_a_problem_that_simulates_the_motion(tiny, tmp_path):
     designed = Problem.read(folder / PROBLEM_FILE)
     (experiment,) = designed.experiments
     assert experiment.duration_s == pytest.approx(0.08)
-    again = simulate(experiment, designed.parameters, designed.scheme).markers_m
+    again = simulate(experiment, designed.parameters, designed.scheme, substeps=1).markers_m
     assert np.abs(again - experiment.markers.positions_m).max() < 1e-6
     content = json.loads((folder / "design.json").read_text())
     assert content["after"]["lambda_pa"]["value"] == pytest.approx(TRUTH["lambda_pa"])

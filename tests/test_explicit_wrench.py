@@ -97,7 +97,7 @@ def pressed() -> Experiment:
 def remembered() -> Experiment:
     """A cube with a memory, in a hand with a sensor."""
     cube = sensing(replace(hung_cube(12, (1, 1, 2)), body=of_branches(1)))
-    found = simulate(cube, ONE, "midpoint")
+    found = simulate(cube, ONE, "midpoint", substeps=1)
     return with_wrenches(with_markers(cube, found.markers_m), found.wrenches)
 
 

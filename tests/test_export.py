@@ -41,6 +41,7 @@ from collocation_sysid.recording import (
 from collocation_sysid.result.export import TARGETS, Identified, export_run, verify_export
 from collocation_sysid.result.export.identified import alone
 from collocation_sysid.result.export.solids import Facets, walls
+from collocation_sysid.result.export.target import at_rest
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
@@ -71,9 +72,11 @@ def held_bar(
     axes: str = "xyz",
     prony: tuple[str, ...] = (),
     moving: bool = False,
+    damping: str = "kelvin-voigt",
 ) -> Identified:
     """A bar held at one end, as if a run had identified it."""
-    body = Body(box_mesh(BAR_M, DIVISIONS), material, 900.0, element, prony=prony)
+    mesh = box_mesh(BAR_M, DIVISIONS)
+    body = Body(mesh, material, 900.0, element, damping=damping, prony=prony)
     t_s = times(8)
     poses = smooth_poses(t_s, sway_m=(0.004, 0.002, 0.003)) if moving else PoseSequence.fixed()
     still = Grasp(nodes_where(body, 0, 0.0), poses)
@@ -342,6 +345,17 @@ def test_no_number_of_a_deck_is_longer_than_calculix_reads(tmp_path):
 # What they say
 
 
+@pytest.mark.parametrize("to", ["mujoco", "newton", "calculix", "sofa", "febio"])
+def test_air_that_is_not_exported_is_said_and_is_not_in_our_equilibrium(to, tmp_path):
+    bar = held_bar()
+    in_air = replace(bar, experiment=replace(bar.experiment, air_density_kg_m3=1.2))
+    said = [export_run(each, to, tmp_path / to).limits for each in (bar, in_air)]
+    assert set(said[1]) - set(said[0]) == {
+        "buoyancy, added mass and drag of the air are not exported"
+    }
+    np.testing.assert_array_equal(at_rest(bar)[0], at_rest(in_air)[0])
+
+
 @pytest.mark.parametrize("to", ["mujoco", "newton", "calculix"])
 def test_memory_that_is_lost_is_said(to, tmp_path):
     values = {**MODULI, "prony_1.share": 0.5, "prony_1.tau_s": 0.2}
@@ -472,6 +486,59 @@ def test_an_error_of_calculix_is_told(tmp_path):
     deck.write_text(deck.read_text().replace("*STATIC", "*STATIK"))
     with pytest.raises(InputError, match="CalculiX failed"):
         verify_export(body, "calculix", folder)
+
+
+@needs_mujoco
+def test_the_flex_of_mujoco_has_the_damping_law_in_material_form(tmp_path, rng):
+    """Its passive force on random shapes and velocities, less that at rest."""
+    import mujoco
+
+    identified = held_bar()
+    folder = exported(identified, "mujoco", tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(folder / "body.xml"))
+    model.opt.timestep = 1e-7  # its damping is of first order in the step
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    free = ~identified.grasped
+    moved = rng.uniform(-2e-3, 2e-3, (int(free.sum()), 3))
+    velocity = rng.standard_normal(moved.shape)
+    data.qpos[-moved.size :] = moved.ravel()
+    passive = []
+    for speed in (velocity, 0 * velocity):
+        data.qvel[:] = 0.0
+        data.qvel[-moved.size :] = speed.ravel()
+        mujoco.mj_forward(model, data)
+        passive.append(data.qfrc_passive[-moved.size :].copy())
+    found = passive[0] - passive[1]
+    off = {}
+    for law in ("material", "kelvin-voigt"):
+        body = Body(identified.body.mesh, "st-venant-kirchhoff", 900.0, damping=law)
+        x = identified.nodes_m.copy()
+        v = np.zeros_like(x)
+        x[free] += moved
+        v[free] = velocity
+        state = x.reshape(1, -1)
+        force = body.force(state, v.reshape(1, -1), identified.theta)
+        force -= body.force(state, np.zeros_like(state), identified.theta)
+        expected = force.reshape(-1, 3)[free].ravel() + _mass_damping(identified, free, velocity)
+        off[law] = np.abs(found - expected).max() / np.abs(expected).max()
+    assert off["material"] < 1e-5
+    assert off["kelvin-voigt"] > 1e-2
+
+
+def _mass_damping(identified: Identified, free: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """γ_m M v, which MuJoCo does not have, to be added to our force."""
+    gamma_m = identified.regions[0].gamma_m_1_s
+    return (gamma_m * identified.node_mass_kg[free][:, None] * velocity).ravel()
+
+
+def test_the_law_of_mujoco_needs_no_note(tmp_path):
+    """A body that is damped in material form is exported as it is."""
+    export_run(held_bar(), "mujoco", tmp_path / "kelvin")
+    export_run(held_bar(damping="material"), "mujoco", tmp_path / "own")
+    told = [(folder / "body.xml").read_text() for folder in (tmp_path / "kelvin", tmp_path / "own")]
+    assert 'the law "material"' in told[0]
+    assert 'the law "material"' not in told[1]
 
 
 @needs_mujoco

@@ -41,7 +41,8 @@ def parameters(guess: float) -> cs.Parameters:
 
 
 def seen(experiment: Experiment, integrator: str = "midpoint", sigma: float = 0.0) -> Experiment:
-    tracks = simulate(experiment, {**TRUTH, "drag_coefficient": DRAG}, integrator).markers_m
+    values = {**TRUTH, "drag_coefficient": DRAG}
+    tracks = simulate(experiment, values, integrator, substeps=1).markers_m
     noise = sigma * np.random.default_rng(4).normal(size=tracks.shape)
     return with_markers(experiment, tracks + noise)
 
@@ -72,7 +73,7 @@ def test_a_users_pressure_on_faces_is_found(element, method):
         body, old.t_s, [cs.Grasp(top, old.grasps[0].poses)], markers, nuisance=Nuisance.none()
     )
     truth = {**TRUTH, "squeeze_pa": 8.0}
-    made = with_markers(made, simulate(made, truth, "midpoint").markers_m)
+    made = with_markers(made, simulate(made, truth, "midpoint", substeps=1).markers_m)
     unknown = {"mu_pa": cs.Unknown(200.0), "squeeze_pa": cs.Unknown(5.0)}
     problem = cs.Problem([made], cs.Parameters.of({**truth, **unknown}), method=METHODS[method]())
     found = cs.solve(problem).parameters
@@ -177,7 +178,7 @@ def test_a_force_across_the_velocity_is_found(method: str):
     old, truth = hung_cube(12, nuisance=Nuisance.none()), {**TRUTH, "spin_n_s_m4": 400.0}
     body = cs.Body(old.body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.of(lift)])
     made = replace(old, body=body)
-    seen = with_markers(made, simulate(made, truth, "midpoint").markers_m)
+    seen = with_markers(made, simulate(made, truth, "midpoint", substeps=1).markers_m)
     unknown = {"spin_n_s_m4": cs.Unknown(150.0), "mu_pa": cs.Unknown(GUESS.items[0].guess)}
     problem = cs.Problem([seen], cs.Parameters.of({**truth, **unknown}), method=METHODS[method]())
     found = cs.solve(problem).parameters

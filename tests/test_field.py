@@ -57,7 +57,7 @@ def problem(ratio: float = 1.0, above_m: float = 0.119, steps: int = 15, **state
     """A bar whose lower half is stiffer, which no description tells."""
     true = bar(stiff=centres(bar())[:, 2] < 0.06)
     values = {**KNOWN, "young_pa": YOUNG_PA, "stiff.young_pa": ratio * YOUNG_PA}
-    tracks = cs.simulate(swung(true, above_m, steps), values, "midpoint").markers_m
+    tracks = cs.simulate(swung(true, above_m, steps), values, "midpoint", substeps=1).markers_m
     noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
     field = cs.Field(**({"length_m": 0.05, "modes": 20} | stated))
     seen = cs.with_markers(swung(bar(field), above_m, steps), tracks + noise)
@@ -187,7 +187,7 @@ def test_a_body_of_another_size_moves_a_field_as_its_budget_says():
     solutions = [
         cs.solve(cs.Problem([cs.with_markers(swung(bar(field)), tracks)], free, substeps=1))
         for body in (shape, true)
-        for tracks in [cs.simulate(swung(body), values, "midpoint").markers_m]
+        for tracks in [cs.simulate(swung(body), values, "midpoint", substeps=1).markers_m]
     ]
     moved = np.subtract(*(solution.q for solution in reversed(solutions)))
     fitted = solutions[0]
@@ -209,7 +209,7 @@ def weighed() -> tuple[cs.Solution, FieldEstimate]:
     half = cs.Region("half", lower, density_kg_m3=HEAVY * light)
     true = Body(bar().mesh, density_kg_m3=light, regions=[half])
     values = {**KNOWN, "young_pa": YOUNG_PA}
-    tracks = cs.simulate(swung(true), values, "midpoint").markers_m
+    tracks = cs.simulate(swung(true), values, "midpoint", substeps=1).markers_m
     noise = SIGMA_M * np.random.default_rng(5).normal(size=tracks.shape)
     seen = cs.with_markers(swung(bar(OF_DENSITY)), tracks + noise)
     unknown = {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}
@@ -281,7 +281,7 @@ def test_a_solve_keeps_clear_of_masses_below_zero():
     heavy = cs.Region("half", lower, density_kg_m3=190.0)
     true = Body(bar().mesh, density_kg_m3=10.0, regions=[heavy])
     values = {**KNOWN, "young_pa": YOUNG_PA}
-    tracks = cs.simulate(swung(true, steps=8), values, "midpoint").markers_m
+    tracks = cs.simulate(swung(true, steps=8), values, "midpoint", substeps=1).markers_m
     body = bar(cs.Field(0.03, "density_kg_m3", 12, 0.5))
     seen = cs.with_markers(swung(body, steps=8), tracks)
     solution = cs.solve(cs.Problem([seen], values, substeps=1))

@@ -92,6 +92,9 @@ CASES = {
     "of a user, on quadratic faces": lambda: breathed("tet10"),
     "of a user": cube_in_air,
     "tendon and pressure": lambda: Collocation([BAR], GUESS),
+    "of the air": lambda: Collocation(
+        [replace(joined_cube(), air_density_kg_m3=20.0)], parameters()
+    ),
     "weight and loads": lambda: Collocation([joined_cube()], parameters()),
 }
 

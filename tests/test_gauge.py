@@ -70,7 +70,7 @@ def swung(steps: int = 24) -> Experiment:
     inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
     gauges = accelerometer(inner), strain_gauge(cube.t_s[::2])
     made = replace(cube, markers=Markers.none(cube.t_s), readings=gauges)
-    accelerations, strains = simulate(made, TRUTH, "midpoint").readings
+    accelerations, strains = simulate(made, TRUTH, "midpoint", substeps=1).readings
     return with_readings(made, [accelerations + np.array([0, 0, 0.3]), 1.04 * strains])
 
 
@@ -88,7 +88,7 @@ def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
     cube = replace(hung_cube(20), nuisance=IDEAL)
     top = cube.grasps[0].nodes[0]
     at_top = accelerometer(cube.t_s, points_m=cube.body.nodes_m[[top]])
-    (found,) = simulate(instrumented(cube, at_top), TRUTH, "midpoint").readings
+    (found,) = simulate(instrumented(cube, at_top), TRUTH, "midpoint", substeps=1).readings
     carried = cube.grasps[0].carry(cube.body.nodes_m, np.linspace(0, cube.t_s[-1], 2001))[:, 0]
     expected = np.gradient(np.gradient(carried, axis=0), axis=0)[::100] / (cube.t_s[-1] / 2000) ** 2
     inside = slice(3, -3)
@@ -169,7 +169,7 @@ def test_a_reading_of_another_time_or_place_is_refused():
         instrumented(cube, nobody)
     far = instrumented(cube, accelerometer(cube.t_s, points_m=[[1.0, 0, 0]]))
     with pytest.raises(InputError, match="accelerometer 1"):
-        simulate(far, TRUTH, "midpoint")
+        simulate(far, TRUTH, "midpoint", substeps=1)
 
 
 # At a grasp ---------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ def clamped(steps: int = 16) -> Experiment:
     inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
     cell = Gauge("cell", pull, inner, np.zeros(len(inner)), 1e-3, unknowns={"gain": 0.1}, grasp=0)
     made = replace(cube, markers=Markers.none(cube.t_s), readings=[cell, strain_gauge(cube.t_s)])
-    felt, strains = simulate(made, TRUTH, "midpoint").readings
+    felt, strains = simulate(made, TRUTH, "midpoint", substeps=1).readings
     return with_readings(made, [1.05 * felt, 1.04 * strains])
 
 
@@ -256,7 +256,7 @@ def worn(tiny: Path) -> Path:
     write("mine.py", MINE)(tiny)
     text = (tiny / "problem.toml").read_text()
     (tiny / "problem.toml").write_text(text.partition("\n[experiment.markers]")[0] + READINGS)
-    truth = settings(*AT_TRUTH)
+    truth = settings(*AT_TRUTH, "transcription.substeps=1")  # the step that it is solved with
     done = run_command("simulate", *ALLOWED, *truth, "--integrator", "midpoint", "--out", "data")
     assert done.code == 0, done.err
     return tiny

@@ -53,7 +53,7 @@ def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
     (sentence,) = verdicts(uncertainty(spread([0.2, 0.01, 0.02, 0.05])))
     assert sentence == (
         "the data determine mu_pa to ±2 %, gamma_r_s to ±4 % and gamma_m_1_s to ±10 %; "
-        "lambda_pa only to ±48 % (95 %)"
+        "lambda_pa only to ±48 % (95 %, statistical)"
     )
 
 
@@ -68,8 +68,8 @@ def test_wide_intervals_are_told_by_their_factor(deviation, said):
 
 def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
     found = uncertainty(spread([0.9, 0.01, 0.02, 0.05]))
-    assert found.estimates["lambda_pa"].std_error is None
-    low, high = found.estimates["lambda_pa"].ci95 or (0, 0)
+    assert found.estimates["lambda_pa"].statistical_std_error is None
+    low, high = found.estimates["lambda_pa"].statistical95 or (0, 0)
     assert np.log(high / low) == pytest.approx(2 * Z95 * 0.9, rel=1e-3)
     (sentence,) = [s for s in verdicts(found) if "not identifiable" in s]
     assert sentence in found.notes
@@ -79,7 +79,7 @@ def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
 
 def test_a_parameter_the_data_say_nothing_of_is_not_determined():
     found = uncertainty(spread([0.1, 0.01, 0.02, 1e4]))
-    assert found.estimates["gamma_m_1_s"].ci95 is None
+    assert found.estimates["gamma_m_1_s"].statistical95 is None
     said = verdicts(found)
     assert "gamma_m_1_s" not in said[0]
     silent = "gamma_m_1_s is not determined: no information on damping in these data"
@@ -97,7 +97,7 @@ def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
     assert "alone" not in sentence  # another note says how well each is known
     assert "young_pa only to ±34 % and poisson only to ±40 % (95 %)" in verdicts(found)[0]
     for name in ENGINEERING:
-        assert found.estimates[name].std_error is None
+        assert found.estimates[name].statistical_std_error is None
         assert "confounded with" in (found.estimates[name].reason or "")
     unidentifiable = [note for note in found.notes if "not identifiable" in note]
     assert len(unidentifiable) == 1  # of both
@@ -115,7 +115,7 @@ def test_the_powers_of_a_combination_are_those_that_cancel():
 
 def test_parameters_known_very_well_keep_their_error_though_confounded():
     found = uncertainty(spread([0.01, 0.01, 0.02, 0.02], {(0, 1): 0.99}))
-    assert found.estimates["mu_pa"].std_error is not None
+    assert found.estimates["mu_pa"].statistical_std_error is not None
     assert any("confounded" in sentence for sentence in verdicts(found))
 
 
@@ -163,8 +163,8 @@ def test_poisson_that_can_be_anything_is_not_identifiable():
     of = parameters(ENGINEERING, poisson={"guess": 0.25})
     found = uncertainty(spread([0.01, 1.2, 0.02, 0.02]), of)
     estimate = found.estimates["poisson"]
-    assert estimate.std_error is None
-    low, high = estimate.ci95 or (0.0, 1.0)
+    assert estimate.statistical_std_error is None
+    low, high = estimate.statistical95 or (0.0, 1.0)
     assert 0 < low < 0.05
     assert 0.45 < high < 0.5
     assert "(0, 0.5)" in (estimate.reason or "")
@@ -173,7 +173,7 @@ def test_poisson_that_can_be_anything_is_not_identifiable():
 def test_an_interval_beyond_both_bounds_is_no_estimate():
     of = parameters(mu_pa={"lower": 270.0, "upper": 330.0})
     estimate = uncertainty(spread([0.1, 0.1, 0.02, 0.02]), of).estimates["mu_pa"]
-    assert estimate.std_error is None
+    assert estimate.statistical_std_error is None
     assert "between its bounds" in (estimate.reason or "")
 
 

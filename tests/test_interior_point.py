@@ -3,9 +3,11 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sys
 import time
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,18 +30,28 @@ from wrenches_small import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.moduli import engineering
+from collocation_sysid.methods.condensed import condensed
+from collocation_sysid.methods.initial_point import NEAR, adjoint_multipliers
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.methods.start import carried_rigidly, initial_variables
+from collocation_sysid.methods.start import carried_rigidly, initial_variables, placed_at_guess
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
-from collocation_sysid.pipeline import solve
+from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation, carried_over
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Markers, Nuisance
+from collocation_sysid.runs.warm_start import Earlier
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from benchmark_distant_guesses import TRUTH as SOFT
+from benchmark_distant_guesses import bar
 
 PRECISE = InteriorPoint(tolerance=1e-11)
+# IPOPT alone, from the simulation at the guess.
+ALONE = InteriorPoint(initial="simulation")
 
 
 @cache
@@ -149,7 +161,7 @@ def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
     assert len(notes) == 1
     assert notes[0].startswith("experiment 'hung cube': the simulation at the guess failed (")
     assert notes[0].endswith("started from the rest shape carried rigidly by the grasp")
-    solution = PRECISE(collocation)
+    solution = replace(PRECISE, initial="simulation")(collocation)
     assert solution.notes == tuple(notes)
     assert solution.status is Status.CONVERGED
     assert np.abs(relative_errors(solution)).max() < 1e-5
@@ -178,6 +190,154 @@ def test_a_given_start_is_used():
     assert again.history[0].parameters == solved_cube().parameters
     assert again.history[0].rms_m == pytest.approx(solved_cube().rms_m)
     np.testing.assert_allclose(again.theta, solved_cube().theta, rtol=1e-5)
+
+
+# The initial point
+
+
+def note_of(solution: Solution) -> str:
+    """The note on the initial point."""
+    (note,) = (each for each in solution.notes if each.startswith("initial point: "))
+    return note
+
+
+def test_ipopt_starts_near_the_optimum_and_the_notes_tell_how():
+    seen: list[Iteration] = []
+    solution = PRECISE(cube(), watch=seen.append)
+    sweeps = len(ReducedSpace(tolerance=NEAR)(cube()).history)
+    assert re.fullmatch(
+        r"initial point: \d+ sweeps of reduced space, to within 0.1 % of a parameter; "
+        "IPOPT solved the whole program from there",
+        note_of(solution),
+    )
+    assert solution.iterations <= 4
+    assert len(seen) == sweeps + solution.iterations + 1
+    assert list(solution.history) == seen
+    numbers = [line.number for line in seen]
+    assert numbers == sorted(numbers)
+    np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
+
+
+def test_the_initial_point_is_not_the_answer():
+    solution = InteriorPoint(max_iterations=1, tolerance=1e-15)(cube())
+    assert solution.status is Status.ITERATION_LIMIT
+    coarse = ReducedSpace(tolerance=NEAR)(cube())
+    assert not np.array_equal(solution.z, coarse.z)
+
+
+def test_where_reduced_space_finds_no_motion_ipopt_starts_without_it():
+    collocation = Collocation([measured(hung_cube())], soft_guess())
+    solution = PRECISE(collocation)
+    assert "found none" in note_of(solution)
+    assert "started from the rest shape carried rigidly" in solution.notes[-1]
+    assert solution.status is Status.CONVERGED
+    assert np.abs(relative_errors(solution)).max() < 1e-5
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, None])
+def test_the_search_for_the_initial_point_ends_at_once_and_keeps_its_best(
+    end: signal.Signals | None,
+):
+    def interrupt(iteration: Iteration) -> None:
+        if iteration.number == 2 and end is not None:
+            os.kill(os.getpid(), end)
+        if iteration.number == 2 and end is None:
+            time.sleep(0.3)
+
+    method = InteriorPoint(max_time_s=1e6 if end else 0.3)
+    solution = method(cube(), watch=interrupt)
+    assert solution.status is (Status.INTERRUPTED if end else Status.TIME_LIMIT)
+    assert solution.method == "interior-point"
+    assert solution.iterations == 0
+    assert solution.history[-1].number < len(ReducedSpace()(cube()).history)
+    assert np.isfinite(solution.rms_m)
+
+
+@pytest.mark.parametrize("name", ["memory", "places", "wrench"])
+def test_initial_multipliers_balance_the_lagrangian(name: str):
+    make, truth, _ = UNKNOWN[name]
+    given = {k: Unknown(v, 0.1 * v, 10 * v) for k, v in truth.items()}
+    collocation = Problem([make()], given, scheme="midpoint").collocation()
+    z, _ = initial_variables(collocation)
+    program = condensed(collocation.made_explicit())
+    found = adjoint_multipliers(program, collocation, z)
+    assert found is not None
+    at = carried_over(z, collocation, program)
+    slope = program.gradient(at) + program.jacobian(at).T @ found.constraints
+    lower, upper = program.bounds()
+    of_p = np.zeros(program.variables, dtype=bool)
+    of_p[: program.nq] = of_p[program.of_phi] = True
+    scale = np.abs(program.gradient(at)).max()
+    assert np.abs(slope[~of_p & (lower < upper)]).max() < 1e-8 * scale
+    bounded = of_p & (np.isfinite(lower) | np.isfinite(upper))
+    np.testing.assert_array_equal(found.bounds, np.where(bounded, -slope, 0.0))
+    assert bounded.any()
+
+
+@cache
+def soft_bar(divisions: tuple[int, int, int] = (4, 1, 1), samples: int = 31) -> Problem:
+    """A soft bar whose markers have unknown places; its guesses are wrong by factors of three."""
+    return bar(divisions, samples, ideal=False)
+
+
+def alone_from_the_guess(problem: Problem) -> Solution:
+    """IPOPT from the simulation at the guess, with unknown places where that has them."""
+    return ALONE(placed_at_guess(problem.collocation()))
+
+
+def test_distant_guesses_lead_to_the_optimum_of_reduced_space():
+    problem = soft_bar()
+    expected = solve(problem, ReducedSpace())
+    found = solve(problem, InteriorPoint())
+    assert found.status is Status.CONVERGED
+    assert "sweeps of reduced space" in note_of(found)
+    assert found.iterations <= 5
+    np.testing.assert_allclose(found.q, expected.q, atol=1e-5)
+    assert found.kkt_residual < 1e-7
+
+
+@pytest.mark.long
+def test_a_finer_soft_bar_converges_from_distant_guesses_too():
+    problem = soft_bar((5, 2, 2), 41)
+    expected = solve(problem, ReducedSpace())
+    found = solve(problem, InteriorPoint())
+    assert found.status is Status.CONVERGED
+    assert found.iterations <= 5
+    np.testing.assert_allclose(found.q, expected.q, atol=1e-5)
+    alone = alone_from_the_guess(problem)
+    assert alone.status is Status.CONVERGED
+    assert alone.iterations <= 25
+
+
+def test_rows_of_the_equations_do_not_slow_the_steps_of_ipopt_alone():
+    soft = soft_bar()
+    wrong = {"mu_pa": 3 * SOFT["mu_pa"]}
+    found = alone_from_the_guess(replace(soft, parameters=soft.parameters.with_guess(wrong)))
+    assert found.status is Status.CONVERGED
+    assert found.iterations <= 14
+
+
+def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
+    problem = soft_bar()
+    answer = run(problem, ReducedSpace(), seek_causes=False)
+    substeps = answer.solution.collocation.substeps
+    folder = answer.save(tmp_path / "answer")
+    found = run(problem, InteriorPoint(), start=folder, seek_causes=False).solution
+    assert found.status is Status.CONVERGED
+    assert found.iterations <= 5
+    assert found.collocation.substeps == substeps
+    assert found.history[0].rms_m == pytest.approx(answer.solution.rms_m, rel=1e-2)
+    again = solve(problem, InteriorPoint(), start=folder)
+    found_by = r"initial point: (the start given|1 sweep|[2-5] sweeps)\b"
+    assert re.match(found_by, note_of(again))
+
+
+def test_a_start_with_finer_steps_is_continued_with_these():
+    problem = soft_bar()
+    answer = Earlier.of(ReducedSpace()(replace(problem, substeps=2).collocation()))
+    assert answer.substeps == 2
+    assert solve(problem, start=answer).collocation.substeps == 2
+    assert solve(replace(problem, substeps=1), start=answer).collocation.substeps == 1
 
 
 # What is unknown by default
@@ -215,7 +375,7 @@ def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(name: str
     given = {k: v if k == known else Unknown(factors[k] * v) for k, v in truth.items()}
     problem = Problem([replace(make(), nuisance=Nuisance())], given, scheme="midpoint")
     expected = solve(problem, ReducedSpace(tolerance=1e-10))
-    precise = InteriorPoint(tolerance=1e-10, ipopt={"print_level": 5})
+    precise = replace(ALONE, tolerance=1e-10, ipopt={"print_level": 5})
     found = precise(expected.collocation)  # where its markers are read
     shifts = re.findall(ITERATION, capfd.readouterr().out, re.MULTILINE)
     assert found.status.converged
@@ -228,7 +388,7 @@ def test_what_is_unknown_by_default_is_found_and_no_hessian_is_shifted(name: str
 
 
 def test_the_iteration_limit_is_a_status_and_violations_are_listed():
-    solution = InteriorPoint(max_iterations=2)(cube())
+    solution = replace(ALONE, max_iterations=2)(cube())
     assert solution.status is Status.ITERATION_LIMIT
     assert not solution.status.converged
     assert solution.message.endswith("(IPOPT: Maximum_Iterations_Exceeded)")
@@ -280,7 +440,7 @@ def test_an_interruption_keeps_the_best_iterate():
             time.sleep(0.5)  # until it is heard, on the main thread
 
     handler = signal.getsignal(signal.SIGINT)
-    solution = InteriorPoint()(cube(), watch=interrupt)
+    solution = ALONE(cube(), watch=interrupt)
     assert signal.getsignal(signal.SIGINT) is handler
     assert solution.status is Status.INTERRUPTED
     assert solution.iterations == 4
@@ -358,7 +518,7 @@ def test_the_message_holds_the_sentence_and_what_ipopt_said():
 
 def test_the_history_counts_iterations_and_ends_at_the_answer():
     seen: list[Iteration] = []
-    solution = InteriorPoint()(cube(), watch=seen.append)
+    solution = ALONE(cube(), watch=seen.append)
     assert list(solution.history) == seen
     assert [iteration.number for iteration in seen] == list(range(solution.iterations + 1))
     assert (np.diff([iteration.time_s for iteration in seen]) >= 0).all()

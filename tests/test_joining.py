@@ -38,7 +38,7 @@ def loaded(from_s: float, joining_s: float | None = 0.01, steps: int = 24) -> Ex
 
 def seen(truth_s: float, stated_s: float, joining_s: float | None = 0.01) -> Experiment:
     """What the weight does that joins at one time, of which another is stated."""
-    tracks = simulate(loaded(truth_s), TRUTH, "midpoint").markers_m
+    tracks = simulate(loaded(truth_s), TRUTH, "midpoint", substeps=1).markers_m
     return with_markers(loaded(stated_s, joining_s), tracks)
 
 

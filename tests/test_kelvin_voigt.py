@@ -244,7 +244,7 @@ def spun(
         nuisance=IDEAL,
     )
     truth = CONSTANTS | {"gamma_r_s": 5e-3}
-    return simulate(experiment, truth, scheme).positions_m.reshape(len(t_s), -1, 3)
+    return simulate(experiment, truth, scheme, substeps=1).positions_m.reshape(len(t_s), -1, 3)
 
 
 def momenta(body: Body, x: np.ndarray, step_s: float) -> np.ndarray:

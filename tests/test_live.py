@@ -48,10 +48,12 @@ TWENTY = 20 * "9"
 
 
 @cache
-def swing(steps: int = 36, nuisance: Nuisance = IDEAL, seed: int = 1) -> cs.Problem:
+def swing(
+    steps: int = 36, nuisance: Nuisance = IDEAL, seed: int = 1, air_density_kg_m3: float = 0.0
+) -> cs.Problem:
     """A cube swung by its top, seen with noise, described rightly."""
-    hung = hung_cube(steps, nuisance=nuisance)
-    tracks = cs.simulate(hung, TRUTH, integrator="midpoint").markers_m
+    hung = hung_cube(steps, nuisance=nuisance, air_density_kg_m3=air_density_kg_m3)
+    tracks = cs.simulate(hung, TRUTH, integrator="midpoint", substeps=1).markers_m
     noise = np.random.default_rng(seed).normal(scale=NOISE_M, size=tracks.shape)
     seen = cs.with_markers(hung, tracks + noise)
     seen = replace(seen, markers=replace(seen.markers, sigma_m=NOISE_M))
@@ -103,13 +105,13 @@ OF_THE_USER = Nuisance.none(
 
 
 @pytest.mark.parametrize(
-    "nuisance",
-    [IDEAL, Nuisance(), OF_THE_USER],
-    ids=["ideal", "as in a laboratory", "a user's own"],
+    ("nuisance", "air_density_kg_m3"),
+    [(IDEAL, 0.0), (IDEAL, 10.0), (Nuisance(), 0.0), (OF_THE_USER, 0.0)],
+    ids=["ideal", "in dense air", "as in a laboratory", "a user's own"],
 )
-def test_frames_one_by_one_say_what_the_batch_says(nuisance, monkeypatch):
+def test_frames_one_by_one_say_what_the_batch_says(nuisance, air_density_kg_m3, monkeypatch):
     monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
-    problem, count = swing(nuisance=nuisance), 30
+    problem, count = swing(nuisance=nuisance, air_density_kg_m3=air_density_kg_m3), 30
     live = streamed(problem, count)
     collocation = problem.collocation()
     horizon, p = Horizon(collocation, [count], prior=model.WEAK), collocation.guess_p
@@ -151,8 +153,10 @@ def test_when_frames_end_the_estimate_settles_where_the_batch_ends(problem):
     assert update is not None
     for name, estimate in update.estimates.items():
         known = batch.estimates[name]
-        assert abs(estimate.value - known.value) < 1e-4 * known.std_error
-        assert estimate.std_error == pytest.approx(known.std_error, rel=1e-4)
+        assert abs(estimate.value - known.value) < 1e-4 * known.statistical_std_error
+        assert estimate.statistical_std_error == pytest.approx(
+            known.statistical_std_error, rel=1e-4
+        )
     assert update.trust.verdict == batch.trust.verdict
     assert update.marker_rms_m == pytest.approx(batch.solution.rms_m)
     assert update.relinearised > 0
@@ -223,7 +227,7 @@ def test_two_rows_passed_again_a_frame_follow_the_batch(scheme):
     solution = cs.solve(problem, ReducedSpace())
     batch = covariance(solution.collocation, solution.z).estimates
     for name, estimate in update.estimates.items():
-        assert abs(estimate.value - batch[name].value) < 0.5 * batch[name].std_error
+        assert abs(estimate.value - batch[name].value) < 0.5 * batch[name].statistical_std_error
 
 
 def test_rows_are_begun_that_end_in_time():
@@ -394,7 +398,7 @@ def test_doubled_late_unordered_and_dropped_frames_are_told_and_change_little():
     assert any("late" in note for note in notes)
     assert live.track.rows == whole.track.rows
     for name, estimate in live._estimates_at(live.track.information, live.p).items():
-        error = expected.estimates[name].std_error
+        error = expected.estimates[name].statistical_std_error
         if error is not None:
             assert abs(estimate.value - expected.estimates[name].value) < 2 * error
 
@@ -482,8 +486,8 @@ def test_frames_at_rest_tell_nothing_of_damping_and_the_verdict_says_so():
         tracks = first.tracks_m + noise.normal(scale=NOISE_M, size=first.tracks_m.shape)
         update = live.take(replace(first, t_s=0.01 * k, tracks_m=tracks))
     damping = update.estimates["gamma_r_s"]
-    assert damping.std_error is None
-    assert damping.ci95[1] > 100 * damping.ci95[0]
+    assert damping.statistical_std_error is None
+    assert damping.statistical95[1] > 100 * damping.statistical95[0]
     assert update.trust.verdict != "good"
     assert any("gamma_r_s is not known yet" in reason for reason in update.trust.reasons)
 
@@ -582,7 +586,7 @@ def felt(bias_m_s2: float = 0.3) -> cs.Problem:
     seen = replace(seen, markers=replace(seen.markers, sigma_m=1e-3))
     inner = np.linspace(seen.t_s[0] + 1e-3, seen.t_s[-1], 2 * len(seen.t_s))
     made = instrumented(seen, accelerometer(inner), strain_gauge(seen.t_s))
-    accelerations, strains = cs.simulate(made, TRUTH, "midpoint").readings
+    accelerations, strains = cs.simulate(made, TRUTH, "midpoint", substeps=1).readings
     rng = np.random.default_rng(2)
     accelerations = accelerations + [0, 0, bias_m_s2] + 0.05 * rng.normal(size=(len(inner), 3))
     accelerations[5, 1] = accelerations[7] = np.nan
@@ -620,8 +624,8 @@ def test_truth_and_what_a_chip_does_not_know_of_itself_are_found_from_frames():
     for frame in frames_of(problem, live):
         without = alone.take(replace(frame, told=()))
     for name, estimate in update.estimates.items():
-        assert abs(estimate.value - TRUTH[name]) < 4 * estimate.std_error
-        assert estimate.std_error < without.estimates[name].std_error
+        assert abs(estimate.value - TRUTH[name]) < 4 * estimate.statistical_std_error
+        assert estimate.statistical_std_error < without.estimates[name].statistical_std_error
     bias = live.p[live.model.collocation.nq :] * live.model.segment.nuisance.scales
     assert bias[0] == pytest.approx(0.3, abs=0.05)
     settled, batch = live.settle(), cs.run(problem, seek_causes=False)

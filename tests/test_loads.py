@@ -207,7 +207,7 @@ def test_a_release_starts_from_the_equilibrium_in_all_grasps():
     both_hold, one_holds = (
         rest_state(e, as_theta(TRUTH)) for e in (let_go, replace(bar, grasps=(still,)))
     )
-    motion = simulate(let_go, TRUTH, "midpoint")
+    motion = simulate(let_go, TRUTH, "midpoint", substeps=1)
     np.testing.assert_allclose(motion.positions_m[0].ravel(), both_hold, atol=1e-12)
     assert np.abs(both_hold - one_holds).max() > 1e-3
     tip = moving.nodes[0]

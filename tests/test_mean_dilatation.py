@@ -340,7 +340,7 @@ def bar() -> Experiment:
     grasp = Grasp(nodes_where(body, 0, 0.0), gently)
     markers = point_markers(body, body.nodes_m[-5:], t_s)
     unseen = Experiment(body, t_s, (grasp,), markers)
-    return with_markers(unseen, simulate(unseen, TRUTH, "midpoint").markers_m)
+    return with_markers(unseen, simulate(unseen, TRUTH, "midpoint", substeps=1).markers_m)
 
 
 def test_reduced_space_finds_the_truth():

@@ -164,6 +164,6 @@ def test_a_share_of_zero_is_no_memory():
     experiment = remembering("hung-cube", 6, 2)
     none = TWO | {"prony_1.share": 0.0, "prony_2.share": 0.0}
     forgetful = remembering("hung-cube", 6, 0)
-    expected = simulate(forgetful, truth(0), "midpoint").positions_m
-    found = simulate(experiment, none, "midpoint").positions_m
+    expected = simulate(forgetful, truth(0), "midpoint", substeps=1).positions_m
+    found = simulate(experiment, none, "midpoint", substeps=1).positions_m
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)

@@ -42,10 +42,10 @@ def test_the_instantaneous_modulus_has_an_error_bar():
     at_once = uncertainty.derived["instantaneous_young_pa"]
     share = uncertainty.estimates["prony_1.share"]
     assert at_once.value == pytest.approx(young.value * (1 + share.value), rel=1e-12)
-    assert at_once.ci95 is not None
-    assert at_once.ci95[0] < 720.0 * 1.4 < at_once.ci95[1]
-    assert share.ci95 is not None
-    assert share.ci95[0] < 0.4 < share.ci95[1]
+    assert at_once.statistical95 is not None
+    assert at_once.statistical95[0] < 720.0 * 1.4 < at_once.statistical95[1]
+    assert share.statistical95 is not None
+    assert share.statistical95[0] < 0.4 < share.statistical95[1]
 
 
 def test_a_memory_that_is_not_there_is_not_found():
@@ -54,7 +54,7 @@ def test_a_memory_that_is_not_there_is_not_found():
     assert any("no memory" in note for note in uncertainty.notes)
     share = uncertainty.estimates["prony_1.share"]
     assert share.value < 0.05
-    assert share.ci95 is None or share.ci95[0] >= 0
+    assert share.statistical95 is None or share.statistical95[0] >= 0
 
 
 def test_a_branch_slower_than_the_recordings_is_told():

@@ -37,6 +37,7 @@ from collocation_sysid.plan.variants import (
     file_variants,
     models,
     parse_branches,
+    parse_dampings,
     parse_materials,
     toml,
     variants,
@@ -219,6 +220,8 @@ def test_of_one_recording_the_last_third_is_held_out(tiny: Path):
     np.testing.assert_array_equal(earlier, whole.markers.positions_m[~later])
 
 
+LAWS = ("kelvin-voigt", "material", "rayleigh")
+
 # Variants ---------------------------------------------------------------------------------------
 
 
@@ -295,6 +298,39 @@ def test_materials_and_branches_are_combined(bar):
     ]
 
 
+def test_laws_of_damping_take_the_place_of_their_budget_entry(bar):
+    found = {v.label: v for v in variants(bar, (), (), (), TIMES_S, dampings=LAWS)}
+    assert tuple(found) == LAWS
+    for law in LAWS:
+        problem = Problem.read(bar, found[law].overrides)
+        assert [part.damping.name for part in problem.bodies[0].parts] == [law]
+        stated = problem.uncertainty.assumptions.deviations
+        assert stated["damping_law"] is None
+        assert stated["rayleigh_damping"] is None
+        assert problem.parameters.names == Problem.read(bar).parameters.names
+
+
+def test_laws_of_damping_are_combined_with_materials(bar):
+    found = variants(bar, (), BOTH, (), TIMES_S, dampings=LAWS[:2])
+    assert [v.label for v in found] == [
+        "neo-hookean, kelvin-voigt",
+        "neo-hookean, material",
+        "yeoh, kelvin-voigt",
+        "yeoh, material",
+    ]
+    last = Problem.read(bar, found[-1].overrides).bodies[0].parts[0]
+    assert (last.material.name, last.damping.name) == ("yeoh", "material")
+
+
+def test_a_region_alone_may_have_the_laws_of_damping(bar, tiny):
+    TWO_REGIONS(tiny)
+    found = {v.label: v for v in variants(bar, (), (), (), TIMES_S, "stiff", LAWS)}
+    problem = Problem.read(bar, found["stiff: material"].overrides)
+    laws = {part.name: part.damping.name for part in problem.bodies[0].parts}
+    assert laws["stiff"] == "material"
+    assert set(laws.values()) == {"kelvin-voigt", "material"}
+
+
 def test_files_are_combined_with_materials(bar, tiny):
     other = tiny / "other.toml"
     other.write_text(bar.read_text().replace("= 30.0", "= 31.0"))
@@ -317,6 +353,10 @@ def test_a_value_is_written_as_toml_reads_it():
 def test_bad_models_are_refused_in_one_line(bar, tiny):
     with pytest.raises(InputError, match=r"'yeho'.*did you mean 'yeoh'"):
         parse_materials("yeho,gent")
+    with pytest.raises(InputError, match=r"'matrial'.*did you mean 'material'"):
+        parse_dampings("kelvin-voigt,matrial")
+    with pytest.raises(InputError, match=r"--damping: .*material alone; expected two or more"):
+        models([Problem.read(bar)], (), dampings=("material",))
     with pytest.raises(InputError, match="whole numbers up to 20, such as 0,1,2"):
         parse_branches("1,x")
     with pytest.raises(InputError, match="yeoh alone; expected two or more"):
@@ -469,8 +509,14 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
     for name, free, young_pa in (("a", 3, 70e3), ("b", 4, 100e3)):
         model = row_of(name, free, {"a": WAVY.tolist()}, 900)
         model["found"][""]["parameters"] = {"young_pa": young_pa, "c10_pa": young_pa / 7}
-        whole95 = (young_pa / 1.04, young_pa * 1.04)
-        line = {"shares": {"noise": 0.8, "mass": 0.2}, "whole95": whole95}
+        combined95 = (young_pa / 1.04, young_pa * 1.04)
+        line = {
+            "value": young_pa,
+            "shares": {"noise": 0.8, "mass": 0.2},
+            "combined95": combined95,
+            "combined_std_error": young_pa * np.log(1.04) / 1.96,
+            "systematic": 0.01,
+        }
         model["found"][""]["budget"] = {"young_pa": line}
         found[name] = model
     rows = rows_of(found["a"], found["b"])
@@ -478,8 +524,8 @@ def test_the_law_is_a_source_of_the_chosen_ones_budget():
     assert told.values == {"a": 70e3, "b": 100e3}
     apart, known = np.log(100 / 70) / np.sqrt(2), np.log(1.04) / 1.96
     assert told.share == pytest.approx(apart**2 / (apart**2 + known**2))
-    assert told.whole95[1] == pytest.approx(70e3 * np.exp(1.96 * np.hypot(apart, known)))
-    assert told.whole95[0] < 70e3 < 100e3 < told.whole95[1]
+    assert told.combined95[1] == pytest.approx(70e3 * np.exp(1.96 * np.hypot(apart, known)))
+    assert told.combined95[0] < 70e3 < 100e3 < told.combined95[1]
     assert "with the law (99% of the variance), 6.73e+04 to 7.28e+04 without" in advice(rows)
     table = law_table([told])
     assert table.rows[0][:4] == ("E Pa", "7e+04", "1e+05", "43 %")
@@ -548,8 +594,21 @@ def test_a_comparison_of_models_from_the_command_line(tiny: Path, monkeypatch):
     assert page.code == 0
 
 
+@pytest.mark.long
+def test_a_comparison_of_laws_of_damping_from_the_command_line(tiny: Path, monkeypatch):
+    monkeypatch.chdir(tiny)
+    words = ("compare", "problem.toml", "--damping", "kelvin-voigt,material", "--out", "laws")
+    done = run_command(*words, "--quiet")
+    assert done.code == 0, done.err
+    summary = json.loads((tiny / "laws" / "summary.json").read_text())
+    assert [row["model"] for row in summary["runs"]] == ["kelvin-voigt", "material"]
+    assert all("gamma_r_s" in row["parameters"] for row in summary["runs"])
+    for row in summary["runs"]:
+        assert all("damping_law" not in line["shares"] for line in row["budget"].values())
+
+
 def test_there_must_be_something_to_compare(tiny: Path):
     nothing = run_command("compare", "problem.toml")
-    assert (nothing.code, "--materials, --prony or --with" in nothing.err) == (2, True)
+    assert (nothing.code, "--materials, --damping, --prony or --with" in nothing.err) == (2, True)
     several = ("compare", "problem.toml", "--materials", "gent,yeoh", "--methods")
     assert "expected one method" in run_command(*several, "reduced-space,shooting").err

@@ -214,6 +214,6 @@ def test_intervals_of_a_whole_identification_follow_the_residuals(claimed):
         each = uncertainty_of(fit, collocation.parameters, solution.q)
         assert each.noise == ("by-marker" if claimed == "uneven" else "estimated")
         for name, value in truth().items():
-            low, high = {**each.estimates, **each.derived}[name].ci95 or (0.0, np.inf)
+            low, high = {**each.estimates, **each.derived}[name].statistical95 or (0.0, np.inf)
             held.append(low <= value <= high)
     assert np.mean(held) >= 0.75  # of two twins, whose quantities are related

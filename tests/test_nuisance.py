@@ -54,7 +54,7 @@ def readings(experiment: Experiment, phi: np.ndarray) -> np.ndarray:
     collocation = alone(experiment)
     followed, p = collocation.following(np.append(GUESS.guess_q, phi))
     (segment,) = followed.segments
-    motion = simulate(segment.corrected(phi), TRUTH, "midpoint")
+    motion = simulate(segment.corrected(phi), TRUTH, "midpoint", substeps=1)
     return segment.markers.of_samples(motion.positions_m, p[followed.nq :])
 
 
@@ -69,7 +69,7 @@ def seen_with(experiment: Experiment, phi: np.ndarray) -> Experiment:
 
 def test_without_nuisance_markers_read_where_they_are():
     cube = hung_cube()
-    plain = simulate(cube, TRUTH, "midpoint").markers_m
+    plain = simulate(cube, TRUTH, "midpoint", substeps=1).markers_m
     np.testing.assert_allclose(readings(cube, np.zeros(0)), plain, atol=1e-15)
     everything = cube_with_nuisance()
     zero = np.zeros(NuisanceMap.of(everything).size)
@@ -81,7 +81,7 @@ def test_an_error_of_a_place_turns_with_the_body():
     phi = np.random.default_rng(1).uniform(-2, 2, NuisanceMap.of(cube).size)
     places = cube.markers.observe(cube.body.nodes_m) + 0.003 * phi.reshape(-1, 3)
     really = replace(cube, markers=point_markers(cube.body, places, cube.t_s), nuisance=IDEAL)
-    expected = simulate(really, TRUTH, "midpoint").markers_m
+    expected = simulate(really, TRUTH, "midpoint", substeps=1).markers_m
     assert np.ptp(expected - readings(cube, 0 * phi), axis=0).max() > 1e-3
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-12)
 
@@ -93,7 +93,7 @@ def test_a_motion_in_the_grasp_is_a_body_held_elsewhere():
     phi = np.array([1.0, -0.6, 0.8, 0.5, -1.0, 0.3])
     (grasp,) = plain.grasps
     moved = Grasp(grasp.nodes, grasp.poses.after(NuisanceMap.of(cube).in_grasp(phi)))
-    expected = simulate(replace(plain, grasps=(moved,)), TRUTH, "midpoint").markers_m
+    expected = simulate(replace(plain, grasps=(moved,)), TRUTH, "midpoint", substeps=1).markers_m
     assert np.abs(expected - readings(cube, 0 * phi)).max() > 3e-3
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-9)
 
@@ -120,7 +120,7 @@ def test_a_time_shift_reads_the_motion_at_another_time(share: float):
     grid = simulate(cube, TRUTH, "midpoint", substeps=10)
     found = segment.markers.of_samples(grid.positions_m, np.array([share]))
     dense = replace(cube, t_s=np.linspace(0, 0.2, 201), markers=_on(cube, np.linspace(0, 0.2, 201)))
-    expected = simulate(dense, TRUTH, "midpoint").markers_m
+    expected = simulate(dense, TRUTH, "midpoint", substeps=1).markers_m
     moved = np.abs(expected - expected[0]).max()
     inside = np.arange(3, 18)
     wanted = expected[inside * 10 + round(10 * share)]
@@ -152,7 +152,7 @@ def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
         (turn * Rotation.from_matrix(rotations)).as_quat(),
     )
     really = replace(plain, grasps=(Grasp(plain.grasps[0].nodes, moved),))
-    expected = simulate(really, TRUTH, "midpoint").markers_m
+    expected = simulate(really, TRUTH, "midpoint", substeps=1).markers_m
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-9)
 
 

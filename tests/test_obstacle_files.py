@@ -187,7 +187,7 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path:
     both, theta = pressed_cube(4), as_theta(TRUTH)
     held, _, plate = both.grasps
     cube = replace(both, grasps=[held, plate])
-    motion = cs.simulate(cube, TRUTH, "bdf2")
+    motion = cs.simulate(cube, TRUTH, "bdf2", substeps=1)
     x = motion.positions_m.reshape(len(motion.t_s), -1)
     touched = gaps_m, pressures_pa = on_surface(cube, theta, x)
     (term,) = contacts(cube)

@@ -274,7 +274,7 @@ def test_curves_tell_where_the_horizon_grows():
 def replay(make=hung_cube) -> Replay:
     """An experiment seen as it is simulated, with the same for a fit."""
     experiment = measured(make())
-    x = simulate(experiment, TRUTH, "midpoint")
+    x = simulate(experiment, TRUTH, "midpoint", substeps=1)
     seen = (x.positions_m, x.markers_m)
     return Replay.of(experiment, seen, seen, np.array([3.0, 7.0]))
 

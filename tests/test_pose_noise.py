@@ -48,7 +48,7 @@ def reading(of: Collocation, poses: PoseSequence, phi: np.ndarray) -> tuple[np.n
     (grasp,) = experiment.grasps
     moved = replace(experiment, grasps=(replace(grasp, poses=poses),))
     (segment,) = replace(of, experiments=(moved,)).segments
-    motion = simulate(segment.corrected(phi), TRUTH, of.scheme)
+    motion = simulate(segment.corrected(phi), TRUTH, of.scheme, substeps=1)
     positions = motion.positions_m.reshape(len(motion.positions_m), -1)
     return segment.markers.of_positions(positions, phi), positions
 

@@ -42,23 +42,34 @@ NOISE_M = 1e-4
 
 
 @cache
-def probed(fault: str = "", off: float = 0.0) -> Run:
-    """A cube that was swung, of which something is off, solved as if nothing were."""
+def swung(fault: str = "", off: float = 0.0) -> Problem:
+    """A cube that was swung, of which something is off, described as if nothing were."""
     hung = hung_cube(80)
     hung = replace(hung, body=Body(hung.body.mesh, density_kg_m3=60.0), nuisance=Nuisance.none())
-    swung = wrong(hung, TRUTH, {} if fault == "clock_rate" else {fault: off})
-    tracks = swung.markers.positions_m
+    recorded = wrong(hung, TRUTH, {} if fault == "clock_rate" else {fault: off})
+    tracks = recorded.markers.positions_m
     if fault == "clock_rate":  # cameras' times are too large
-        tracks = CubicSpline(swung.t_s, tracks)(swung.t_s * (1 - off))
+        tracks = CubicSpline(recorded.t_s, tracks)(recorded.t_s * (1 - off))
     tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
-    seen = replace(swung.markers, positions_m=tracks, sigma_m=sigma_m)
+    seen = replace(recorded.markers, positions_m=tracks, sigma_m=sigma_m)
     parameters = Parameters.of({name: Unknown(value) for name, value in TRUTH.items()})
     exact = {n: "none" for n in Assumptions().deviations if n not in FREED}
     stated = Assumptions(**exact, density_gradient=0.1)
     options = UncertaintyOptions(assumptions=stated)
-    problem = Problem([replace(swung, markers=seen)], parameters, substeps=1, uncertainty=options)
-    return run(problem, seek_causes=False, probe=True)
+    return Problem([replace(recorded, markers=seen)], parameters, substeps=1, uncertainty=options)
+
+
+@cache
+def probed(fault: str = "", off: float = 0.0) -> Run:
+    """The answer, with all probes."""
+    return run(swung(fault, off), seek_causes=False, probe=True)
+
+
+@cache
+def plain(fault: str = "", off: float = 0.0) -> Run:
+    """The answer, with the probes of every solve."""
+    return run(swung(fault, off), seek_causes=False)
 
 
 def named(solved: Run, name: str) -> Probe:
@@ -109,7 +120,7 @@ def test_each_of_several_recordings_says_what_it_has_alone():
     rng, swings = np.random.default_rng(2), []
     for k, damping in enumerate((5e-3, 9e-3)):
         swing = replace(hung_cube(25), name=f"swing {k}")
-        tracks = simulate(swing, LAME | {"gamma_r_s": damping}, "midpoint").markers_m
+        tracks = simulate(swing, LAME | {"gamma_r_s": damping}, "midpoint", substeps=1).markers_m
         tracks = tracks + swing.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
         swings.append(with_markers(swing, tracks))
     exact = Assumptions(**{name: "none" for name in Assumptions().deviations})
@@ -125,11 +136,11 @@ def test_each_of_several_recordings_says_what_it_has_alone():
 
 def test_shares_of_both_intervals_stand_beside_every_change():
     solved = probed("density_gradient z", -0.1)
-    low, high = solved.estimates["young_pa"].ci95
-    least, most = solved.estimates["young_pa"].whole95
+    low, high = solved.optimum["young_pa"].statistical95
+    least, most = solved.estimates["young_pa"].combined95
     move = named(solved, "density_gradient z").moves["young_pa"]
-    assert move.of_ci95 == pytest.approx(2 * move.change / (high - low))
-    assert move.of_whole95 == pytest.approx(2 * move.change / (most - least))
+    assert move.of_statistical95 == pytest.approx(2 * move.change / (high - low))
+    assert move.of_combined95 == pytest.approx(2 * move.change / (most - least))
 
 
 def test_terminal_page_and_file_have_the_probes(tmp_path):
@@ -138,18 +149,32 @@ def test_terminal_page_and_file_have_the_probes(tmp_path):
     result = Result.read(folder)
     assert {p.name for p in result.probes} == {p.name for p in solved.probes}
     said = plain_text(summary(result, folder))
-    assert "the data tell density gradient z: -0.1" in said
+    assert "the data determine density gradient z: -0.1" in said
     assert "−Δχ²" in said
     assert run_command("report", folder).code == 0
-    assert "the data tell density gradient z" in next(folder.glob("*.html")).read_text()
+    assert "the data determine density gradient z" in next(folder.glob("*.html")).read_text()
 
 
-def test_a_solve_probes_where_asked_to_and_says_where_it_would_help(tmp_path):
+def test_a_solve_makes_two_probes_and_all_of_them_where_asked_to(tmp_path):
     file = write_problem(tmp_path, {"swing": 12})
     plain = run_command("solve", file, "--out", tmp_path / "plain", "--quiet")
-    assert Result.read(tmp_path / "plain").probes == ()
-    assert "solve --probe" in plain.out
+    routine = Result.read(tmp_path / "plain").probes
+    assert [p.name for p in routine] == ["stiffness_drift", "clock_rate"]
+    assert all(p.routine for p in routine)
+    assert "no significant stiffness drift (" in plain.out
     probing = run_command("solve", file, "--out", tmp_path / "probed", "--quiet", "--probe")
-    assert Result.read(tmp_path / "probed").probes
+    deep = Result.read(tmp_path / "probed").probes
+    assert not any(p.routine for p in deep)
+    assert {p.kind for p in deep} == {"window", "assumption"}
     assert "solve --probe" not in probing.out
-    assert "in half widths of the 95 % and of the whole interval" in " ".join(probing.out.split())
+    assert "in half widths of the statistical and of the combined interval" in " ".join(
+        probing.out.split()
+    )
+
+
+def test_an_assumption_that_a_deep_probe_contradicts_means_check():
+    wrong_density = probed("density_gradient z", -0.1)
+    (concern,) = (c for c in wrong_density.trust.concerns if c.topic == "assumption")
+    assert concern.grade == "check"
+    assert concern.data["name"] == "density gradient z"
+    assert not [c for c in probed().trust.concerns if c.topic == "assumption"]

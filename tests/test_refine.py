@@ -15,13 +15,16 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import Run, run
-from collocation_sysid.problem import Problem, RolloutOptions
+from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOptions
 from collocation_sysid.runs.refine import refine
+from collocation_sysid.statistics.assumptions import Assumptions
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.numerical import Refinement, numerical_error
 from collocation_sysid.statistics.trust import numerical_concerns
 
 FREE = ("mu_pa", "gamma_r_s")
+# Lower bounds of `write_problem`.
+LOWER = {"lambda_pa": 10.0, "mu_pa": 10.0, "gamma_r_s": 1e-5, "gamma_m_1_s": 1e-3}
 
 
 def errors_of(x, order, levels=3, **options):
@@ -41,7 +44,7 @@ def test_three_levels_tell_order_and_limit(order):
 
 def test_two_levels_hold_the_limit_of_any_order_from_one_upwards():
     for order in (1.05, 2.0, 4.0):
-        low, high = errors_of(5.0, order, levels=2).ci95 or (0, 0)
+        low, high = errors_of(5.0, order, levels=2).interval95 or (0, 0)
         assert low < np.exp(5.0) < high
     assert errors_of(5.0, 2.0, levels=2).extrapolated == pytest.approx(np.exp(5.0))
 
@@ -50,15 +53,15 @@ def test_the_mesh_may_converge_more_slowly():
     for order in (0.55, 1.0, 2.0, 4.0):
         values = [float(np.exp(5.0 - 0.1 * 2.0 ** (-order * k))) for k in range(2)]
         answer = Estimate(values[0], 0.01, (values[0] * 0.9999, values[0] * 1.0001))
-        low, high = numerical_error("mu_pa", answer, [], values[1:]).ci95 or (0, 0)
+        low, high = numerical_error("mu_pa", answer, [], values[1:]).interval95 or (0, 0)
         assert low < np.exp(5.0) < high
 
 
 def test_without_numerical_error_the_interval_is_that_of_the_noise():
     answer = Estimate(0.3, 0.01, (0.27, 0.33))
     found = numerical_error("poisson", answer, [0.3, 0.3], [0.3])
-    assert found.ci95 is not None
-    odds = [v / (0.5 - v) for v in (*found.ci95, *answer.ci95)]  # type: ignore[misc]
+    assert found.interval95 is not None
+    odds = [v / (0.5 - v) for v in (*found.interval95, *answer.statistical95)]  # type: ignore[misc]
     assert odds[1] / odds[0] == pytest.approx(odds[3] / odds[2])
     assert found.extrapolated == pytest.approx(0.3)
 
@@ -67,7 +70,7 @@ def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
     found = numerical_error("mu_pa", Estimate(100.0, 1.0, (98, 102)), [110.0, 121.0], [])
     assert found.step_order is None
     assert found.extrapolated == pytest.approx(121.0)
-    low, high = found.ci95 or (0, 0)
+    low, high = found.interval95 or (0, 0)
     assert low < 110
     assert high > 132
 
@@ -75,13 +78,13 @@ def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
 @pytest.mark.parametrize(("value", "half_step"), [(-0.1, -0.11), (0.01, -0.01)])
 def test_a_poisson_ratio_below_zero_has_an_interval(value, half_step):
     estimate = Estimate(value, 0.02, (value - 0.04, value + 0.04))
-    low, high = numerical_error("poisson", estimate, [half_step], []).ci95 or (0, 0)
+    low, high = numerical_error("poisson", estimate, [half_step], []).interval95 or (0, 0)
     assert low < value + 4 / 3 * (half_step - value) < high
     assert high - low == pytest.approx(0.08, rel=0.1)
 
 
 def test_an_estimate_without_an_interval_gets_none():
-    assert numerical_error("mu_pa", Estimate(100.0), [101.0], [99.0]).ci95 is None
+    assert numerical_error("mu_pa", Estimate(100.0), [101.0], [99.0]).interval95 is None
 
 
 # On problems
@@ -94,7 +97,8 @@ def coarse() -> Problem:
     experiment = measured(hung_cube(16, divisions=(1, 1, 2)), substeps=4)
     sigma_m = np.full(len(experiment.markers.names), 1e-5)
     seen = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m))
-    return Problem([seen], Parameters(tuple(items)), substeps=1)
+    exact = UncertaintyOptions(assumptions=Assumptions.exact())
+    return Problem([seen], Parameters(tuple(items)), substeps=1, uncertainty=exact)
 
 
 @pytest.fixture(scope="module")
@@ -145,18 +149,22 @@ def test_roll_outs_that_are_no_finer_tell_nothing():
 
 
 def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
-    assert any(reason.startswith("the step moves") for reason in answer.trust.reasons)
-    estimates = {"mu_pa": Estimate(100.0, 1.0, (98, 102))}
+    assert any(
+        reason.startswith("the estimated time-step error dominates")
+        for reason in answer.trust.reasons
+    )
+    optimum = {"mu_pa": Estimate(100.0, 1.0, (98, 102))}
+    combined = {"mu_pa": 1.0}
 
     def concerns(half_step_pa: float) -> list:
-        error = numerical_error("mu_pa", estimates["mu_pa"], [half_step_pa], [])
-        return numerical_concerns(estimates, Refinement({"mu_pa": error}))
+        error = numerical_error("mu_pa", optimum["mu_pa"], [half_step_pa], [])
+        return numerical_concerns(optimum, combined, Refinement({"mu_pa": error}))
 
     assert concerns(101.4) == []
-    assert numerical_concerns(estimates, None) == []
+    assert numerical_concerns(optimum, combined, None) == []
     (found,) = concerns(97.77)
     assert (found.code, found.grade) == ("scheme/step", "check")
-    assert "mu_pa by +3 %, 3 standard errors" in found.sentence
+    assert "corrected by -3 %, 3 standard uncertainties" in found.sentence
 
 
 def test_other_numbers_of_levels_are_refused(answer):
@@ -177,13 +185,17 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
     after = json.loads((folder / "result.json").read_text())
     kept = json.loads((folder / "refinement.json").read_text())
     for name, found in after["parameters"].items():
-        assert found["value"] == before["parameters"][name]["value"]
+        assert found["optimum"] == before["parameters"][name]["optimum"]
         if not found["fixed"] and not found["at_bound"]:
             assert found["numerical_error"] == kept["errors"][name]
-            assert found["ci95"] == kept["errors"][name]["ci95"]
-            assert found["ci95_holds"] == ["noise", "step", "mesh"]
-            assert found["ci95_noise"] == before["parameters"][name]["ci95_noise"]
-            assert before["parameters"][name]["ci95_holds"] == ["noise", "step"]
+            corrected = max(kept["errors"][name]["extrapolated"], LOWER[name])
+            assert found["value"] == pytest.approx(corrected)
+            low, high = found["combined95"]
+            least, most = kept["errors"][name]["interval95"]
+            assert low <= max(least, LOWER[name]) <= found["value"] < most <= high
+            assert sum(after["budget"][name].values()) == pytest.approx(1.0)
+            assert found["numerical_error"]["mesh"] is not None
+            assert before["parameters"][name]["numerical_error"]["mesh"] is None
     rows = {level["halved"]: level["timesteps"] for level in kept["levels"]}
     assert rows == {"step": 4 * 8 + 1, "mesh": 2 * 8 + 1}
     assert run_command("report", folder).code == 0
@@ -219,7 +231,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeyp
     assert both["levels"][0] == kept["levels"][0]
     assert [level["halved"] for level in both["levels"]] == ["step", "mesh"]
     told = json.loads((folder / "result.json").read_text())["parameters"]["mu_pa"]
-    assert told["ci95_holds"] == ["noise", "step", "mesh"]
+    assert told["numerical_error"]["mesh"] is not None
 
 
 def test_a_problem_may_ask_for_it(tmp_path):

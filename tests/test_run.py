@@ -88,7 +88,10 @@ def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(fi
 def test_the_material_is_found_within_its_error_bars(finished):
     for name, truth in TRUTH.items():
         estimate = finished.uncertainty.estimates[name]
-        assert abs(np.log(estimate.value / truth)) < 4 * estimate.std_error / estimate.value
+        assert (
+            abs(np.log(estimate.value / truth))
+            < 4 * estimate.statistical_std_error / estimate.value
+        )
 
 
 def test_the_result_says_what_its_error_bars_are_based_on(finished):
@@ -112,7 +115,7 @@ def test_a_result_is_read_as_it_was_written(finished):
         (("fit",), [1]),
         (("converged",), "yes"),
         (("parameters", "mu_pa", "value"), "x"),
-        (("parameters", "mu_pa", "ci95"), [1.0]),
+        (("parameters", "mu_pa", "statistical95"), [1.0]),
         (("trust", "concerns"), [{"code": "noise/larger", "grade": "fine", "data": {}}]),
         (("history",), [{"iteration": 1}]),
         (("iterations",), 1.5),
@@ -139,7 +142,9 @@ def test_a_profile_agrees_with_the_error_bar_where_the_loss_is_round(finished):
     solution, uncertainty = finished.solution, finished.uncertainty
     fit = linearised_fit(solution.collocation, solution.z)
     profile = profile_of(solution, fit, uncertainty, "mu_pa")
-    np.testing.assert_allclose(profile.interval, uncertainty.estimates["mu_pa"].ci95, rtol=0.01)
+    np.testing.assert_allclose(
+        profile.interval, uncertainty.estimates["mu_pa"].statistical95, rtol=0.01
+    )
     best = profile.values[np.argmin(profile.losses)]
     assert best == pytest.approx(solution.parameters["mu_pa"])
 
@@ -163,7 +168,8 @@ def test_a_profile_counts_the_prior_of_its_parameter(finished):
     assert lower is not None
     assert np.log(upper / lower) == pytest.approx(4 * 1e-3, rel=0.1)
     assert np.log(upper / lower) < np.log(
-        uncertainty.estimates["mu_pa"].ci95[1] / uncertainty.estimates["mu_pa"].ci95[0]
+        uncertainty.estimates["mu_pa"].statistical95[1]
+        / uncertainty.estimates["mu_pa"].statistical95[0]
     )
 
 
@@ -216,7 +222,7 @@ def test_what_the_data_do_not_tell_has_no_error_bar(tmp_path):
     outcome = run_command("solve", file, *REDUCED, *sigma, "--json", "--out", folder / "run")
     found = json.loads(outcome.out)
     poisson = found["parameters"]["poisson"]
-    assert poisson["std_error"] is None
+    assert poisson["statistical_std_error"] is None
     assert poisson["reason"]
     said = [sentence for sentence in found["uncertainty"]["verdicts"] if "poisson" in sentence]
     assert any("not identifiable" in s or "ended at its lower bound" in s for s in said)

@@ -97,7 +97,7 @@ def test_it_is_said_before_the_solve_and_in_the_verdict():
     finished = run(found, seek_causes=False)
     assert finished.trust.verdict == "doubtful"
     assert any(said in reason for reason in finished.trust.reasons)
-    assert all(finished.estimates[name].std_error is None for name in NAMES)
+    assert all(finished.estimates[name].statistical_std_error is None for name in NAMES)
 
 
 def test_where_a_mass_sets_the_scale_the_density_is_found_and_nothing_said():

@@ -351,5 +351,5 @@ def test_a_linear_constant_without_a_guess_gets_an_error_bar():
     found = run(Problem([bench], still), seek_causes=False)
     estimate = found.estimates["mu_pa"]
     assert estimate.value == pytest.approx(300.0, rel=1e-6)
-    assert estimate.std_error is not None
-    assert 0 < estimate.std_error < 10.0
+    assert estimate.statistical_std_error is not None
+    assert 0 < estimate.statistical_std_error < 10.0

@@ -89,7 +89,7 @@ def test_widened_intervals_hold_the_truth_as_often_as_they_say():
     held = []
     for seed in range(SEEDS):
         found = judged(seed, spread=SPREAD)
-        low, high = found.estimates["mu_pa"].ci95 or (0, 0)
+        low, high = found.estimates["mu_pa"].statistical95 or (0, 0)
         held.append(low < 1.0 < high)
     assert np.sum(held) >= binom.ppf(1e-3, SEEDS, 0.95)
 

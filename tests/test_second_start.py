@@ -19,7 +19,7 @@ TRUTH = {"young_pa": 600.0, "poisson": 0.46, **KNOWN}
 def answer(*free: str) -> cs.Solution:
     """That of a cube with a Poisson's ratio near one half, of which only some numbers are free."""
     swung = hung_cube()
-    tracks_m = cs.simulate(swung, TRUTH, "midpoint").markers_m
+    tracks_m = cs.simulate(swung, TRUTH, "midpoint", substeps=1).markers_m
     estimated = {name: cs.Unknown(TRUTH[name]) for name in free}
     return cs.solve(cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated}))
 

@@ -49,7 +49,7 @@ def relative_errors(result: dict, truth: dict) -> np.ndarray:
 def test_foam_cylinder_errors_are_consistent_with_the_noise(method: str, tmp_path: Path):
     result = solved(PROBLEMS / "foam_cylinder" / "problem.toml", tmp_path / "run", method)
     assert result["status"] == "converged"
-    deviations = np.array([result["parameters"][name]["std_error"] for name in FOAM])
+    deviations = np.array([result["parameters"][name]["statistical_std_error"] for name in FOAM])
     errors = relative_errors(result, FOAM) * list(FOAM.values())
     assert np.abs(errors / deviations).max() < 3.5
     # 0.5 mm a coordinate, three coordinates
@@ -89,9 +89,9 @@ def test_a_wrist_sensor_tells_stiffness_and_density_apart(felt: bool):
     if felt:
         for name, true in WRIST.items():
             found = estimates[name]
-            assert abs(found.value - true) < 2.6 * found.std_error < 0.02 * true, name
+            assert abs(found.value - true) < 2.6 * found.statistical_std_error < 0.02 * true, name
         return
-    assert {estimates[name].std_error for name in WRIST} == {None}
+    assert {estimates[name].statistical_std_error for name in WRIST} == {None}
     ratio = estimates["young_pa"].value / estimates["density_kg_m3"].value
     assert ratio == pytest.approx(WRIST["young_pa"] / WRIST["density_kg_m3"], rel=0.03)
     assert finished.trust.verdict == "doubtful"
@@ -106,7 +106,7 @@ def test_a_poked_block_tells_its_stiffness_though_nobody_knows_where_it_begins()
     finished = run(problem, seek_causes=False)
     assert finished.solution.status.converged
     assert {each.code for each in finished.trust.concerns} == {"contact/coarse"}
-    low, high = finished.result.parameters["young_pa"].ci95
+    low, high = finished.result.parameters["young_pa"].statistical95
     assert low < 2e4 < high
     assert high - low < 0.05 * 2e4 / np.sqrt(12)  # of one place 5 %
 

@@ -256,8 +256,8 @@ def test_a_static_problem_tells_nothing_of_damping_before_and_after():
         "'block' is static: no information on damping; fix gamma_r_s and"
     )
     found = run(problem, seek_causes=False)
-    assert found.estimates["gamma_r_s"].std_error is None
-    assert "these data do not tell gamma_r_s and gamma_m_1_s" in found.trust.reasons
+    assert found.estimates["gamma_r_s"].statistical_std_error is None
+    assert "the data do not determine gamma_r_s and gamma_m_1_s" in found.trust.reasons
     assert isinstance(found.rollouts["block"], Rollout)
     assert found.rollouts["block"].rms_m == pytest.approx(found.solution.rms_m, rel=1e-6)
 

@@ -67,11 +67,11 @@ def test_a_damping_of_which_nothing_is_known_did_not_end_at_its_bound(guess):
     found = run(Problem([hanging()], Parameters(items)))
     estimate = found.estimates["gamma_r_s"]
     assert not estimate.at_bound
-    assert estimate.ci95 is None
+    assert estimate.statistical95 is None
     assert estimate.reason == "the data do not determine it"
     assert any(
         n.startswith("gamma_r_s is not determined: no information on damping")
         for n in found.all_notes
     )
     assert not any("ended at its" in said for said in (*found.all_notes, *found.trust.reasons))
-    assert found.estimates["mu_pa"].std_error is not None
+    assert found.estimates["mu_pa"].statistical_std_error is not None

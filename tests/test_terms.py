@@ -111,7 +111,7 @@ def test_error_bars_of_regions_follow_the_noise(rng):
     assert set(found.derived) >= {"young_pa", "stiff.young_pa"}
     for name in guesses:
         error = solution.parameters[name] - truth[name]
-        deviation = found.estimates[name].std_error
+        deviation = found.estimates[name].statistical_std_error
         assert deviation is not None
         assert abs(error) < 4 * deviation
 

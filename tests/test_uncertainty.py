@@ -215,8 +215,8 @@ def test_error_bars_are_relative_in_the_logarithm():
     for name, variance in zip(NAMES, np.diag(uncertainty.covariance), strict=True):
         estimate = uncertainty.estimates[name]
         assert estimate.value == pytest.approx(TRUTH[name])
-        assert estimate.std_error == pytest.approx(TRUTH[name] * np.sqrt(variance))
-        assert np.log(estimate.ci95) - np.log(TRUTH[name]) == pytest.approx(
+        assert estimate.statistical_std_error == pytest.approx(TRUTH[name] * np.sqrt(variance))
+        assert np.log(estimate.statistical95) - np.log(TRUTH[name]) == pytest.approx(
             1.96 * np.sqrt(variance) * np.array([-1, 1]), rel=1e-4
         )
     deviations = np.sqrt(np.diag(uncertainty.covariance))
@@ -287,15 +287,15 @@ def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs(
     expected = covariance(*simulated([experiment]))
     at_bound = uncertainty.estimates["lambda_pa"]
     assert at_bound.at_bound
-    assert at_bound.std_error is None
-    assert at_bound.ci95 is None
+    assert at_bound.statistical_std_error is None
+    assert at_bound.statistical95 is None
     np.testing.assert_allclose(uncertainty.covariance[1:, 1:], expected.covariance[1:, 1:])
     assert np.isnan(uncertainty.covariance[0]).all()
     assert np.isnan(uncertainty.correlation[0]).all()
     assert not uncertainty.estimates["mu_pa"].at_bound
     assert uncertainty.degrees_of_freedom == expected.degrees_of_freedom
     assert uncertainty.derived["poisson"].at_bound
-    assert uncertainty.derived["poisson"].std_error is None
+    assert uncertainty.derived["poisson"].statistical_std_error is None
     assert uncertainty.derived["poisson"].reason
     assert any("lambda_pa ended at its upper bound 200" in note for note in uncertainty.notes)
 
@@ -306,10 +306,10 @@ def test_fixed_parameters_have_no_error_bar():
     uncertainty = covariance(*simulated([experiment], fixed))
     assert uncertainty.names == NAMES[:3]
     assert uncertainty.estimates["gamma_m_1_s"].value == 1.0
-    assert uncertainty.estimates["gamma_m_1_s"].std_error is None
+    assert uncertainty.estimates["gamma_m_1_s"].statistical_std_error is None
     everything = changed(AT_TRUTH, **{name: {"fixed": True} for name in NAMES})
     known = covariance(*simulated([experiment], everything))
-    assert known.derived["young_pa"].std_error is None
+    assert known.derived["young_pa"].statistical_std_error is None
     assert known.derived["young_pa"].value == pytest.approx(720.0)
 
 
@@ -318,9 +318,9 @@ def test_damping_of_a_body_at_rest_is_reported_as_undetermined():
     still = replace(moving, grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),))
     uncertainty = covariance(*simulated([measured(still)]))
     assert np.isinf(np.diag(uncertainty.covariance)).tolist() == [False, False, True, True]
-    assert uncertainty.estimates["gamma_r_s"].std_error is None
-    assert uncertainty.estimates["mu_pa"].std_error is not None
-    assert uncertainty.derived["young_pa"].std_error is not None
+    assert uncertainty.estimates["gamma_r_s"].statistical_std_error is None
+    assert uncertainty.estimates["mu_pa"].statistical_std_error is not None
+    assert uncertainty.derived["young_pa"].statistical_std_error is not None
     silent = [note for note in uncertainty.notes if "no information on damping" in note]
     assert [note.split()[0] for note in silent] == ["gamma_r_s", "gamma_m_1_s"]
 
@@ -335,14 +335,20 @@ def test_derived_error_bars_are_those_of_a_fit_in_the_other_convention():
     for derived, direct in ((lame, young), (young, lame)):
         for name, estimate in derived.derived.items():
             assert estimate.value == pytest.approx(direct.estimates[name].value)
-            assert estimate.std_error == pytest.approx(direct.estimates[name].std_error, rel=1e-6)
-    assert lame.derived["young_pa"].ci95 == pytest.approx(young.estimates["young_pa"].ci95)
-    assert young.derived["mu_pa"].ci95 == pytest.approx(lame.estimates["mu_pa"].ci95)
+            assert estimate.statistical_std_error == pytest.approx(
+                direct.estimates[name].statistical_std_error, rel=1e-6
+            )
+    assert lame.derived["young_pa"].statistical95 == pytest.approx(
+        young.estimates["young_pa"].statistical95
+    )
+    assert young.derived["mu_pa"].statistical95 == pytest.approx(
+        lame.estimates["mu_pa"].statistical95
+    )
 
 
 def test_the_interval_of_poisson_stays_physical():
     collocation, z = simulated([with_sigma(measured(hung_cube()), 0.03)])
-    low, high = covariance(collocation, z).derived["poisson"].ci95 or (0.0, 0.0)
+    low, high = covariance(collocation, z).derived["poisson"].statistical95 or (0.0, 0.0)
     assert 0 < low < 0.2 < high < 0.5
 
 
@@ -350,9 +356,9 @@ def test_an_interval_too_wide_to_be_of_use_has_no_standard_error():
     collocation, z = simulated([measured(hung_cube())])  # sigma of 1 mm: too much for γ_m
     uncertainty = covariance(collocation, z)
     estimate = uncertainty.estimates["gamma_m_1_s"]
-    assert estimate.std_error is None
-    assert estimate.ci95 is not None
-    assert estimate.ci95[1] > 10 * estimate.ci95[0]
+    assert estimate.statistical_std_error is None
+    assert estimate.statistical95 is not None
+    assert estimate.statistical95[1] > 10 * estimate.statistical95[0]
     assert "factor of 10" in (estimate.reason or "")
     assert any(n.startswith("gamma_m_1_s is not identifiable") for n in uncertainty.notes)
-    assert uncertainty.estimates["mu_pa"].std_error is not None
+    assert uncertainty.estimates["mu_pa"].statistical_std_error is not None

@@ -37,7 +37,7 @@ def swung(seed: int = 0, nuisance: Nuisance | None = None, steps: int = 40) -> E
     """The cube swung for a while, seen and felt with noise, all by the midpoint rule."""
     rng = np.random.default_rng(seed)
     cube = sensing(replace(hung_cube(steps), nuisance=nuisance or Nuisance.none()), frame="grasp")
-    found = simulate(cube, TRUTH, "midpoint")
+    found = simulate(cube, TRUTH, "midpoint", substeps=1)
     tracks = found.markers_m + NOISE_M * rng.normal(size=found.markers_m.shape)
     noise = np.repeat([SIGMA_N, SIGMA_NM], 3)
     wrenches = [values + noise * rng.normal(size=values.shape) for values in found.wrenches]
@@ -69,7 +69,7 @@ def test_a_sensor_improves_what_is_known_of_the_stiffness():
         solution = ReducedSpace()(collocation)
         found = covariance(collocation, solution.z)
         (young,) = (found.derived[n] for n in found.derived if n.startswith("young"))
-        deviations[name] = young.std_error
+        deviations[name] = young.statistical_std_error
     assert deviations["felt"] < 0.8 * deviations["only seen"]
 
 
@@ -113,7 +113,7 @@ def test_tare_clock_lag_and_tool_are_found():
     true[["mass of the tool" in name for name in names]] = 0.012
     true[["centre of the tool" in name for name in names]] = (0.0, 0.01, -0.005)
     phi = true / scales
-    made = simulate(swung(0, wanted, 60), TRUTH, "midpoint")
+    made = simulate(swung(0, wanted, 60), TRUTH, "midpoint", substeps=1)
     grid, forced = made.reactions
     (sensor,) = segment.sensors
     read = sensor.on(grid).of_forced(forced, phi)
@@ -192,7 +192,7 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     fit = linearised_fit(collocation, solution.z)
     found = uncertainty_of(fit, felt.parameters, solution.q).estimates
     for name, true in {**TRUTH, "density_kg_m3": 30.0}.items():
-        assert abs(found[name].value - true) < 4 * found[name].std_error, name
+        assert abs(found[name].value - true) < 4 * found[name].statistical_std_error, name
     # The error bars are those of the slopes that the search has.
     p, x = collocation.unpack(solution.z)
     point = Horizon(collocation, [len(x[0])]).evaluate(p, x)
@@ -200,7 +200,7 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     np.testing.assert_allclose(rows.T @ rows, point.fit.information, rtol=1e-6)
     seen = Problem([blind(swung())], unknown)
     told = covariance(seen.collocation(), seen.collocation().pack(p, x)).estimates
-    assert told["density_kg_m3"].std_error is None
+    assert told["density_kg_m3"].statistical_std_error is None
 
 
 def test_equilibria_under_gravity_tell_the_density_too():

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from ..errors import SimulationError
 from ..files import require_possible, run_name
 from ..methods import require_method
 from ..methods.solution import Status
@@ -128,12 +129,28 @@ def simulate(options: Simulate) -> None:
     problem = options.read(simulation=True)
     require_possible(options.out)
     with Progress(errors, problem, quiet=options.quiet) as progress:
-        written = write_data(problem, options.out, options.recipe, progress.share)
+        try:
+            written = write_data(problem, options.out, options.recipe, progress.share)
+        except SimulationError as error:
+            if error.lost_stability is not None:
+                _draw_instability(error, options.out)
+            raise
     if options.as_json:
         typer.echo(json.dumps([str(file) for file in written]))
     else:
         for file in written:
             typer.echo(file)
+
+
+def _draw_instability(error: SimulationError, folder: Path) -> None:
+    """Write a picture of the mode in which the body loses its stability into the folder."""
+    from ..result.pictures.instability import instability_picture
+    from ..result.style import RESOLUTION_DPI
+
+    file = folder / "instability.png"
+    folder.mkdir(parents=True, exist_ok=True)
+    instability_picture(error.lost_stability).savefig(file, dpi=RESOLUTION_DPI)
+    errors.print(f"the mode is drawn in {file}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,7 +52,7 @@ def refine(options: Refine) -> None:
     except KeyboardInterrupt:
         raise interrupted(f"what was solved is kept in {options.run_folder}") from None
     told = {**content(refinement), "trust": result.trust}
-    options.tell(told, [refinement_table(refinement.errors), verdict_of(result.trust)])
+    options.tell(told, [refinement_table(result), verdict_of(result.trust)])
 
 
 @dataclass(frozen=True, kw_only=True)

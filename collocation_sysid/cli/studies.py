@@ -24,7 +24,7 @@ from ..plan import (
 )
 from ..plan.arguments import parse_methods, parse_over, read_truth
 from ..plan.table import Yardstick
-from ..plan.variants import models, parse_branches, parse_materials
+from ..plan.variants import models, parse_branches, parse_dampings, parse_materials
 from ..problem import Problem
 from .common import errors, interrupted, show
 from .options import OfProblem, Out, Told, command
@@ -57,10 +57,13 @@ class Compare(Many):
         Methods to compare, each with its options in the file.
     materials : A,B,…
         Materials to compare, in place of the object's.
+    damping : A,B,…
+        Laws of damping to compare, in place of the object's.
     prony : 0,1,…
         Numbers of viscoelastic branches to compare.
     region : NAME
-        The region that has these materials and branches; by default the whole body.
+        The region that has these materials, laws of damping and branches; by default the whole
+        body.
     with_ : FILE
         Another problem file of the same recordings, as a model.
     truth : FILE|NAME=VALUE
@@ -71,6 +74,7 @@ class Compare(Many):
 
     methods: str | None = None
     materials: str | None = None
+    damping: str | None = None
     prony: str | None = None
     region: str | None = None
     with_: list[Path] | None = None
@@ -84,24 +88,27 @@ class Compare(Many):
     "compare problem.toml --methods reduced-space,shooting --starts 40",
     "compare problem.toml --methods penalty,shooting --truth truth.toml",
     "compare problem.toml --materials neo-hookean,yeoh",
+    "compare problem.toml --damping kelvin-voigt,material,rayleigh",
 )
 def compare(options: Compare) -> None:
     """Compare methods from many starts, or fit several models and say which to use.
 
-    With --materials, --prony or --with each model is fitted to all recordings, and to all but each
-    of them, which it then predicts; of one recording the last third is held out. In a body with
-    regions all of it has the model, or --region. --with takes other problem files as models, each
-    with all of the materials and numbers of branches.
+    With --materials, --damping, --prony or --with each model is fitted to all recordings, and to
+    all but each of them, which it then predicts; of one recording the last third is held out. In a
+    body with regions all of it has the model, or --region. --with takes other problem files as
+    models, each with all of the materials, laws of damping and numbers of branches.
 
     Finished runs are kept in the output folder: the same command resumes.
     """
     methods = parse_methods(options.methods) if options.methods is not None else ()
     problem = options.read()
-    if options.with_ or options.materials is not None or options.prony is not None:
+    if options.with_ or {options.materials, options.damping, options.prony} != {None}:
         _study("models", options, _planned_models(options, problem, methods))
         return
     if not methods:
-        raise InputError("nothing to compare; expected --methods, --materials, --prony or --with")
+        raise InputError(
+            "nothing to compare; expected --methods, --materials, --damping, --prony or --with"
+        )
     free = [item.name for item in problem.parameters.free]
     truth = read_truth(options.truth or (), problem.parameters.names, free)
     yardstick, changes = Yardstick(truth, options.within), (options.set_ or (), options.starts)
@@ -112,19 +119,26 @@ def compare(options: Compare) -> None:
 def _planned_models(
     options: Compare, problem: Problem, methods: Sequence[str]
 ) -> Sequence[PlannedRun]:
-    """The runs that compare models: materials and branches, of a region, or whole files."""
+    """Return the runs that compare models: laws and branches, of a region, or whole files."""
     if len(methods) > 1:
         raise InputError(
             f"found {', '.join(methods)}; expected one method to compare models by, or methods "
-            "without --materials and --prony",
+            "without --materials, --damping and --prony",
             None,
             "--methods",
         )
     others = [replace(options, problem=file).read() for file in options.with_ or ()]
     materials = parse_materials(options.materials) if options.materials is not None else ()
+    dampings = parse_dampings(options.damping) if options.damping is not None else ()
     branches = parse_branches(options.prony) if options.prony is not None else ()
-    overrides, region = options.set_ or (), options.region
-    variants = models([problem, *others], overrides, materials, branches, region)
+    variants = models(
+        [problem, *others],
+        options.set_ or (),
+        materials,
+        branches,
+        region=options.region,
+        dampings=dampings,
+    )
     for variant in variants:  # a model that cannot be would fail every run
         Problem.read(variant.path, variant.overrides, options.allow_code)
     return plan_models(problem, variants, methods[0] if methods else None, options.allow_code)

@@ -20,13 +20,15 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import accumulate
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from ..errors import InputError
+from .air import placed_unit_drag
 from .constants import DENSITY, Constant
 from .discretisation import Discretisation
 from .field import Field, FieldModes
@@ -36,6 +38,7 @@ from .mesh import TetMesh
 from .node_force import NodeForce, PlacedForce
 from .pattern import Joined, SymmetricPattern
 from .regions import BodyPart, Model, Region, Theta, parts_of
+from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
 from .selection import Selection
 from .stress import Stresses
 from .two_phase import PhaseSamples, TwoPhaseModes
@@ -113,6 +116,10 @@ class Body(Discretisation):
         Of the user's own, on its nodes, such as the drag of the air.
     field : Field, optional
         A constant that differs from place to place within what no region claims.
+    rest_shape : UnderGravity or "stress_free", optional
+        How the body was held while its mesh was made: the stress-free shape is then found, see
+        `rest_shape`. "stress_free": the mesh is. By default it counts as such, but the budget of
+        the intervals includes that it may be a shape under gravity.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
         for a material that vector code cannot evaluate.
@@ -136,8 +143,8 @@ class Body(Discretisation):
     Raises
     ------
     InputError
-        For unknown names, a mass that is not positive, regions that overlap, or a material that
-        "simd" cannot evaluate.
+        For unknown names, a mass that is not positive, regions that overlap, a material that
+        "simd" cannot evaluate, or a scan of a body with memory or a field.
     """
 
     def __init__(
@@ -153,10 +160,22 @@ class Body(Discretisation):
         prony: Sequence[str | Prony] = (),
         forces: Sequence[NodeForce] = (),
         field: Field | None = None,
+        rest_shape: UnderGravity | Literal["stress_free"] | None = None,
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
         parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony, field)
+        generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
+        self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
+            generated if rest_shape is None else rest_shape
+        )
+        if rest_shape not in (None, "stress_free") and not isinstance(rest_shape, UnderGravity):
+            raise InputError(
+                f"found {rest_shape!r}; expected 'stress_free' or UnderGravity(nodes, gravity)",
+                where="rest_shape",
+            )
+        if self.scan is not None:
+            require_supported(parts)
         super().__init__(parts, tuple(forces), mesh, element, evaluator, threads)
         # (3n,) of each part.
         self._lumped_m3 = [np.repeat(self._lumped(part), 3) for part in self.parts]
@@ -169,6 +188,73 @@ class Body(Discretisation):
             f"Body({len(self.nodes_m)} nodes, {len(self.cells)} {self.element.name}, "
             f"{self.mass_kg:.4g} kg, {materials})"
         )
+
+    @property
+    def scan(self) -> UnderGravity | None:
+        """How the body was held while its mesh was made, where that is stated."""
+        return self.rest_shape if isinstance(self.rest_shape, UnderGravity) else None
+
+    @cached_property
+    def inverse(self) -> InverseEquilibrium | None:
+        """Solver of the stress-free shape; none where the mesh is free of stress."""
+        return None if self.scan is None else InverseEquilibrium(self)
+
+    def unreachable(self, theta: Theta) -> str | None:
+        """Return why there is no stress-free shape at θ and what helps, None where there is one."""
+        if self.inverse is None:
+            return None
+        try:
+            self.inverse.shape(theta)
+        except RestShapeError as error:
+            return error.message
+        return None
+
+    def stress_free_geometry(self, theta: Theta) -> Array:
+        """Return shape gradients and volumes (E, q, 3·nodes + 1) in the stress-free shape at θ."""
+        if self.inverse is None:
+            return self.geometry
+        return self._geometry_at(self.inverse.shape(theta).positions_m)
+
+    def with_stress_free(self, positions_m: Array) -> Body:
+        """Return the same body, free of stress where its nodes are at (n, 3), of the same mass."""
+        other = copy(self)
+        other.geometry = self._geometry_at(positions_m)
+        other.rest_shape = "stress_free"
+        for name in ("inverse", "stresses"):
+            vars(other).pop(name, None)
+        other._evaluators, other._framed = {}, {}
+        return other
+
+    def _geometry_at(self, positions_m: Array) -> Array:
+        """Shape gradients and volumes where nodes are at (n, 3) instead of where the mesh is."""
+        count, points = self.geometry.shape[:2]
+        slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
+        G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
+        own = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(count, points, -1)
+        volumes = self.geometry[..., -1:] * np.linalg.det(G)[..., None]
+        return np.concatenate([own, volumes], axis=2)
+
+    def stress_free_mesh(self, theta: Theta) -> TetMesh:
+        """Return the mesh in its stress-free shape at θ (k,), with straight sides.
+
+        Raises
+        ------
+        RestShapeError
+            If there is none whose equilibrium under gravity is the mesh.
+        """
+        if self.inverse is None:
+            return self.mesh
+        positions_m = self.inverse.shape(theta).positions_m[: len(self.mesh.points_m)]
+        mesh = self.mesh
+        return TetMesh(
+            positions_m, mesh.tetrahedra, mesh.point_arrays, mesh.cell_arrays, mesh.face_sets
+        )
+
+    @property
+    def density_places(self) -> list[int]:
+        """Where in θ the densities that are free are."""
+        pairs = zip(self.parts, self._gamma_places, strict=True)
+        return [place + 1 for part, place in pairs if part.free_density]
 
     def __getstate__(self) -> dict[str, Any]:
         # Kernels are of this process, and what follows from the rest is found anew.
@@ -233,7 +319,7 @@ class Body(Discretisation):
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
         """The same body, whose parts of the same cells have other constants."""
         other = copy(self)
-        for name in self._following - {"pattern", "_shape_slopes", "part_of_cells"}:
+        for name in self._following - {"pattern", "shape_gradients", "part_of_cells"}:
             vars(other).pop(name, None)
         Model.__init__(other, parts, self.forces, self.frictions)
         other._evaluators, other._framed = {}, {}
@@ -244,8 +330,8 @@ class Body(Discretisation):
     ) -> Body:
         """The same body and frames of so many obstacles: four nodes each that no cell has.
 
-        They are at `frame_m`, behind all others. `rubs` is whether any has friction, and
-        `frictions` are the coefficients that are parameters.
+        They are at `frame_m`, behind all others. `rubs` is whether slopes of contact have
+        a skew part, and `frictions` are the coefficients that are parameters.
         """
         key = count, rubs, frictions
         if key == (len(self.frames), self.rubs, self.frictions):
@@ -368,6 +454,11 @@ class Body(Discretisation):
             found.append(PlacedForce.on(force, self.nodes, chosen, volume, columns))
         return tuple(found)
 
+    @cached_property
+    def unit_air_drag(self) -> PlacedForce:
+        """Drag on the surface in a fluid of density one, see `air`."""
+        return placed_unit_drag(self.nodes, self.dof_volume_m3[::3])
+
     @property
     def dof_volume_m3(self) -> Array:
         """(3n,) lumped volume of every degree of freedom."""
@@ -466,7 +557,8 @@ class Body(Discretisation):
             slopes = spread.field.slopes(np.asarray(theta)[here])
             spread.nodal(own["by_theta"], slopes, by_theta[:, :, here])
         for column, slope in self._drag_slopes(theta, tied_kg):
-            by_theta[:, :, column] = -slope * v
+            # A density also changes the stress-free shape of a mesh made under gravity.
+            by_theta[:, :, column] += -slope * v
         self._spread_stiffening(by_theta, carried)
         return Linearisation(force, by_position, by_velocity, by_theta, skew, skew[:, :0])
 
@@ -523,8 +615,9 @@ class Body(Discretisation):
         )
         x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
         for column, slope in self._drag_slopes(theta, tied_kg):
-            v_theta[:, :, column] = -slope * w
-            by_theta[:, column] = np.einsum("ti,ti->t", v_theta[:, :, column], v)
+            drag = -slope * w
+            v_theta[:, :, column] += drag
+            by_theta[:, column] += np.einsum("ti,ti->t", drag, v)
         theta_theta = theta_theta.reshape(len(x), k, k)
         for number, own in self._of_fields("curvature", rows):
             here, spread = self.mode_places[number], self.spreads[number]

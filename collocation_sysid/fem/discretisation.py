@@ -21,6 +21,7 @@ from .mesh import Nodes, TetMesh
 from .node_force import NodeForce
 from .pattern import SymmetricPattern, dofs_of, element_destinations, in_ascending_order
 from .regions import BodyPart, Model, Theta
+from .rest_shape import InverseEquilibrium
 from .selection import Selection
 
 # The outputs that have columns for θ: one more, cell by cell, for the logarithm of a field.
@@ -109,10 +110,33 @@ class Discretisation(Model):
         """What the points of a part obey."""
         part = self.parts[number]
         scaled = part.field.scaled if part.field else ()
-        return Law(part.material, part.damping, memory, scaled)
+        rest = self.inverse.layout if self.inverse else None
+        return Law(part.material, part.damping, memory, scaled, rest)
 
-    def brought(self, number: int, theta: Theta, carried: Array | None = None) -> Array | None:
-        """What the points of a part carry (T, any), then the logarithms of its field."""
+    @cached_property
+    def inverse(self) -> InverseEquilibrium | None:
+        """Solver of the stress-free shape; none where the mesh is free of stress."""
+        return None
+
+    def point_constants(self, number: int, theta: Theta) -> Array:
+        """Return what θ gives the points of a part.
+
+        With a stress-free shape, the changes of its inputs follow: zero, as it is solved at θ.
+        """
+        own = np.asarray(self.split(theta)[number], dtype=float)[: self.parts[number].of_points]
+        changes = np.zeros(self.inverse.layout.inputs if self.inverse else 0)
+        return np.concatenate([own, changes])
+
+    def brought(
+        self, number: int, theta: Theta, carried: Array | None = None, second: bool = False
+    ) -> Array | None:
+        """Return what the points of a part carry (T, any), then the logarithms of its field.
+
+        Of a stress-free shape that is not the mesh its data (1, any) at θ, if `second` with second
+        derivatives; such a body has neither memory nor field.
+        """
+        if self.inverse is not None:
+            return self.inverse.point_data(theta, second)[number]
         field = self.parts[number].stress_field
         if field is None:
             return carried
@@ -127,12 +151,12 @@ class Discretisation(Model):
         found = {}
         for number, part in enumerate(self.parts):
             if part.stress_field is not None:
-                cells, _ = self._laid_out(part)
+                cells, _ = self.laid_out(part)
                 found[number] = Spread(part.stress_field, dofs_of(cells), self.pattern.size)
         return found
 
-    def _laid_out(self, part: BodyPart) -> tuple[Index, Array]:
-        """Elements of a part, and their geometry, as its kernels have them."""
+    def laid_out(self, part: BodyPart) -> tuple[Index, Array]:
+        """Return the elements of a part and their geometry, as its kernels have them."""
         cells, geometry = self.cells[part.cells], self.geometry[part.cells]
         if part.damping.stress is None:
             return cells, geometry
@@ -194,7 +218,7 @@ class Discretisation(Model):
         nodes, (count, points) = len(self.nodes_m), self.geometry.shape[:2]
         x = self._states(positions)[0].reshape(-1, nodes, 3)
         by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
-        slopes = (self._shape_slopes @ by_node).reshape(3, count * points, 3, len(x))
+        slopes = (self.shape_gradients @ by_node).reshape(3, count * points, 3, len(x))
         a, b, c = slopes.transpose(0, 2, 1, 3)
         ratios = (
             a[0] * (b[1] * c[2] - b[2] * c[1])
@@ -204,8 +228,8 @@ class Discretisation(Model):
         return ratios.reshape(count, points, -1).transpose(2, 0, 1)
 
     @cached_property
-    def _shape_slopes(self) -> sp.csr_array:
-        """Slopes along each axis, at every quadrature point, of what has values at the nodes."""
+    def shape_gradients(self) -> sp.csr_array:
+        """Derivatives of the shape functions (3 E q, n), axis by axis at all quadrature points."""
         count, points = self.geometry.shape[:2]
         gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
         values = np.moveaxis(gradients, 3, 0)
@@ -259,11 +283,11 @@ class Discretisation(Model):
             out = np.empty(shape)
         elif out.shape != shape or out.dtype != float or not out.flags.c_contiguous:
             raise InputError(f"out is {out.dtype} {out.shape}; expected contiguous float64 {shape}")
-        shares = self.split(np.asarray(theta, dtype=float))
+        theta = np.asarray(theta, dtype=float)
         for k, evaluate in enumerate(self._evaluators[name]):
-            values = shares[k][: self.parts[k].of_points].copy()
+            values = self.point_constants(k, theta)
             if not self.parts[k].prony or name == "energy":
-                own = self.brought(k, theta)
+                own = self.brought(k, theta, second=name == "curvature")
                 evaluate(fields, values, out, self.threads, k > 0, own)
                 continue
             past = carried or self.memory.nothing(len(out))
@@ -292,11 +316,14 @@ class Discretisation(Model):
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[name](self.element, self.law(number, memory))
-        cells, geometry = self._laid_out(part)
+        cells, geometry = self.laid_out(part)
         vector, lower = element_destinations(self.pattern, cells)
         total, count = len(self.constants), len(cells)
         # γ_m and the density come after the constants of the points and need no elements.
         columns = self.starts[number] + np.arange(part.of_points)
+        if self.inverse is not None:
+            # What changes with an input changes so with the entry of θ that it is.
+            columns = np.concatenate([columns, self.inverse.places])
         by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
         square = (columns[:, None] + total * columns).ravel()
         whole = np.zeros((count, 1), dtype=np.int64)
@@ -335,6 +362,8 @@ class Discretisation(Model):
         if part.stress_field is not None:
             logs = np.broadcast_to(width + np.arange(count)[:, None, None], (*carried.shape[:2], 1))
             carried = np.concatenate([carried, logs], axis=-1)
+        if self.inverse is not None:
+            carried = self.inverse.places_of_points(number)
         own = carried if carried.shape[-1] else None
         return Batch(kernel, cells, geometry, destinations, self._width(name), own)
 

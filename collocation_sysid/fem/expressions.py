@@ -9,7 +9,7 @@ w        3·nodes       weights on the node forces (Lagrange multipliers)
 geometry 3·nodes + 1   shape gradients ∂N_a/∂X_j at 3a + j, then the volume [m³]
 theta    k             constants of the material, then of the damping law, then s
 carried  6             H; for second derivatives 12, H and the weights σ of S; then, where there
-                       is a field, its logarithm
+                       is a field, its logarithm; of a stress-free shape see `rest_point`
 ======== ============= ==============================================================
 
 and outputs that are summed over points and elements. Matrices are given by the lower triangles of
@@ -36,6 +36,7 @@ from .elements import Element
 from .kernel import Derivative, Outputs, Pieces, PointKernel, QuadraturePoint
 from .materials import Damping, Material
 from .mean_dilatation import averaging_kernel
+from .rest_point import RestPoint
 
 # Bodies of the same law and element share their kernels: so many of these are kept.
 KEPT = 64
@@ -46,18 +47,21 @@ class Law:
     """What a quadrature point obeys: a material and a damping law, with or without memory.
 
     θ holds the material's constants, those of the damping law and, with memory, the stiffening s.
-    Those at the places `scaled` are multiplied by a field.
+    Those at the places `scaled` are multiplied by a field. With a stress-free shape `rest` that is
+    not the mesh, the changes of the inputs of that follow.
     """
 
     material: Material
     damping: Damping
     memory: bool = False
     scaled: tuple[int, ...] = ()
+    rest: RestPoint | None = None
 
     @property
     def constants(self) -> int:
         """Length of θ."""
-        return len(self.material.constants) + len(self.damping.constants) + self.memory
+        own = len(self.material.constants) + len(self.damping.constants) + self.memory
+        return own + (self.rest.inputs if self.rest else 0)
 
     @property
     def carried(self) -> int:
@@ -94,7 +98,9 @@ def point_of(
 ) -> QuadraturePoint:
     """A point of an element that obeys a law."""
     brought = law.carried if carried is None else carried
-    return QuadraturePoint.of(element, law.constants, *fields, carried=brought, scaled=law.scaled)
+    return QuadraturePoint.of(
+        element, law.constants, *fields, carried=brought, scaled=law.scaled, rest=law.rest
+    )
 
 
 def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKernel:
@@ -104,7 +110,12 @@ def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKerne
     pieces: Pieces = {}
     for key, terms in outputs.items():
         found = [
-            term.of(point.derivative(term.scalar, term.by) if term.known is None else term.known)
+            # What is known is by the material's own gradient, which that of the mesh is not.
+            term.of(
+                point.derivative(term.scalar, term.by)
+                if term.known is None or point.rest is not None
+                else term.known
+            )
             for term in terms
         ]
         pieces[key] = terms[0].contraction, sum(found[1:], found[0])

@@ -20,6 +20,7 @@ from typing import Any, Literal
 import casadi as ca
 
 from .elements import Element
+from .rest_point import RestPoint
 
 # What becomes of a piece: nothing; (9, k), conjugate to F, to (3·nodes, k); or a symmetric (9, 9)
 # to the lower triangle of (3·nodes, 3·nodes).
@@ -258,6 +259,9 @@ class QuadraturePoint:
         What the point brings from the past, see `memory`; with a field, the logarithm comes last.
     scaled : tuple of int
         Places in θ of the constants that a field multiplies, see `field`.
+    rest : RestPoint, optional
+        Layout of the stress-free shape, where that is not the mesh, see `rest_shape`: its numbers
+        are the last ones carried, and the changes of its inputs the last entries of θ.
     """
 
     nodes: int
@@ -268,6 +272,7 @@ class QuadraturePoint:
     stretches: tuple[ca.SX, ...]
     carried: ca.SX
     scaled: tuple[int, ...] = ()
+    rest: RestPoint | None = None
 
     @classmethod
     def of(
@@ -277,6 +282,7 @@ class QuadraturePoint:
         *fields: str,
         carried: int = 0,
         scaled: tuple[int, ...] = (),
+        rest: RestPoint | None = None,
     ) -> QuadraturePoint:
         """A point of an element, with θ of so many constants, that carries so many numbers."""
         stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
@@ -287,8 +293,9 @@ class QuadraturePoint:
             ca.SX.sym("theta", constants),
             {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
             tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
-            ca.SX.sym("carried", carried + bool(scaled)),
+            ca.SX.sym("carried", carried + bool(scaled) + (rest.count if rest else 0)),
             scaled,
+            rest,
         )
 
     @property
@@ -310,15 +317,36 @@ class QuadraturePoint:
         return self.carried[:-1] if self.scaled else self.carried
 
     @property
-    def volume(self) -> ca.SX:
-        """The point's share of the element's."""
+    def mesh_volume(self) -> ca.SX:
+        """The point's share of the element's volume in the mesh."""
         return self.geometry[3 * self.nodes]
+
+    @property
+    def volume(self) -> ca.SX:
+        """The point's share of the element's volume free of stress."""
+        if self.rest is None:
+            return self.mesh_volume
+        return self.mesh_volume * ca.det(ca.reshape(self._rest_values[:9], 3, 3))
+
+    @property
+    def _rest_values(self) -> ca.SX:
+        """Numbers of the stress-free shape here, see `RestPoint`."""
+        assert self.rest is not None
+        data = self.carried[self.carried.numel() - self.rest.count :]
+        changes = self.theta[self.theta.numel() - self.rest.inputs :]
+        return self.rest.expand(data, changes)
 
     @property
     def felt(self) -> ca.SX:
         """The deformation gradient that the material feels, (3, 3)."""
         F = ca.reshape(self.gradients["x"], 3, 3)
-        return ca.exp(self.stretches[0]) * F if self.stretches else F
+        stretch = self.stretches[0] if self.stretches else None
+        if self.rest is not None:
+            values = self._rest_values
+            F = F @ ca.inv_minor(ca.reshape(values[:9], 3, 3))
+            if stretch is not None:
+                stretch = stretch + values[9] / 3
+        return F if stretch is None else ca.exp(stretch) * F
 
     @property
     def strain(self) -> ca.SX:

@@ -9,8 +9,10 @@ written in isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂
 ½ κ (J − 1)². Ogden's is left out: its derivatives by principal stretches are not exact where
 stretches coincide.
 
-A `Damping` law is a potential or a stress of the rate of deformation. Kelvin and Voigt's is
-objective and dissipates at any strain, with viscosities by the small-strain Lamé constants.
+A `Damping` law is a potential or a stress of the rate of deformation. "kelvin-voigt" and "material"
+are objective and dissipate at any strain, with viscosities by the small-strain Lamé constants: the
+former is a viscous fluid in the current shape, the latter is viscous in the rate of the Green
+strain.
 Rayleigh's is the same at small strain, but it also resists that a stretched body turns, and feeds
 energy in where the stiffness is not positive.
 
@@ -307,6 +309,25 @@ def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[c
     return stress, slope
 
 
+def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """P_v = F S_v, S_v = γ_r (λ tr(Ė) I + 2μ Ė) with the rate Ė of the Green strain.
+
+    S_v : Ė = γ_r (λ (tr Ė)² + 2μ Ė:Ė) is positive whatever F. Its half is the potential D of the
+    stress, P_v = ∂D/∂Ḟ. Of St. Venant and Kirchhoff's material S_v is γ_r times the rate of the
+    elastic second Piola–Kirchhoff stress.
+    """
+    stiffness, _ = ca.hessian(psi, F)
+    if not ca.depends_on(stiffness, F):  # a linear material does not distinguish the shapes
+        return gamma_r_s * mirrored(stiffness) @ rate, ca.SX(9, 9)
+    lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
+    deformation = ca.reshape(F, 3, 3)
+    product = deformation.T @ ca.reshape(rate, 3, 3)
+    strain_rate = (product + product.T) / 2
+    second_piola = lame * ca.trace(strain_rate) * ca.SX.eye(3) + 2 * shear * strain_rate
+    stress = ca.vec(deformation @ second_piola)
+    return stress, ca.jacobian(stress, F)
+
+
 def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
     """γ_r ∂ψ/∂F:Ḟ, which makes the damping force −γ_r K(x) v."""
     return gamma_r_s * ca.jtimes(psi, F, rate)
@@ -314,6 +335,7 @@ def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
 
 DAMPINGS: dict[str, Damping] = {
     "kelvin-voigt": Damping("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
+    "material": Damping("material", (GAMMA_R,), stress=material_form),
     "rayleigh": Damping("rayleigh", (GAMMA_R,), rayleigh),
 }
 

@@ -78,7 +78,7 @@ class _Shape:
     @classmethod
     def of(cls, point: QuadraturePoint) -> _Shape:
         F, *rates = point.gradients.values()
-        own = point.volume * ca.det(ca.reshape(F, 3, 3))
+        own = point.mesh_volume * ca.det(ca.reshape(F, 3, 3))
         for rate in rates:
             own = ca.vertcat(own, ca.jtimes(own, F, rate))
         return cls(point, ca.SX.sym("volume"), ca.SX.sym("volumes", len(point.stretches)), own)
@@ -96,7 +96,7 @@ class _Shape:
     def at_sums(self, pieces: Pieces) -> Pieces:
         """Pieces with m put in."""
         m = _stretches(self.volumes, self.volume)
-        m -= _stretches(self.own_volumes, self.point.volume)
+        m -= _stretches(self.own_volumes, self.point.mesh_volume)
         return {
             key: (how, ca.substitute(piece, self.stretches, m))
             for key, (how, piece) in pieces.items()
@@ -105,7 +105,7 @@ class _Shape:
     def first(self, order: int) -> Pieces:
         """V, s and, to couple, ∂s/∂x."""
         sums: Pieces = {
-            "volume": ("none", self.point.volume),
+            "volume": ("none", self.point.mesh_volume),
             "volumes": ("none", self.own_volumes),
         }
         if order:
@@ -175,7 +175,7 @@ class _Chain:
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
         by_s, _ = _slopes(shape.volumes, shape.volume, self.slopes)
-        by_own, bent_by_own = _slopes(shape.own_volumes, point.volume, self.by_stretch)
+        by_own, bent_by_own = _slopes(shape.own_volumes, point.mesh_volume, self.by_stretch)
         bent = ca.jacobian(
             ca.gradient(ca.dot(weights, shape.own_volumes), point.gradients[alpha]),
             point.gradients[beta],
@@ -189,7 +189,7 @@ class _Chain:
 
     def _lifted(self, field: str) -> ca.SX:
         """∂(F, m)/∂F at fixed s, or its like for another field."""
-        by_own, _ = _slopes(self.shape.own_volumes, self.shape.point.volume, self.by_stretch)
+        by_own, _ = _slopes(self.shape.own_volumes, self.shape.point.mesh_volume, self.by_stretch)
         return ca.vertcat(ca.SX.eye(9), -by_own @ self.shape.own_by(field))
 
     def _hessian(self, alpha: str, beta: str) -> ca.SX:

@@ -63,6 +63,8 @@ class TetMesh:
         The same per element.
     face_sets : mapping of name to (k, 3) integer array, optional
         Corners of triangles, such as those of a cavity's wall.
+    is_generated : bool, default False
+        Whether the mesh was made of stated lengths, as those of `structured` are, not of a scan.
 
     Attributes
     ----------
@@ -88,6 +90,7 @@ class TetMesh:
     file_index: np.ndarray
     file_node_count: int
     notes: tuple[str, ...]
+    is_generated: bool
 
     def __init__(
         self,
@@ -96,6 +99,8 @@ class TetMesh:
         point_arrays: Mapping[str, ArrayLike] | None = None,
         cell_arrays: Mapping[str, ArrayLike] | None = None,
         face_sets: Mapping[str, ArrayLike] | None = None,
+        *,
+        is_generated: bool = False,
     ) -> None:
         given = checked_points(points_m)
         elements = checked_tetrahedra(tetrahedra, len(given))
@@ -114,6 +119,7 @@ class TetMesh:
             file_index=_read_only(used),
             file_node_count=len(given),
             notes=notes,
+            is_generated=is_generated,
         )
 
     def _set(self, **values: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from .mesh import Nodes, TetMesh
 from .mesh_checks import orient
 from .node_force import NodeForce, PlacedForce
 from .regions import Region
-from .selection import Ball, Box, Selection
+from .rest_shape import UnderGravity
+from .selection import Ball, Box, Indices, Selection
 
 if TYPE_CHECKING:
     from .body import Body
@@ -49,6 +50,7 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
         {name: np.concatenate([a, a[ends].min(axis=1)]) for name, a in masks.items()},
         {name: np.repeat(a, 8, axis=0) for name, a in mesh.cell_arrays.items()},
         {name: faces_in_four(faces, mesh) for name, faces in mesh.face_sets.items()},
+        is_generated=mesh.is_generated,
     )
 
 
@@ -85,6 +87,7 @@ def refined(body: Body) -> Body:
         regions=regions,
         prony=rest.prony,
         forces=[_finer(placed, mesh, body) for placed in body.placed_forces],
+        rest_shape=_finer_rest_shape(body, mesh),
         evaluator=body.evaluator,
         threads=body.threads,
     )
@@ -94,6 +97,18 @@ def refined(body: Body) -> Body:
     fields = [part.field and part.field.split_in_eight() for part in body.parts]
     parts = zip(finer.parts, fields, strict=True)
     return finer.with_parts(tuple(replace(part, field=field) for part, field in parts))
+
+
+def _finer_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
+    """Return what is stated of the stress-free shape, with the held nodes of the finer mesh."""
+    if body.scan is None:
+        return None if body.rest_shape is None else "stress_free"
+    if isinstance(body.scan.nodes, (Box, Ball)):
+        return body.scan
+    corners = len(body.mesh.points_m)
+    held = np.isin(np.arange(corners), body.scan.held_nodes(body.nodes))
+    chosen = np.concatenate([held, held[body.mesh.edges].all(axis=1)])
+    return replace(body.scan, nodes=Indices(np.flatnonzero(chosen).tolist()))
 
 
 def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:

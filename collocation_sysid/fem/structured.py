@@ -55,7 +55,7 @@ def cylinder_of_edge(
     points_m = np.where(np.abs(whole.points_m) < 1e-12 * diameter_m, 0.0, whole.points_m)
     kept = (points_m[whole.tetrahedra][..., :2] >= 0).all(axis=(1, 2))
     corners_kept, tetrahedra = np.unique(whole.tetrahedra[kept], return_inverse=True)
-    return TetMesh(points_m[corners_kept], tetrahedra.reshape(-1, 4))
+    return TetMesh(points_m[corners_kept], tetrahedra.reshape(-1, 4), is_generated=True)
 
 
 def _divided(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
@@ -105,7 +105,7 @@ def box_mesh(
     orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
     paths = np.array([[0, *np.cumsum(stride[list(order)])] for order in orders])
     tetrahedra = (corner.reshape(-1, 1, 1) + paths).reshape(-1, 4)
-    return TetMesh(points, orient(points, tetrahedra)[0])
+    return TetMesh(points, orient(points, tetrahedra)[0], is_generated=True)
 
 
 def cylinder_mesh(
@@ -153,7 +153,8 @@ def cylinder_mesh(
         for a, b, c in [(up if layer % 2 == 0 else up[:, ::-1]).T + layer * len(disc)]
         for a_, b_, c_ in [(a + len(disc), b + len(disc), c + len(disc))]
     ]
-    return TetMesh(points, orient(points, np.concatenate(tetrahedra))[0])
+    cells = orient(points, np.concatenate(tetrahedra))[0]
+    return TetMesh(points, cells, is_generated=True)
 
 
 def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:

@@ -37,6 +37,8 @@ class Touching:
     area_m2 : (i,)
     edge_m : float
         Mean length of an edge of the faces.
+    edges_m : (f,)
+        Mean length of the edges of each face.
     part : int
         Of the body, that has most of the faces.
     a_face : int
@@ -47,6 +49,7 @@ class Touching:
     points: ForcePoints
     area_m2: Array
     edge_m: float
+    edges_m: Array
     part: int
     a_face: int
     faces: Index
@@ -75,8 +78,16 @@ class Touching:
         )
         held = [np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts]
         part = int(np.argmax([area[each].sum() for each in held]))
-        edge_m = float(np.linalg.norm(sides, axis=2).mean())
-        return cls(points, np.outer(area, weights).ravel(), edge_m, part, count, rows)
+        edges_m = np.linalg.norm(sides, axis=2).mean(axis=1)
+        return cls(
+            points=points,
+            area_m2=np.outer(area, weights).ravel(),
+            edge_m=float(edges_m.mean()),
+            edges_m=edges_m,
+            part=part,
+            a_face=count,
+            faces=rows,
+        )
 
 
 def on_faces(places: Array, nodes: int) -> tuple[Array, Array]:

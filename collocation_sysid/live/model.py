@@ -368,6 +368,7 @@ def _not_live(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
     given = experiment.start == "given"
     yield "a start that is given", given, "one in equilibrium, or undeformed"
     yield "a material with memory", body.remembers, "one without Prony branches"
+    yield "a mesh made under gravity", body.scan is not None, "a stress-free one"
     carry = any(placed.force.carries for placed in body.placed_forces)
     yield "a force that carries something from step to step", carry, "none"
     yield "tensions and pressures, which frames do not bring,", experiment.actuators, "none"

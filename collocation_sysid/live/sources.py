@@ -119,7 +119,11 @@ def collected_before() -> Iterator[None]:
 def as_json(update: Update) -> str:
     """A line that tells an update; what is not known is null."""
     parameters = {
-        name: {"value": each.value, "std_error": each.std_error, "ci95": each.ci95}
+        name: {
+            "value": each.value,
+            "statistical_std_error": each.statistical_std_error,
+            "statistical95": each.statistical95,
+        }
         for name, each in update.estimates.items()
     }
     rms_m = update.marker_rms_m

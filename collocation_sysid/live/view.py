@@ -39,7 +39,11 @@ def picture(updates: Sequence[Update]) -> list[Shown]:
     last = updates[-1]
     rows = []
     for name, estimate in last.estimates.items():
-        error = "" if estimate.std_error is None else f"{estimate.std_error:.2g}"
+        error = (
+            ""
+            if estimate.statistical_std_error is None
+            else f"{estimate.statistical_std_error:.2g}"
+        )
         way = bars([update.estimates[name].value for update in updates[-COLUMNS:]])
         rows.append((name, f"{estimate.value:.5g}", error, unit_of(name), way))
     return [
@@ -96,7 +100,7 @@ def _drawn(
     """Lines of a parameter's value and interval, empty yet, and what they will show."""
     found = [update.estimates[name] for update in updates]
     value = np.array([each.value for each in found])
-    ends = np.array([each.ci95 or (np.nan, np.nan) for each in found])
+    ends = np.array([each.statistical95 or (np.nan, np.nan) for each in found])
     axes = figure.add_subplot(count, 1, k + 1)
     # Intervals of the beginning would leave no room for those of the end.
     near = value[len(value) // 4 :]

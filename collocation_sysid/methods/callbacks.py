@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..fem.rest_shape import RestShapeError
 from ..program.collocation import Collocation, carried_over
 from .recorder import Recorder
 
@@ -63,6 +64,9 @@ class TimedFunction(ca.Callback):
                 [np.frombuffer(a) if a is not None else np.zeros(0) for a in arguments],
                 [np.frombuffer(r) if r is not None else None for r in results],
             )
+        except RestShapeError:
+            # The solver shortens its step, as after a value that is not finite.
+            return 1
         except BaseException as error:
             self._errors.append(error)
             return 1
@@ -235,6 +239,7 @@ class Monitor(ca.Callback):
         self.stop = False
         self.best: tuple[Array, Array] | None = None
         self.seconds = 0.0
+        self.lines = 0
         self._best_merit = np.inf
         self.construct("monitor")
 
@@ -274,4 +279,6 @@ class Monitor(ca.Callback):
             self._best_merit, self.best = merit, (z, multipliers)
         recorder, loss = self.recorder, float(value[0]) / self.program.loss_scale
         at = carried_over(z, self.program, recorder.collocation)
-        recorder.line(len(recorder.history), at, loss)
+        number = recorder.history[-1].number + 1 if recorder.history else 0
+        self.lines += 1
+        recorder.line(number, at, loss)

@@ -191,6 +191,11 @@ class Condensed(Collocation):
         return len(self._kept[1])
 
     @property
+    def kept_rows(self) -> Index:
+        """Rows of the program given that are rows here, too."""
+        return self._kept[1]
+
+    @property
     def of_phi(self) -> slice:
         """The nuisance parameters in z."""
         first = int(self._numbers[0][self.whole.of_phi.start])

@@ -132,7 +132,8 @@ class _Climb:
         recorder = self.recorder
         part = recorder.collocation if share == 1 else first_part(recorder.collocation, share)
         start = None if self.known is None else _continued(part, *self.known)
-        before, elapsed_s = self.iterations, recorder.elapsed_s
+        before = max([self.iterations, *(line.number for line in recorder.history[-1:])])
+        elapsed_s = recorder.elapsed_s
 
         def follow(line: Iteration) -> None:
             number, time_s = line.number + before, line.time_s + elapsed_s

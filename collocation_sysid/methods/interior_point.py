@@ -1,4 +1,8 @@
-"""Interior point: the whole NLP to IPOPT, with exact sparse derivatives from the assembly."""
+"""Interior point: the whole NLP to IPOPT, with exact sparse derivatives from the assembly.
+
+IPOPT starts from a coarse solution by reduced space, see `initial_point`, or from a simulation at
+the guess.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,7 @@ from . import nlpsol
 from .callbacks import NlpFunctions
 from .complementarity import hardened, require_smooth
 from .condensed import condensed
+from .initial_point import InitialPoint, adjoint_multipliers, coarse_solution
 from .recorder import Recorder
 from .solution import Solution, Status, Watch
 
@@ -60,11 +65,21 @@ IPOPT_STATUS = {
 # Longest step of a parameter's logarithm while warming up.
 STEP_LIMIT = np.log(2.0)
 # A row without a pivot of its own on the diagonal waits for its columns' pivots, and fills the
-# factor on the way. A constant there slows the last steps by its product with what the objective
-# curves, which must stay small.
-ROW_PIVOT, ROW_SLOWNESS = 1e-9, 1e-7
+# factor on the way. With a constant there a step leaves a violation of that constant times the
+# change of the multipliers, which are some hundreds. So it must be small: with 1e-9 the fit of a
+# soft bar with unknown places gains a third of the remaining distance per iteration near the
+# optimum, and hardly moves far from it.
+ROW_PIVOT = 1e-11
+# Largest product of that constant with the largest curvature of the objective.
+ROW_SLOWNESS = 1e-9
 # Of MUMPS: lower than what that diagonal gives, higher than what rounding makes of a zero.
-PIVOT_TOLERANCE = 1e-10
+PIVOT_TOLERANCE = 1e-12
+# Near the optimum variables and multipliers of bounds stay where they are, to this distance.
+WARM_PUSH = 1e-9
+# The barrier parameter begins there at this share of the tolerance, near where it ends.
+WARM_BARRIER = 0.1
+# Time that IPOPT is given at least, in which it begins and ends at once [s].
+SHORTEST_S = 1e-9
 # By how much a step may change the damping, and the share from which on it is as good as none.
 DAMPING_CHANGE, NO_DAMPING = (0.1, 10.0), 1e-2
 
@@ -78,6 +93,10 @@ class InteriorPoint(Options):
     hessian : {"exact", "gauss-newton", "limited-memory"}
         Second derivatives of the Lagrangian: all of them once parameters move by less than
         `warm_up`, those of the loss with readings that count as linear, or IPOPT's own.
+    initial : {"reduced-space", "simulation"}
+        Where IPOPT starts: near the optimum, after a coarse solution of the same program by reduced
+        space, with multipliers of its adjoint; or at a simulation at the guess, or at the start
+        given, with multipliers zero. Where reduced space finds no motion, the latter is done too.
     warm_up : float
         While an iteration still changes a parameter by more than this share (or a nuisance
         parameter, of its prior deviation), an exact Hessian is replaced by Gauss–Newton's with
@@ -108,6 +127,7 @@ class InteriorPoint(Options):
     name: ClassVar[str] = "interior-point"
 
     hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
+    initial: Literal["reduced-space", "simulation"] = "reduced-space"
     warm_up: NotNegative = 0.1
     proximal: NotNegative = 1e-5
     contact: Literal["energy", "complementarity"] = "energy"
@@ -145,18 +165,68 @@ class InteriorPoint(Options):
         found = self._solved(collocation, watch, start)
         if not is_hard or not found.status.converged:
             return found
-        return hardened(found, lambda relaxed, z: self._solved(relaxed, watch, z))
+        relaxed_method = replace(self, initial="simulation")
+        return hardened(found, lambda relaxed, z: relaxed_method._solved(relaxed, watch, z))
 
     def _solved(
         self, collocation: Collocation, watch: Watch | None, start: Array | None
     ) -> Solution:
         """The answer with contact as obstacles have it."""
         recorder = Recorder(self.name, collocation, watch)
+        if self.initial == "simulation":
+            return self._by_ipopt(recorder, start)
+        initial = coarse_solution(recorder, start, max_time_s=self.max_time_s)
+        coarse = initial.coarse
+        spent = coarse.timing
+        recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
+        recorder.notes.append(initial.note)
+        if coarse.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
+            recorder.collocation = coarse.collocation
+            end = coarse.status, coarse.status.sentence, coarse.z, coarse.given_multipliers
+            return recorder.solution(*end, 0, coarse.evaluations)
+        if not initial.is_usable:
+            return self._by_ipopt(recorder, start)
+        recorder.collocation = coarse.collocation
+        solution = self._by_ipopt(recorder, coarse.z, initial)
+        return replace(solution, evaluations=solution.evaluations + coarse.evaluations)
+
+    def _by_ipopt(
+        self, recorder: Recorder, start: Array | None, initial: InitialPoint | None = None
+    ) -> Solution:
+        """Solve the recorder's program by IPOPT.
+
+        Parameters
+        ----------
+        recorder : Recorder
+        start : (variables,) ndarray, optional
+            By default those of a simulation at the guess.
+        initial : InitialPoint, optional
+            What `start` is from; where that is near the optimum, multipliers, barrier parameter and
+            Hessian are those of the last iterations.
+        """
+        multipliers = None
         with recorder.stopwatch.building():
-            program = condensed(collocation.made_explicit())
-            hessian = _DampedHessian(program, self)
-        settings = hessian, self._settings, IPOPT_STATUS
-        solution = nlpsol.solve(recorder, program, start, "ipopt", *settings)
+            program = condensed(recorder.collocation.made_explicit())
+            if initial is not None and initial.is_near:
+                multipliers = adjoint_multipliers(program, recorder.collocation, initial.coarse.z)
+            is_warm = multipliers is not None
+            hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)
+
+        def settings(functions: NlpFunctions) -> dict[str, Any]:
+            found = self._settings(functions, is_warm=is_warm)
+            left_s = max(SHORTEST_S, self.max_time_s - recorder.elapsed_s)
+            return {"ipopt.max_wall_time": left_s} | found
+
+        solution = nlpsol.solve(
+            recorder,
+            program,
+            start,
+            "ipopt",
+            hessian,
+            settings,
+            IPOPT_STATUS,
+            initial_multipliers=multipliers,
+        )
         if "Invalid_Option" not in solution.message:
             return solution
         missing = (
@@ -165,12 +235,19 @@ class InteriorPoint(Options):
         )
         return replace(solution, notes=(*solution.notes, missing))
 
-    def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
+    def _settings(self, functions: NlpFunctions, *, is_warm: bool) -> dict[str, Any]:
+        """Return what CasADi is given, without IPOPT's time.
+
+        Parameters
+        ----------
+        functions : NlpFunctions
+        is_warm : bool
+            Whether IPOPT starts near the optimum, with multipliers.
+        """
         settings: dict[str, Any] = {
             "ipopt.linear_solver": self.linear_solver,
             "ipopt.tol": self.tolerance,
             "ipopt.max_iter": self.max_iterations,
-            "ipopt.max_wall_time": self.max_time_s,
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
@@ -178,6 +255,14 @@ class InteriorPoint(Options):
             "jac_g": functions.function("jac_g", "g", "jac_g"),
             "grad_f": functions.function("grad_f", "f", "grad_f"),
         }
+        if is_warm:
+            settings |= {
+                "ipopt.warm_start_init_point": "yes",
+                "ipopt.warm_start_bound_push": WARM_PUSH,
+                "ipopt.warm_start_bound_frac": WARM_PUSH,
+                "ipopt.warm_start_mult_bound_push": WARM_PUSH,
+                "ipopt.mu_init": WARM_BARRIER * self.tolerance,
+            }
         if self.linear_solver == "mumps":  # METIS's ordering as it is: IPOPT refines
             settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
             settings |= {"ipopt.mumps_pivtol": PIVOT_TOLERANCE}

@@ -20,6 +20,7 @@ from ..program.collocation import Collocation, carried_over
 from ..starting import LEFT
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .condensed import whole_multipliers
+from .initial_point import Multipliers
 from .recorder import Recorder
 from .solution import Solution, Status
 
@@ -47,6 +48,7 @@ def solve(
     settings: Settings,
     statuses: Mapping[str, Status],
     judged: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
+    initial_multipliers: Multipliers | None = None,
 ) -> Solution:
     """Solve the recorder's collocation; Ctrl-C ends it after the iteration, or after 2 s.
 
@@ -65,6 +67,8 @@ def solve(
         Its words for how it ended in ours; a failure where one is not among them.
     judged : callable
         What to say of the status, variables and multipliers of the recorder's collocation.
+    initial_multipliers : Multipliers, optional
+        Initial multipliers of the program; zeros by default.
 
     Raises
     ------
@@ -73,6 +77,11 @@ def solve(
     """
     collocation, watch = recorder.collocation, recorder.stopwatch
     errors: list[BaseException] = []
+    earlier_evaluations_s = watch.evaluations
+    earlier_linear_algebra_s = watch.linear_algebra
+    unaccounted_s = (
+        recorder.elapsed_s - watch.build - earlier_evaluations_s - earlier_linear_algebra_s
+    )
     with watch.building():
         start = recorder.start(start)
         functions = NlpFunctions(program, hessian, errors)
@@ -80,20 +89,22 @@ def solve(
         given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
         solver = _nlpsol(plugin, functions, given)
     began = carried_over(start, collocation, program)
-    z, multipliers, said, count = _run(solver, program.bounds(), began, monitor)
+    z, multipliers, said, count = _run(
+        solver, program.bounds(), began, monitor, initial_multipliers
+    )
     if errors and not isinstance(errors[0], _LeftBehind):
         raise errors[0]
-    watch.evaluations = functions.seconds
+    watch.evaluations = earlier_evaluations_s + functions.seconds
     # What is neither set-up nor callback.
-    others = watch.build + functions.seconds + monitor.seconds
-    watch.linear_algebra = max(0.0, recorder.elapsed_s - others)
+    others_s = watch.build + watch.evaluations + monitor.seconds + unaccounted_s
+    watch.linear_algebra = max(earlier_linear_algebra_s, recorder.elapsed_s - others_s)
     status = statuses.get(said, Status.NUMERICAL_FAILURE)
     if monitor.stop or (recorder.late and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
         z, multipliers = monitor.best or (began, np.zeros(program.constraints))
     # A solver that never began leaves its count as memory had it.
-    iterations = 0 if status is Status.REFUSED else count or max(0, len(recorder.history) - 1)
+    iterations = 0 if status is Status.REFUSED else count or max(0, monitor.lines - 1)
     of_rows = whole_multipliers(program, z, multipliers)[: collocation.constraints]
     at = carried_over(z, program, collocation)
     status = judged(status, at, of_rows)
@@ -122,15 +133,22 @@ class _LeftBehind(Exception):
 
 
 def _run(
-    solver: ca.Function, bounds: tuple[Array, Array], start: Array, monitor: Monitor
+    solver: ca.Function,
+    bounds: tuple[Array, Array],
+    start: Array,
+    monitor: Monitor,
+    multipliers: Multipliers | None,
 ) -> tuple[Array, Array, str, int]:
     """Variables, multipliers, what the solver said, and its iterations."""
     lower, upper = bounds
+    given = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
+    if multipliers is not None:
+        given |= {"lam_g0": multipliers.constraints, "lam_x0": multipliers.bounds}
     found: list[tuple[Array, Array, str, int]] = []
 
     def search() -> None:
         try:
-            answer = solver(x0=start, lbx=lower, ubx=upper, lbg=0, ubg=0)
+            answer = solver(**given)
             stats = solver.stats()
         except RuntimeError as error:  # of its own, or what a callback's failure makes of it
             said = str(error).strip().splitlines()[-1].split(": ", 1)[-1]

@@ -98,6 +98,18 @@ def memory_mb(collocation: Collocation) -> float:
     return (8 * numbers + sum(chunks[-together:])) / 1e6
 
 
+def _measured(collocation: Collocation) -> tuple[str, str]:
+    """Return in words what the recordings measure most of, and what states its noise."""
+    experiments = [segment.experiment for segment in collocation.segments]
+    if any(each.markers.samples for each in experiments):
+        return "markers", "sigma_m"
+    if any(each.depths for each in experiments):
+        return "points of depth cameras", "sigma_m of depth"
+    if any(each.wrenches for each in experiments):
+        return "wrenches", "sigma_n"
+    return "readings", "sigma of the readings"
+
+
 def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) -> list[str]:
     notes = []
     if indefinite:
@@ -110,11 +122,12 @@ def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) 
         squares = sum(part.loss for part in collocation.parts(z))
         misfit = float(np.sqrt(squares / max(1, collocation.measurements)))
         if misfit > MISFIT:
-            marked = any(s.experiment.markers.samples for s in collocation.segments)
-            size = f" ({1e3 * collocation.rms_m(z):.3g} mm rms)" if marked else ""
+            size = f" ({1e3 * collocation.rms_m(z):.3g} mm rms)"
+            what, stated = _measured(collocation)
+            marked = stated == "sigma_m"
             notes.append(
-                f"the {'markers' if marked else 'wrenches'} are missed by {misfit:.3g} of their "
-                f"standard deviations{size}: {'sigma_m' if marked else 'sigma_n'}, the model or "
-                "the recording is off, or a better fit lies elsewhere; another guess may tell"
+                f"the {what} are missed by {misfit:.3g} of their standard deviations"
+                f"{size if marked else ''}: {stated}, the model or the recording is off, or a "
+                "better fit lies elsewhere; another guess may tell"
             )
     return notes

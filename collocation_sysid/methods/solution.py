@@ -122,6 +122,7 @@ class Solution:
     z : (variables,) the final variables, see `program.collocation`
     given_multipliers : (constraints,) of g, in the scaling of the NLP, or None
     iterations : int
+        Those of the method itself; the history may also have lines of a search for its start.
     history : sequence of Iteration
     timing : Timing
     notes : sequence of str
@@ -160,14 +161,15 @@ class Solution:
 
     def after(self, first: Solution, why: str) -> Solution:
         """The answer with what the solve took that it started from, and why there was another."""
-        done, began_s = first.iterations, first.timing.total
+        done = max([first.iterations, *(line.number for line in first.history[-1:])])
+        began_s = first.timing.total
         own = [
             replace(each, number=each.number + done, time_s=each.time_s + began_s)
             for each in self.history
         ]
         return replace(
             self,
-            iterations=self.iterations + done,
+            iterations=self.iterations + first.iterations,
             evaluations=self.evaluations + first.evaluations,
             history=(*first.history, *own),
             timing=self.timing + first.timing,

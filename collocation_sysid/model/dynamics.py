@@ -108,7 +108,10 @@ class Dynamics:
         dofs = experiment.body.pattern.size
         lags = tables.p @ np.arange(tables.p.shape[1])
         evaluated_s = t_s - lags * experiment.timestep_s / substeps
-        forces = Forces.of(experiment, evaluated_s)
+        averaged_s = 0.0
+        if not experiment.static and table.is_midpoint:
+            averaged_s = experiment.timestep_s / substeps
+        forces = Forces.of(experiment, evaluated_s, step_s=averaged_s)
         goals = experiment.grasped(t_s)[1].reshape(rows, -1)
         taken = ~np.isnan(goals)
         taken[:, experiment.held_dofs] = False
@@ -376,7 +379,7 @@ class StencilRow:
             tuple(tables.w[t].tolist()),
             tuple((tables.s[t] / step_s**2).tolist()),
             float(tables.r[t]) / step_s,
-            dynamics.mass.own_kg + dynamics.mass.tied_kg[t],
+            dynamics.mass.row_kg(t),
         )
 
     @cached_property

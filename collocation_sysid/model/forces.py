@@ -23,7 +23,7 @@ from ..fem.pattern import Joined, SymmetricPattern
 from ..recording.experiment import Experiment
 from .contact import Contact, contacts
 from .force_term import ForceTerm, Potential, Slots, States
-from .point_forces import Pointwise, point_forces
+from .point_forces import PointForces, Pointwise, air_drag, point_forces
 from .weight import Mass, Weight
 
 
@@ -55,16 +55,28 @@ class Forces:
 
     @classmethod
     def of(
-        cls, experiment: Experiment, t_s: ArrayLike, theta: Sequence[float] | Array | None = None
+        cls,
+        experiment: Experiment,
+        t_s: ArrayLike,
+        theta: Sequence[float] | Array | None = None,
+        step_s: float = 0.0,
     ) -> Forces:
-        """Those of an experiment at the times `t_s` (T,)."""
+        """Those of an experiment at the times `t_s` (T,).
+
+        Contact pressures are means over time steps of `step_s`; where it is 0, those at each state.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
             Potential(actuator.measure, actuator.amplitude(times)[:, None])
             for actuator in experiment.actuators
         )
-        touching = contacts(experiment)
-        further = (*potentials, *touching, *point_forces(experiment.body, times))
+        touching = contacts(experiment, step_s)
+        further = (
+            *potentials,
+            *touching,
+            *air_drag(experiment, times),
+            *point_forces(experiment.body, times),
+        )
         unknown = np.full(len(experiment.body.constants), np.nan)
         still = experiment.static
         found = cls(Weight.of(experiment, times), further, experiment.joined, unknown, still)
@@ -89,7 +101,7 @@ class Forces:
 
     @property
     def mass(self) -> Mass:
-        """What gravity pulls at and γ_m damps."""
+        """What accelerates, what gravity pulls at, and what γ_m damps."""
         return self.weight.mass
 
     @property
@@ -275,6 +287,12 @@ class Forces:
         term, places = self._placed[1 + number]
         assert isinstance(term, Pointwise)
         return term, term.columns(places)
+
+    @property
+    def air_drag(self) -> PointForces | None:
+        """Drag of the air around the body; None in a vacuum and where nothing moves."""
+        terms = (term for term in self.further if isinstance(term, PointForces) and term.of_air)
+        return next(terms, None)
 
     @property
     def carrying(self) -> list[int]:

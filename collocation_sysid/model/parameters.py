@@ -309,6 +309,16 @@ class Parameters:
         """Names of those that are not found by their logarithms."""
         return frozenset(item.name for item in self.items if item.scale == "linear")
 
+    def scale_and_bounds(self, name: str) -> tuple[bool, tuple[float, float]]:
+        """Return whether an estimate is its own coordinate, and its (lower, upper) bounds.
+
+        The bounds of a derived modulus, or of a fixed or tied parameter, are infinite.
+        """
+        item = next((each for each in self.free if each.name == name), None)
+        if item is None:
+            return name in self.linear, (-np.inf, np.inf)
+        return item.scale == "linear", (item.lower, item.upper)
+
     @property
     def unguessed(self) -> tuple[str, ...]:
         """Names of those that are estimated without a guess."""

@@ -19,10 +19,12 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from ..arrays import Array, Index
+from ..fem.air import unit_drag
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.force_points import ForcePoints
 from ..fem.node_force import DATA, NodeForce, PlacedForce
 from ..fem.pattern import SymmetricPattern
+from ..recording.experiment import Experiment
 from .force_term import ForceTerm, Slots, States
 from .generated import Generated
 
@@ -265,7 +267,7 @@ class _At:
 
 @dataclass(frozen=True, eq=False)
 class PointForces(Pointwise):
-    """A user's force at T times.
+    """A user's force, or the drag of the air, at T times.
 
     Attributes
     ----------
@@ -295,6 +297,11 @@ class PointForces(Pointwise):
     def carries(self) -> int:  # type: ignore[override]
         """How many numbers the user's law leaves."""
         return self.placed.force.carries
+
+    @property
+    def of_air(self) -> bool:
+        """Whether this is the drag of the air around the body, not a user's law."""
+        return self.placed.force is unit_drag()
 
     @property
     def points(self) -> ForcePoints:  # type: ignore[override]
@@ -338,6 +345,17 @@ class PointForces(Pointwise):
 def generated(force: NodeForce, dofs: int) -> Generated:
     """Its law with derivatives at so many dofs; those of the last few are kept."""
     return Generated(force.expression, force.inputs(dofs), DATA)
+
+
+def air_drag(experiment: Experiment, t_s: Array) -> tuple[PointForces, ...]:
+    """Return the drag of the air on an experiment's body at times (T,); none where nothing is.
+
+    Drag is linear in the density of the air, which is the share of that at a density of one.
+    """
+    if not experiment.has_air_drag:
+        return ()
+    placed = experiment.body.unit_air_drag
+    return (PointForces(placed, t_s, share=experiment.air_density_kg_m3),)
 
 
 def point_forces(body: Body, t_s: Array) -> tuple[PointForces, ...]:

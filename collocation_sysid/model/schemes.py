@@ -49,6 +49,15 @@ class Scheme:
         return self.start[row - 1] if row <= len(self.start) else self.regular
 
     @property
+    def is_midpoint(self) -> bool:
+        """Whether forces are evaluated half way between the last two states, with their difference.
+
+        Then ξ ∓ Δt ν/2 are these states, and a force may be averaged over the step.
+        """
+        stencils = (self.regular, *self.start)
+        return all((each.p, each.q) == ((0.5, 0.5), (1.0, -1.0)) for each in stencils)
+
+    @property
     def reach(self) -> int:
         """Largest lag l with ∂c_t/∂x_{t−l} ≠ 0."""
         lags = []

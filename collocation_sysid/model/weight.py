@@ -3,8 +3,10 @@
 With M(u) = M(ρ) + m + Σ_l s_l m_l the mass of every dof, of which m is tied to the body as stated
 and m_l joins with a load whose share is s_l(t), f_l a load's force and γ_m what damps all mass,
 
-    F_k = M(u_k) g + f_k + Σ_l s_l,k (f_l,k − γ_m m_l ν_k),    c_t ∋ −M(ū_t) a_t,
+    F_k = (M(u_k) − D) g + f_k + Σ_l s_l,k (f_l,k − γ_m m_l ν_k),    c_t ∋ −(M(ū_t) + A) a_t,
 
+D being the mass of the air that the body displaces and A that of the air that moves with it, which
+γ_m does not damp and gravity does not pull at, see `fem.air`,
 ū_t being the mean over the evaluations as row t weighs them, so that what falls freely goes on
 falling so, whatever joins it. Inputs are gravity, where a parameter turns it, and each s_l, as a
 change from the share that is stated.
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from ..fem.air import ADDED_MASS_SHARE
 from ..fem.body import Body, Curvature, Linearisation
 from ..fem.regions import Theta
 from ..recording.experiment import Experiment
@@ -30,16 +33,24 @@ from .force_term import ForceTerm, Slots, States
 
 @dataclass(frozen=True, eq=False)
 class Mass:
-    """What moves with every dof at T times: M, the body's own and what is tied to it.
+    """Mass of every dof at T times: the body's own, what is tied to it, and that of the air.
 
     Attributes
     ----------
     own_kg : (3n,)
+        The body's own.
     tied_kg : (T, 3n)
+        Point masses.
+    displaced_kg : (3n,)
+        Air that the body displaces: buoyancy makes its weight less by the weight of this air.
+    added_kg : (3n,)
+        Air that moves with the body: inertia, without weight or mass-proportional damping.
     """
 
     own_kg: Array
     tied_kg: Array
+    displaced_kg: Array
+    added_kg: Array
 
     def rows(self, rows: slice) -> Mass:
         """The same at some of the times."""
@@ -47,10 +58,28 @@ class Mass:
 
     @cached_property
     def kg(self) -> Array:
-        """M (T, 3n)."""
-        if len(self.tied_kg) and self.tied_kg.strides[0] == 0:  # in the memory of one row
-            return np.broadcast_to(self.own_kg + self.tied_kg[0], self.tied_kg.shape)
-        return self.own_kg + self.tied_kg
+        """Inertia M + A (T, 3n): all that accelerates with the dofs, the air included."""
+        return self._with(self.own_kg + self.added_kg)
+
+    @cached_property
+    def damped_kg(self) -> Array:
+        """M (T, 3n), which γ_m damps: the body and what is tied to it, without the air."""
+        return self._with(self.own_kg)
+
+    @cached_property
+    def weighed_kg(self) -> Array:
+        """M − D (T, 3n), whose weight acts on the dofs: less the air that the body displaces."""
+        return self._with(self.own_kg - self.displaced_kg)
+
+    def row_kg(self, t: int) -> Array:
+        """Inertia M + A (3n,) at the time with index t."""
+        return self.own_kg + self.added_kg + self.tied_kg[t]
+
+    def _with(self, constant_kg: Array) -> Array:
+        """(T, 3n) sum of a constant mass (3n,) and what is tied, in the memory of one row if so."""
+        if len(self.tied_kg) and self.tied_kg.strides[0] == 0:
+            return np.broadcast_to(constant_kg + self.tied_kg[0], self.tied_kg.shape)
+        return constant_kg + self.tied_kg
 
     @cached_property
     def tied(self) -> Array | None:
@@ -95,7 +124,8 @@ class Weight(ForceTerm):
         """That of an experiment at the times `t_s` (T,)."""
         applied, body = experiment.node_forces_n(t_s), experiment.body
         tied = np.repeat(experiment.tied_mass_kg(t_s), 3, axis=1)
-        mass = Mass(_own_kg(body), _compact(tied))
+        air_kg = experiment.air_density_kg_m3 * body.dof_volume_m3
+        mass = Mass(_own_kg(body), _compact(tied), air_kg, ADDED_MASS_SHARE * air_kg)
         applied = _compact(applied.reshape(len(applied), -1))
         return cls(body, mass, experiment.gravity_m_s2, applied, False, *_no_loads(applied))
 
@@ -103,7 +133,8 @@ class Weight(ForceTerm):
     def none(cls, body: Body) -> Weight:
         """That of a body that nothing acts on, at one time."""
         nothing = np.zeros((1, body.pattern.size))
-        mass = Mass(_own_kg(body), nothing)
+        no_air_kg = nothing[0]
+        mass = Mass(_own_kg(body), nothing, no_air_kg, no_air_kg)
         return cls(body, mass, np.zeros(3), nothing, False, *_no_loads(nothing))
 
     def with_theta(self, theta: Theta) -> Self:
@@ -193,7 +224,7 @@ class Weight(ForceTerm):
     @cached_property
     def external_n(self) -> Array:
         """The same: it does not depend on the state."""
-        return self.mass.kg * self.gravity + self.applied_n
+        return self.mass.weighed_kg * self.gravity + self.applied_n
 
     def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
         """Add F and its slopes."""
@@ -203,7 +234,7 @@ class Weight(ForceTerm):
         own = places.inputs.start
         if self.turns:
             for axis in range(3):
-                at.by_theta[:, axis::3, own + axis] += self.mass.kg[:, axis::3]
+                at.by_theta[:, axis::3, own + axis] += self.mass.weighed_kg[:, axis::3]
         for k, (kg, newtons) in enumerate(self._joining, own + 3 * self.turns):
             at.by_theta[:, :, k] += kg * self._falling(states) + newtons
 
@@ -214,7 +245,7 @@ class Weight(ForceTerm):
         own = places.inputs.start
         if self.turns:
             here = slice(own, own + 3)
-            at.theta[:, here] += _of_axes(weights * self.mass.kg)
+            at.theta[:, here] += _of_axes(weights * self.mass.weighed_kg)
             for place, kg in self.mass_by_input(own).items():
                 mixed = _of_axes(weights * kg)
                 at.theta_theta[:, place, here] += mixed

@@ -396,13 +396,12 @@ def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[st
     options, parameters = problem.uncertainty, solution.collocation.parameters
     try:
         known = uncertainty_of(fit, parameters, solution.q, options)
-        changes = assumed(solution.collocation, solution.z, options.assumptions.deviations)
+        changes = assumed(solution.collocation, solution.z, options.considered)
     except (InputError, SimulationError):
         return {}  # without error bars there is none
-    sources = Sources.of(fit, changes, parameters, solution.q, known)
-    return {
-        name: asdict(line) for name, line in budget(sources, known, {}, parameters.linear).items()
-    }
+    means = options.assumptions.means
+    sources = Sources.of(fit, changes, parameters, solution.q, known, means)
+    return {name: asdict(line) for name, line in budget(sources, known, {}, parameters).items()}
 
 
 def without(problem: Problem, name: str) -> tuple[Problem, float]:

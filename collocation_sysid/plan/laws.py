@@ -16,13 +16,13 @@ from ..display import Table
 from ..fem.constants import bare, is_damping, symbol_of, with_unit
 from ..statistics.budget import BudgetLine
 from ..statistics.estimates import Coordinate
+from ..statistics.remedies import LAW
 from .table import Row
 
 # Ratio of what alike models find beyond which they disagree.
 APART = 1.05
 # Moduli at small strain, which every law has; with dampings what means the same by any.
 MODULI = ("young_pa", "poisson")
-LAW = "law"
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Disagreement:
     values : mapping of law to number, that of the chosen first
     without : BudgetLine or None
         The chosen one's, where its budget is known.
-    whole95 : (lower, upper) or None
-        Its whole interval, with what the laws disagree by.
+    combined95 : (lower, upper) or None
+        Its combined interval, with what the laws disagree by.
     share : float
         Of its variance.
     """
@@ -44,7 +44,7 @@ class Disagreement:
     name: str
     values: Mapping[str, float]
     without: BudgetLine | None
-    whole95: tuple[float, float] | None
+    combined95: tuple[float, float] | None
     share: float
 
     @property
@@ -58,11 +58,13 @@ class Disagreement:
         unit = with_unit(self.name).removeprefix(symbol)
         said = f"By those that predict alike, {symbol} is {low:.3g} to {high:.3g}{unit}"
         told = f"{said}: these recordings do not tell it better."
-        if self.without is None or self.whole95 is None:
+        if self.without is None or self.combined95 is None:
             return told
-        ends, least = ("{:.3g} to {:.3g}".format(*w) for w in (self.whole95, self.without.whole95))
+        ends, least = (
+            "{:.3g} to {:.3g}".format(*w) for w in (self.combined95, self.without.combined95)
+        )
         share = f"{self.share:.0%} of the variance"
-        return f"{told} Its whole interval is {ends} with the law ({share}), {least} without."
+        return f"{told} Its combined interval is {ends} with the law ({share}), {least} without."
 
 
 def disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
@@ -91,10 +93,10 @@ def _of_number(
     if known is None:
         return Disagreement(name, values, None, None, 0.0)
     line = BudgetLine(**known)  # type: ignore[arg-type]
-    at = Coordinate.of(name, (*values.values(), *line.whole95), False)
+    at = Coordinate.of(name, (*values.values(), *line.combined95), False)
     places = np.array([at.at(value) for value in values.values()])
     with_law = line.widened(LAW, float(np.sqrt(np.mean((places - places[0]) ** 2))), at)
-    return Disagreement(name, values, line, with_law.whole95, with_law.shares[LAW])
+    return Disagreement(name, values, line, with_law.combined95, with_law.shares[LAW])
 
 
 def law_table(told: Sequence[Disagreement]) -> Table:
@@ -106,11 +108,11 @@ def law_table(told: Sequence[Disagreement]) -> Table:
         spread = 100 * (max(values) / min(values) - 1)
         intervals = (
             w and "{:.3g} … {:.3g}".format(*w)
-            for w in (each.without and each.without.whole95, each.whole95)
+            for w in (each.without and each.without.combined95, each.combined95)
         )
         cells = (f"{value:.4g}" for value in values)
         rows.append(
             (with_unit(each.name), *cells, f"{spread:.0f} %", *(w or "" for w in intervals))
         )
-    heads = ("", *laws, "spread", "whole interval", "with the law")
+    heads = ("", *laws, "spread", "combined interval", "with the law")
     return Table("Which law?", heads, tuple(rows))

@@ -168,8 +168,8 @@ def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, floa
         estimate = estimates.get(name)
         value = None if estimate is None else estimate.value
         row[f"value_{name}"] = value
-        row[f"std_error_{name}"] = None if estimate is None else estimate.std_error
-        interval = None if estimate is None else estimate.ci95
+        row[f"std_error_{name}"] = None if estimate is None else estimate.combined_std_error
+        interval = None if estimate is None else estimate.combined95
         row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
         if name in truth:
             row[f"error_{name}"] = None if value is None else abs(value / truth[name] - 1)

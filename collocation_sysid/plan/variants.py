@@ -1,4 +1,4 @@
-"""Variants of a problem's model as overrides of its file: other materials, other memory.
+"""Variants of a problem's model as overrides of its file: other materials, damping, memory.
 
 What is estimated follows the model. Constants that a material does not have are left out, those
 that it needs besides are estimated, from as stiff a start as the file guesses, or where a scan of
@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from ..errors import InputError, require_among
 from ..fem.constants import bare, usual_value
-from ..fem.materials import MATERIALS
+from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
 from ..problem import Problem
 from ..problem.reading import read_problem_file
@@ -27,6 +28,8 @@ from .arguments import each_once
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
 MOST_BRANCHES = 20
+# Budget entries that stand for other laws of damping, in place of which these are fitted.
+DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
 # Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
 USUAL_POISSON, LESS = 0.3, 0.1
 
@@ -62,6 +65,20 @@ def parse_materials(text: str) -> tuple[str, ...]:
     return names
 
 
+def parse_dampings(text: str) -> tuple[str, ...]:
+    """Return names of laws of damping separated by commas, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the one that was probably meant.
+    """
+    names = each_once(text)
+    for name in names or ("",):
+        require_among(name, DAMPINGS, None, "--damping", "some")
+    return names
+
+
 def parse_branches(text: str) -> tuple[int, ...]:
     """Numbers of Prony branches separated by commas, each once.
 
@@ -84,14 +101,15 @@ def models(
     materials: Sequence[str] = (),
     branches: Sequence[int] = (),
     region: str | None = None,
+    dampings: Sequence[str] = (),
 ) -> list[Variant]:
-    """Every problem file with every material and every number of branches.
+    """Every problem file with every material, law of damping and number of branches.
 
     Parameters
     ----------
     problems : sequence of Problem
         Of the same recordings, each with its file.
-    overrides, materials, branches, region
+    overrides, materials, branches, region, dampings
         See `variants`.
 
     Raises
@@ -100,20 +118,26 @@ def models(
         For less than two models, and what the files or variants refuse.
     """
     compared = file_variants(problems, overrides)
-    if materials or branches:
+    if materials or branches or dampings:
         fitted = [e for e in problems[0].experiments if not e.validation]
         times_s = min(e.timestep_s for e in fitted), max(e.duration_s for e in fitted)
         files, compared = compared, []
         for file in files:
-            of_file = variants(file.path, overrides, materials, branches, times_s, region)
+            of_file = variants(file.path, overrides, materials, branches, times_s, region, dampings)
             front = f"{file.label}: " * (len(files) > 1)
             compared += [replace(v, label=front + v.label, path=file.path) for v in of_file]
     if len(compared) < 2:
+        options = {
+            "--materials": (materials, "neo-hookean,yeoh"),
+            "--damping": (dampings, "kelvin-voigt,material"),
+            "--prony": (branches or (0,), "0,1"),
+        }
+        option, example = next((o, e) for o, (stated, e) in options.items() if stated)
         raise InputError(
             f"found the model {compared[0].label} alone; expected two or more to compare, such as "
-            "neo-hookean,yeoh",
+            f"{example}",
             None,
-            "--materials" if materials else "--prony",
+            option,
         )
     return compared
 
@@ -125,8 +149,9 @@ def variants(
     branches: Sequence[int],
     times_s: tuple[float, float],
     region: str | None = None,
+    dampings: Sequence[str] = (),
 ) -> list[Variant]:
-    """Every material with every number of branches.
+    """Every material with every law of damping and every number of branches.
 
     Parameters
     ----------
@@ -137,7 +162,9 @@ def variants(
     times_s : (shortest, longest)
         Time constants of branches start between them.
     region : str, optional
-        Whose material and branches they are; by default every part of the body has them.
+        Whose material, law and branches they are; by default every part of the body has them.
+    dampings : sequence of names of laws of damping; as in the file if there is none
+        Where some are compared, the first-order estimate of other laws is no budget entry.
 
     Raises
     ------
@@ -149,27 +176,35 @@ def variants(
     body = content["object"]
     _refuse_region(body, region, bool(branches), path)
     varied = []
-    for material in materials or (None,):
-        for count in branches or (None,):
-            label, changes = [], {}
-            parameters = content["parameters"]
-            if material is not None:
-                label.append(material)
-                changes |= _with_material(body, material, region)
-                parameters = _of_material(parameters, material, region)
-            if count is not None:
-                label.append("no memory" if count == 0 else f"{count} branch{'es' * (count > 1)}")
-                own = [t for t in body.get("prony", []) if t.get("region") == region]
-                others = [t for t in body.get("prony", []) if t.get("region") != region]
-                tables = _branches(own, count, {t["name"] for t in others}, region)
-                if tables or body.get("prony"):
-                    changes["object.prony"] = [*others, *tables]
-                old = [each["name"] for each in own]
-                parameters = _with_memory(parameters, old, tables, times_s)
-            changes["parameters"] = parameters
-            settings = tuple(f"{key}={toml(value)}" for key, value in changes.items())
-            said = f"{region}: " * (region is not None) + ", ".join(label)
-            varied.append(Variant(said, (*overrides, *settings), path))
+    for material, damping, count in product(
+        materials or (None,), dampings or (None,), branches or (None,)
+    ):
+        label = []
+        changes: dict[str, Any] = {}
+        parameters = content["parameters"]
+        if material is not None:
+            label.append(material)
+            changes |= _with_law(body, {"material": material}, region)
+            parameters = _of_material(parameters, material, region)
+        if damping is not None:
+            label.append(damping)
+            laws = {"damping": damping} | ({} if material is None else {"material": material})
+            changes |= _with_law(body, laws, region)
+            for name in DAMPING_ASSUMPTIONS:
+                changes[f"uncertainty.assumptions.{name}"] = "none"
+        if count is not None:
+            label.append("no memory" if count == 0 else f"{count} branch{'es' * (count > 1)}")
+            own = [t for t in body.get("prony", []) if t.get("region") == region]
+            others = [t for t in body.get("prony", []) if t.get("region") != region]
+            tables = _branches(own, count, {t["name"] for t in others}, region)
+            if tables or body.get("prony"):
+                changes["object.prony"] = [*others, *tables]
+            old = [each["name"] for each in own]
+            parameters = _with_memory(parameters, old, tables, times_s)
+        changes["parameters"] = parameters
+        settings = tuple(f"{key}={toml(value)}" for key, value in changes.items())
+        said = f"{region}: " * (region is not None) + ", ".join(label)
+        varied.append(Variant(said, (*overrides, *settings), path))
     return varied
 
 
@@ -226,16 +261,21 @@ def _refuse_region(body: Mapping[str, Any], region: str | None, branches: bool, 
         raise InputError(f"found branches of {whose}; expected {expected}", path, "object.prony")
 
 
-def _with_material(body: Mapping[str, Any], material: str, region: str | None) -> dict[str, Any]:
-    """The object's keys with a material for a region, or for all parts."""
+def _with_law(
+    body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
+) -> dict[str, Any]:
+    """Return the object's keys with a material or damping for a region, or for all parts."""
     regions = [dict(each) for each in body.get("region", [])]
     for each in regions:
         if region is None:
-            each.pop("material", None)
+            for key in laws:
+                each.pop(key, None)
         elif each["name"] == region:
-            each["material"] = material
+            each |= laws
     changes: dict[str, Any] = {"object.region": regions} if regions else {}
-    return changes if region is not None else changes | {"object.material": material}
+    if region is not None:
+        return changes
+    return changes | {f"object.{key}": law for key, law in laws.items()}
 
 
 def _of_material(

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ..errors import InputError
 from ..fem.body import Body
@@ -14,6 +14,7 @@ from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.field import Field
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
+from ..fem.rest_shape import UnderGravity
 from ..fem.structured import box_of_edge, cylinder_of_edge
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
@@ -27,6 +28,9 @@ from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
+
+# The key of `Experiment` that stands in a table of its own, of all experiments.
+AIR_KEY = "air_density_kg_m3"
 
 
 def contents_of(
@@ -56,7 +60,9 @@ def contents_of(
         parameters.fit([rubbed])
     experiments, notes = [], []
     for section in file.experiment:
-        reader = RecordingReader(section, folder, body, parameters, simulation, code)
+        reader = RecordingReader(
+            section, folder, body, parameters, simulation, code, file.environment.air_density_kg_m3
+        )
         with _in_table(path, f"experiment '{section.name}'", odd):
             experiments.append(reader.read())
         notes += reader.notes
@@ -96,7 +102,9 @@ def _in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]
         yield
     except InputError as error:
         source, where = error.source, error.where
-        if source is None:  # else it speaks of a file of its own
+        if where == AIR_KEY:
+            source, where = path, f"environment.{AIR_KEY}"
+        elif source is None:  # else it speaks of a file of its own
             inner = where if where != table else None
             separator = ": " if " " in table else "."
             source, where = path, separator.join(part for part in (table, inner) if part)
@@ -153,8 +161,16 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
         prony=branches(None),
         forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
         field=field(section.field, "field"),
+        rest_shape=_rest_shape(section),
         evaluator=section.evaluator,
     )
+
+
+def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"] | None:
+    """Return what is stated of the stress-free shape; None where nothing is."""
+    if section.scan is not None:
+        return UnderGravity(selection(section.scan.nodes), section.scan.gravity_m_s2)
+    return "stress_free" if section.rest_shape is not None else None
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from ..checked import Options, Positive, Text
-from ..statistics.assumptions import Assumptions
+from ..statistics.assumptions import CORRELATION_KEY, Assumptions
+from ..statistics.shape_error import CORRELATION
 from ..statistics.uncertainty import ErrorModel
 
 
@@ -38,11 +39,19 @@ class UncertaintyOptions(ErrorModel):
         Solve again with half the step and on a finer mesh: the numerical error.
     assumptions : Assumptions
         How far off what is assumed may be.
+    surface_correlation : float
+        Correlation length of the error of the surface over the longest extent of the body.
     """
 
     profile: tuple[Text, ...] = ()
     numerical: bool = False
     assumptions: Assumptions = field(default_factory=Assumptions)
+    surface_correlation: Positive = CORRELATION
+
+    @property
+    def considered(self) -> dict[str, float | None]:
+        """Deviations of what is assumed by name, and the correlation length of the surface."""
+        return self.assumptions.deviations | {CORRELATION_KEY: self.surface_correlation}
 
 
 @dataclass(frozen=True)

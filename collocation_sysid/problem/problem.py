@@ -240,6 +240,7 @@ class Problem:
                 where="transcription.substeps",
             )
         self.parameters.fit(self.bodies)
+        _require_rest_shapes(self.bodies, self.parameters)
         _require_one_of_each_field(self.bodies)
         locals_of([each for each in self.experiments if not each.validation], 0)
         for experiment in self.experiments:
@@ -255,6 +256,19 @@ class Problem:
                     f"found {name!r}; expected estimated parameters, {', '.join(free)}",
                     where="uncertainty.profile",
                 )
+
+
+def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None:
+    """Refuse guesses with which no stress-free shape hangs as the mesh does.
+
+    Parameters without a guess are not known yet: the search starts where there is such a shape.
+    """
+    if any(item.guess is None for item in parameters.items if item.tied is None):
+        return
+    for body in bodies:
+        theta = body.theta(parameters.values(parameters.guess_q))
+        if (unreachable := body.unreachable(theta)) is not None:
+            raise InputError(unreachable, where="object.rest_shape")
 
 
 def _require_one_of_each_field(bodies: Iterable[Body]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -72,6 +72,7 @@ class RecordingReader:
     parameters: Parameters
     simulation: bool
     code: Code
+    air_density_kg_m3: float | Literal["none"]
     notes: list[str] = field(default_factory=list)
 
     def read(self) -> Experiment:
@@ -104,6 +105,7 @@ class RecordingReader:
             depths=[self._depth(k, t_s) for k in range(len(section.depth))],
             markers=self._markers(t_s, table),
             nuisance=nuisance_of(section.nuisance, self.code.row),
+            air_density_kg_m3=self.air_density_kg_m3,
             **stated_in(section, Experiment, ""),
             **loads,
         )

@@ -6,14 +6,24 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from ..checked import Count, Finite, Flag, Positive, Text
+from ..checked import Count, Finite, Flag, NotNegative, Positive, Text
 from ..fem.elements import ELEMENTS
 from ..fem.field import Field as MaterialField
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..model.parameters import Unknown
 from ..model.schemes import MOST_STEPS, SCHEMES
+from ..recording.environment import usual_air_density
 from ..recording.selected import Nodes
-from ..section import Among, ByForm, Section, Unit, given_keys, require_one, section_of
+from ..section import (
+    Among,
+    ByForm,
+    Section,
+    Unit,
+    Vector,
+    given_keys,
+    require_one,
+    section_of,
+)
 from .options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
@@ -120,6 +130,21 @@ class CylinderSection(Section):
     quarter: Flag = False
 
 
+class ScanSection(Section):
+    """How the object hung or stood while its mesh was made, with rest_shape = "under_gravity".
+
+    Attributes
+    ----------
+    nodes : Nodes
+        Selection of the nodes that were held: those in a clamp or on a table.
+    gravity_m_s2 : list
+        Gravity in the axes of the mesh; its direction is the pose of the scan.
+    """
+
+    nodes: Nodes
+    gravity_m_s2: Vector = (0.0, 0.0, -9.81)
+
+
 class ObjectSection(Section):
     """The soft object: its mesh, surface or shape, mass and material.
 
@@ -144,7 +169,8 @@ class ObjectSection(Section):
     material : Material
         A material's name, or a table of file and function.
     damping : DampingName
-        Law of γ_r; rayleigh, the paper's, brakes rotation.
+        Law of γ_r: kelvin-voigt, a viscous fluid in the current shape; material, viscous in the
+        rate of the Green strain, as in MuJoCo; rayleigh, the paper's, also damps rotation.
     region : list of RegionSection
         [[object.region]] tables: cells that differ.
     prony : list of PronySection
@@ -153,6 +179,12 @@ class ObjectSection(Section):
         [[object.force]] tables: forces of the user's own on the nodes.
     field : FieldSection, optional
         A constant that differs from place to place: parameter, length_m, modes, amplitude.
+    rest_shape : {"stress_free", "under_gravity"}, optional
+        Whether the mesh is free of stress, or the shape in which the object hung or stood under its
+        own weight while it was scanned; not known by default, which widens the intervals of a mesh
+        from a file.
+    scan : ScanSection, optional
+        Pose and held nodes of the scan: gravity_m_s2, nodes.
     evaluator : {"auto", "simd", "casadi"}
         How element kernels are evaluated.
     """
@@ -172,6 +204,8 @@ class ObjectSection(Section):
     prony: list[PronySection] = Field(default_factory=list)
     force: list[NodeForceSection] = Field(default_factory=list)
     field: FieldSection | None = None
+    rest_shape: Literal["stress_free", "under_gravity"] | None = None
+    scan: ScanSection | None = None
     evaluator: Literal["auto", "simd", "casadi"] = "auto"
 
     @model_validator(mode="after")
@@ -184,6 +218,11 @@ class ObjectSection(Section):
             )
         if len(given_keys(self, "mass_kg", "density_kg_m3")) > 1:
             require_one(self, "mass_kg", "density_kg_m3")
+        if (self.rest_shape == "under_gravity") != (self.scan is not None):
+            raise ValueError(
+                'rest_shape = "under_gravity" and [object.scan] belong together; expected both, '
+                "or neither"
+            )
         regions = [region.name for region in self.region]
         for branch in self.prony:
             if branch.region is not None and branch.region not in regions:
@@ -288,6 +327,22 @@ class TranscriptionSection(Section):
     explicit_grasps: Flag = False
 
 
+AirDensity = Annotated[Literal["none"] | NotNegative, ByForm(str)]
+
+
+class EnvironmentSection(Section):
+    """What surrounds the object.
+
+    Attributes
+    ----------
+    air_density_kg_m3 : float or "none"
+        Of the air, which lifts the object, moves along and drags at it, 1.2 by default; or "none"
+        in a vacuum, and for recordings that were simulated without air.
+    """
+
+    air_density_kg_m3: AirDensity = Field(default_factory=usual_air_density)
+
+
 class ProblemFile(Section):
     """A problem file (TOML).
 
@@ -306,6 +361,7 @@ class ProblemFile(Section):
     parameters: Parameters
     experiment_defaults: dict[str, Any] = Field(default_factory=dict)
     experiment: list[ExperimentSection] = Field(min_length=1)
+    environment: EnvironmentSection = Field(default_factory=EnvironmentSection)
     transcription: TranscriptionSection = TranscriptionSection()
     solver: SolverSection = Field(default_factory=SolverSection)
     rollout: RolloutSection = RolloutSection()

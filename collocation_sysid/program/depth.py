@@ -204,8 +204,9 @@ class DepthReading(Reading):
     def pooled(self, values: Array) -> Array:
         """(S, M, 3, …): sums over patches whose variance is that of a point."""
         means, counts = self._pooling
-        flat = means @ values.reshape(values.shape[0] * values.shape[1] * values.shape[2], -1)
-        return flat.reshape(len(counts), -1, GROUP, *values.shape[3:])
+        columns = int(np.prod(values.shape[3:]))  # zero where nothing is estimated
+        flat = means @ values.reshape(values.shape[0] * values.shape[1] * values.shape[2], columns)
+        return flat.reshape(len(counts), counts.shape[1] // GROUP, GROUP, *values.shape[3:])
 
     # In pictures ------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..errors import SimulationError
+from ..fem.rest_shape import RestShapeError
 from ..model.dynamics import Dynamics, StencilRow, weighted
 from ..model.histories import AnyLeft, ahead, following
 from ..recording.experiment import Experiment
@@ -76,6 +77,9 @@ def march_on(
     if (massless := dynamics.body.massless(dynamics.theta)) is not None:
         failure = SimulationError(massless, float(dynamics.t_s[0]))
         return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
+    if (unreachable := dynamics.body.unreachable(dynamics.theta)) is not None:
+        failure = RestShapeError(unreachable)
+        return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
     solvers = Solvers(experiment, options, stopwatch)
     held = ~np.isnan(dynamics.goals_m)
     x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
@@ -113,7 +117,10 @@ def march_on(
             x[t] = solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
-            return x[:t], simulation_error(solver, failure, time_s, f"the step at row {t}")
+            static = dynamics.static
+            return x[:t], simulation_error(
+                solver, failure, time_s, f"the step at row {t}", static=static
+            )
         forces[t] = row.force(x[t])
         forces[t, dynamics.taken[t]] = 0
         if left:

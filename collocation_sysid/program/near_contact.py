@@ -29,7 +29,7 @@ class NearPoints:
     Attributes
     ----------
     law : ContactLaw
-    data : (2, i) of it
+    chosen : (i,) indices of the points
     nodes : (i, k) of the face at each
     weights : (i, k) of these
     dofs : (i, 3k) of these
@@ -38,7 +38,7 @@ class NearPoints:
     """
 
     law: ContactLaw
-    data: Array
+    chosen: Index
     nodes: Index
     weights: Array
     dofs: Index
@@ -56,7 +56,7 @@ class NearPoints:
         row, column = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
         return NearPoints(
             law,
-            law.data[:, some],
+            some,
             nodes,
             points.mix[some, 0, :-VECTORS],
             dofs,
@@ -65,15 +65,15 @@ class NearPoints:
             np.sign(row - column) / 2,
         )
 
-    def inputs(self, xi: Array, nu: Array, theta: Array) -> tuple[Array, Array]:
-        """Those of the law's push, and its data, at ξ and ν (3n,)."""
+    def inputs(self, contact: Contact, xi: Array, nu: Array, theta: Array) -> tuple[Array, Array]:
+        """Return the inputs of the push of a contact with this law, and its data, at ξ, ν (3n,)."""
         frame = self.law.obstacle.nodes
-        moving = [each.reshape(-1, 3) for each in (xi, nu)[: 1 + self.law.obstacle.rubs]]
+        moving = [each.reshape(-1, 3) for each in (xi, nu)[: 1 + self.law.by_velocity]]
         own = [np.einsum("ik,ikj->ji", self.weights, x[self.nodes] - x[frame[0]]) for x in moving]
         ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
         same = np.concatenate([*ends, theta[self.law.columns]])
         data = np.broadcast_to(same[:, None], (len(same), len(self.nodes)))
-        return np.concatenate(own), np.concatenate([data, self.data])
+        return np.concatenate(own), np.concatenate([data, contact.data_of(self.chosen)])
 
     def summed(self, push: Array, size: int) -> Array:
         """(size,) on the dofs of a body, of forces (3, i) on the points."""
@@ -89,9 +89,11 @@ class NearContact:
         self, contacts: Sequence[Contact], theta: Array, pattern: SymmetricPattern
     ) -> None:
         self._contacts, self._theta, self._pattern = contacts, theta, pattern
-        self._from, self._near = np.full(1, np.nan), list[NearPoints]()
+        self._from, self._near = np.full((2, 1), np.nan), list[tuple[Contact, NearPoints]]()
         edges_m = [each.contact.surface.edge_m for each in contacts]
         self.acts, self._margin_m = bool(contacts), MARGIN * min(edges_m, default=0.0)
+        # A pressure that is averaged over a step depends on the states at both ends.
+        self._half_s = max((each.step_s for each in contacts), default=0.0) / 2
 
     def force(self, xi: Array, nu: Array) -> Array:
         """(3n,) at ξ and ν, (1, 3n) each."""
@@ -109,19 +111,19 @@ class NearContact:
         something rubs.
         """
         force = np.zeros(xi.size)
-        rubs = any(each.contact.obstacle.rubs for each in self._contacts)
+        rubs = any(each.contact.by_velocity for each in self._contacts)
         parts = np.zeros(self._pattern.entries), np.zeros(self._pattern.entries * rubs)
         for near, u, data in self._at(xi[0], nu[0]):
             push, slopes = near.law.push.slopes(u, data)
             force += near.summed(push, xi.size)
             (touch,) = np.nonzero(push.any(axis=0))
             by_way = rates[0] * slopes[:, :3, touch]
-            if near.law.obstacle.rubs:
+            if near.law.by_velocity:
                 by_way += rates[1] * slopes[:, 3:, touch]
             weights, here = near.weights[touch], near.entries[touch].ravel()
             blocks = np.einsum("pa,ijp,pb->paibj", weights, by_way, weights)
             blocks = blocks.reshape(near.entries[touch].shape)
-            counted = (near.symmetric, near.skew)[: 1 + near.law.obstacle.rubs]
+            counted = (near.symmetric, near.skew)[: 1 + near.law.by_velocity]
             for part, counts in zip(parts, counted, strict=False):
                 part += np.bincount(
                     here, weights=(counts[touch] * blocks).ravel(), minlength=len(part)
@@ -130,12 +132,14 @@ class NearContact:
 
     def _at(self, xi: Array, nu: Array) -> Iterator[tuple[NearPoints, Array, Array]]:
         """What is near, with inputs and data of its law."""
-        if not np.abs(xi - self._from).max() <= CHANGE * self._margin_m:
-            self._from, self._near = xi, []
+        ends = np.array([xi - self._half_s * nu, xi + self._half_s * nu])
+        if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:
+            self._from, self._near = ends, []
             for each in self._contacts:
-                (gap,) = each.contact.gaps(each.points.vectors(xi[None]))
-                (chosen,) = np.nonzero(gap < each.contact.width_m + self._margin_m)
+                gaps = each.contact.gaps(each.points.vectors(ends)).min(axis=0)
+                (chosen,) = np.nonzero(gaps < each.contact.widths_m + self._margin_m)
                 if len(chosen):
-                    self._near.append(NearPoints.of(each.contact, self._pattern, chosen.tobytes()))
-        for near in self._near:
-            yield near, *near.inputs(xi, nu, self._theta)
+                    near = NearPoints.of(each.contact, self._pattern, chosen.tobytes())
+                    self._near.append((each, near))
+        for contact, near in self._near:
+            yield near, *near.inputs(contact, xi, nu, self._theta)

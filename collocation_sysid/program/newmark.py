@@ -1,4 +1,13 @@
-"""Implicit Newmark (β = ¼, γ = ½), the reference integrator, with a step of its own."""
+"""Implicit Newmark (β = ¼, γ = ½), the reference integrator, with a step of its own.
+
+All forces but contact are those at both ends of a step, as ever. Contact acts by its mean over the
+step, C(ξ, ν) at ξ = (x_0 + x_1)/2 and ν = (x_1 − x_0)/h, whose work is the loss of its energy, see
+`model.contact`; forces at both ends would add energy at every impact:
+
+    M (v_1 − v_0) = h/2 (F_0 + F_1) + h C,    x_1 − x_0 = h/2 (v_0 + v_1).
+
+So the accelerations a = M⁻¹ F of states are those without contact.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
+from ..model.contact import Contact
+from ..model.force_term import States
 from ..model.forces import Forces
 from ..model.histories import AnyLeft, ahead, following, left_at_start
 from ..model.weight import Weight
 from ..recording.experiment import Experiment
 from .channel import Forced
 from .lapack import one_blas_thread
+from .near_contact import NearContact
 from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
 from .rest import start_state
 
@@ -30,6 +42,7 @@ class _State:
     v: Array
     a: Array
     left: tuple[AnyLeft, ...] = ()
+    contact_n: Array | None = None  # (3n,) mean over the step that led here, where there is contact
 
 
 @one_blas_thread()
@@ -55,13 +68,22 @@ def newmark(
     step = experiment.timestep_s / steps_per_sample
     felt = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
     felt[:, 0] = stepper.felt(state, sensed)
+    means_n = np.zeros_like(felt[0])
+    if state.contact_n is not None:
+        means_n[0] = state.contact_n[sensed]
     for k in range(1, len(times)):
         for j in range(1, steps_per_sample + 1):
             state = stepper.advance(state, float(times[k - 1] + j * step))
-            felt[:, (k - 1) * steps_per_sample + j] = stepper.felt(state, sensed)
+            row = (k - 1) * steps_per_sample + j
+            felt[:, row] = stepper.felt(state, sensed)
+            if state.contact_n is not None:
+                means_n[row] = state.contact_n[sensed]
         x[k], v[k] = state.x, state.v
         if progress:
             progress(k / (len(times) - 1))
+    # Contact at a time is the mean over the steps before and after it.
+    felt[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
+    felt[0, [0, -1]] -= means_n[[0, -1]]
     return x, v, Forced(*felt)
 
 
@@ -81,6 +103,8 @@ class _Stepper:
         x, v = start_state(self.experiment, self._forces(time_s), solver)
         left = left_at_start(self._forces(time_s), x, v, self.experiment.loaded_since_s)
         state = _State(time_s, x, v, np.zeros_like(x), left)
+        if self.experiment.obstacles:
+            state = replace(state, contact_n=self._contact_n(x, v, time_s))
         return self._balanced(state, time_s, solver.free)
 
     def advance(self, state: _State, goal_s: float) -> _State:
@@ -109,14 +133,23 @@ class _Stepper:
         return reaction[dofs], state.x[dofs]
 
     def _force(self, state: _State, load_s: float) -> Array:
-        """All forces (3n,) in a state, under the loads of a time."""
-        forces = self._forces(load_s)
+        """Return all forces (3n,) but contact in a state, under the loads of a time."""
+        forces, _ = self._forces(load_s).without_contact()
         for each in state.left:
             forces = each.now(forces)
         return forces.total(state.x, state.v)[0]
 
-    def _forces(self, load_s: float) -> Forces:
-        return Forces.of(self.experiment, load_s, self.theta)
+    def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
+        return Forces.of(self.experiment, load_s, self.theta, step_s=step_s)
+
+    def _contact_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
+        """Return the contact forces (3n,) at a state, or their means over a step about it."""
+        forces = self._forces(load_s, step_s)
+        total_n = np.zeros_like(x)
+        for term in forces.further:
+            if isinstance(term, Contact) and not term.relaxed:
+                total_n += term.force(States(x[None], v[None], self.theta))[0]
+        return total_n
 
     def _solver(self, time_s: float) -> Solver:
         return self.solvers.holding(self.experiment.held(time_s)[0])
@@ -140,7 +173,8 @@ class _Stepper:
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
         """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
         h = end_s - state.t_s
-        forces = ahead(self._forces(load_s), state.left, h)
+        forces, touching = ahead(self._forces(load_s, step_s=h), state.left, h).without_contact()
+        contact = NearContact(touching, self.theta, forces.pattern)
         mass = forces.mass.kg[0]
         x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
@@ -153,9 +187,13 @@ class _Stepper:
             v[solver.held], a[solver.held] = v_held, a_held
             return v, a
 
+        def middle(x: Array) -> tuple[Array, Array]:
+            return (state.x + x)[None] / 2, (x - state.x)[None] / h
+
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
-            return forces.total(x, v)[0] - mass * a
+            found = forces.total(x, v)[0] - mass * a
+            return found + 2 * contact.force(*middle(x)) if contact.acts else found
 
         def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
@@ -165,16 +203,32 @@ class _Stepper:
             skew = -at.by_position_skew[0]
             if at.by_velocity_skew.size:
                 skew = skew - slope * at.by_velocity_skew[0]
-            return at.force[0] - mass * a, matrix, skew
+            found = at.force[0] - mass * a
+            if contact.acts:
+                pushed, symmetric, askew = contact.linearise(*middle(x), (0.5, 1 / h))
+                found = found + 2 * pushed
+                matrix -= 2 * symmetric
+                skew = skew - 2 * askew
+            return found, matrix, skew
 
         guess = state.x + h * state.v + 0.5 * h * h * state.a
+        if state.contact_n is not None:
+            guess += 0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
         guess[solver.held] = x_held
         if not solver.is_upright(guess):
             guess = state.x.copy()
             guess[solver.held] = x_held
         x = solver.newton(guess, residual, linearise)
         v, a = kinematics(x)
-        return _State(end_s, x, v, a, following(forces, state.left, x, v, h))
+        contact_n = None
+        if contact.acts:
+            xi, nu = middle(x)
+            contact_n = self._contact_n(xi[0], nu[0], load_s, step_s=h)
+            # Held dofs have the acceleration of the grasp.
+            free = solver.free
+            a[free] -= 2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
+        left = following(forces, state.left, x, v, h)
+        return _State(end_s, x, v, a, left, contact_n)
 
     def _held_motion(
         self, solver: Solver, time_s: float, h: float, holding_s: float

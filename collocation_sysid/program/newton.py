@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from ..arrays import Array
 from ..errors import SimulationError
 from ..recording.experiment import Experiment
 from .factorisation import Factor, Factoriser
+from .retraction import Retraction, added
 from .stopwatch import Stopwatch
 
 Residual = Callable[[Array], Array]
@@ -83,6 +85,8 @@ class Solver:
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
+        # A retraction moves surfaces off the obstacles that hold them.
+        self._is_free_of_contact = not experiment.obstacles
         self.options = options or NewtonOptions()
         at_start = experiment.held(experiment.t_s[:1])[0]
         holding = at_start if held is None else held
@@ -104,8 +108,9 @@ class Solver:
 
         A step is accepted when the next one, computed with the same factor, is shorter
         (Deuflhard's natural monotonicity test), no element is inverted, and with
-        `keep_definite` only while −∂r/∂x stays positive definite. Without, the factor of the
-        solution before serves as long as steps shrink fast.
+        `keep_definite` only while −∂r/∂x stays positive definite. An equilibrium (`keep_definite`)
+        may be far from x: without obstacles its steps are rotations and strains, see `Retraction`.
+        Otherwise the factor of the solution before serves as long as steps shrink fast.
 
         Parameters
         ----------
@@ -193,9 +198,11 @@ class Solver:
         """The next iterate, its factor and its step."""
         length = np.linalg.norm(step)
         share = 1.0
+        update = self._retraction if keep_definite and self._is_free_of_contact else added
         for _ in range(self.options.backtracks):
-            trial = x.copy()
-            trial[self.free] += share * step
+            increment = np.zeros_like(x)
+            increment[self.free] = share * step
+            trial = update(x, increment)
             if self.is_upright(trial):
                 # A whole step is mostly taken: it is evaluated with its derivatives at once.
                 if share == 1:
@@ -215,6 +222,13 @@ class Solver:
                         pass
             share /= 2
         raise NewtonFailure(x, "no step along Newton's direction makes progress")
+
+    @cached_property
+    def _retraction(self) -> Retraction:
+        """How increments towards an equilibrium are applied."""
+        prescribed = np.zeros(self.pattern.size, dtype=bool)
+        prescribed[self.held] = True
+        return Retraction(self.body, prescribed.reshape(-1, 3))
 
     def _is_last(self, step: Array, share: float = 1.0) -> bool:
         tolerance = share * self.options.tolerance * self._size_m
@@ -309,9 +323,12 @@ class Solvers:
 
 
 def simulation_error(
-    solver: Solver, failure: NewtonFailure, time_s: float, what: str
+    solver: Solver, failure: NewtonFailure, time_s: float, what: str, *, static: bool = False
 ) -> SimulationError:
-    """The error for the user: what failed, when, at which element, and what to change."""
+    """Return the error for the user: what failed, when, at which element, and what to change.
+
+    Of a static path it has the state where the path ended, see `lost_stability.explained`.
+    """
     element = solver.worst_element(failure.x)
     ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())
     return SimulationError(
@@ -319,4 +336,5 @@ def simulation_error(
         "Stiffer parameters, a smaller timestep or a finer mesh may help",
         time_s,
         element,
+        failure.x if static else None,
     )

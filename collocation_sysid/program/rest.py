@@ -73,7 +73,9 @@ def _at_rest(
     try:
         return followed(solve, away.ravel(), solver.options.halvings, guess)
     except NewtonFailure as failure:
-        raise simulation_error(solver, failure, at_s, "finding the rest state") from failure
+        raise simulation_error(
+            solver, failure, at_s, "finding the rest state", static=True
+        ) from failure
 
 
 def _before_contact(forces: Forces, shape: Array) -> Array:

@@ -156,13 +156,22 @@ class Sighting:
 
     def _scatter_m(self, shapes_m: Array, phi: Array) -> float:
         """How far points of the body may be from the surface, by how far half of them are."""
-        apart = []
+        apart_m = self.apart_m(shapes_m, phi)
+        all_of_them = np.abs(apart_m[np.isfinite(apart_m)])
+        return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
+
+    def apart_m(self, shapes_m: Array, phi: Array) -> Array:
+        """Return how far points (S, E) are behind shapes (S, n, 3), along the normals.
+
+        NaN where a point does not count.
+        """
+        apart_m = np.full(self.used.shape, np.nan)
         for k, x in enumerate(shapes_m):
             surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
             seen = self.view.corrected_at(phi, self.points[k], self.rays[k], k)
-            apart.append(np.sum(self.normals[k] * (surface - seen), axis=1)[self.used[k]])
-        all_of_them = np.abs(np.concatenate(apart))
-        return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
+            behind_m = np.sum(self.normals[k] * (surface - seen), axis=1)
+            apart_m[k] = np.where(self.used[k], behind_m, np.nan)
+        return apart_m
 
 
 def _seen(

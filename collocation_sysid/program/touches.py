@@ -73,8 +73,8 @@ def on_surface(experiment: Experiment, theta: Array, x: Array) -> tuple[Array, A
             here = rows, law.surface.faces
             gaps = law.gaps(contact.points.vectors(x[rows])).reshape(by_face)
             gaps_m[here] = np.fmin(gaps_m[here], gaps.min(axis=2))
-            pressing = contact.pressing(x[rows])[0].reshape(by_face).mean(axis=2)
-            pressures_pa[here] += law.stiffness_at(theta) * pressing
+            pressures = law.stiffness_at(theta) * contact.pressing(x[rows])[0]
+            pressures_pa[here] += pressures.reshape(by_face).mean(axis=2)
     return gaps_m, pressures_pa
 
 
@@ -131,7 +131,7 @@ def touches(experiment: Experiment, x: Array, t_s: Array) -> Iterator[Touch]:
         ever = np.zeros(contact.points.count, dtype=bool)
         for first in range(0, len(x), AT_ONCE):
             gap = law.gaps(contact.points.vectors(x[first : first + AT_ONCE]))
-            least, near = min(least, float(gap.min())), gap < law.width_m
+            least, near = min(least, float(gap.min())), gap < law.widths_m
             points.append(near.sum(axis=1))
             ever |= near.any(axis=0)
         count = np.concatenate(points)

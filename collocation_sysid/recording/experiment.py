@@ -19,6 +19,7 @@ from .actuator import Actuator
 from .arrays import floats, read_only_floats
 from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
 from .depth import Depth
+from .environment import air_density, usual_air_density
 from .gauge import Gauge
 from .grasp import Grasp, free_motions, held_dofs
 from .loads import Change, Force, PointMass, ramp
@@ -92,6 +93,9 @@ class Experiment:
         Instruments of one's own.
     depths : sequence of Depth
         Depth cameras and scanners.
+    air_density_kg_m3 : float or "none"
+        Of the air around the body, which lifts it, moves along and drags; "none", stored as zero,
+        in a vacuum, and for a recording that was simulated without air.
     nuisance : Nuisance
         What else is to be estimated about this recording alone: by default what a careful
         laboratory does not know better; `Nuisance.none` for ideal data.
@@ -123,10 +127,11 @@ class Experiment:
     readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
     nuisance: Nuisance = AS_IN_A_LABORATORY
+    air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
 
     def __post_init__(self) -> None:
         loads = ("masses", "forces", "tendons", "pressures")
-        vars(self)["body"] = with_frames_of(self.body, self.obstacles)
+        vars(self)["body"] = with_frames_of(self.body, self.obstacles, static=self.static)
         framed = zip(self.obstacles, self.body.frames, strict=True)
         vars(self).update(
             grasps=(
@@ -143,6 +148,7 @@ class Experiment:
         self._check_start()
         self._check_actuators()
         self._check_obstacles()
+        self._check_air()
 
     @property
     def place(self) -> str:
@@ -300,6 +306,11 @@ class Experiment:
         return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
     @property
+    def has_air_drag(self) -> bool:
+        """Whether air drags at the body: nothing does in a vacuum or in an equilibrium."""
+        return self.air_density_kg_m3 > 0 and not self.static
+
+    @property
     def actuators(self) -> tuple[Actuator, ...]:
         """Its tendons, then its pressures."""
         return (*self.tendons, *self.pressures)
@@ -309,6 +320,7 @@ class Experiment:
         """The mesh graph of its body, and the couplings of each actuator, obstacle and force."""
         couplings = [each.measure.couplings for each in self.actuators]
         couplings += [each.surface(self.body).points.couplings for each in self.obstacles]
+        couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
         return self.body.joined_with(couplings)
 
     @property
@@ -372,6 +384,18 @@ class Experiment:
                     f"{name} is {getattr(self, name)!r}, but the experiment is static: each sample "
                     f"is an equilibrium, and nothing moves; expected no {name}"
                 )
+
+    def _check_air(self) -> None:
+        lightest = min(self.body.parts, key=lambda part: part.density_kg_m3)
+        if self.air_density_kg_m3 < lightest.density_kg_m3:
+            return
+        whose = f"region {lightest.name!r}" if lightest.name else "the body"
+        raise InputError(
+            f"the air has a density of {self.air_density_kg_m3:g} kg/m³, and {whose} of "
+            f"{lightest.density_kg_m3:.4g} kg/m³; expected air that is lighter, 1.2 kg/m³ in a "
+            "laboratory: check air_density_kg_m3, and mass or density of the body",
+            where="air_density_kg_m3",
+        )
 
     def _check_time(self) -> None:
         fewest = 1 if self.static else 3

@@ -44,8 +44,8 @@ class Obstacle(Grasp):
     """A rigid solid that pushes away the surface of a body, and may rub on it.
 
     It is a grasp that holds nothing but a frame of its own, so that poses, displacements and forces
-    are stated and read as those of grasps are. Its force is that on the body. Where a body hits it,
-    take the scheme "bdf2": under the midpoint rule contact rings.
+    are stated and read as those of grasps are. Its force is that on the body. Where a body comes
+    to rest on it, take the scheme "bdf2": under the midpoint rule contact rings.
 
     Parameters
     ----------
@@ -60,10 +60,11 @@ class Obstacle(Grasp):
     faces : Selection, optional
         Faces that it may touch: those with all corners there. All by default.
     stiffness_pa_m : float, optional
-        κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; a hundred times E over the length of
-        an edge by default, at the E of the trial.
+        κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; a hundred times E over the mean edge
+        of the face at each point by default, at the E of the trial.
     width_m : float, optional
-        δ, the gap at which it begins; a five-hundredth of an edge by default.
+        δ, the gap at which it begins; a five-thousandth of that edge by default, with friction a
+        five-hundredth.
     slip : float, optional
         Speed [m/s], or slip from sample to sample [m] of a static experiment, at which friction is
         seven tenths of its limit.
@@ -151,8 +152,13 @@ def _touching(body: Body, obstacle: Obstacle) -> Touching:
     return Touching.of(body, obstacle.nodes, obstacle.faces)
 
 
-def with_frames_of(body: Body, obstacles: Sequence[Obstacle]) -> Body:
-    """A body that has frames for obstacles."""
+def with_frames_of(body: Body, obstacles: Sequence[Obstacle], *, static: bool) -> Body:
+    """Return the body with a frame for each obstacle.
+
+    Slopes of contact have a skew part where an obstacle has friction, and where pressures are
+    averaged over time steps, which they may be unless the experiment is static.
+    """
     named = (each.coefficient for each in obstacles)
     frictions = tuple(dict.fromkeys(constant for constant in named if constant is not None))
-    return body.with_frames(len(obstacles), any(each.rubs for each in obstacles), frictions)
+    unsymmetric = any(each.rubs or (each.relaxed is None and not static) for each in obstacles)
+    return body.with_frames(len(obstacles), unsymmetric, frictions)

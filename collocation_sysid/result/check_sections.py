@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ..display import Line, Shown, Table, duration, labelled
 from ..fem.constants import symbol_of, unit_of
 from ..runs.check import BodyFinding, Findings, Glance, Recording
@@ -54,6 +56,7 @@ def _body_section(body: BodyFinding) -> Table:
             "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
+            "rest shape": _rest_shape(body),
         }
         | {
             f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
@@ -62,6 +65,18 @@ def _body_section(body: BodyFinding) -> Table:
             for name, each in body.fields.items()
         },
     )
+
+
+def _rest_shape(body: BodyFinding) -> str:
+    """Return what is known of the stress-free shape."""
+    if body.rest_shape == "stress_free":
+        return "the mesh is free of stress"
+    if body.rest_shape is None:
+        return "not stated: see object.rest_shape"
+    if np.isnan(body.rest_shape_change_m):
+        return "the mesh was made under gravity; no stress-free shape at the guess"
+    change = f"{1e3 * body.rest_shape_change_m:.3g} mm"
+    return f"the mesh was made under gravity; the stress-free shape is up to {change} away"
 
 
 def _motion_section(findings: Findings) -> list[Shown]:
@@ -98,9 +113,18 @@ def _measurements_section(findings: Glance) -> Table:
         )
     if len(findings.recordings) > SHOWN_RECORDINGS:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
+    densities = {recording.air_density_kg_m3 for recording in findings.recordings}
+    rows["air"] = ", ".join(map(_air, sorted(densities)))
     for hold in findings.holds[:SHOWN_RECORDINGS]:
         rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
     return labelled("Measurements", rows)
+
+
+def _air(density_kg_m3: float) -> str:
+    """Return what the model contains of the air around a body; a density of zero is a vacuum."""
+    if not density_kg_m3:
+        return "none (as in a vacuum)"
+    return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
 
 
 def _markers_seen(recording: Recording) -> str:

@@ -53,12 +53,15 @@ class ElementFields:
             places = len(NAMES) * part.cells[:, None] + np.arange(len(NAMES))
             width = len(NAMES) * len(body.cells)
             cells, geometry = body.cells[part.cells], body.geometry[part.cells]
-            logs = np.broadcast_to(np.arange(len(cells))[:, None, None], (*geometry.shape[:2], 1))
-            batch = Batch(
-                kernel, cells, geometry, places, width, logs if part.stress_field else None
-            )
+            carried = None
+            if part.stress_field:
+                logs = np.arange(len(cells))[:, None, None]
+                carried = np.broadcast_to(logs, (*geometry.shape[:2], 1))
+            elif body.inverse is not None:
+                carried = body.inverse.places_of_points(number)
+            batch = Batch(kernel, cells, geometry, places, width, carried)
             evaluators.append(body.make_evaluator(batch))
-        volumes = body.geometry[:, :, -1].sum(axis=1)
+        volumes = body.stress_free_geometry(theta)[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)
 
     def at(self, positions_m: ArrayLike) -> dict[str, Array]:
@@ -72,6 +75,8 @@ class ElementFields:
         shares = body.split(self.theta)
         for k, (part, evaluate) in enumerate(zip(body.parts, self._evaluators, strict=True)):
             constants = np.array(shares[k][: part.of_law], dtype=float)
+            if body.inverse is not None:
+                constants = body.point_constants(k, self.theta)
             evaluate([x], constants, sums, body.threads, k > 0, body.brought(k, self.theta))
         means = sums.reshape(len(x), -1, len(NAMES)) / self._volumes[:, None]
         return {name: means[:, :, k] for k, name in enumerate(NAMES)}

@@ -1,4 +1,4 @@
-"""What probes say: a table of refits, and in a sentence or two what to make of them."""
+"""Probes as a table of refits with a conclusion, and when a deeper check is worthwhile."""
 
 from __future__ import annotations
 
@@ -9,16 +9,30 @@ from ..errors import listed
 from ..fem.constants import symbol_of
 from ..runs.result import Result
 from ..statistics.budget import worded
-from ..statistics.probes import Move, Probe
+from ..statistics.relaxation import Move, Probe
 
 # Estimates in the table, what tells stiffness first.
 FOREMOST, SHOWN = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa"), 4
-# Topics of a verdict about which parts of the data and freed assumptions say more.
-ASKING = ("residuals", "noise", "roll-out", "nuisance")
+# Concerns that relaxed assumptions and parts of the data can explain: residuals that are not noise,
+# or predictions that miss. A description that is wrong is none: it is to be corrected first.
+EXPLICABLE = (
+    "assumption/contradicted",
+    "noise/larger",
+    "residuals/persist",
+    "residuals/recordings",
+    "residuals/shared",
+    "roll-out/predicted",
+)
+# Topics of a verdict that come first.
+FIRST_TO_CORRECT = ("description", "solve")
+DEEPER = (
+    "For a deeper check, run `solve --probe`: it refits subsets of the data and relaxes each "
+    "assumption."
+)
 
 
 def probe_section(result: Result) -> Section:
-    """The table and its sentences; nothing where no probes were asked for."""
+    """Return the table of all probes with its sentences; no parts without probes."""
     if not result.probes:
         return Section("Probes", ())
     names = _shown(result)
@@ -33,27 +47,48 @@ def probe_section(result: Result) -> Section:
         for p in result.probes
     ]
     read = (
-        "in brackets the changes in half widths of the 95 % and of the whole interval; of parts of "
-        "the data to first order"
+        "changes of the estimates; in brackets in half widths of the statistical and of the "
+        "combined interval; to first order, but of significant assumptions"
     )
     return Section("Probes", (Table("", heads, tuple(rows), texts=1), read, *_said(result)))
 
 
-def asks_for_probes(result: Result) -> bool:
-    """Whether a verdict, or a budget, is asked to look harder."""
-    wide = any(
-        each.ci95
-        and each.whole95
-        and each.whole95[1] - each.whole95[0] > 2 * (each.ci95[1] - each.ci95[0])
-        for each in result.values.values()
-    )
-    asked = any(concern.topic in ASKING for concern in result.trust.concerns)
-    return bool(result.budget) and not result.probes and (asked or wide)
+def probe_lines(result: Result) -> list[str | Table]:
+    """Return what a terminal shows of the probes: a line where every solve's found nothing."""
+    if is_routine(result) and not any(probe.told for probe in result.probes):
+        return [*_said(result)] if result.probes else []
+    return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
+
+
+def _first_order(probe: Probe) -> str:
+    """Return the size of a relaxed assumption and what it gains, in words."""
+    size, error = short(probe.size or 0.0), short(probe.size_error or 0.0)
+    return f"{worded(probe.name)} ({size} ± {error}, −Δχ² {probe.chi_squared:.1f})"
+
+
+def is_routine(result: Result) -> bool:
+    """Whether only the probes of every solve were made, not those of a deeper check."""
+    return all(probe.routine for probe in result.probes)
+
+
+def is_deeper_check_worthwhile(result: Result) -> bool:
+    """Whether `solve --probe` may explain what the verdict says.
+
+    It may where the residuals, a prediction or a routine probe contradict the model, the error bars
+    are there, and nothing else is to be corrected first. A wide combined interval is no such case:
+    its budget says what to measure.
+    """
+    concerns = result.trust.concerns
+    if not result.budget or not is_routine(result):
+        return False
+    if any(concern.topic in FIRST_TO_CORRECT for concern in concerns):
+        return False
+    return any(concern.code in EXPLICABLE for concern in concerns)
 
 
 def _shown(result: Result) -> list[str]:
     """The estimates of the table."""
-    known = [n for n, each in result.values.items() if each.ci95]
+    known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in FOREMOST[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][:SHOWN]
 
@@ -61,7 +96,9 @@ def _shown(result: Result) -> list[str]:
 def _moved(move: Move | None, value: float) -> str:
     if move is None:
         return "–"
-    shares = ", ".join(f"{x:+.1f}" for x in (move.of_ci95, move.of_whole95) if x is not None)
+    shares = ", ".join(
+        f"{x:+.1f}" for x in (move.of_statistical95, move.of_combined95) if x is not None
+    )
     return f"{_change(move, value)} ({shares})"
 
 
@@ -83,14 +120,18 @@ def _said(result: Result) -> Iterator[str]:
         moved = [_goes(first, result, n) for n in names if n in first.moves][:2]
         size, error = short(first.size or 0.0), short(first.size_error or 0.0)
         yield (
-            f"the data tell {worded(first.name)}: {size} ± {error}, with which χ² falls by "
-            f"{first.chi_squared:.3g} and {listed(moved)} follow: measure it, or estimate it"
+            f"the data determine {worded(first.name)}: {size} ± {error}, with which χ² falls by "
+            f"{first.chi_squared:.3g} and the estimates change by {listed(moved)}: measure it, or "
+            "estimate it"
         )
         if others := [f"{worded(p.name)} ({p.chi_squared:.3g})" for p in freed[1:]]:
             yield f"instead of it also {listed(others)}: one cause may look like another"
     elif not told:
-        yield "no part of the data, and no assumption that is freed, fits better than by chance"
-    yield from _matters(result)
+        tested = " or ".join(_first_order(p) for p in result.probes)
+        nothing = "no part of the data, and no relaxed assumption, fits better than by chance"
+        yield f"no significant {tested}" if is_routine(result) else nothing
+    if not is_routine(result):
+        yield from _matters(result)
 
 
 def _goes(probe: Probe, result: Result, name: str) -> str:

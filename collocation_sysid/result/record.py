@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..fem.body import Body
+from ..program.depth_comparison import SurfaceComparison
 from ..program.touches import on_surface
 from ..recording.experiment import Experiment
 from ..runs.answer import Answer
@@ -113,16 +114,26 @@ def replays(finished: Answer) -> list[Replay]:
 
 
 def _seen(finished: Answer, experiment: Experiment) -> dict[str, Array]:
-    """What depth cameras see, see `Replay.seen`; nothing of what was not fitted."""
-    part = finished.solution.part_of(experiment.name)
-    if part is None or not experiment.depths:
-        return {}
-    from .seen import seen_as_fitted  # which needs matplotlib
+    """Return points of depth cameras on the fitted surface, or else on the simulated one.
 
-    return {
-        reading.sighting.view.depth.name: seen_as_fitted(part, reading, looked)
-        for reading, looked in part.sights
-    }
+    By camera, see `Replay.seen`; empty where neither is known.
+    """
+    part, rollout = finished.solution.part_of(experiment.name), finished.rollouts[experiment.name]
+    surfaces: Mapping[str, SurfaceComparison] = {}
+    if part is not None:
+        surfaces = {
+            reading.sighting.view.depth.name: SurfaceComparison.from_fit(
+                reading, part.x, looked, part.phi
+            )
+            for reading, looked in part.sights
+        }
+    elif isinstance(rollout, Rollout):
+        surfaces = rollout.surfaces
+    if not surfaces:
+        return {}
+    from .seen import compared_rows  # which needs matplotlib
+
+    return {name: compared_rows(surface, experiment.up) for name, surface in surfaces.items()}
 
 
 def _touched(

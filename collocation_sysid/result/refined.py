@@ -9,15 +9,23 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files import RESULT_FILE, require_own, whole_file
+from ..model.parameters import Parameters
 from ..problem import Problem
 from ..runs.refine import refinement_of
-from ..runs.result import FoundValue, Result
+from ..runs.result import ReportedEstimate, Result
+from ..runs.verdict import combined_concerns
 from ..runs.warm_start import Earlier
-from ..statistics.numerical import Level, Refinement
+from ..statistics.budget import NUMERICAL as DISCRETISATION
+from ..statistics.combined import combine
+from ..statistics.estimates import Estimate
+from ..statistics.numerical import Level, NumericalError, Refinement
 from ..statistics.trust import NUMERICAL, Trust, numerical_concerns
 from ..tree import as_json, read
 from .record import REFINEMENT_FILE
 from .replay import reading_run
+
+# Code of the concern that the budget gives anew.
+UNDETERMINED = "information/combined"
 
 
 def refine_run(
@@ -28,9 +36,9 @@ def refine_run(
 ) -> tuple[Refinement, Result]:
     """Solve the problem of a run folder again at finer discretisations, and write what that tells.
 
-    ``refinement.json`` holds the levels, and those that it holds already are not solved again; in
-    ``result.json`` parameters and moduli get their ``numerical_error`` and intervals that hold it,
-    and the verdict takes it into account.
+    ``refinement.json`` holds the levels, and those that it holds already are not solved again. In
+    ``result.json`` the values of parameters and moduli are corrected for the measured error,
+    their combined intervals and the budget contain it, and the verdict takes it into account.
 
     Returns
     -------
@@ -48,15 +56,15 @@ def refine_run(
     home = before.home(file, "use collocation_sysid.refine")
     if not before.converged:
         raise InputError("the run did not converge: there is no answer to refine", file)
-    estimates = {name: each.by_noise for name, each in before.values.items()}
+    problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
+    problem = replace(problem, substeps=before.problem.substeps)
+    estimates = _at_optimum(before, problem.parameters)
     with reading_run(run):
         known = _known_levels(beside, estimates)
         answer = Earlier.of_result(before, run)
-    problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
-    problem = replace(problem, substeps=before.problem.substeps)
 
     def keep(refinement: Refinement) -> Result:
-        after = refined(before, refinement)
+        after = refined(before, refinement, problem.parameters)
         with whole_file(beside) as levels, whole_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
@@ -66,27 +74,88 @@ def refine_run(
     return refinement, keep(refinement)
 
 
-def refined(before: Result, refinement: Refinement) -> Result:
-    """A result with what was measured of the numerical error in place of what was estimated."""
+def refined(before: Result, refinement: Refinement, parameters: Parameters) -> Result:
+    """Return a result with the measured discretisation error in place of the estimated one.
 
-    def allowing(values: Mapping[str, FoundValue]) -> dict[str, FoundValue]:
-        after = dict(values)
-        for name in values.keys() & refinement.errors.keys():
-            error = refinement.errors[name]
-            holds = () if error.ci95 is None else refinement.holds
-            after[name] = replace(
-                values[name], numerical_error=error, ci95=error.ci95, ci95_holds=holds
-            )
-        return after
+    Parameters
+    ----------
+    before : Result
+        Content of ``result.json`` after the solve.
+    refinement : Refinement
+        The measured discretisation errors.
+    parameters : Parameters
+        Of the problem, with their coordinates and bounds.
+    """
+    optimum = _at_optimum(before, parameters)
 
-    estimates = {name: each.by_noise for name, each in before.values.items()}
-    kept = [each for each in before.trust.concerns if each.code not in NUMERICAL]
-    return replace(
-        before,
-        parameters=allowing(before.parameters),
-        derived=allowing(before.derived),
-        trust=Trust.of((*kept, *numerical_concerns(estimates, refinement))),
+    def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
+        return {
+            name: _corrected(name, each, optimum[name], refinement.errors[name], parameters)
+            if name in optimum and name in refinement.errors
+            else each
+            for name, each in values.items()
+        }
+
+    after = replace(
+        before, parameters=corrected(before.parameters), derived=corrected(before.derived)
     )
+    budget = {
+        name: _shares(shares, before.values[name], after.values[name])
+        for name, shares in before.budget.items()
+    }
+    uncertainties = {name: each.combined_std_error for name, each in after.values.items()}
+    kept = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, UNDETERMINED)]
+    concerns = (
+        *kept,
+        *numerical_concerns(optimum, uncertainties, refinement),
+        *combined_concerns(parameters, after.values, budget),
+    )
+    return replace(after, budget=budget, trust=Trust.of(concerns))
+
+
+def _at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
+    """Return the estimates before the correction of the discretisation error, by name."""
+    return {
+        name: each.at_optimum(name, linear=name in parameters.linear)
+        for name, each in result.values.items()
+    }
+
+
+def _corrected(
+    name: str,
+    before: ReportedEstimate,
+    optimum: Estimate,
+    error: NumericalError,
+    parameters: Parameters,
+) -> ReportedEstimate:
+    """Correct an estimate for its measured discretisation error."""
+    linear, bounds = parameters.scale_and_bounds(name)
+    combined = combine(
+        name,
+        optimum,
+        error,
+        before.systematic,
+        known_effect=before.known_effect or 0.0,
+        linear=linear,
+        bounds=bounds,
+    )
+    return replace(before, **vars(combined), numerical_error=error)
+
+
+def _shares(
+    shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
+) -> dict[str, float]:
+    """Return the shares of the budget with the measured discretisation error."""
+    if not before.combined_std_error or not after.combined_std_error:
+        return dict(shares)
+    ratio = (before.combined_std_error / after.combined_std_error) ** 2
+    # Standard errors are relative to their values, see `Coordinate`.
+    ratio *= (after.value / before.value) ** 2 if before.value else 1.0
+    others = {name: share * ratio for name, share in shares.items() if name != DISCRETISATION}
+    total = max(1.0, sum(others.values()))
+    found = {name: share / total for name, share in others.items()}
+    found[DISCRETISATION] = 1.0 - sum(found.values())
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
 def _known_levels(file: Path, names: Iterable[str]) -> list[Level]:

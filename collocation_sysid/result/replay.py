@@ -337,11 +337,12 @@ def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:
 
 
 def headline(result: Result) -> str:
-    """Young's moduli with their standard errors, and the verdict, in one line."""
+    """Return Young's moduli with their combined uncertainties, and the verdict, in one line."""
     moduli = {symbol_of(n): each for n, each in result.values.items() if bare(n) == "young_pa"}
     said = []
     for name, each in moduli.items():
-        bar = f" ± {float(format(each.std_error, '.2g')):g}" if each.std_error else ""
+        deviation = each.combined_std_error
+        bar = f" ± {float(format(deviation, '.2g')):g}" if deviation else ""
         said.append(f"{name} = {each.value:.5g}{bar} Pa")
     return "; ".join([*said, f"verdict: {result.trust.verdict}"])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,14 +26,15 @@ from ..display import (
 from ..errors import listed
 from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import is_own
+from ..program.depth_comparison import DepthError
 from ..recording.nuisance import in_unit_for_people
-from ..runs.result import FoundValue, Result, SimulatedExperiment
+from ..runs.prediction import PredictionError
+from ..runs.result import Result, SimulatedExperiment
 from ..statistics.budget import largest_first, worded
 from ..statistics.concern import Concern, topics_of
-from ..statistics.numerical import NumericalError
 from ..statistics.trust import Trust
 from ..tree import content
-from .probe_sections import FOREMOST, asks_for_probes, probe_section
+from .probe_sections import DEEPER, FOREMOST, is_deeper_check_worthwhile, probe_lines, probe_section
 from .replay import LARGEST, read_arrays, reading_run
 
 MEANINGS = {
@@ -46,6 +47,8 @@ WORST, APART = 8, 5
 SHOWN_DIAGNOSES = 2
 # Of the budget: estimates and sources; the page has all above a share.
 SHOWN_BUDGETS, SHOWN_SOURCES, LITTLE = 3, 3, 0.01
+# Ratio of combined to statistical standard uncertainty beyond which the sources are named.
+MOSTLY_SYSTEMATIC = 1.5
 
 CAPTIONS = {
     "depth": "What a depth camera saw under outlines of the fitted surface, of up to four samples, "
@@ -77,8 +80,7 @@ def summary(result: Result, folder: Path, budget: bool = False) -> list[Shown]:
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (_ended(result), *answer(result), _fit(result), _notes(result))
     tables = [budget_table(result)] if budget and result.budget else []
-    probed = flat([probe_section(result)])
-    return [*flat(sections), *tables, *probed, *ended, f"written to {folder}"]
+    return [*flat(sections), *tables, *probe_lines(result), *ended, f"written to {folder}"]
 
 
 def answer(result: Result) -> list[Shown]:
@@ -147,9 +149,8 @@ def verdict_of(trust: Trust, linked: bool = False, most: int | None = None) -> S
 
 
 def _harder(result: Result) -> list[Line]:
-    """Whether to look harder."""
-    said = "look harder: solve --probe refits parts of the data, and with each assumption freed"
-    return [Line(said, "quiet")] if asks_for_probes(result) else []
+    """Return the recommendation of a deeper check, where it is worthwhile."""
+    return [Line(DEEPER, "quiet")] if is_deeper_check_worthwhile(result) else []
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:
@@ -159,49 +160,74 @@ def how_to(concerns: Iterable[Concern]) -> list[Line]:
 
 
 def _parameters(result: Result) -> Section:
-    """Values with their intervals, what these hold, and what the values rest on."""
-    values, holds = result.values, result.holds
-    rows = tuple((with_unit(name), *_cells(each)) for name, each in values.items())
-    heads = ("", "value", "±", "95 % interval", "whole interval", "guess", "")
+    """Corrected values with their combined and statistical uncertainties, and how to read them."""
+    values = result.values
+    rows = tuple((with_unit(name), *_cells(result, name)) for name in values)
+    heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
     parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
     parts += [field.sentence(name) for name, field in result.fields.items()]
-    if holds:
-        moving = any(not each.static for each in result.fit.experiments.values())
-        left = [f"the {k}" for k in ("step", "mesh")[not moving :] if k not in holds]
-        said = f"intervals cover {listed(f'the {kind}' for kind in holds)}"
-        parts.append(said + (f", not {listed(left)}: see refine" if left else ""))
-    if result.budget:
-        parts.append("whole intervals also cover what is assumed, see docs/howto/budget.md")
-    if "mesh" in holds:
-        parts.append(refinement_table(result.numerical_errors))
-    elif moved := [
-        f"{symbol_of(name)} {100 * (1 - error.extrapolated / values[name].value):+.2g} %"
+    if any(each.combined95 for each in values.values()):
+        parts.append(_covered(result))
+    elif any(each.statistical95 for each in values.values()):
+        parts.append("combined intervals are missing: systematic effects were not evaluated")
+    if "mesh" in result.covers:
+        parts.append(refinement_table(result))
+    elif corrected := [
+        f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
         for name, error in result.numerical_errors.items()
-        if values[name].value and values[name].std_error is not None
+        if (optimum := values[name].optimum) and values[name].statistical95 is not None
     ]:
-        parts.append(f"the step moves, to first order: {', '.join(moved)}")
-    return Section("Parameters", (*parts, *_most_assumed(result), *result.basis))
+        parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
+    if known := [
+        f"{symbol_of(name)} {100 * each.known_correction / each.value:+.2g} %"
+        for name, each in values.items()
+        if each.known_correction and each.value
+    ]:
+        parts.append(f"corrected for grip layer and machine as stated: {', '.join(known)}")
+    parts += _not_determined(result)
+    return Section("Parameters", (*parts, *_largest_contributions(result), *result.basis))
 
 
-def _most_assumed(result: Result) -> list[str]:
-    """Of the estimates that assumptions make most uncertain, what does so."""
-    wider = {
-        name: ratio
+def _not_determined(result: Result) -> list[str]:
+    """Name the estimates with intervals wider than their values, and the largest contributions."""
+    sources = []
+    for name, shares in result.budget.items():
+        if name in result.values and not result.values[name].is_determined:
+            source, share = next(iter(shares.items()))
+            sources.append(f"{symbol_of(name)} (mostly {worded(source)}, {share:.0%})")
+    if not sources:
+        return []
+    return [f"not determined, as the interval is wider than the value: {listed(sources)}"]
+
+
+def _covered(result: Result) -> str:
+    """Return what the combined intervals contain, and which discretisation error they do not."""
+    moving = any(not each.static for each in result.fit.experiments.values())
+    kinds = ("step", "mesh") if moving else ("mesh",)
+    covered = [f"the {kind}" for kind in kinds if kind in result.covers]
+    left = [f"the {kind}" for kind in kinds if kind not in result.covers]
+    parts = listed(["noise", *covered, "systematic effects"])
+    said = f"± (standard uncertainty) and intervals combine {parts}"
+    return said + (f", not {listed(left)}: see refine" if left else "")
+
+
+def _largest_contributions(result: Result) -> list[str]:
+    """Name the main sources of the estimates whose uncertainty is mostly systematic."""
+    ratios = {
+        name: each.combined_std_error / each.statistical_std_error
         for name, each in result.values.items()
-        if each.ci95 and each.whole95 and (ratio := _width(each.whole95) / _width(each.ci95)) > 1.5
+        if each.combined_std_error and each.statistical_std_error and name in result.budget
     }
-    names = sorted(wider, key=lambda name: -wider[name])[:SHOWN_BUDGETS]
-    said = []
-    for name in names:
+    systematic = {name: ratio for name, ratio in ratios.items() if ratio > MOSTLY_SYSTEMATIC}
+    sentences = []
+    for name in sorted(systematic, key=lambda name: -systematic[name])[:SHOWN_BUDGETS]:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
         sources = ", ".join(f"{worded(s)} {share:.0%}" for s, share in shares if share > LITTLE)
-        said.append(f"{symbol_of(name)}'s whole interval comes mostly from {sources}")
-    return said
-
-
-def _width(interval: tuple[float, float]) -> float:
-    return max(interval[1] - interval[0], 1e-300)
+        sentences.append(
+            f"largest contributions to the combined uncertainty of {symbol_of(name)}: {sources}"
+        )
+    return sentences
 
 
 def budget_table(result: Result) -> Table:
@@ -212,34 +238,55 @@ def budget_table(result: Result) -> Table:
     return Table("", ("% of the variance", *map(symbol_of, lines)), tuple(rows))
 
 
-def _cells(value: FoundValue) -> tuple[str, ...]:
-    interval = _interval(value.ci95)
-    if value.at_bound:
+def _cells(result: Result, name: str) -> tuple[str, ...]:
+    """Return the row of an estimate: value, uncertainties, guess, and a remark."""
+    each = result.values[name]
+    interval = _interval(each.combined95)
+    remark = each.reason or ""
+    if each.at_bound:
         interval = "at its bound"
-    elif value.reason:
-        interval = "not determined" if value.ci95 is None else "not identifiable"
-    spread = "" if value.std_error is None else f"{value.std_error:.2g}"
-    guess = "" if value.guess is None else f"{value.guess:.5g}"
-    if value.fixed:
-        guess = "tied" if value.tied else "fixed"
-    whole = "" if value.whole95 is None else "{:.4g} … {:.4g}".format(*value.whole95)
-    return f"{value.value:.5g}", spread, interval, whole, guess, value.reason or ""
+    elif each.reason:
+        interval = "not determined" if each.statistical95 is None else "not identifiable"
+    guess = "" if each.guess is None else f"{each.guess:.5g}"
+    if each.fixed:
+        guess = "tied" if each.tied else "fixed"
+    return (
+        f"{each.value:.5g}",
+        _spread(each.combined_std_error),
+        interval,
+        _spread(each.statistical_std_error),
+        _spread(each.systematic_std_error),
+        guess,
+        remark,
+    )
 
 
-def refinement_table(errors: Mapping[str, NumericalError]) -> Table:
-    """What step and mesh change, and intervals for noise and discretisation."""
+def _spread(deviation: float | None) -> str:
+    return "" if deviation is None else short(deviation)
+
+
+def refinement_table(result: Result) -> Table:
+    """Return what step and mesh change, and the corrected values with combined intervals."""
     halved = ("half the step", "order", "half the edges", "order")
     rows = []
-    for name, e in errors.items():
-        step, mesh = ("" if x is None else f"{x:+.3g}" for x in (e.step, e.mesh))
-        first, second = ("" if x is None else f"{x:.1f}" for x in (e.step_order, e.mesh_order))
-        limit = f"{e.extrapolated:.5g}", _interval(e.ci95)
-        rows.append((with_unit(name), step, first, mesh, second, *limit))
-    return Table("", ("", *halved, "limit", "95 % interval"), tuple(rows))
+    for name, error in result.numerical_errors.items():
+        each = result.values[name]
+        rows.append(
+            (
+                with_unit(name),
+                "" if error.step is None else f"{error.step:+.3g}",
+                "" if error.step_order is None else f"{error.step_order:.1f}",
+                "" if error.mesh is None else f"{error.mesh:+.3g}",
+                "" if error.mesh_order is None else f"{error.mesh_order:.1f}",
+                f"{each.value:.5g}",
+                _interval(each.combined95),
+            )
+        )
+    return Table("", ("", *halved, "corrected", "95 % interval"), tuple(rows))
 
 
-def _interval(ci95: tuple[float, float] | None) -> str:
-    return "" if ci95 is None else "{:.5g} … {:.5g}".format(*ci95)
+def _interval(ends: tuple[float, float] | None) -> str:
+    return "" if ends is None else "{:.5g} … {:.5g}".format(*ends)
 
 
 def _fit(result: Result) -> Section:
@@ -262,7 +309,10 @@ def _fit(result: Result) -> Section:
                 f"friction of {obstacle} in '{name}': at most {rubbed.used:.0%} of its limit, "
                 f"slips {rubbed.slipping:.0%} of the time, takes {short(rubbed.dissipated_j)} J"
             )
-    lines += [_simulated(name, each) for name, each in result.rollout.experiments.items()]
+        for camera, error in (each.depth or {}).items():
+            lines.append(f"depth of {camera} in '{name}': {_depth(error)}")
+    for name, each in result.rollout.experiments.items():
+        lines += _simulated(name, each)
     lines.append(
         f"{result.iterations} iterations in {timing.total:.1f} s "
         f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"
@@ -273,18 +323,56 @@ def _fit(result: Result) -> Section:
     return Section("Fit", tuple(lines))
 
 
-def _simulated(name: str, simulated: SimulatedExperiment) -> str:
-    """How far a forward simulation is from the measurements."""
+def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
+    """Yield how far a forward simulation is from the measurements, beside its yardsticks."""
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:
-        return f"{kind} '{name}': failed: {simulated.failed}"
-    forces = _forces(simulated.wrench_rms_n, simulated.wrench_rms_nm)
-    said = [f"{forces} RMS"] if forces else []
-    if simulated.rms_m:  # none without markers
-        most_mm = 1e3 * (simulated.max_m or 0.0)
-        said.insert(0, f"{_mm(simulated.rms_m)} mm RMS, at most {most_mm:.2f} mm")
-    said += [f"{reading} {rms:.2g} RMS" for reading, rms in (simulated.reading_rms or {}).items()]
-    return f"{kind} '{name}': {'; '.join(said) or 'compared with nothing but depth images'}"
+        yield f"{kind} '{name}': failed: {simulated.failed}"
+        return
+    own = PredictionError(
+        rms_m=simulated.rms_m,
+        max_m=simulated.max_m,
+        wrench_rms_n=simulated.wrench_rms_n,
+        wrench_rms_nm=simulated.wrench_rms_nm,
+        reading_rms=simulated.reading_rms,
+        depth=simulated.depth,
+    )
+    yield f"{kind} '{name}': {_errors(own) or 'compared with nothing'}"
+    if simulated.fitted:
+        return
+    if simulated.blind is not None:
+        blind = _errors(simulated.blind)
+        yield f"  with the nuisance parameters of the fitted recordings (blind): {blind}"
+    if simulated.copied is not None:
+        copied = simulated.copied
+        yield f"  the measurements of '{copied.copied}' copied: {_errors(copied.error)}"
+    elif simulated.not_copied:
+        yield f"  no copy as a yardstick: {simulated.not_copied}"
+
+
+def _errors(error: PredictionError) -> str:
+    """Return the errors of a prediction in words; "" if nothing is compared."""
+    said = []
+    if error.rms_m:  # none without markers
+        said.append(f"{_mm(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
+    if forces := _forces(error.wrench_rms_n, error.wrench_rms_nm):
+        said.append(f"{forces} RMS")
+    said += [f"{reading} {rms:.2g} RMS" for reading, rms in (error.reading_rms or {}).items()]
+    said += [f"depth of {camera} {_depth(each)}" for camera, each in (error.depth or {}).items()]
+    return "; ".join(said)
+
+
+def _depth(error: DepthError) -> str:
+    """Return the distances of a depth camera's points from the surface, in words."""
+    if error.rms_m is None:
+        return "has no point near the body"
+    said = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
+    if not error.share_beyond_gate:
+        return f"{said}, all within the gate of {1e3 * error.gate_m:.3g} mm"
+    beyond = f"{said}, {error.share_beyond_gate:.0%} beyond the gate of {1e3 * error.gate_m:.3g} mm"
+    if error.rms_within_gate_m is None:
+        return beyond
+    return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
 
 
 def _mm(metres: float) -> str:
@@ -308,7 +396,8 @@ def _cards(result: Result) -> Cards:
     """The three numbers that matter: stiffness, misfit, and how well the answer repeats it."""
     values, fit, simulated = result.values, result.fit, result.rollout
     name = next((key for key in FOREMOST if key in values), next(iter(values)))
-    interval, value = values[name].ci95, f"{number(values[name].value, 4)} {unit_of(name)}"
+    interval = values[name].combined95
+    value = f"{number(values[name].value, 4)} {unit_of(name)}"
     known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
     alone = f"RMS; noise alone leaves {millimetres(fit.noise_rms_m)}"
     most = f"RMS; {millimetres(simulated.max_m)} at most"

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.nuisance import NuisanceMap
-from ..program.depth import DepthReading
-from ..program.part import Part
+from ..program.depth_comparison import SurfaceComparison
 from ..program.skin import Skin
 from ..program.view import View
 from ..recording.experiment import Experiment
@@ -84,16 +83,26 @@ class Projection:
         return rows
 
 
-def seen_as_fitted(part: Part, reading: DepthReading, looked: Array) -> Array:
-    """(k, 8) of all samples, see `Replay.seen`; outlines of some."""
-    seen, shapes_m, phi = reading.sighting, reading.shapes(part.x, part.phi), part.phi
-    apart_m, up = reading.apart_m(looked, phi), part.segment.experiment.up
+def compared_rows(surface: SurfaceComparison, up: Array) -> Array:
+    """Return the points of all images beside a fitted or simulated surface, see `Replay.seen`.
+
+    Parameters
+    ----------
+    surface : SurfaceComparison
+    up : (3,) unit vector against gravity
+
+    Returns
+    -------
+    (k, 8) array
+        With outlines of some of the samples.
+    """
+    seen, shapes_m, phi = surface.sighting, surface.shapes_m, surface.phi
     shown = Projection.of(seen.view, seen.skin, phi, shapes_m[0], up)
     samples = np.flatnonzero(seen.used[: len(shapes_m)].any(axis=1)).tolist()
     rows = [np.zeros((0, 8))]
     for k in samples:
         within = seen.weights[k].any(axis=1)
-        sights = seen.points[k], seen.rays[k], apart_m[k]
+        sights = seen.points[k], seen.rays[k], surface.apart_m[k]
         rows.append(shown.rows(k, *(each[within] for each in sights)))
     few = np.unique(np.linspace(0, len(samples) - 1, OUTLINED).round().astype(int))
     rows += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]

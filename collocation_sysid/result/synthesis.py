@@ -14,7 +14,7 @@ from ..errors import InputError, require_among
 from ..files import whole_file
 from ..model.schemes import SCHEMES
 from ..problem import Problem
-from ..program.simulation import Trajectory, simulate
+from ..program.simulation import NEWMARK, Trajectory, simulate
 from ..recording import (
     Experiment,
     write_gauge_csv,
@@ -34,7 +34,7 @@ class Recipe(Options):
     integrator : str
         newmark, or a scheme: midpoint, backward-euler, bdf2.
     timestep_s : float
-        The step of newmark.
+        The step of newmark; chosen so that the motion does not depend on it by default.
     noise_m : float
         Standard deviation of the markers' noise.
     noise_n : float
@@ -54,7 +54,7 @@ class Recipe(Options):
         For an unknown integrator, and a timestep, noise or seed that cannot be.
     """
 
-    integrator: str = "newmark"
+    integrator: str = NEWMARK
     timestep_s: Positive | None = None
     noise_m: NotNegative = 0.0
     noise_n: NotNegative = 0.0
@@ -65,7 +65,7 @@ class Recipe(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_among(self.integrator, ("newmark", *SCHEMES), None, "integrator")
+        require_among(self.integrator, (NEWMARK, *SCHEMES), None, "integrator")
 
 
 def write_data(
@@ -106,10 +106,18 @@ def write_data(
     _refuse_inputs(problem, place)
     for experiment in problem.experiments if recipe.frames else ():
         require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
-    rng, how = np.random.default_rng(recipe.seed), (recipe.integrator, recipe.timestep_s)
+    rng = np.random.default_rng(recipe.seed)
     simulated = [
-        simulate(e, problem.parameters, *how, problem.first_substeps, None, progress)
-        for e in problem.experiments
+        simulate(
+            experiment,
+            problem.parameters,
+            recipe.integrator,
+            timestep_s=recipe.timestep_s,
+            # The grid of the problem is that of schemes; Newmark's step is stated in the recipe.
+            substeps="auto" if recipe.integrator == NEWMARK else problem.substeps,
+            progress=progress,
+        )
+        for experiment in problem.experiments
     ]
     written = []
     with ExitStack() as whole:  # all files appear at its end, or none

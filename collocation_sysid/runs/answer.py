@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from typing import Any
@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, hint_at
-from ..fem.constants import unit_of
+from ..fem.constants import is_mode, unit_of
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..statistics.budget import BudgetLine, Sources, budget
+from ..statistics.combined import combine
 from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
@@ -23,15 +24,15 @@ from ..statistics.fields import FieldEstimate, fields_of
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import verdicts
 from ..statistics.linearised import Derived
-from ..statistics.numerical import Refinement
-from ..statistics.probes import Probe
+from ..statistics.numerical import NumericalError, Refinement
 from ..statistics.profile import Profile
-from ..statistics.trust import Trust, cause_concerns, numerical_concerns
+from ..statistics.relaxation import Probe
+from ..statistics.trust import Trust, cause_concerns, numerical_concerns, probe_concerns
 from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout
-from .result import FoundValue
-from .verdict import concerns, expected_rms_m, motions_of
+from .result import ReportedEstimate
+from .verdict import combined_concerns, concerns, expected_rms_m, motions_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,8 @@ class Answer:
     sources : Sources or None
         What moves the estimates beside the noise, where there are error bars.
     probes : tuple of Probe
-        Refits of parts of the data and with assumptions freed, where these were asked for.
+        Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
+        of parts of the data, where these were asked for. Empty without error bars.
     """
 
     problem: Problem
@@ -84,8 +86,8 @@ class Answer:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Every parameter, by name."""
-        return self.solution.parameters
+        """Every parameter by name, corrected for the known discretisation error."""
+        return {name: self.estimates[name].value for name in self.solution.parameters}
 
     @property
     def started_from(self) -> Parameters:
@@ -94,53 +96,65 @@ class Answer:
 
     @cached_property
     def derived(self) -> dict[str, float]:
-        """Moduli that follow from the parameters, by name."""
+        """Moduli that follow from the parameters at the optimum, by name."""
         constants = (segment.constants for segment in self.solution.collocation.segments)
         return dict(Derived.of(constants, self.solution.q).values)
 
     @cached_property
-    def estimates(self) -> dict[str, FoundValue]:
-        """Parameters and derived moduli, with intervals for all that `interval_holds` names."""
-        errors = {} if self.refinement is None else self.refinement.errors
-        items, values = {item.name: item for item in self.started_from.items}, {}
-        for name, by_noise in self.noise_estimates.items():
-            item, error = items.get(name), errors.get(name)
-            ci95 = by_noise.ci95 if error is None else error.ci95
-            guess, tied = item and item.guess, item and item.tied is not None
-            values[name] = FoundValue(
-                **vars(replace(by_noise, ci95=ci95)),
-                ci95_holds=() if ci95 is None else self.interval_holds,
-                ci95_noise=by_noise.ci95,
-                numerical_error=error,
-                whole95=self.budget[name].whole95 if name in self.budget else None,
-                guess=np.nan if item and guess is None else guess,
-                fixed=item and (item.fixed or tied),
-                tied=tied or None,
-            )
-        return values
+    def estimates(self) -> dict[str, ReportedEstimate]:
+        """Parameters and derived moduli with their combined and statistical intervals, by name."""
+        return {name: self._reported(name, each) for name, each in self.optimum.items()}
+
+    def _reported(self, name: str, optimum: Estimate) -> ReportedEstimate:
+        """Correct an estimate at the optimum and combine its uncertainties."""
+        item = next((each for each in self.started_from.items if each.name == name), None)
+        line = self.budget.get(name)
+        error = None if is_mode(name) else self.discretisation_errors.get(name)
+        linear, bounds = self.started_from.scale_and_bounds(name)
+        systematic = None if line is None else line.systematic
+        known_effect = 0.0 if line is None else line.known_effect
+        combined = combine(
+            name,
+            optimum,
+            error,
+            systematic,
+            known_effect=known_effect,
+            linear=linear,
+            bounds=bounds,
+        )
+        guess = None if item is None else item.guess
+        tied = item is not None and item.tied is not None
+        return ReportedEstimate(
+            **vars(combined),
+            at_bound=optimum.at_bound,
+            reason=optimum.reason,
+            optimum=optimum.value,
+            systematic=systematic,
+            known_effect=known_effect or None,
+            numerical_error=error,
+            guess=np.nan if item is not None and guess is None else guess,
+            fixed=None if item is None else item.fixed or tied,
+            tied=tied or None,
+        )
 
     @cached_property
     def budget(self) -> dict[str, BudgetLine]:
-        """What the variance of each estimate is made of, by name; empty without error bars."""
+        """The uncertainty budget of each estimate, by name; empty without error bars."""
         if self.uncertainty is None or self.sources is None:
             return {}
-        errors = {} if self.refinement is None else self.refinement.errors
-        linear = [item.name for item in self.started_from.items if item.scale == "linear"]
-        return budget(self.sources, self.uncertainty, errors, linear)
+        return budget(self.sources, self.uncertainty, self.discretisation_errors, self.started_from)
 
     @property
-    def interval_holds(self) -> tuple[str, ...]:
-        """What the intervals hold: "noise", and of "step" and "mesh" what is known."""
-        if self.uncertainty is None:
-            return ()
-        return ("noise",) if self.refinement is None else self.refinement.holds
+    def discretisation_errors(self) -> Mapping[str, NumericalError]:
+        """What is known of the discretisation error of each estimate, by name."""
+        return {} if self.refinement is None else self.refinement.errors
 
     @cached_property
-    def noise_estimates(self) -> dict[str, Estimate]:
-        """The same with intervals for the noise alone."""
+    def optimum(self) -> dict[str, Estimate]:
+        """Estimates at the optimum of the discretised problem, with statistical intervals."""
         bars = self.uncertainty
         known = {} if bars is None else {**bars.estimates, **bars.derived}
-        values = self.parameters | self.derived
+        values = self.solution.parameters | self.derived
         return {name: known.get(name, Estimate(value)) for name, value in values.items()}
 
     @cached_property
@@ -155,12 +169,26 @@ class Answer:
         of_fit = concerns(
             self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
         )
-        numerical = numerical_concerns(self.estimates, self.refinement)
+        uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
+        numerical = numerical_concerns(self.optimum, uncertainties, self.refinement)
+        shares = {name: line.shares for name, line in self.budget.items()}
+        vague = combined_concerns(self.started_from, self.estimates, shares)
         of_fields = [concern for field in self.fields.values() for concern in field.concerns]
         if not self.missing:
-            return Trust.of((*cause_concerns(self.causes), *of_fit, *of_fields, *numerical))
+            probed = probe_concerns(self.probes, self._discretisation_corrections)
+            causes = cause_concerns(self.causes)
+            return Trust.of((*causes, *of_fit, *of_fields, *probed, *numerical, *vague))
         interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.missing})
         return Trust.of((interrupted, *(of_fit if self.uncertainty is not None else ())))
+
+    @property
+    def _discretisation_corrections(self) -> dict[str, float]:
+        """Factors from optimum to reported value of the estimated parameters, without fields."""
+        return {
+            item.name: each.value / each.optimum if each.optimum else 1.0
+            for item in self.started_from.free
+            if not is_mode(item.name) and (each := self.estimates[item.name])
+        }
 
     @cached_property
     def motions(self) -> dict[str, Motion]:
@@ -181,31 +209,34 @@ class Answer:
         return expected_rms_m(self.solution, self.uncertainty)
 
     def interval(self, name: str) -> tuple[float, float] | None:
-        """95 % interval of a parameter or derived modulus; None where there is none.
+        """Return the combined 95 % interval of a parameter or derived modulus, the one to publish.
 
-        It holds what `interval_holds` names.
+        None for what was not estimated or has no error bar, see `ReportedEstimate`.
 
         Raises
         ------
         InputError
             For an unknown name.
         """
-        return self._estimate(name).ci95
+        return self._estimate(name).combined95
 
     def std_error(self, name: str) -> float | None:
-        """Standard error of a parameter or derived modulus; None where there is none.
+        """Return the combined standard uncertainty of a parameter or derived modulus.
+
+        None for what was not estimated or has no error bar, see `ReportedEstimate`.
 
         Raises
         ------
         InputError
             For an unknown name.
         """
-        return self._estimate(name).std_error
+        return self._estimate(name).combined_std_error
 
     def to_frame(self) -> Any:
-        """The estimates as a pandas DataFrame, a row each.
+        """Return the estimates as a pandas DataFrame, one row each.
 
-        Columns value, std_error, lower, upper, interval_holds, verdict, guess, unit.
+        Columns: value, combined_std_error, combined_lower, combined_upper, statistical_std_error,
+        statistical_lower, statistical_upper, verdict, guess, unit. NaN stands for what is unknown.
 
         Raises
         ------
@@ -216,22 +247,28 @@ class Answer:
             pandas = import_module("pandas")
         except ImportError as error:
             raise InputError("a data frame needs pandas: pip install pandas") from error
-        rows = {}
-        for name, each in self.estimates.items():
-            lower, upper = each.ci95 or (np.nan, np.nan)
-            rows[name] = {
-                "value": each.value,
-                "std_error": np.nan if each.std_error is None else each.std_error,
-                "lower": lower,
-                "upper": upper,
-                "interval_holds": ", ".join(each.ci95_holds),
-                "verdict": self.trust.verdict,
-                "guess": np.nan if each.tied or each.guess is None else each.guess,
-                "unit": unit_of(name),
-            }
+        rows = {name: self._row(name) for name in self.estimates}
         return pandas.DataFrame.from_dict(rows, orient="index")
 
-    def _estimate(self, name: str) -> Estimate:
+    def _row(self, name: str) -> dict[str, float | str]:
+        """Return the row of a data frame."""
+        each = self.estimates[name]
+        combined = each.combined95 or (np.nan, np.nan)
+        statistical = each.statistical95 or (np.nan, np.nan)
+        return {
+            "value": each.value,
+            "combined_std_error": _or_nan(each.combined_std_error),
+            "combined_lower": combined[0],
+            "combined_upper": combined[1],
+            "statistical_std_error": _or_nan(each.statistical_std_error),
+            "statistical_lower": statistical[0],
+            "statistical_upper": statistical[1],
+            "verdict": self.trust.verdict,
+            "guess": np.nan if each.tied else _or_nan(each.guess),
+            "unit": unit_of(name),
+        }
+
+    def _estimate(self, name: str) -> ReportedEstimate:
         if name not in self.estimates:
             known = list(self.estimates)
             expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
@@ -247,7 +284,14 @@ class Answer:
         return (*dict.fromkeys(said), *(profile.sentence for profile in self.profiles))
 
 
-def _with_error(estimate: Estimate) -> str:
-    error = "" if estimate.std_error is None else f" ± {estimate.std_error:.2g}"
-    interval = "" if estimate.ci95 is None else " [{:.5g}, {:.5g}]".format(*estimate.ci95)
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _with_error(estimate: ReportedEstimate) -> str:
+    """Return value, standard uncertainty and combined interval as text."""
+    error = "" if estimate.combined_std_error is None else f" ± {estimate.combined_std_error:.2g}"
+    interval = (
+        "" if estimate.combined95 is None else " [{:.5g}, {:.5g}]".format(*estimate.combined95)
+    )
     return f"{estimate.value:.5g}{error}{interval}"

@@ -7,16 +7,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..arrays import Array, root_mean
+from ..arrays import Array
 from ..errors import InputError, SimulationError
 from ..fem.kernels import side_by_side
 from ..methods.complementarity import with_energy
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Solution, reading_rms, wrench_rms
+from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
 from ..program.channel import Forced, Motion
 from ..program.collocation import Part
+from ..program.depth_comparison import DepthError, SurfaceComparison
 from ..program.gauge import gauge_readings
 from ..program.segment import Segment
 from ..program.simulation import Trajectory, simulate
@@ -25,6 +26,16 @@ from ..recording import Experiment
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, values_of
 from ..statistics.numerical import Refinement, changes_towards, numerical_errors
+from .prediction import (
+    CopyError,
+    Misfit,
+    Predicted,
+    PredictionError,
+    blind_phi,
+    copy_error,
+    misfits,
+    prediction_error,
+)
 
 # Grid steps over those of a forward simulation that tells the step's error, with room for rounding.
 LEAST_FINER = 1.99
@@ -36,12 +47,14 @@ class Rollout:
 
     Attributes
     ----------
-    rms_m, max_m : distance of the markers from the measurements; the tip error is in `max_m`
+    rms_m, max_m : float
+        Distance of the markers from the measurements, zero without any; the tip error is in
+        `max_m`.
     trajectory : Trajectory
         Its markers are read with the experiment's nuisance parameters.
     nuisance : mapping of name to value
-        Nuisance parameters of an experiment for validation, fitted with the material as found.
-        Of places they are the way from where these were started.
+        Nuisance parameters of an experiment for validation, fitted to it with the material of the
+        answer. Of places they are the way from where these were started.
     places_m : mapping of marker to place [x, y, z], for validation likewise
     wrenches : tuple of (S, 6)
         What the sensors of its grasps should read, NaN where that is not known.
@@ -49,6 +62,16 @@ class Rollout:
     readings : mapping of name to (S, m)
         What readings of one's own should say.
     reading_rms : RMS of each of them, by name
+    surfaces : mapping of the name of a depth camera to SurfaceComparison
+        Its points on the simulated surface.
+    misfits : tuple of Misfit
+        The differences of each instrument over its stated σ.
+    blind : PredictionError or None
+        Of an experiment for validation: the error with the nuisance parameters of the fitted
+        recordings in place of its own; None where that cannot be simulated.
+    copied : CopyError or str
+        Of an experiment for validation: the error of a fitted recording's measurements, or why
+        there is none. Empty of others.
     """
 
     rms_m: float
@@ -60,6 +83,15 @@ class Rollout:
     wrench_rms: tuple[float | None, float | None] = (None, None)
     readings: Mapping[str, Array] = field(default_factory=dict)
     reading_rms: Mapping[str, float] = field(default_factory=dict)
+    surfaces: Mapping[str, SurfaceComparison] = field(default_factory=dict)
+    misfits: tuple[Misfit, ...] = ()
+    blind: PredictionError | None = None
+    copied: CopyError | str = ""
+
+    @property
+    def depth(self) -> dict[str, DepthError]:
+        """Distances of depth cameras' points from the simulated surface, by camera."""
+        return {name: surface.error for name, surface in self.surfaces.items()}
 
 
 def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
@@ -71,42 +103,91 @@ def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
 
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
     """Simulate an experiment with a solution's parameters; or say why that fails."""
-    options = problem.rollout
-    integrator = problem.scheme if options.integrator == "scheme" else "newmark"
     try:
         segment, phi = _seen(experiment, solution)
-        trajectory = simulate(
-            with_energy(segment.corrected(phi)),
-            experiment.body.theta(solution.parameters),
-            integrator,
-            timestep_s=_step_s(problem, segment),
-            substeps=segment.substeps,
-        )
+        trajectory = _simulated(problem, segment, phi, solution)
     except (InputError, SimulationError) as error:
         # A density that leaves a node without mass is input of who simulates, but found here.
         return str(error)
-    readings = segment.markers.of_samples(trajectory.positions_m, phi)
-    distances = np.linalg.norm(readings - experiment.markers.positions_m, axis=2)
-    present = distances[experiment.markers.present]
-    grid, forced = trajectory.reactions
-    wrenches = [sensor.on(grid).of_forced(forced, phi) for sensor in segment.sensors]
-    nuisance, validation = segment.nuisance, experiment.validation
-    own = zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)
-    places = zip(experiment.markers.names, segment.places_m(phi).tolist(), strict=True)
-    x = trajectory.positions_m.reshape(len(trajectory.positions_m), -1)
-    read = zip(segment.gauges, _gauged(segment, x, trajectory.reactions, phi), strict=True)
-    gauged = {gauge.gauge.name: gauge.said(each) for gauge, each in read}
-    return Rollout(
-        root_mean(present**2),
-        float(present.max(initial=0.0)),
-        replace(trajectory, markers_m=readings),
-        dict(own if validation else ()),
-        dict(places if validation else ()),
-        wrenches,
-        wrench_rms(experiment, wrenches),
-        gauged,
-        reading_rms(experiment, gauged),
+    predicted, surfaces = _predicted(segment, trajectory, phi)
+    error = prediction_error(experiment, predicted)
+    rollout = Rollout(
+        rms_m=error.rms_m or 0.0,
+        max_m=error.max_m or 0.0,
+        trajectory=replace(trajectory, markers_m=predicted.markers_m),
+        nuisance={},
+        places_m={},
+        wrenches=predicted.wrenches,
+        wrench_rms=(error.wrench_rms_n, error.wrench_rms_nm),
+        readings=predicted.readings,
+        reading_rms=error.reading_rms or {},
+        surfaces=surfaces,
+        misfits=tuple(misfits(experiment, predicted)),
     )
+    if not experiment.validation:
+        return rollout
+    nuisance = segment.nuisance
+    places_m = segment.places_m(phi).tolist()
+    fitted = [part.segment.experiment for part in solution.parts]
+    return replace(
+        rollout,
+        nuisance=dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)),
+        places_m=dict(zip(experiment.markers.names, places_m, strict=True)),
+        blind=_blind(problem, segment, solution),
+        copied=copy_error(experiment, fitted),
+    )
+
+
+def _simulated(problem: Problem, segment: Segment, phi: Array, solution: Solution) -> Trajectory:
+    """Simulate a recording with its nuisance parameters φ (k,) and a solution's parameters.
+
+    Raises
+    ------
+    InputError, SimulationError
+        Where that fails.
+    """
+    integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
+    return simulate(
+        with_energy(segment.corrected(phi)),
+        segment.body.theta(solution.parameters),
+        integrator,
+        timestep_s=_step_s(problem, segment),
+        substeps=segment.substeps,
+    )
+
+
+def _predicted(
+    segment: Segment, trajectory: Trajectory, phi: Array
+) -> tuple[Predicted, dict[str, SurfaceComparison]]:
+    """Return what the instruments of a recording should read of a motion, with their φ (k,)."""
+    grid, forced = trajectory.reactions
+    positions_m = trajectory.positions_m
+    x = positions_m.reshape(len(positions_m), -1)
+    gauged = zip(segment.gauges, _gauged(segment, x, trajectory.reactions, phi), strict=True)
+    surfaces = {
+        reading.sighting.view.depth.name: SurfaceComparison.from_motion(
+            reading, trajectory.t_s, positions_m, phi
+        )
+        for reading in segment.depths
+    }
+    predicted = Predicted(
+        markers_m=segment.markers.of_samples(positions_m, phi),
+        wrenches=[sensor.on(grid).of_forced(forced, phi) for sensor in segment.sensors],
+        readings={gauge.gauge.name: gauge.said(each) for gauge, each in gauged},
+        depth={name: surface.error for name, surface in surfaces.items()},
+    )
+    return predicted, surfaces
+
+
+def _blind(problem: Problem, segment: Segment, solution: Solution) -> PredictionError | None:
+    """Predict a recording with the nuisance parameters of the fitted ones; None if that fails."""
+    phi = blind_phi(segment, solution)
+    try:
+        trajectory = _simulated(problem, segment, phi, solution)
+    except (InputError, SimulationError):
+        return None
+    predicted, _ = _predicted(segment, trajectory, phi)
+    return prediction_error(segment.experiment, predicted)
 
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:

@@ -44,7 +44,7 @@ def refine(finished: A, levels: int = 2, say: Callable[[str], None] | None = Non
     """A converged run with its numerical error, see `refinement_of`."""
     answer = Earlier.of(finished.solution)
     problem = replace(finished.problem, substeps=finished.solution.collocation.substeps)
-    estimates = finished.noise_estimates
+    estimates = finished.optimum
     return replace(finished, refinement=refinement_of(problem, answer, estimates, levels, say))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..arrays import Array
@@ -14,42 +14,106 @@ from ..fem.field import FieldShapes
 from ..fem.two_phase import PhaseFinding
 from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
+from ..program.depth_comparison import DepthError
 from ..program.touches import Rubbing
 from ..statistics.diagnostics import MarkerDiagnosis
-from ..statistics.estimates import Estimate
+from ..statistics.estimates import Coordinate, Estimate
 from ..statistics.numerical import NumericalError
-from ..statistics.probes import Probe
+from ..statistics.relaxation import Probe
 from ..statistics.trust import Trust
 from ..statistics.uncertainty import Place
 from ..tree import optional, read
+from .prediction import CopyError, PredictionError
 
 
 @dataclass(frozen=True)
-class FoundValue(Estimate):
-    """A parameter, or a modulus that follows from parameters; these have no `guess`.
+class ReportedEstimate(Estimate):
+    """A parameter or derived modulus as it is reported; derived moduli have no `guess`.
+
+    `value` is corrected for the known discretisation error, and `statistical95` is centred on it.
 
     Attributes
     ----------
-    ci95_holds : tuple of str
-        What `ci95` allows for: "noise", and of "step" and "mesh" what is known.
-    ci95_noise : (lower, upper) or None
-        The interval for the noise alone.
-    whole95 : (lower, upper) or None
-        The interval that also holds what is assumed, see `statistics.budget`.
+    combined_std_error : float or None
+        Standard uncertainty due to noise, discretisation and systematic effects; None for what was
+        not estimated, is at a bound, or if systematic effects were not evaluated.
+    combined95 : (lower, upper) or None
+        95 % interval due to the same, the one to publish; None as above.
+    optimum : float or None
+        The optimum of the discretised problem, without the correction; None in a study's summary.
+    systematic : float or None
+        Standard deviation of the systematic effects in the coordinate of the estimate, see
+        `statistics.budget`.
+    known_effect : float or None
+        Correction for known effects, such as the compliance of a machine, in the coordinate of the
+        estimate; None if there is none.
+    known_correction : float or None
+        The same correction as part of `value`; None if there is none.
+    numerical_error : NumericalError or None
+        Discretisation error as far as it is known.
+    guess : float or None
+        Initial guess.
+    fixed, tied : bool or None
+        Whether the parameter was not estimated, or followed another one.
     """
 
-    ci95_holds: tuple[str, ...] = ()
-    ci95_noise: tuple[float, float] | None = None
+    combined_std_error: float | None = None
+    combined95: tuple[float, float] | None = None
+    optimum: float | None = None
+    systematic: float | None = None
+    known_effect: float | None = optional()
+    known_correction: float | None = optional()
     numerical_error: NumericalError | None = None
-    whole95: tuple[float, float] | None = None
     guess: float | None = optional()
     fixed: bool | None = optional()
     tied: bool | None = optional()
 
+    def at_optimum(self, name: str, *, linear: bool) -> Estimate:
+        """Return the estimate before the correction of the discretisation error.
+
+        Parameters
+        ----------
+        name : str
+        linear : bool
+            Whether the parameter is its own coordinate, see `Coordinate`.
+        """
+        if self.optimum is None or self.statistical95 is None or self.optimum == self.value:
+            optimum = self.value if self.optimum is None else self.optimum
+            return replace(self._statistical, value=optimum)
+        at = Coordinate.of(name, (self.value, self.optimum, *self.statistical95), linear)
+        correction = at.at(self.value) - at.at(self.optimum)
+        low, high = (at.value(at.at(end) - correction) for end in self.statistical95)
+        spread = self.statistical_std_error
+        if spread is not None:
+            spread *= at.slope(self.value) / at.slope(self.optimum)
+        return Estimate(self.optimum, spread, (low, high), self.at_bound, self.reason)
+
     @property
-    def by_noise(self) -> Estimate:
-        """With the interval for the noise alone."""
-        return Estimate(self.value, self.std_error, self.ci95_noise, self.at_bound, self.reason)
+    def _statistical(self) -> Estimate:
+        """The value with its statistical uncertainty alone."""
+        return Estimate(
+            self.value,
+            self.statistical_std_error,
+            self.statistical95,
+            self.at_bound,
+            self.reason,
+        )
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the combined interval is not wider than the value; false if there is none."""
+        if self.combined95 is None:
+            return False
+        low, high = self.combined95
+        return high - low <= abs(self.value)
+
+    @property
+    def systematic_std_error(self) -> float | None:
+        """Part of the combined standard uncertainty that is not statistical; None if unknown."""
+        if self.combined_std_error is None or self.statistical_std_error is None:
+            return None
+        difference = self.combined_std_error**2 - self.statistical_std_error**2
+        return max(0.0, difference) ** 0.5
 
 
 @dataclass(frozen=True)
@@ -173,6 +237,9 @@ class FittedExperiment:
     wrench_sigma_n, wrench_sigma_nm, reading_sigma
         What is stated of the noise.
     friction : by obstacle, of those that rub
+    depth : by depth camera, distances of its points from the fitted surface
+    air_density_kg_m3 : float
+        Of the air around the body in the model; zero in a vacuum.
     """
 
     rms_m: float
@@ -187,6 +254,8 @@ class FittedExperiment:
     wrench_sigma_nm: float | None = optional()
     reading_sigma: Mapping[str, float] | None = optional()
     friction: Mapping[str, Rubbing] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
+    air_density_kg_m3: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -202,7 +271,20 @@ class FoundFit:
 
 @dataclass(frozen=True)
 class SimulatedExperiment:
-    """An experiment simulated with the answer; of one that `failed` all else is missing."""
+    """An experiment simulated with the answer; of one that `failed` all else is missing.
+
+    Attributes
+    ----------
+    depth : by depth camera, distances of its points from the simulated surface
+    blind : PredictionError, optional
+        Of an experiment for validation, with the nuisance parameters of the fitted recordings in
+        place of its own.
+    copied : CopyError, optional
+        Of an experiment for validation, with the measurements of the nearest fitted recording as
+        the prediction.
+    not_copied : str, optional
+        Why there is no such copy.
+    """
 
     fitted: bool
     failed: str | None = optional()
@@ -213,6 +295,10 @@ class SimulatedExperiment:
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
     reading_rms: Mapping[str, float] | None = optional()
+    depth: Mapping[str, DepthError] | None = optional()
+    blind: PredictionError | None = optional()  # noqa: RUF009, it returns a field
+    copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
+    not_copied: str | None = optional()
 
 
 @dataclass(frozen=True)
@@ -265,7 +351,8 @@ class Result:
     """The content of ``result.json``, whose names are its keys.
 
     `basis` says what the values rest on: the law of the damping, and what sets the scale; `budget`
-    has each source's share of an estimate's variance; `probes` are there where they were asked for.
+    has each source's share of an estimate's variance; `probes` are
+    refits with an assumption relaxed and, where that was asked for, of parts of the data.
     """
 
     schema: int
@@ -276,8 +363,8 @@ class Result:
     trust: Trust
     method: str
     title: str
-    parameters: Mapping[str, FoundValue]
-    derived: Mapping[str, FoundValue]
+    parameters: Mapping[str, ReportedEstimate]
+    derived: Mapping[str, ReportedEstimate]
     basis: tuple[str, ...]
     budget: Mapping[str, Mapping[str, float]]
     probes: tuple[Probe, ...]
@@ -313,15 +400,18 @@ class Result:
             return read(cls, content)
 
     @property
-    def values(self) -> dict[str, FoundValue]:
+    def values(self) -> dict[str, ReportedEstimate]:
         """Parameters, then moduli that follow; but the shares of a field."""
         both = {**self.parameters, **self.derived}
         return {name: each for name, each in both.items() if not is_mode(name)}
 
     @property
-    def holds(self) -> tuple[str, ...]:
-        """What the intervals hold: "noise", and of "step" and "mesh" what is known."""
-        return max((each.ci95_holds for each in self.values.values()), key=len, default=())
+    def covers(self) -> tuple[str, ...]:
+        """Which discretisation errors the combined intervals contain: "step", "mesh"."""
+        errors = self.numerical_errors.values()
+        of_step = any(error.step is not None for error in errors)
+        of_mesh = any(error.mesh is not None for error in errors)
+        return (*["step"] * of_step, *["mesh"] * of_mesh)
 
     @property
     def numerical_errors(self) -> dict[str, NumericalError]:

@@ -122,8 +122,14 @@ def _solved(
     problem = problem if earlier is None else earlier.started(problem)
     try:
         whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
-        require_memory(problem, collocation, solver)
+        if earlier is not None and problem.substeps == "auto":
+            collocation = replace(collocation, substeps=earlier.substeps)
+        has_guesses = not collocation.parameters.unguessed
+        if has_guesses:
+            require_memory(problem, collocation, solver)
         collocation, scan = started(collocation, whole)
+        if not has_guesses:  # the estimate evaluates the program at a guess
+            require_memory(problem, collocation, solver)
         collocation, variables = placed_at_guess(collocation), None
         if earlier is not None and not scan:
             collocation = earlier.placed(collocation)

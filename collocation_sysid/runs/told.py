@@ -18,6 +18,7 @@ from ..methods.solution import pooled_wrench_rms, reading_rms
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import Part
+from ..program.depth_comparison import DepthError
 from ..program.touches import rubbings
 from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, in_unit_for_people
@@ -28,6 +29,7 @@ from ..statistics.uncertainty import Place
 from ..tree import alike
 from .answer import Answer
 from .forward_simulation import Rollout
+from .prediction import CopyError
 from .result import (
     FittedExperiment,
     FoundDynamics,
@@ -44,6 +46,7 @@ from .result import (
     Result,
     SimulatedExperiment,
 )
+from .verdict import depth_errors
 
 
 def result_of(answer: Answer) -> Result:
@@ -116,7 +119,7 @@ def _basis(problem: Problem) -> Iterator[str]:
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
     said = [law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws]
     if said:
-        yield f"{GAMMA_R.symbol} belongs to the damping law {' and '.join(said)}"
+        yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(said)}"
     if (relative := relative_sentence(problem.experiments, problem.parameters)) is not None:
         yield relative
 
@@ -178,6 +181,9 @@ def _recordings(answer: Answer) -> dict[str, RecordingsAgreement] | None:
 
 def _fit(answer: Answer) -> FoundFit:
     solution, experiments = answer.solution, {}
+    depths: dict[str, dict[str, DepthError]] = {}
+    for (recording, camera), error in depth_errors(solution).items():
+        depths.setdefault(recording, {})[camera] = error
     for part in solution.parts:
         experiment = part.segment.experiment
         name, markers, sensors = experiment.name, experiment.markers, part.segment.sensors
@@ -193,7 +199,9 @@ def _fit(answer: Answer) -> FoundFit:
             reading_rms(experiment, solution.readings[name]) or None,
             *(root_mean(each[np.isfinite(each)]) or None for each in both),
             reading_sigma={gauge.name: gauge.sigma for gauge in experiment.readings} or None,
+            depth=depths.get(name),
             friction=rubbings(experiment, part.setting.dynamics, part.x) or None,
+            air_density_kg_m3=experiment.air_density_kg_m3,
         )
     pooled = pooled_wrench_rms(solution)
     return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled)
@@ -226,6 +234,9 @@ def _compared(answer: Answer, experiment: Experiment) -> SimulatedExperiment:
         wrench_rms_n=force,
         wrench_rms_nm=torque,
         reading_rms=simulated.reading_rms or None,
+        depth=simulated.depth or None,
+        copied=simulated.copied if isinstance(simulated.copied, CopyError) else None,
+        not_copied=simulated.copied if isinstance(simulated.copied, str) else None,
     )
 
 

@@ -6,17 +6,22 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from ..arrays import root_mean
 from ..errors import SimulationError
 from ..methods.solution import Solution, Status, pooled_wrench_rms
+from ..model.parameters import Parameters
 from ..model.schemes import as_scheme
 from ..problem import Problem
+from ..program.depth_comparison import DepthError, SurfaceComparison
 from ..program.stability import instabilities
 from ..program.touches import touched
 from ..recording.nuisance import TIME
 from ..recording.turning import TOO_FAST
+from ..statistics.budget import worded
 from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.plausible import odd_material, oddities
+from ..statistics.remedies import remedy_for
 from ..statistics.scale import scale_concerns
 from ..statistics.trust import (
     clock_concerns,
@@ -26,6 +31,7 @@ from ..statistics.trust import (
     noise_rms_m,
     nuisance_concerns,
     parameter_concerns,
+    prediction_concerns,
     rollout_concerns,
     scheme_concerns,
     stability_concerns,
@@ -34,6 +40,7 @@ from ..statistics.trust import (
 from ..statistics.uncertainty import Uncertainty
 from .check.motion import Motion, motion_of
 from .forward_simulation import Rollout
+from .result import ReportedEstimate
 
 # Noise of cameras over a body's size is less.
 NO_CAMERA = 0.01
@@ -72,7 +79,10 @@ def concerns(
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(instabilities(solution.collocation, solution.z))
     yield from contact_concerns(touched(solution.parts))
+    if not solution.collocation.nq:
+        yield from _of_predictions(rollouts)
     for name, rollout in rollouts.items():
+        yield from _of_unseen(name, rollout)
         yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
     collocation = solution.collocation
     for segment in collocation.segments:
@@ -85,6 +95,35 @@ def concerns(
                 motion.first.numerical_damping_ratio,
                 motion.first.period_error,
             )
+
+
+def combined_concerns(
+    parameters: Parameters,
+    estimates: Mapping[str, ReportedEstimate],
+    shares: Mapping[str, Mapping[str, float]],
+) -> list[Concern]:
+    """Return a concern for each estimated parameter with a combined interval wider than its value.
+
+    Derived moduli give none: λ of a nearly incompressible material is rarely determined.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    estimates : mapping of name to ReportedEstimate
+    shares : mapping of name to the shares of its budget, largest first
+    """
+    return [
+        _undetermined(item.name, estimates[item.name], shares[item.name])
+        for item in parameters.free
+        if item.name in shares and not estimates[item.name].is_determined
+    ]
+
+
+def _undetermined(name: str, estimate: ReportedEstimate, shares: Mapping[str, float]) -> Concern:
+    source, share = next(iter(shares.items()))
+    low, high = estimate.combined95 or (np.nan, np.nan)
+    data = {"name": name, "low": low, "high": high, "source": worded(source), "share": share}
+    return Concern("information/combined", "check", {**data, "remedy": remedy_for(source)})
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
@@ -110,19 +149,55 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
             yield Concern("noise/allowance", data={"sigma_mm": 1e3 * sigma_m, "share": share})
 
 
+def _of_predictions(rollouts: Mapping[str, Rollout | str]) -> Iterator[Concern]:
+    """Return where simulations with stated parameters miss by more than the noise."""
+    for name, rollout in rollouts.items():
+        for misfit in rollout.misfits if isinstance(rollout, Rollout) else ():
+            yield from prediction_concerns(name, **vars(misfit))
+
+
+def _of_unseen(name: str, rollout: Rollout | str) -> Iterator[Concern]:
+    """Return depth cameras none of whose points is near the simulated surface."""
+    for camera, error in rollout.depth.items() if isinstance(rollout, Rollout) else ():
+        if not error.points:
+            data = {"experiment": name, "camera": camera, "seen": error.seen}
+            yield Concern("prediction/unseen", "doubtful", data)
+
+
 def _of_rollout(
     name: str, rollout: Rollout | str, solution: Solution, noise_m: float
 ) -> list[Concern]:
     fit_rms_m = solution.rms_by_experiment_m
-    if isinstance(rollout, Rollout):
-        fitted = name in fit_rms_m
-        fit_m = fit_rms_m.get(name, solution.rms_m)
-        of_markers = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
-        predicted_n, fit_n = rollout.wrench_rms[0], pooled_wrench_rms(solution)[0]
-        if not fitted and not of_markers and predicted_n is not None and fit_n is not None:
-            return rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
+    if not isinstance(rollout, Rollout):
+        return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
+    fitted = name in fit_rms_m
+    fit_m = fit_rms_m.get(name, solution.rms_m)
+    of_markers = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+    predicted_n, fit_n = rollout.wrench_rms[0], pooled_wrench_rms(solution)[0]
+    if fitted or of_markers:
         return of_markers
-    return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
+    if predicted_n is not None and fit_n is not None:
+        of_markers = rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
+    return [*of_markers, *_of_predicted_depth(name, rollout, solution)]
+
+
+def _of_predicted_depth(name: str, rollout: Rollout, solution: Solution) -> Iterator[Concern]:
+    """Compare predicted depth with the fitted one, or with its noise where that is larger."""
+    fitted = [error.tame_sigmas for error in depth_errors(solution).values()]
+    yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
+    for camera, error in rollout.depth.items():
+        yield from rollout_concerns(f"{name}/{camera}", error.tame_sigmas, yardstick, 0.0, False)
+
+
+def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
+    """Distances of depth cameras' points from the fitted surface, by experiment and camera."""
+    return {
+        (part.segment.experiment.name, reading.sighting.view.depth.name): (
+            SurfaceComparison.from_fit(reading, part.x, looked, part.phi).error
+        )
+        for part in solution.parts
+        for reading, looked in part.sights
+    }
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:

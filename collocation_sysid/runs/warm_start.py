@@ -30,12 +30,15 @@ class Earlier:
     values : mapping of name to value, of parameters and of moduli derived from them
     nuisance : mapping of experiment and name to value, by names as in `Collocation.names`
     places_m : mapping of experiment to places (3,) by marker
+    substeps : int
+        Time steps per sample that it was found with.
     """
 
     folder: Path
     values: Mapping[str, float]
     nuisance: Mapping[str, float]
     places_m: Mapping[str, Mapping[str, Array]]
+    substeps: int = 1
 
     @classmethod
     def read(cls, folder: str | Path) -> Earlier:
@@ -58,7 +61,11 @@ class Earlier:
             If it is damaged.
         """
         both = {**result.parameters, **result.derived}
-        values = {name: each.value for name, each in both.items()}
+        # The optimum solves the equations of the trajectory in the folder, not the corrected value.
+        values = {
+            name: each.value if each.optimum is None else each.optimum
+            for name, each in both.items()
+        }
         nuisance = {
             f"{experiment}: {name}": each.value
             for experiment, named in result.nuisance.items()
@@ -73,7 +80,7 @@ class Earlier:
             numbers = np.array([*values.values(), *nuisance.values(), *points.reshape(-1, 3).flat])
             if not np.isfinite(numbers).all():
                 raise ValueError("a value that is not finite")
-        return cls(folder, values, nuisance, places_m)
+        return cls(folder, values, nuisance, places_m, result.problem.substeps)
 
     @classmethod
     def of(cls, solution: Solution) -> Earlier:
@@ -86,7 +93,8 @@ class Earlier:
             markers = segment.experiment.markers.names
             places = segment.places_m(part.phi)
             places_m[segment.experiment.name] = dict(zip(markers, places, strict=True))
-        return cls(Path(), values_of(collocation, solution.q), nuisance, places_m)
+        values = values_of(collocation, solution.q)
+        return cls(Path(), values, nuisance, places_m, collocation.substeps)
 
     def started(self, problem: Problem) -> Problem:
         """The problem with what was found as its guesses, clipped to its bounds.

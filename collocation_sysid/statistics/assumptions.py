@@ -8,31 +8,57 @@ does to the residuals. What changes only what cameras and clocks say is a nuisan
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, make_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Index
 from ..checked import Options, Positive
 from ..fem.body import Body
 from ..fem.constants import GAMMA_R, bare
+from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import engineering
-from ..fem.node_force import surface_of
+from ..fem.rest_shape import RestShape
+from ..model.contact import Contact, contacts
 from ..model.dynamics import Dynamics
+from ..model.force_term import States
 from ..model.parameters import Parameters
 from ..program.collocation import Part
 from ..program.reaction import forces_on, reactions
+from ..program.touches import on_surface
+from ..recording.grasp import free_motions
 from ..recording.nuisance import ROWS
-from ..section import ByForm
+from ..section import ByForm, Section
+from .shape_error import (
+    CORRELATION,
+    SURFACE_MODES,
+    sag_m,
+    standing_nodes,
+    surface_modes,
+    thickness_m,
+)
+from .size_effect import obstacle_shifts_m
 
 # Differences by a scale.
 SMALL = 1e-4
-AIR_KG_M3 = 1.2
+# Relative standard deviation of the density of the air: weather and room temperature, at the stated
+# altitude. At 2000 m the density is 18 % lower, and has to be stated.
+AIR_DENSITY_DEVIATION = 0.03
+# Relative standard deviation of the added mass and of the drag coefficient of a given body: they
+# depend on its shape, on edges, on amplitude and on frequency.
+AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
+# Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
+OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
+# Differences by a displacement: its largest entry over the length of an edge.
+SMALL_STRAIN = 1e-4
+_MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
+# Beside the deviations: the correlation length of the error of the surface.
+CORRELATION_KEY = "surface_correlation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +89,7 @@ class Fitted:
 
     part: Part
     parameters: Parameters
+    surface_correlation: float = CORRELATION
 
     @property
     def body(self) -> Body:
@@ -105,21 +132,105 @@ class Fitted:
         return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
 
     def internal_n(
-        self, scale: float = 1.0, slower: float = 1.0, theta: Array | None = None
+        self,
+        scale: float = 1.0,
+        slower: float = 1.0,
+        theta: Array | None = None,
+        body: Body | None = None,
     ) -> Array:
-        """(N, 3n) what the material gives where space, or time, is scaled; without γ_m."""
+        """Return forces (N, 3n) of the material where space or time is scaled, without γ_m.
+
+        Of a body with another stress-free shape where that is given.
+        """
         still = (self.theta if theta is None else theta).copy()
         still[list(self.body.tied_shares)] = 0.0
         dynamics = self.dynamics.with_theta(still)
         carried = dynamics.forces_along(dynamics.histories(self.part.x)).past
         xi, nu = dynamics.evaluation_states(self.part.x)
+        evaluated = self.body if body is None else body
         return self.of_rows(
-            self.body.force(xi / scale, nu / (scale * slower), still, carried=carried)
+            evaluated.force(xi / scale, nu / (scale * slower), still, carried=carried)
         )
+
+    @cached_property
+    def internal_force_n(self) -> Array:
+        """Forces (N, 3n) of the material, without γ_m."""
+        return self.internal_n(body=self.body.with_stress_free(self.stress_free_m))
+
+    @cached_property
+    def stress_free_m(self) -> Array:
+        """Stress-free positions (n, 3) of the nodes, without frames of obstacles."""
+        body = self.body
+        return body.nodes.points_m if body.inverse is None else self._inverse.positions_m
+
+    @cached_property
+    def _inverse(self) -> RestShape:
+        assert self.body.inverse is not None
+        return self.body.inverse.shape(self.theta)
+
+    def of_reference(self, moved_m: Array) -> Array:
+        """Return the first-order change (N, 3n) of the material's forces by one (n, 3) of X."""
+        largest = float(np.abs(moved_m).max(initial=0.0))
+        if not largest:
+            return np.zeros_like(self.part.x)
+        step = SMALL_STRAIN * self.part.segment.length_m / largest
+        own = self.stress_free_m + step * moved_m[: len(self.stress_free_m)]
+        other = self.body.with_stress_free(own)
+        return (self.internal_n(body=other) - self.internal_force_n) / step
+
+    def of_heavier_scan(self) -> Array:
+        """Return the change (N, 3n) of forces per relative change of the weight during the scan."""
+        if self.body.inverse is None:
+            return np.zeros_like(self.part.x)
+        return self.of_reference(self.body.inverse.weight_slope(self.theta))
+
+    @cached_property
+    def surface_modes_m(self) -> Array:
+        """Displacements (modes, n, 3) where the surface is off by its thickness, mode by mode."""
+        segment = self.part.segment
+        gaps_m = on_surface(segment.experiment, self.theta, self.part.x)[0]
+        nearest = np.fmin.reduce(gaps_m, axis=0)
+        touched = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
+        known = np.unique(self.body.mesh.surface[touched])
+        modes = surface_modes(self.body, known, self.surface_correlation)
+        return thickness_m(self.body) * modes
+
+    @cached_property
+    def likely_held(self) -> Index:
+        """Dofs held while the mesh was made: those of the recording, or those the body stood on."""
+        held = self.part.setting.held.dofs
+        own = held[held < self.body.nodes.points_m.size]
+        points_m = self.body.nodes.points_m
+        if len(free_motions(points_m, _held_mask(own, len(points_m)))):
+            gravity = self.part.segment.experiment.gravity_m_s2
+            nodes = standing_nodes(self.body, gravity)
+            return (3 * nodes[:, None] + np.arange(3)).ravel()
+        return own
 
     def weight_of(self, mass_kg: Array) -> Array:
         """(N, 3n) what gravity and γ_m do to mass (3n,)."""
         return mass_kg * (self.gravity - self.body.tied_drag(self.theta) * self.states[1])
+
+    @property
+    def buoyancy_n(self) -> Array:
+        """(N, 3n) buoyancy in the model; zero in a vacuum."""
+        lifted = -self.dynamics.mass.displaced_kg * self.gravity
+        return np.broadcast_to(lifted, self.part.x.shape)
+
+    @property
+    def added_mass_kg(self) -> Array:
+        """(3n,) air in the model that moves with the body; zero in a vacuum."""
+        return self.dynamics.mass.added_kg
+
+    @cached_property
+    def air_drag_n(self) -> Array:
+        """(N, 3n) drag of the air in the model; zero in a vacuum and where nothing moves."""
+        term = self.dynamics.forces.air_drag
+        if term is None:
+            return np.zeros_like(self.states[1])
+        drag = term.force(States(*self.states, self.theta))
+        drag[: self.dynamics.first_row] = 0.0
+        return drag
 
     @cached_property
     def grasp_force_n(self) -> Array:
@@ -129,6 +240,19 @@ class Fitted:
         mass = self.dynamics.mass.kg[:, dofs]
         given = reactions(self.dynamics, mass, force, self.acceleration[:, dofs])
         return np.where(np.isnan(self.part.setting.held.positions_m), 0.0, given)
+
+    @cached_property
+    def contacts(self) -> dict[int, Contact]:
+        """Contact by an energy, by its number among the further forces."""
+        further = enumerate(self.dynamics.forces.further)
+        return {k: each for k, each in further if isinstance(each, Contact) and not each.relaxed}
+
+    def contact_n(self, number: int) -> Array:
+        """Return the forces (N, 3n) of one of `contacts` at the evaluations [N]."""
+        xi, nu = self.dynamics.evaluation_states(self.part.x)
+        forces = self.dynamics.evaluated
+        term = forces.further[number]
+        return self.of_rows(term.force(forces.states(xi, nu)(term)))
 
     @cached_property
     def proportional_s(self) -> Array:
@@ -145,6 +269,13 @@ class Fitted:
         return min(engineering(*moduli)[0] for moduli in self.body.lame(self.theta).values())
 
 
+def _held_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
+    """Return which coordinates (n, 3) of the nodes are among the dofs."""
+    held = np.zeros(3 * nodes, dtype=bool)
+    held[dofs] = True
+    return held.reshape(nodes, 3)
+
+
 @dataclass(frozen=True)
 class Assumption:
     """Something that is taken as it is stated.
@@ -154,8 +285,9 @@ class Assumption:
     name : str
     unit : str
         Of its deviation.
-    sigma : float
-        The deviation, as a careful laboratory has it.
+    sigma : float, optional
+        The deviation, as a careful laboratory has it; None for what counts only where a problem
+        states its deviation.
     said : str
         What it is.
     effect : callable
@@ -167,7 +299,7 @@ class Assumption:
 
     name: str
     unit: str
-    sigma: float
+    sigma: float | None
     said: str
     effect: Callable[[Fitted, int], Effect | None]
     axes: str = ""
@@ -182,25 +314,43 @@ class Assumption:
 
 
 def _size(at: Fitted, _: int) -> Effect:
-    """The body is larger by a share: f = s² f(x/s, v/s), its goals about the middle of its grasp.
+    """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
 
-    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths.
+    From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
+    about the middle of the grasps; obstacles keep their size and are moved so that they first touch
+    the body as before, see `size_effect.obstacle_shifts_m`. Contact areas grow by s², and a contact
+    stiffness that is not stated falls by s, as it follows the edges of the mesh.
     """
-    larger, smaller = 1 + SMALL, 1 - SMALL
+    larger = 1 + SMALL
+    smaller = 1 - SMALL
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
+    force = force / (2 * SMALL)
+    # Of a body made under gravity the deflection over the size grows with the weight over s².
+    heavier = at.of_heavier_scan() * (-2.0 if at.body.has_stated_mass else 1.0)
     mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
-    grasping = at.part.segment.grasping
-    turns: Array = np.nan_to_num(grasping.poses[0])
-    off = grasping.places(at.part.phi)[0] - at.part.segment.nuisance.grasp_pivot_m
+    for number, contact in at.contacts.items():
+        stated = contact.contact.obstacle.stiffness_pa_m is not None
+        force += (2.0 if stated else 1.0) * at.contact_n(number)
+    segment = at.part.segment
+    turns: Array = np.nan_to_num(segment.grasping.poses[0])
+    off = segment.grasping.places(at.part.phi)[0] - segment.nuisance.grasp_pivot_m
     moved = np.einsum("tgj,gj->tg", turns, off)
-    return Effect(force / (2 * SMALL) + at.weight_of(mass), mass, moved_m=moved)
+    for obstacle, shift_m in obstacle_shifts_m(at.part):
+        along = np.searchsorted(segment.grasping.dofs, obstacle.dofs)
+        moved[:, along] = np.tile(shift_m, len(obstacle.nodes))
+    air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
+    return Effect(
+        force + heavier + at.weight_of(mass) + air,
+        mass + 3.0 * at.added_mass_kg,
+        moved_m=moved,
+    )
 
 
 def _mass(at: Fitted, _: int) -> Effect | None:
     """All of the body is heavier by a share."""
     if any(part.free_density for part in at.body.parts):
         return None
-    return Effect(at.weight_of(at.own_mass_kg), at.own_mass_kg)
+    return Effect(at.weight_of(at.own_mass_kg) + at.of_heavier_scan(), at.own_mass_kg)
 
 
 def _density_gradient(at: Fitted, axis: int) -> Effect:
@@ -218,8 +368,9 @@ def _anisotropy(at: Fitted, axis: int) -> Effect:
     """
     body, (xi, nu) = at.body, at.states
     count, points = body.geometry.shape[:2]
-    slopes = body.geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
-    weight, force = at.young_pa * body.geometry[..., -1], np.zeros_like(xi)
+    geometry = body.stress_free_geometry(at.theta)
+    slopes = geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
+    weight, force = at.young_pa * geometry[..., -1], np.zeros_like(xi)
     gamma = at.proportional_s[:, None, None]
     for x, v, own in zip(xi, nu, force, strict=True):
         stretch, rate = (
@@ -245,8 +396,9 @@ def _pace(at: Fitted, _: int) -> Effect | None:
     if at.part.segment.experiment.static:
         return None
     slower, faster = at.internal_n(slower=1 + SMALL), at.internal_n(slower=1 - SMALL)
-    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.kg * at.states[1]
-    return Effect((faster - slower) / (2 * SMALL) - drag, stretched=-1.0)
+    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
+    air = 2.0 * at.air_drag_n
+    return Effect((faster - slower) / (2 * SMALL) - drag + air, stretched=-1.0)
 
 
 def _poisson(at: Fitted, _: int) -> Effect | None:
@@ -327,36 +479,102 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
     return Effect(force) if platens else None
 
 
-def _buoyancy(at: Fitted, _: int) -> Effect:
-    """The air that the body displaces."""
-    return Effect(np.broadcast_to(-AIR_KG_M3 * at.body.dof_volume_m3 * at.gravity, at.part.x.shape))
+def _contact_stiffness(at: Fitted, _: int) -> Effect | None:
+    """Return the effect of rigid contact in place of the pressure law, to first order."""
+    if not at.contacts:
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.part.x)
+    forces = at.dynamics.evaluated
+    change_n = np.zeros_like(xi)
+    for contact in contacts(at.part.segment.experiment):
+        if not contact.relaxed:
+            change_n += contact.rigid_limit_n(forces.states(xi, nu)(contact))
+    return Effect(at.of_rows(change_n))
+
+
+def _buoyancy(at: Fitted, _: int) -> Effect | None:
+    """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
+    return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
 
 
 def _added_mass(at: Fitted, _: int) -> Effect | None:
-    """Half the air that the body displaces moves with it, as with a sphere."""
-    if at.part.segment.experiment.static:
+    """Return the effect of more added mass, as a share of that in the model; None in a vacuum."""
+    if at.part.segment.experiment.static or not at.added_mass_kg.any():
         return None
-    return Effect(mass_kg=0.5 * AIR_KG_M3 * at.body.dof_volume_m3)
+    return Effect(mass_kg=at.added_mass_kg)
 
 
 def _air_drag(at: Fitted, _: int) -> Effect | None:
-    """−½ ρ c_d a |v| v at the body's surface, c_d being one; a quarter of it faces the way it goes.
+    """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
+    return Effect(at.air_drag_n) if at.part.segment.experiment.has_air_drag else None
 
-    That is what a convex body shows on average (Cauchy).
+
+def _other_damping(at: Fitted, law: str) -> Effect | None:
+    """The damping force of another law with the same γ_r, less that of the stated one.
+
+    Parts with a law that has no name keep it, and so does what is linear, which all laws damp
+    alike. None where that leaves no difference.
     """
-    if at.part.segment.experiment.static:
+    body = at.body
+    names = body.constants.items()
+    is_damped = any(
+        constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
+    )
+    if at.part.segment.experiment.static or not is_damped:
         return None
-    area_m2, shape = surface_of(at.body.nodes)[0], at.states[1].shape
-    v = at.states[1].reshape(shape[0], -1, 3)[:, : len(area_m2)]
-    drag = np.zeros((shape[0], shape[1] // 3, 3))
-    speed = np.linalg.norm(v, axis=2, keepdims=True)
-    drag[:, : len(area_m2)] = -0.125 * AIR_KG_M3 * area_m2[:, None] * speed * v
-    return Effect(drag.reshape(shape))
+    parts = tuple(
+        replace(part, damping=DAMPINGS[law])
+        if part.damping in DAMPINGS.values() and part.material is not MATERIALS["linear"]
+        else part
+        for part in body.parts
+    )
+    if all(own.damping is other.damping for own, other in zip(body.parts, parts, strict=True)):
+        return None
+    xi, nu = at.dynamics.evaluation_states(at.part.x)
+    carried = at.dynamics.forces_along(at.dynamics.histories(at.part.x)).past
+    forces_n = (
+        each.force(xi, nu, at.theta, carried=carried) for each in (body.with_parts(parts), body)
+    )
+    return Effect(at.of_rows(next(forces_n) - next(forces_n)))
+
+
+def _objective_damping(at: Fitted, number: int) -> Effect | None:
+    """The body obeys another objective law of damping than the stated one."""
+    return _other_damping(at, OBJECTIVE_DAMPINGS[number])
+
+
+def _rayleigh_damping(at: Fitted, _: int) -> Effect | None:
+    """The body obeys Rayleigh's law of damping, which is not objective."""
+    return _other_damping(at, "rayleigh")
+
+
+def _rest_shape(at: Fitted, axis: int) -> Effect | None:
+    """The mesh is the shape under the body's own weight along one of its axes, not the stress-free.
+
+    Meshes that are made of a shape, and those of which the stress-free shape is stated, are not.
+    """
+    if at.body.rest_shape is not None:
+        return None
+    return Effect(at.of_reference(sag_m(at.body, at.theta, at.likely_held, axis)))
+
+
+def _surface(at: Fitted, mode: int) -> Effect:
+    """The surface is off along its normal, by a mode of a smooth error of the thickness."""
+    moved_m = at.surface_modes_m[mode]
+    grasping = at.part.segment.grasping
+    turns: Array = np.nan_to_num(grasping.poses[0])
+    off = moved_m.ravel()[3 * (at.part.setting.held.dofs // 3)[:, None] + np.arange(3)]
+    return Effect(at.of_reference(moved_m), moved_m=np.einsum("tgj,gj->tg", turns, off))
 
 
 # fmt: off
 ASSUMPTIONS = (
     Assumption("body_scale", "1", 0.01, "size of the mesh", _size),
+    Assumption("rest_shape", "1", 0.58,
+        "weight under which a mesh hung that nothing is stated of, along each axis", _rest_shape,
+        "x y z"),
+    Assumption("surface", "1", 0.005,
+        "place of the surface along its normal over the thickness", _surface, _MODES),
     Assumption("mass", "1", 0.01, "mass of the body, where it is not estimated", _mass),
     Assumption("density_gradient", "1", 0.05,
         "density at one end of the body over that in its middle", _density_gradient, "x y z"),
@@ -366,21 +584,51 @@ ASSUMPTIONS = (
         "stiffness at the end over that at the beginning", _drift),
     Assumption("time_scale", "1", 1e-4, "pace of all clocks", _pace),
     Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson),
+    Assumption("damping_law", "1", 1.0,
+        "damping force of another objective law, in its difference from the stated one",
+        _objective_damping, " ".join(OBJECTIVE_DAMPINGS)),
+    Assumption("rayleigh_damping", "1", None,
+        "damping force of Rayleigh's law, in its difference from the stated one",
+        _rayleigh_damping),
     Assumption("grip_layer_m", "m", 2e-4,
         "what grip and skin give way, as thickness of the body's own material", _grip),
     Assumption("machine_compliance_m_n", "m/N", 1e-6, "what a test bench gives way", _machine),
     Assumption("platen_friction", "", 0.1,
         "friction of what holds nodes across and lets them slide", _platen_friction),
-    Assumption("buoyancy", "1", 1.0, "air that the body displaces, in 1.2 kg/m³", _buoyancy),
-    Assumption("added_mass", "1", 1.0, "air that moves with it, in half of that", _added_mass),
-    Assumption("air_drag", "1", 1.0, "drag of the air, in that of a coefficient of one", _air_drag),
+    Assumption("contact_stiffness", "1", 1.0,
+        "softness of contact with obstacles, in that of the pressure law", _contact_stiffness),
+    Assumption("buoyancy", "1", AIR_DENSITY_DEVIATION,
+        "buoyancy over that in the model, by the density of the air", _buoyancy),
+    Assumption("added_mass", "1", AIR_COEFFICIENT_DEVIATION,
+        "air that moves with the body over that in the model", _added_mass),
+    Assumption("air_drag", "1", AIR_COEFFICIENT_DEVIATION,
+        "drag of the air over that in the model", _air_drag),
 )
 # fmt: on
 
 
+class KnownEffect(Section):
+    """An effect of known sign and size, for which estimates are corrected to first order.
+
+    Attributes
+    ----------
+    mean : float
+        Its size, as measured.
+    deviation : float
+        Standard deviation of its size.
+    """
+
+    mean: Positive
+    deviation: Positive
+
+
 Deviation = Annotated[Literal["none"] | Positive, ByForm(str)]
+KnownDeviation = Annotated[KnownEffect | Deviation, ByForm((dict, KnownEffect))]
+# Rows that are never negative, of which a mean may be stated: what gives way does not push.
+OF_KNOWN_SIGN = ("grip_layer_m", "machine_compliance_m_n")
 _SAID = """How far off what is assumed may be: standard deviations, or "none" of what is exact.
 
+Of what is known to be there, such as the compliance of a machine, a table of mean and deviation.
 Nuisance parameters of recordings, by their names, count where they are not estimated.
 
 Attributes
@@ -393,10 +641,29 @@ _FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in RO
 class _Stated(Options):
     """What `Assumptions` does with its fields."""
 
+    @classmethod
+    def exact(cls) -> Assumptions:
+        """Return assumptions of which each is exactly true, as of a simulated recording."""
+        exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
+        return Assumptions(**exact)
+
     @property
     def deviations(self) -> dict[str, float | None]:
         """By name; None of what is known exactly."""
-        return {name: None if s == "none" else s for name, s in vars(self).items()}
+        found: dict[str, float | None] = {}
+        for name, stated in vars(self).items():
+            known = stated.deviation if isinstance(stated, KnownEffect) else stated
+            found[name] = None if known == "none" else known
+        return found
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Sizes of the known effects by name, each over its standard deviation."""
+        return {
+            name: stated.mean / stated.deviation
+            for name, stated in vars(self).items()
+            if isinstance(stated, KnownEffect)
+        }
 
 
 if TYPE_CHECKING:
@@ -405,12 +672,21 @@ if TYPE_CHECKING:
     class Assumptions(_Stated):
         """Made from the tables."""
 
-        def __init__(self, **deviations: float | Literal["none"]) -> None: ...
+        def __init__(
+            self, **deviations: float | Literal["none"] | KnownEffect | Mapping[str, float]
+        ) -> None: ...
 
 else:
     Assumptions = make_dataclass(
         "Assumptions",
-        [(name, Deviation, field(default=sigma or "none")) for name, sigma, _ in _FIELDS],
+        [
+            (
+                name,
+                KnownDeviation if name in OF_KNOWN_SIGN else Deviation,
+                field(default=sigma or "none"),
+            )
+            for name, sigma, _ in _FIELDS
+        ],
         bases=(_Stated,),
         frozen=True,
         kw_only=True,

@@ -10,48 +10,70 @@ decides intervals are Student's with their degrees of freedom (Welch & Satterthw
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..arrays import Array
 from ..model.parameters import Parameters
+from .combined import NORMAL_95, Interval, combine
 from .considered import Changes
 from .distributions import student_ppf
-from .estimates import Coordinate
+from .estimates import Coordinate, Estimate
 from .linearised import LinearisedFit, least_squares
 from .numerical import NumericalError, shifts
 from .uncertainty import Uncertainty
 
-# Half a 95 % interval of what is normal, in deviations.
-NORMAL = 1.96
 NOISE, NUISANCES, NUMERICAL = "noise", "nuisance parameters", "step and mesh"
 BETWEEN = "between recordings"
 
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """One estimate's variance by source.
+    """The variance of one estimate by source.
 
     Attributes
     ----------
+    value : float
+        The estimate, corrected for the discretisation error.
     shares : mapping of source to its share of the variance, largest first; they sum to one
-    whole95 : (lower, upper)
-        95 % interval that holds all of them.
+    combined95 : (lower, upper)
+        95 % interval due to all sources.
+    combined_std_error : float
+        Standard uncertainty due to all sources.
+    systematic : float
+        Standard deviation of the systematic effects and of the differences between recordings, in
+        the coordinate of the estimate, see `Coordinate`.
+    known_effect : float
+        Correction for the known effects, in the same coordinate; `value` contains it.
     """
 
+    value: float
     shares: Mapping[str, float]
-    whole95: tuple[float, float]
+    combined95: Interval
+    combined_std_error: float
+    systematic: float
+    known_effect: float = 0.0
 
     def widened(self, source: str, deviation: float, at: Coordinate) -> BudgetLine:
-        """With one more source, of a deviation in a coordinate."""
-        low, high = map(at.at, self.whole95)
-        known, more = ((high - low) / 2 / NORMAL) ** 2, deviation**2
-        shares = {name: share * known / (known + more) for name, share in self.shares.items()}
-        shares[source] = more / (known + more)
-        ranked = dict(sorted(shares.items(), key=lambda part: -part[1]))
-        return BudgetLine(ranked, _whole(at, (low, high), NORMAL * deviation))
+        """Add a source with a standard deviation in the coordinate `at` of the estimate."""
+        low, high = map(at.at, self.combined95)
+        known = ((high - low) / 2 / NORMAL_95) ** 2
+        total = known + deviation**2
+        shares = {name: share * known / total for name, share in self.shares.items()}
+        shares[source] = deviation**2 / total
+        centre = at.at(self.value)
+        below = float(np.hypot(centre - low, NORMAL_95 * deviation))
+        above = float(np.hypot(high - centre, NORMAL_95 * deviation))
+        return BudgetLine(
+            self.value,
+            _ranked(shares),
+            (at.value(centre - below), at.value(centre + above)),
+            (below + above) / 2 / NORMAL_95 / at.slope(self.value),
+            float(np.hypot(self.systematic, deviation)),
+            self.known_effect,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +91,8 @@ class Sources:
     between : (nq, b) how q follows what parameters differ by between recordings
     freedom : int
         How many recordings tell that, less one.
+    means : mapping of assumption to the size of a known effect over its deviation
+        Estimates are to be corrected for these effects.
     """
 
     names: tuple[str, ...]
@@ -79,6 +103,7 @@ class Sources:
     wider: Array
     between: Array
     freedom: int = 0
+    means: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -88,8 +113,9 @@ class Sources:
         parameters: Parameters,
         q: Array,
         uncertainty: Uncertainty,
+        means: Mapping[str, float] | None = None,
     ) -> Sources:
-        """Those of a fit near its answer q (nq,)."""
+        """Those of a fit near its answer q (nq,), with known effects `means` if there are any."""
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared]
         all_free, known = (np.zeros((fit.shared, fit.shared)) for _ in range(2))
@@ -103,7 +129,10 @@ class Sources:
         if scatter is not None:
             between, freedom = scatter.between[: fit.shared], len(scatter.recordings) - 1
         wider = uncertainty.wider
-        return cls(assumed.names, moved, all_free, known, by_q, wider, between, freedom)
+        known_effects = dict(means or {})
+        return cls(
+            assumed.names, moved, all_free, known, by_q, wider, between, freedom, known_effects
+        )
 
     def of_noise(self, by_q: Array) -> tuple[float, float]:
         """Of a variance by noise, the shares if nuisances were known and recordings agreed."""
@@ -126,7 +155,12 @@ class Sources:
         if not more:
             return 0.0
         freedom = self.freedom * ((others + more) / more) ** 2
-        return more * float(student_ppf(0.975, freedom) / NORMAL) ** 2
+        return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
+
+    def known_effect(self, by_q: Array) -> float:
+        """Return the correction for known effects of what has the derivative `by_q` (nq,)."""
+        sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
+        return float(by_q @ self.moved @ sizes)
 
     def of_assumed(self, by_q: Array) -> dict[str, float]:
         """Variances by each assumption, of what has this derivative."""
@@ -141,61 +175,91 @@ def budget(
     sources: Sources,
     uncertainty: Uncertainty,
     numerical: Mapping[str, NumericalError],
-    linear: Container[str] = (),
+    parameters: Parameters,
 ) -> dict[str, BudgetLine]:
-    """The budget of all estimates that have an interval, by name.
+    """Return the uncertainty budget of every estimate that has a statistical interval, by name.
 
     Parameters
     ----------
     sources : Sources
+        What moves the estimates beside the noise.
     uncertainty : Uncertainty
-    numerical : mapping of estimate to NumericalError, of those that are known
-    linear : names of the parameters that are their own coordinates
+        Statistical uncertainty of the fit.
+    numerical : mapping of estimate to NumericalError
+        Discretisation errors; estimates without an entry have none, or an unknown one.
+    parameters : Parameters
+        The parameters of the problem, with their coordinates and bounds.
     """
     lines = {}
     for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
-        by_q, error = sources.by_q[name], numerical.get(name)
-        if estimate.ci95 is None or not by_q.any():
-            continue
-        ends = error.ci95 if error is not None and error.ci95 is not None else estimate.ci95
-        at = Coordinate.of(name, (estimate.value, *estimate.ci95, *ends), name in linear)
-        low, high = map(at.at, estimate.ci95)
-        noise = ((high - low) / 2 / NORMAL) ** 2
-        low, high = map(at.at, ends)
-        own, agreed = sources.of_noise(by_q)
-        told = noise * (1 - agreed)
-        parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
-        parts[NUMERICAL] = max(0.0, ((high - low) / 2 / NORMAL) ** 2 - noise)
-        in_chart = by_q * at.slope(estimate.value)
-        by_assumption = sources.of_assumed(in_chart)
-        others = sum(parts.values()) + sum(by_assumption.values())
-        more = sources.of_recordings(in_chart, others, told)
-        parts[BETWEEN] = told + more
-        assumed = sum(by_assumption.values()) + more
-        total = others + told + more
-        ranked = sorted((parts | by_assumption).items(), key=lambda part: -part[1])
-        lines[name] = BudgetLine(
-            {source: variance / total for source, variance in ranked if variance > 0},
-            _whole(at, (low, high), NORMAL * float(np.sqrt(assumed))),
-        )
+        by_q = sources.by_q[name]
+        if estimate.statistical95 is not None and by_q.any():
+            lines[name] = _line(name, estimate, sources, numerical.get(name), parameters)
     return lines
 
 
-def _whole(at: Coordinate, ends: tuple[float, float], reach: float) -> tuple[float, float]:
-    """An interval with what is assumed, from its ends and the assumptions' half width.
-
-    Of an effect as large as the estimate itself the first order is true of one chart only: what
-    brakes a body adds to a damping, what makes it heavier multiplies its moduli. So it reaches as
-    far as in the worse of both, the estimate's coordinate and its value.
-    """
-    middle, whole = sum(ends) / 2, float(np.hypot((ends[1] - ends[0]) / 2, reach))
-    centre, low, high = map(at.value, (middle, *ends))
-    below, above = (float(np.hypot(reach / at.slope(centre), end - centre)) for end in (low, high))
-    least, most = at.range
-    return (
-        min(at.value(middle - whole), max(least, centre - below)),
-        max(at.value(middle + whole), min(most, centre + above)),
+def _line(
+    name: str,
+    estimate: Estimate,
+    sources: Sources,
+    error: NumericalError | None,
+    parameters: Parameters,
+) -> BudgetLine:
+    """Return the budget of one estimate that has a statistical interval."""
+    assert estimate.statistical95 is not None
+    linear, bounds = parameters.scale_and_bounds(name)
+    ends = estimate.statistical95
+    if error is not None and error.interval95 is not None:
+        ends = error.interval95
+    at = Coordinate.of(name, (estimate.value, *estimate.statistical95, *ends), linear)
+    noise = _variance(at, estimate.value, estimate.statistical95)
+    middle = estimate.value if error is None else error.extrapolated
+    by_q = sources.by_q[name]
+    own, agreed = sources.of_noise(by_q)
+    excess = noise * (1 - agreed)
+    parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
+    parts[NUMERICAL] = max(0.0, _variance(at, middle, ends) - noise)
+    by_coordinate = by_q * at.slope(estimate.value)
+    by_assumption = sources.of_assumed(by_coordinate)
+    others = sum(parts.values()) + sum(by_assumption.values())
+    between = sources.of_recordings(by_coordinate, others, excess)
+    systematic = float(np.sqrt(sum(by_assumption.values()) + between))
+    variances = parts | {BETWEEN: excess + between} | by_assumption
+    total = sum(variances.values())
+    known_effect = sources.known_effect(by_coordinate)
+    combined = combine(
+        name,
+        estimate,
+        error,
+        systematic,
+        known_effect=known_effect,
+        linear=linear,
+        bounds=bounds,
     )
+    assert combined.combined95 is not None
+    assert combined.combined_std_error is not None
+    return BudgetLine(
+        combined.value,
+        _ranked({source: part / total for source, part in variances.items() if part > 0}),
+        combined.combined95,
+        combined.combined_std_error,
+        systematic,
+        known_effect,
+    )
+
+
+def _variance(at: Coordinate, middle: float, ends: Interval) -> float:
+    """Return the variance of a 95 % interval, one end of which may be cut off by a bound."""
+    centre = at.at(middle)
+    low, high = map(at.at, ends)
+    if np.isclose(centre - low, high - centre, rtol=1e-6):
+        return ((high - low) / 2 / NORMAL_95) ** 2
+    return float(np.mean([((centre - low) / NORMAL_95) ** 2, ((high - centre) / NORMAL_95) ** 2]))
+
+
+def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
+    """Sort shares of a variance, the largest first."""
+    return dict(sorted(shares.items(), key=lambda part: -part[1]))
 
 
 def _slopes(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:

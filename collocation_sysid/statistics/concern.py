@@ -154,15 +154,31 @@ TOPICS: Mapping[str, Topic] = {
             "far": "{percent:.0f} % of the markers' samples lie far from where they can be",
         },
     ),
+    "assumption": Topic(
+        "Assumptions that the data contradict",
+        "budget",
+        "Find out whether the assumption is wrong, for instance by repeating the first recording "
+        "at the end, or whether the model lacks something that looks alike, such as memory, which "
+        "looks like a drift. solve --probe follows the effect beyond one linear step and relaxes "
+        "the other assumptions.",
+        {
+            "contradicted": "the data contradict the assumption that {assumption}: with "
+            "{name} = {size} ± {size_error} χ² falls by {chi_squared:.3g}, and the estimates are "
+            "{estimates}{instead}",
+        },
+    ),
     "information": Topic(
-        "What the data do not tell",
-        "trust",
+        "What the data do not determine",
+        "budget",
         "Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
         "motion that it matters to.",
         {
             "bound": "{names} ended at its bound",
             "bounds": "{names} ended at their bounds",
-            "none": "these data do not tell {names}",
+            "none": "the data do not determine {names}",
+            "combined": "{name} is not determined: its combined 95 % interval, {low:.3g} to "
+            "{high:.3g}, is wider than its value; largest contribution "
+            "{source} ({share:.0%}): {remedy}",
             "at-bound": "{name} is at a bound",
             "not-yet": "{name} is not known yet: {reason}",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
@@ -207,8 +223,9 @@ TOPICS: Mapping[str, Topic] = {
         "Raise transcription.substeps, or take the midpoint scheme, which damps least. "
         "refine RUN measures what is left.",
         {
-            "step": "the step moves {name} by {percent:+.2g} %, {errors:.2g} standard errors: its "
-            "interval allows for that; raise transcription.substeps, or run refine to measure it",
+            "step": "the estimated time-step error dominates the uncertainty of {name}: it was "
+            "corrected by {percent:+.2g} %, {errors:.2g} standard uncertainties; raise "
+            "transcription.substeps, or run refine to measure the error",
             "damping": "the scheme adds a damping ratio of {added:.2g} to the {damping:.2g} of the "
             "first mode of '{experiment}'",
             "period": "the scheme changes the first period of '{experiment}' by {change:+.1%}",
@@ -257,8 +274,8 @@ TOPICS: Mapping[str, Topic] = {
         'Refine it, and take element = "tet10", or "tet10-p0" from ν = 0.45 on. '
         "refine RUN measures what is left.",
         {
-            "refined": "step and mesh move {name} by {percent:+.2g} %, {errors:.2g} standard "
-            "errors: its interval allows for that",
+            "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
+            "{percent:+.2g} %, {errors:.2g} standard uncertainties",
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",
@@ -281,6 +298,19 @@ TOPICS: Mapping[str, Topic] = {
             "by {fit_mm:.2g} mm",
             "predicted": "'{experiment}' is predicted {times:.2g} times worse than the others are "
             "fitted",
+        },
+    ),
+    "prediction": Topic(
+        "The prediction",
+        "trust",
+        "The parameters are stated, not estimated: make sure that they belong to this body, and "
+        "that sigma is the sensor's noise. Then look for what the model lacks, or estimate a "
+        "parameter.",
+        {
+            "misses": "the prediction of '{experiment}' misses {what} by {size}{sigmas:.2g} times "
+            "{stated}",
+            "unseen": "none of the {seen} points of {camera} is near the predicted surface of "
+            "'{experiment}'",
         },
     ),
     "memory": Topic(

@@ -8,7 +8,7 @@ ones do, of the same program with them among its parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -24,8 +24,9 @@ from ..program.reading import Reading
 from ..program.sweep import Columns, Forward, GraspMotion, Sweep
 from ..recording.experiment import Experiment
 from ..recording.nuisance import ROWS
-from .assumptions import ASSUMPTIONS, Assumption, Effect, Fitted
+from .assumptions import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, Fitted
 from .linearised import linearised_fit
+from .shape_error import CORRELATION
 
 # A threshold of Huber's loss that no residual reaches.
 UNWEIGHTED = 1e9
@@ -61,6 +62,13 @@ class Changes(NamedTuple):
     names: tuple[str, ...]
     blocks: list[Array]
 
+    def without(self, assumptions: Iterable[str]) -> Changes:
+        """Return the changes by all others than some assumptions, each with all its components."""
+        left_out = set(assumptions)
+        kept = [k for k, name in enumerate(self.names) if name.partition(" ")[0] not in left_out]
+        names = tuple(self.names[k] for k in kept)
+        return Changes(names, [block[..., kept] for block in self.blocks])
+
 
 def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float | None]) -> Changes:
     """The changes by all that a fit assumes.
@@ -73,7 +81,9 @@ def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float |
         In place of those of the tables; None for what is known exactly.
     """
     rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
-    of_bodies = changed_residuals(collocation, z, [(row, s) for row, s in rows if s is not None])
+    stated = [(row, s) for row, s in rows if s is not None]
+    correlation = deviations.get(CORRELATION_KEY) or CORRELATION
+    of_bodies = changed_residuals(collocation, z, stated, surface_correlation=correlation)
     of_nuisances = considered(collocation, z, deviations)
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
     blocks = [np.concatenate(each, axis=3) for each in both]
@@ -107,13 +117,17 @@ def considered(
 
 @one_blas_thread()
 def changed_residuals(
-    collocation: Collocation, z: Array, assumptions: Sequence[tuple[Assumption, float]]
+    collocation: Collocation,
+    z: Array,
+    assumptions: Sequence[tuple[Assumption, float]],
+    *,
+    surface_correlation: float = CORRELATION,
 ) -> Changes:
-    """Those by assumptions, each with its deviation, see `assumed`."""
+    """Return the changes by assumptions, each with its deviation, see `assumed`."""
     names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
     for part in collocation.parts(z):
-        at = Fitted(part, collocation.parameters)
+        at = Fitted(part, collocation.parameters, surface_correlation)
         effects = [
             (row.effect(at, axis), sigma)
             for row, sigma in assumptions

@@ -43,20 +43,21 @@ class Estimate:
     Attributes
     ----------
     value : float
-    std_error : float or None
-        None for what was not estimated, is at a bound, or is not identified by the data.
-    ci95 : (lower, upper) or None
-        95 % confidence interval; within what is physically possible. An interval may be there,
-        and wide, where there is no `std_error`.
+    statistical_std_error : float or None
+        Standard error due to noise and nuisance parameters. None for what was not estimated, is at
+        a bound, or is not identified by the data.
+    statistical95 : (lower, upper) or None
+        95 % interval due to noise and nuisance parameters, within what is physically possible. It
+        may exist, and be wide, where there is no `statistical_std_error`.
     at_bound : bool
         The value, or one it follows from, ended at a bound.
     reason : str or None
-        Why something that was estimated has no `std_error`.
+        Why something that was estimated has no `statistical_std_error`.
     """
 
     value: float
-    std_error: float | None = None
-    ci95: tuple[float, float] | None = None
+    statistical_std_error: float | None = None
+    statistical95: tuple[float, float] | None = None
     at_bound: bool = False
     reason: str | None = None
 
@@ -133,17 +134,17 @@ def user_estimates(
         estimate = _of_parameter(item, value, deviation, float(quantiles[k]))
         other = int(np.argmax(partners[k]))
         relative = deviation * item.per_value(value) / max(abs(value), 1e-300)
-        if estimate.std_error is None or estimate.ci95 is None:
+        if estimate.statistical_std_error is None or estimate.statistical95 is None:
             pass
-        elif estimate.ci95[0] <= item.lower and estimate.ci95[1] >= item.upper:
+        elif estimate.statistical95[0] <= item.lower and estimate.statistical95[1] >= item.upper:
             reason = "its 95 % interval covers the whole range between its bounds"
-            estimate = Estimate(value, None, estimate.ci95, reason=reason)
+            estimate = Estimate(value, None, estimate.statistical95, reason=reason)
         elif partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION:
             reason = (
                 f"confounded with {parameters.free[other].name} "
                 f"(correlation {correlation_of(of_q)[k, other]:.3f})"
             )
-            estimate = Estimate(value, None, estimate.ci95, reason=reason)
+            estimate = Estimate(value, None, estimate.statistical95, reason=reason)
         found[item.name] = estimate
     for item in parameters.items:
         if item.tied is not None:
@@ -200,10 +201,14 @@ def _of_parameter(item: Parameter, value: float, deviation: float, quantile: flo
 
 def _multiplied(estimate: Estimate, ratio: float) -> Estimate:
     """The estimate of a multiple."""
-    ends = estimate.ci95 and sorted((ratio * estimate.ci95[0], ratio * estimate.ci95[1]))
+    ends = estimate.statistical95 and sorted(
+        (ratio * estimate.statistical95[0], ratio * estimate.statistical95[1])
+    )
     return Estimate(
         ratio * estimate.value,
-        None if estimate.std_error is None else abs(ratio) * estimate.std_error,
+        None
+        if estimate.statistical_std_error is None
+        else abs(ratio) * estimate.statistical_std_error,
         None if not ends else (ends[0], ends[1]),
         estimate.at_bound,
         estimate.reason,
@@ -251,14 +256,14 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
                 "bar, and the others' allow for other values of it; widen the bound, or fix it "
                 "if it is known"
             )
-        elif found.ci95 is None:
+        elif found.statistical95 is None:
             damping = is_damping(name)
             by = ": no information on damping in these data" if damping else " by these data"
             notes.append(
                 f"{name} is not determined{by}; fix it, give it a prior, or move the body"
                 f"{'' if damping else ' differently'}"
             )
-        elif found.std_error is None:
+        elif found.statistical_std_error is None:
             reasons[name] = str(found.reason)
     return [*notes, *_unidentifiable(reasons)]
 
@@ -294,12 +299,12 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
                 f"no memory found: the share of {branch} ended at 0, and its relaxation time "
                 "means nothing; leave that branch out"
             )
-        elif share.ci95 is not None and share.ci95[0] <= 0:
+        elif share.statistical95 is not None and share.statistical95[0] <= 0:
             notes.append(
                 f"no memory is told from none: the share of {branch} may be 0, and is at most "
-                f"{share.ci95[1]:.2g} (95 %)"
+                f"{share.statistical95[1]:.2g} (95 %)"
             )
-        elif (share.at_bound or share.ci95) and tau and tau.value > LONG * longest_s:
+        elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
                 f"{branch} relaxes within {tau.value:.2g} s, slower than the longest recording of "
                 f"{longest_s:.2g} s: its share and long-term moduli rest on how it begins; record "

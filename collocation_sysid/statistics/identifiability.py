@@ -49,7 +49,7 @@ def _one_by_one(uncertainty: Uncertainty) -> list[str]:
     well = [f"{name} to {_spread(f)}" for name, f in factors.items() if f <= WELL_FIXED]
     badly = [f"{name} only to {_spread(f)}" for name, f in factors.items() if f > WELL_FIXED]
     parts = [listed(part) for part in (well, badly) if part]
-    return [f"the data determine {'; '.join(parts)} (95 %)"] if parts else []
+    return [f"the data determine {'; '.join(parts)} (95 %, statistical)"] if parts else []
 
 
 def _combinations(uncertainty: Uncertainty) -> list[str]:
@@ -107,9 +107,9 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
 
 def _factor(estimate: Estimate) -> float | None:
     """Half width of the interval as a factor."""
-    if estimate.ci95 is None or not estimate.ci95[0] > 0:
+    if estimate.statistical95 is None or not estimate.statistical95[0] > 0:
         return None
-    factor = float(np.sqrt(estimate.ci95[1] / estimate.ci95[0]))
+    factor = float(np.sqrt(estimate.statistical95[1] / estimate.statistical95[0]))
     return factor if factor < HOPELESS else None
 
 

@@ -215,7 +215,7 @@ def _level(
     raw = np.maximum(squares - more, 0.0)
     least = np.maximum(LEAST_SHARE * raw / np.maximum(counts, 1.0), ROUNDING**2)
     by_marker = np.maximum(np.linalg.lstsq(expected, own)[0], least)
-    pooled = max(own.sum() / max(1.0, expected.sum()), counts @ least / counts.sum())
+    pooled = max(own.sum() / max(1.0, expected.sum()), counts @ least / max(1.0, counts.sum()))
     exact = squares.sum() <= ROUNDING**2 * counts.sum()
     tested = not exact and left.sum() >= 1
     statistic = float(squares.sum()) * freedom / max(float(means.sum()), 1e-300)

@@ -60,8 +60,8 @@ class NumericalError:
         Observed orders; None where there were two levels, or the changes did not shrink.
     extrapolated : float
         The value without discretisation, by Richardson's extrapolation.
-    ci95 : (lower, upper) or None
-        Interval for noise and discretisation; None where the noise's is not known.
+    interval95 : (lower, upper) or None
+        95 % interval due to noise and discretisation; None if that due to noise is not known.
     """
 
     step: float | None
@@ -69,7 +69,7 @@ class NumericalError:
     step_order: float | None
     mesh_order: float | None
     extrapolated: float
-    ci95: tuple[float, float] | None
+    interval95: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Refinement:
         moves = {
             name: abs(estimates[name].value - error.extrapolated) / spread
             for name, error in self.errors.items()
-            if (spread := estimates[name].std_error)
+            if (spread := estimates[name].statistical_std_error)
         }
         # Moduli that move alike differ by rounding: the first is the parameter itself.
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
@@ -190,14 +190,14 @@ def numerical_error(
     linear : bool
         Whether the parameter is its own coordinate.
     """
-    known = (estimate.value, *(estimate.ci95 or ()), *by_step, *by_mesh)
+    known = (estimate.value, *(estimate.statistical95 or ()), *by_step, *by_mesh)
     at = Coordinate.of(name, known, linear)
     x = at.at(estimate.value)
     step = _Limit.of([x, *map(at.at, by_step)], step_order, step_order / 2)
     mesh = _Limit.of([x, *map(at.at, by_mesh)], MESH_ORDER, LEAST_ORDER)
     limit, interval = x + step.way + mesh.way, None
-    if estimate.ci95 is not None:
-        low, high = map(at.at, estimate.ci95)
+    if estimate.statistical95 is not None:
+        low, high = map(at.at, estimate.statistical95)
         down = float(np.hypot((high - low) / 2, step.below + mesh.below))
         up = float(np.hypot((high - low) / 2, step.above + mesh.above))
         interval = at.value(limit - down), at.value(limit + up)
@@ -255,10 +255,13 @@ def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     changes : of each block (T, M, 3, a), in units of σ
     """
     free, count = np.flatnonzero(~fit.at_bound), changes[0].shape[-1] if changes else 0
+    if not free.size:
+        return np.zeros((len(fit.names), count))
     known = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
     score = np.zeros((len(free), count))
     for block, change in zip(fit.blocks, changes, strict=True):
-        slope = block.slope[..., free].reshape(-1, len(free))
+        slope = block.slope[..., free]
+        slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
         known = known.add(np.zeros(len(slope)), slope)
         apart = change * block.weight[..., None] * block.seen[..., None]
         score += slope.T @ apart.reshape(len(slope), count)

@@ -11,143 +11,68 @@ order in its own size. Error bars are those of any fit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Array
 from ..methods.start import marched
-from ..program.collocation import Collocation
-from .budget import BudgetLine
-from .considered import Changes, assumed
+from .assumptions import CORRELATION_KEY
 from .distributions import normal_isf
-from .estimates import Estimate
-from .linearised import Derived, FitBlock, LinearisedFit, best_step, least_squares, linearised_fit
-from .scatter import TELLING, part_fit, recordings_of, single_fits
-from .uncertainty import ErrorModel, Uncertainty, uncertainty_of
+from .linearised import FitBlock, LinearisedFit, best_step, least_squares, linearised_fit
+from .relaxation import (
+    Answered,
+    Kind,
+    Probe,
+    assumption_of,
+    probed_changes,
+    relaxed_probe,
+    with_freedom,
+)
+from .routine_probes import ROUTINE, WIDENING, is_alarming, routine_probes, significance
+from .scatter import part_fit, recordings_of, single_fits
 
 # Into so many windows of time the data are cut.
 WINDOWS = ("first third", "middle third", "last third")
-# Probability that a faultless run has anything told by one of its probes.
+# Probability that a faultless run has any significant probe, beside those of every solve.
 CHANCE = 0.01
-# Steps of a freed assumption that is told; and one of a parameter's logarithm that is the last.
-STEPS, SETTLED = 4, 0.02
-Kind = Literal["window", "recording", "assumption"]
+# Most linear steps of a significant assumption: each is a simulation.
+STEPS = 4
+# Change of a parameter's logarithm in a step that is the last.
+SETTLED = 0.02
 
 
-@dataclass(frozen=True)
-class Move:
-    """How far an estimate goes in a refit.
+def probes_of_every_solve(at: Answered) -> tuple[Probe, ...]:
+    """Relax the routine assumptions by one linear step, and follow the one that gives concern.
 
-    Attributes
-    ----------
-    value, std_error : float
-        Of the refit.
-    change : float
-    of_ci95, of_whole95 : float or None
-        The same over the half widths of its intervals.
+    A linear step suffices to find that an assumption is wrong, but not for estimates that change by
+    much of their value. So the most significant assumption that gives concern, if there is one,
+    takes a few steps more, each a simulation.
     """
-
-    value: float
-    std_error: float
-    change: float
-    of_ci95: float | None
-    of_whole95: float | None
-
-
-@dataclass(frozen=True)
-class Probe:
-    """One refit.
-
-    Attributes
-    ----------
-    kind : {"window", "recording", "assumption"}
-    name : str
-        The window, the recording, or the assumption with its component.
-    chi_squared : float
-        By how much χ² falls, of σ as stated and with priors.
-    moves : mapping of estimate to Move
-        Of those that the refit tells.
-    size, size_error : float or None
-        Of a freed assumption, in its unit.
-    told : tuple of str
-        Of a part of the data the estimates that are elsewhere not by chance; an assumption that is
-        not zero by chance.
-    """
-
-    kind: Kind
-    name: str
-    chi_squared: float
-    moves: Mapping[str, Move]
-    size: float | None = None
-    size_error: float | None = None
-    told: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Answered:
-    """A fit at its answer, as probes take it.
-
-    Attributes
-    ----------
-    collocation : Collocation
-    z : (variables,)
-    fit : LinearisedFit
-    errors : ErrorModel
-    estimates : mapping of name to Estimate
-    budget : mapping of name to BudgetLine
-    deviations : mapping of all assumptions and nuisance parameters to their deviations
-    """
-
-    collocation: Collocation
-    z: Array
-    fit: LinearisedFit
-    errors: ErrorModel
-    estimates: Mapping[str, Estimate]
-    budget: Mapping[str, BudgetLine]
-    deviations: Mapping[str, float | None]
-
-    def found(self, fit: LinearisedFit, p: Array) -> Uncertainty:
-        """Estimates and error bars of another fit at p."""
-        q = p[: fit.shared]
-        constants = (segment.constants for segment in self.collocation.segments)
-        fit = replace(fit, derived=Derived.of(constants, q))
-        return uncertainty_of(fit, self.collocation.parameters, q, self.errors)
-
-    def moves(self, found: Uncertainty) -> dict[str, Move]:
-        """How far estimates went that a refit tells."""
-        went = {}
-        for name, each in {**found.estimates, **found.derived}.items():
-            error, joint = each.std_error, self.estimates[name]
-            if error and error < TELLING * abs(each.value):
-                change = each.value - joint.value
-                whole95 = self.budget[name].whole95 if name in self.budget else None
-                of = _share(change, joint.ci95), _share(change, whole95)
-                went[name] = Move(each.value, error, change, *of)
-        return went
-
-    @property
-    def p(self) -> Array:
-        """All parameters at the answer."""
-        return self.collocation.parameters_of(self.z)
+    found = routine_probes(at)
+    alarming = [probe for probe in found if is_alarming(probe)]
+    if not alarming:
+        return found
+    worst = max(alarming, key=lambda probe: probe.chi_squared)
+    followed = replace(_released(at, worst, significance(at.changes)), routine=True)
+    return tuple(followed if probe is worst else probe for probe in found)
 
 
 def probes(at: Answered) -> tuple[Probe, ...]:
-    """All refits: windows, recordings where there are several, and freed assumptions."""
-    parts, freed = [*_windows(at), *_recordings(at)], [*_freed(at)]
+    """Refit windows of time, recordings where there are several, and with assumptions relaxed.
+
+    Assumptions that every solve probes have the same prior and level of significance as there.
+    """
+    parts = [*_windows(at), *_recordings(at)]
+    freed = [*_freed(at)]
     tests = sum(len(probe.moves) for probe in parts) + len(freed)
     limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
+    limits = dict.fromkeys(ROUTINE, significance(at.changes))
     return (
         *(_elsewhere(each, limit) for each in parts),
-        *(_released(at, probe, limit) for probe in freed),
+        *(_released(at, probe, limits.get(probe.name, limit)) for probe in freed),
     )
-
-
-def _share(change: float, interval: tuple[float, float] | None) -> float | None:
-    """A change in half widths of an interval."""
-    return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
 
 
 def _windows(at: Answered) -> Iterator[Probe]:
@@ -204,60 +129,30 @@ def _elsewhere(probe: Probe, limit: float) -> Probe:
 
 
 def _freed(at: Answered) -> Iterator[Probe]:
-    """Each assumption freed that changes anything."""
-    changes = assumed(at.collocation, at.z, at.deviations)
-    for name in dict.fromkeys(changes.names):
-        wide = with_freedom(at.fit, changes, name)
+    """Relax each assumption that changes anything, by one linear step."""
+    for name in dict.fromkeys(at.changes.names):
+        wide = with_freedom(at.fit, at.changes, name, _widening(name))
         if any(block.slope[..., len(at.fit.names) :].any() for block in wide.blocks):
-            yield _of_freedom(at, name, wide, at.p)
-
-
-def with_freedom(fit: LinearisedFit, changes: Changes, name: str) -> LinearisedFit:
-    """A fit in which an assumption is one more nuisance parameter, or several of its name.
-
-    Parameters
-    ----------
-    fit : LinearisedFit
-    changes : Changes
-        Each off by its deviation, which is that of the prior.
-    name : str
-    """
-    columns = [k for k, other in enumerate(changes.names) if other == name]
-    blocks = []
-    for block, change in zip(fit.blocks, changes.blocks, strict=True):
-        more = change[..., columns] * (block.weight * block.seen)[..., None]
-        blocks.append(replace(block, slope=np.concatenate([block.slope, more], axis=3)))
-    count = len(columns)
-    return replace(
-        fit,
-        blocks=tuple(blocks),
-        names=(*fit.names, *(f"{name} {k}" for k in range(count))),
-        prior_residual=np.append(fit.prior_residual, np.zeros(count)),
-        prior_slope=np.append(fit.prior_slope, np.ones(count)),
-        at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
-    )
-
-
-def _of_freedom(at: Answered, name: str, wide: LinearisedFit, p: Array) -> Probe:
-    """The best of a fit with one more freedom, linearised at p."""
-    first, step = len(at.fit.names), best_step(wide)
-    after, own = wide.after(step), step[first:]
-    found = at.found(after, p + step[:first])
-    before, left = least_squares(at.fit), least_squares(after)
-    falls = before.loss(np.zeros(first)) - left.loss(np.zeros(len(step)))
-    worst, unit = int(np.argmax(np.abs(own))), at.deviations[_row(name)] or 1.0
-    error = [*found.nuisance.values()][first - wide.shared + worst]
-    size = float(unit * own[worst]), float(unit * error)
-    return Probe("assumption", name, falls, at.moves(found), *size)
+            yield relaxed_probe(at, name, wide, at.p)
 
 
 def _released(at: Answered, probe: Probe, limit: float) -> Probe:
-    """One that the data tell once more, from where its first step leads."""
-    if not _is_told(probe, limit):
+    """Return a probe that is significant after further steps, from where its first step leads.
+
+    Parameters
+    ----------
+    at : Answered
+    probe : Probe
+        Of an assumption, after one linear step; one that is not significant is returned as it is.
+    limit : float
+        The least significant size, in its standard errors.
+    """
+    if not probe.is_beyond(limit):
         return probe
     first, collocation = len(at.fit.names), at.collocation
-    alone = {name: s if name == _row(probe.name) else None for name, s in at.deviations.items()}
-    wide = with_freedom(at.fit, assumed(collocation, at.z, alone), probe.name)
+    kept = assumption_of(probe.name), CORRELATION_KEY
+    alone = {name: size if name in kept else None for name, size in at.deviations.items()}
+    wide = with_freedom(at.fit, at.changes, probe.name, _widening(probe.name))
     p, (_, near) = at.p, collocation.unpack(at.z)
     for _ in range(STEPS):
         step = best_step(wide)[:first]
@@ -266,20 +161,15 @@ def _released(at: Answered, probe: Probe, limit: float) -> Probe:
         if failure is not None:
             break
         z = collocation.pack(p, near)
-        changes = assumed(collocation, z, alone)
+        changes = probed_changes(collocation, z, alone)
         there = linearised_fit(collocation, z).disturbed(b.disturbances for b in at.fit.blocks)
-        wide = with_freedom(there, changes, probe.name)
-        probe = _of_freedom(at, probe.name, wide, p)
+        wide = with_freedom(there, changes, probe.name, _widening(probe.name))
+        probe = relaxed_probe(at, probe.name, wide, p)
         if np.abs(step[: wide.shared]).max(initial=0.0) < SETTLED:
             break
-    return replace(probe, told=(probe.name,) if _is_told(probe, limit) else ())
+    return replace(probe, told=(probe.name,) if probe.is_beyond(limit) else ())
 
 
-def _is_told(probe: Probe, limit: float) -> bool:
-    assert probe.size is not None
-    return probe.size_error is not None and abs(probe.size) > limit * probe.size_error
-
-
-def _row(name: str) -> str:
-    """The row of an assumption with its component."""
-    return name.partition(" ")[0]
+def _widening(name: str) -> float:
+    """Return the deviation of an assumption's prior, in deviations of the budget."""
+    return WIDENING if name in ROUTINE else 1.0

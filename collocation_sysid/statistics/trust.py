@@ -14,17 +14,23 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from ..arrays import Array
+from ..display import short
+from ..errors import listed
+from ..fem.constants import symbol_of, unit_of
 from ..program.stability import Instability
 from ..program.touches import Touch
 from ..recording.experiment import Experiment
 from ..recording.turning import FAST, fastest_turn
+from .budget import worded
 from .concern import Concern, concerned
 from .diagnostics import MOST_WILD, MarkerDiagnosis
-from .distributions import normal_isf
+from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, told_of
 from .hypothesis import Hypothesis
 from .noise import NoiseLevel
 from .numerical import Refinement
+from .relaxation import Probe
+from .routine_probes import is_alarming
 from .uncertainty import Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
@@ -33,13 +39,16 @@ Verdict = Literal["good", "check", "doubtful"]
 CERTAIN = 2.0
 # Probability of a false alarm, of each test.
 RARE = 1e-4
-# Residuals this many times sigma_m, or one over it, deserve a look; as many as the second, and not
-# white, are no noise.
-MISFIT, GROSS_MISFIT = 1.5, 3.0
+# Residuals over sigma, or sigma over residuals: from here on "check". The noise of
+# cameras is known to about this factor.
+MISFIT = 1.5
+# Residuals over sigma: from here on "doubtful" if they are not white, or are those of a prediction.
+# The only threshold for doubtful residuals; docs/howto/verdict.md states its value.
+GROSS_MISFIT = 3.0
 # One marker alone may differ by more.
 MARKER_MISFIT = 2.0
-# Autocorrelation that matters, and from which on hardly any of the residuals is noise.
-PERSISTENT, NO_NOISE = 0.2, 0.9
+# Autocorrelation that matters.
+PERSISTENT = 0.2
 # What a forward simulation misses more than the fit, over the fit's own RMS or that of the noise.
 ROLLOUT, GROSS_ROLLOUT = 0.35, 2.0
 # A prediction this many times worse than the fit.
@@ -56,7 +65,8 @@ PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
 E_FOLDINGS, GROSS_E_FOLDINGS = 1.0, 7.0
 # A contact of fewer faces is as wide as the mesh makes it.
 FEWEST_FACES = 4.0
-# Standard errors that step and mesh may move a parameter: the half width of its interval.
+# Combined standard uncertainties by which step and mesh may change a parameter: the half width of
+# its 95 % interval.
 MOVED = 2.0
 # What is said of the numerical error: estimated, and measured.
 NUMERICAL = "scheme/step", "mesh/refined"
@@ -129,7 +139,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
         *(outlier.concern for outlier in uncertainty.outliers),
         *concerned(
             matters and persistent,
-            found.lag1 > NO_NOISE and factor > MISFIT,
+            factor > GROSS_MISFIT,
             "residuals/persist",
             autocorrelation=found.lag1,
         ),
@@ -170,7 +180,11 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
     bounded = [name for name, found in estimates.items() if found.at_bound]
-    vague = [n for n, found in estimates.items() if not found.at_bound and found.std_error is None]
+    vague = [
+        name
+        for name, found in estimates.items()
+        if not found.at_bound and found.statistical_std_error is None
+    ]
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
     return [
@@ -180,16 +194,83 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def numerical_concerns(
-    estimates: Mapping[str, Estimate], refinement: Refinement | None
+    optimum: Mapping[str, Estimate],
+    combined_std_errors: Mapping[str, float | None],
+    refinement: Refinement | None,
 ) -> list[Concern]:
-    """Where step or mesh matter more than the noise; what is unknown gives no concern."""
-    worst, many = ("", 0.0) if refinement is None else refinement.worst(estimates)
-    if refinement is None or many <= MOVED:
+    """Return a concern if step or mesh dominate the uncertainty of a parameter.
+
+    Parameters
+    ----------
+    optimum : mapping of name to Estimate
+        Estimates before the correction of the discretisation error.
+    combined_std_errors : mapping of name to float or None
+        Combined standard uncertainties; None if unknown.
+    refinement : Refinement or None
+        Discretisation errors; None if they are unknown, which is no concern.
+    """
+    if refinement is None:
         return []
-    value = estimates[worst].value
-    percent = 100 * (value - refinement.errors[worst].extrapolated) / abs(value)
+    corrections = {
+        name: abs(error.extrapolated - optimum[name].value) / uncertainty
+        for name, error in refinement.errors.items()
+        if (uncertainty := combined_std_errors.get(name))
+    }
+    # Moduli with the same relative correction differ by rounding: the first is the parameter.
+    worst, largest = max(corrections.items(), key=lambda item: round(item[1], 6), default=("", 0.0))
+    if largest <= MOVED:
+        return []
+    value = optimum[worst].value
+    percent = 100 * (refinement.errors[worst].extrapolated - value) / abs(value)
     code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
-    return [Concern(code, data={"name": worst, "percent": percent, "errors": many})]
+    return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
+
+
+# What a relaxed assumption says of a body or a recording, by its name.
+RELAXED = {
+    "stiffness_drift": "the stiffness is constant during a recording",
+    "clock_rate": "the clocks of cameras and robot run at the same rate",
+    "time_scale": "all clocks run at the right rate",
+}
+
+
+def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) -> list[Concern]:
+    """The assumption that the data contradict most, with the estimates without it.
+
+    Other assumptions that would explain the data less well are named in the same concern: relaxing
+    one is mostly a substitute for relaxing another.
+
+    Parameters
+    ----------
+    probes : iterable of Probe
+    corrections : mapping of parameter to float
+        The estimated parameters, in the order in which they are reported, each with the factor that
+        corrects its optimum for the known discretisation error.
+    """
+    alarming = sorted(filter(is_alarming, probes), key=lambda each: -each.chi_squared)
+    if not alarming:
+        return []
+    worst, *others = alarming
+    instead = listed(f"{worded(p.name)} ({p.chi_squared:.3g})" for p in others)
+    data = {
+        "assumption": RELAXED.get(worst.name, f"{worded(worst.name)} is as stated"),
+        "name": worded(worst.name),
+        "size": short(worst.size or 0.0),
+        "size_error": short(worst.size_error or 0.0),
+        "chi_squared": worst.chi_squared,
+        "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
+        "instead": f"; less well also by {instead}" if others else "",
+    }
+    return [Concern("assumption/contradicted", data=data)]
+
+
+def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
+    """Return the estimate of a parameter with an assumption relaxed, in words."""
+    move = probe.moves.get(name)
+    if move is None:
+        return f"{symbol_of(name)} not determined"
+    value = correction * move.value
+    return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
 
 
 def marker_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
@@ -248,6 +329,45 @@ def rollout_concerns(
         experiment=name,
         rms_mm=1e3 * rms_m,
         fit_mm=1e3 * fit_rms_m,
+    )
+
+
+def prediction_concerns(
+    name: str,
+    what: str,
+    stated: str,
+    sigmas: float,
+    tame_sigmas: float,
+    numbers: int,
+    size: str = "",
+) -> list[Concern]:
+    """Return whether a prediction, of which nothing was fitted, misses the measurements.
+
+    Parameters
+    ----------
+    name : str
+        Of the experiment.
+    what, stated : str
+        What was measured, and what states its σ.
+    sigmas : float
+        Root mean square of the differences over σ.
+    tame_sigmas : float
+        The same without wild samples, by which the prediction is judged.
+    numbers : int
+        How many numbers were measured.
+    size : str
+        The root mean square in a unit, for people.
+    """
+    is_chance = float(chi2_sf(numbers * tame_sigmas**2, numbers)) > RARE
+    return concerned(
+        tame_sigmas > MISFIT and not is_chance,
+        tame_sigmas > GROSS_MISFIT,
+        "prediction/misses",
+        experiment=name,
+        what=what,
+        stated=stated,
+        sigmas=sigmas,
+        size=f"{size}, " if size else "",
     )
 
 

@@ -21,7 +21,9 @@ HOLDS = Holds(
         "st-venant-kirchhoff": "St.Venant-Kirchhoff",
         "linear": "isotropic elastic",
     },
-    stiffness_damping="γ_r = {gamma_r_s:.4g} s is not exported",
+    stiffness_damping="γ_r = {gamma_r_s:.4g} s is not exported, since the step is static; in a "
+    'dynamic one a solid mixture with a "Newtonian viscous solid" of mu = γ_r μ and kappa = '
+    "γ_r (λ + 2/3 μ) is kelvin-voigt, but for the ratio of volumes J",
     mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not exported; in a dynamic step a body load "
     '"mass damping" is it',
     memory=True,

@@ -22,7 +22,7 @@ from ...fem.moduli import engineering
 from ...problem import Problem
 from ...recording import Experiment, Markers, Obstacle
 from ...recording.solids import name_of
-from ...runs.result import FoundValue, Result
+from ...runs.result import ReportedEstimate, Result
 from ...runs.warm_start import Earlier
 from ..replay import Replay, read_arrays, reading_run
 
@@ -105,7 +105,7 @@ class Identified:
     verdict : str
     warnings : tuple of str
         What to know before these numbers are used anywhere else.
-    parameters : mapping of name to FoundValue
+    parameters : mapping of name to ReportedEstimate
     body : Body
     theta : (k,) its constants
     experiment : Experiment
@@ -118,7 +118,7 @@ class Identified:
     title: str
     verdict: str
     warnings: tuple[str, ...]
-    parameters: Mapping[str, FoundValue]
+    parameters: Mapping[str, ReportedEstimate]
     body: Body
     theta: Array
     experiment: Experiment
@@ -156,6 +156,14 @@ class Identified:
         )
         if problem.parameters.free:
             problem = answer.started(problem)  # which may state no guess itself
+        if any(body.scan is not None for body in problem.bodies):
+            raise InputError(
+                "the mesh was made under gravity, and targets take meshes as free of stress; "
+                "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
+                'solve with that and rest_shape = "stress_free"',
+                folder,
+                "object.rest_shape",
+            )
         collocation = problem.collocation()
         names = [segment.experiment.name for segment in collocation.segments]
         if experiment is not None and experiment not in names:
@@ -164,7 +172,9 @@ class Identified:
             )
         segment = collocation.segments[names.index(experiment) if experiment else 0]
         with reading_run(folder):
-            values = {item.name: answer.values[item.name] for item in problem.parameters.items}
+            values = {
+                item.name: result.parameters[item.name].value for item in problem.parameters.items
+            }
         phi = answer.nuisance_of(collocation)[0][segment.local.places]
         with reading_run(folder):
             replay = Replay.from_arrays(segment.experiment.name, read_arrays(folder))
@@ -288,7 +298,15 @@ class Identified:
     def as_dict(self) -> dict[str, Any]:
         """All of it, for a file."""
         e, body = self.experiment, self.body
-        names = ("value", "std_error", "ci95", "at_bound", "fixed")
+        names = (
+            "value",
+            "combined_std_error",
+            "combined95",
+            "statistical_std_error",
+            "statistical95",
+            "at_bound",
+            "fixed",
+        )
         return {
             "title": self.title,
             "verdict": self.verdict,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -38,10 +39,11 @@ HOLDS = Holds(
     {"st-venant-kirchhoff": "flex"},
     "a flex is St. Venant and Kirchhoff's; {material} has the same E and ν at small strain, "
     "another stress from its second order on",
-    "the damping of a flex is γ_r times the rate of its second Piola–Kirchhoff stress, which is "
-    "that of {damping} at small strain",
+    'the damping of a flex is the law "material", γ_r (λ tr(Ė) I + 2 μ Ė); {damping} is the same '
+    "at small strain",
     "damping by mass, γ_m = {gamma_m_1_s:.4g} 1/s, is not known, and MuJoCo refuses dampers on the "
     "nodes of a flex",
+    damping="material",
     motion=True,
     roundings=False,
     faces=False,
@@ -263,7 +265,8 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
     oscillating = squares[squares > 1e-9 * squares[-1]]
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
-    forces = Forces.of(body.experiment, body.start_s, body.theta)
+    in_vacuum = replace(body.experiment, air_density_kg_m3="none")
+    forces = Forces.of(in_vacuum, body.start_s, body.theta)
     ours = natural_modes(forces, body.nodes_m, dofs, 1).frequencies_hz
     return Comparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
 

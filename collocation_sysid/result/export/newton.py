@@ -18,8 +18,8 @@ NUMBERS = "body.json"
 HOLDS = Holds(
     {"stable-neo-hookean": "soft mesh"},
     "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
-    "damping γ_r becomes a viscosity, γ_r μ / 2 in Pa s, of shape alone: changes of volume are "
-    "damped less",
+    "damping γ_r becomes a viscosity k = γ_r μ / 2 [Pa s] with the stress 4 k Ė, the law "
+    '"material" without its part λ tr(Ė): changes of volume are damped less; here it is {damping}',
     roundings=False,
     faces=False,
 )

@@ -230,21 +230,23 @@ def walls(body: Identified) -> tuple[Wall, ...]:
         corners = np.array([list(product(*each)) for each in ends])
         seen = np.einsum("tki,tij->tkj", corners, rotations).reshape(-1, 3)
         size_m = SHEET * float(np.ptp(seen, axis=0).max())
-        solid = grown(obstacle.shape, law.width_m / 2)
-        facets = Facets.of(solid, seen.mean(axis=0), size_m, law.width_m / 2)
+        area_m2 = law.surface.area_m2
+        stiffness = 2 * float(np.average(law.stiffness_at(body.theta), weights=area_m2))
+        width_m = float(np.average(law.widths_m, weights=area_m2))
+        solid = grown(obstacle.shape, width_m / 2)
+        facets = Facets.of(solid, seen.mean(axis=0), size_m, width_m / 2)
         faces = law.surface.faces
         touching = np.unique(body.body.nodes.on_faces(body.body.mesh.surface[faces]))
         # Nodes may be deeper than the points at which ours are pushed.
         back_m = -max(depth_m, 0.0) * normal
         nearest = (carried[0, touching] - places[0] - back_m) @ rotations[0]
         back_m -= facets.depth_m(nearest) * normal
-        stiffness = 2 * law.stiffness_at(body.theta)
-        of_node = stiffness * float(law.surface.area_m2.sum()) / len(touching)
+        of_node = stiffness * float(area_m2.sum()) / len(touching)
         shown = facets.towards(
             np.concatenate([seen, seen[: len(corners[0])] - back_m @ rotations[0]])
         )
         start_m = shown.points_m @ rotations[0].T + places[0] + back_m
-        law_of = stiffness, of_node, law.width_m, faces
+        law_of = stiffness, of_node, width_m, faces
         made.append(Wall(obstacle, shown, back_m, start_m, nodes, cells, *law_of))
         nodes, cells = nodes + len(start_m), cells + len(shown.triangles)
     return tuple(made)

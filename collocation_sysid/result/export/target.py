@@ -173,6 +173,8 @@ def _never_held(body: Identified) -> Iterator[str]:
     e, times = body.experiment, body.experiment.t_s
     if e.actuators:
         yield "tendons and pressures are not exported"
+    if e.air_density_kg_m3:
+        yield "buoyancy, added mass and drag of the air are not exported"
     if e.body.forces:
         yield f"{', '.join(f.name for f in e.body.forces)} of your own is not exported"
     if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
@@ -189,7 +191,11 @@ def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
     (T, n, 3) how far they move the nodes, and (T, o, 3) the forces of obstacles on the body
     """
     whole = replace(
-        body.touching or body.experiment, tendons=(), pressures=(), loaded_since_s=np.inf
+        body.touching or body.experiment,
+        tendons=(),
+        pressures=(),
+        loaded_since_s=np.inf,
+        air_density_kg_m3="none",
     )
     if samples > 1:
         states = simulate(whole, body.theta).positions_m[:samples].reshape(samples, -1)

@@ -177,6 +177,11 @@ class BodyFinding:
     concerns : tuple of Concern
         What the elements will do to the answer; `warnings` are their sentences.
     fields : by the name of its constant, what differs from place to place
+    rest_shape : str or None
+        "stress_free" or "under_gravity" where that is stated or follows from how the mesh was made.
+    rest_shape_change_m : float
+        Largest distance of the mesh from the stress-free shape at the guess; NaN where there is no
+        such shape.
     """
 
     TOLD: ClassVar = ("warnings",)
@@ -196,6 +201,8 @@ class BodyFinding:
     guess: dict[str, float]
     concerns: tuple[Concern, ...]
     fields: dict[str, FieldShapes]
+    rest_shape: str | None = None
+    rest_shape_change_m: float = 0.0
 
     @property
     def diagonal_m(self) -> float:
@@ -230,7 +237,26 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
         guess=_guess(body, theta),
         concerns=(*element_concerns(body, theta, shape, worst[0]), *_field_concerns(fields)),
         fields=fields,
+        rest_shape=_rest_shape(body),
+        rest_shape_change_m=_rest_shape_change_m(body, theta),
     )
+
+
+def _rest_shape(body: Body) -> str | None:
+    """Return the name of what is stated of the stress-free shape, None where nothing is."""
+    if body.rest_shape is None:
+        return None
+    return "stress_free" if body.scan is None else "under_gravity"
+
+
+def _rest_shape_change_m(body: Body, theta: Array) -> float:
+    """Return the largest distance of the mesh from the stress-free shape [m], NaN without one."""
+    if body.inverse is None:
+        return 0.0
+    if body.unreachable(theta) is not None:
+        return float("nan")
+    change_m = body.inverse.shape(theta).positions_m - body.nodes.points_m
+    return float(np.linalg.norm(change_m, axis=1).max())
 
 
 def _field_concerns(fields: Mapping[str, FieldShapes]) -> Iterator[Concern]:

@@ -43,7 +43,13 @@ class MarkerFinding:
 
 @dataclass(frozen=True)
 class Recording:
-    """One experiment's measurements."""
+    """One experiment's measurements.
+
+    Attributes
+    ----------
+    air_density_kg_m3 : float
+        Of the air around the body in the model; zero in a vacuum.
+    """
 
     experiment: str
     validation: bool
@@ -55,6 +61,7 @@ class Recording:
     missing: int
     markers: tuple[MarkerFinding, ...]
     instruments: tuple[str, ...]
+    air_density_kg_m3: float = 0.0
 
     @property
     def farthest(self) -> MarkerFinding:
@@ -108,6 +115,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
             *(gauge.name for gauge in experiment.readings),
             *(f"{sum(map(len, d.clouds)):,} points of '{d.name}'" for d in experiment.depths),
         ),
+        experiment.air_density_kg_m3,
     )
 
 

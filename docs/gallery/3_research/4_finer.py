@@ -41,8 +41,8 @@ run.plot(count=3)
 # %%
 # The interval of the noise alone misses the truth by far; the one that holds the discretisation
 # does not.
-error, noise = run.refinement.errors["young_pa"], run.noise_estimates["young_pa"]
-intervals = {"noise": noise.ci95, "noise, mesh and step": run.interval("young_pa")}
+error, noise = run.refinement.errors["young_pa"], run.optimum["young_pa"]
+intervals = {"noise": noise.statistical95, "noise, mesh and step": run.interval("young_pa")}
 held = {label: low < 2e4 < high for label, (low, high) in intervals.items()}
 assert held == {"noise": False, "noise, mesh and step": True}
 for k, (label, (low, high)) in enumerate(intervals.items()):

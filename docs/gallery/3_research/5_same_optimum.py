@@ -30,7 +30,7 @@ problem = cs.Problem([cs.with_markers(swing, tracks_m)], {"mu_pa": cs.Unknown(30
 found = {}
 for name, method in (
     ("reduced space", cs.ReducedSpace()),
-    ("interior point", cs.InteriorPoint()),
+    ("interior point", cs.InteriorPoint(initial="simulation")),
     ("augmented Lagrangian", cs.AugmentedLagrangian()),
     ("penalty", cs.Penalty(inner="levenberg-marquardt")),
 ):

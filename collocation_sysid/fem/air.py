@@ -1,0 +1,60 @@
+"""The air around a body: what it lifts, what of it moves along, and how it drags at the surface.
+
+A body of volume V in air of density ρ_a that rests is under three forces besides its weight:
+
+- buoyancy −ρ_a V g, exactly;
+- the inertia of the air that moves with the body, c_m ρ_a V a, where c_m is ½ for a sphere;
+- drag −½ ρ_a c_d A |v| v on each surface element, where A is the area that faces the motion. Of a
+  convex body that is a quarter of its surface on average over directions (Cauchy).
+
+V is the volume of the undeformed body, lumped at its nodes as mass is. The coefficients c_m and c_d
+depend on shape and motion; they are true to some 40 %, see `statistics.assumptions`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import casadi as ca
+import numpy as np
+
+from ..arrays import Array
+from .mesh import Nodes
+from .node_force import AtNode, NodeForce, PlacedForce, surface_of
+
+# Air at 20 °C and sea level, half humid [kg/m³].
+AIR_KG_M3 = 1.2
+# Share of the displaced air that moves with a body: that of a sphere in an ideal fluid.
+ADDED_MASS_SHARE = 0.5
+# Drag coefficient c_d of a bluff body at Reynolds numbers of 10³ to 10⁵.
+DRAG_COEFFICIENT = 1.0
+# Share of the surface of a convex body that faces a direction, on average over directions.
+FACING_SHARE = 0.25
+# Below this speed [m/s] drag becomes linear in the velocity, so that it is smooth at rest. There it
+# is less than 1e-8 of the weight of a foam cube of 0.1 m.
+SMOOTH_BELOW_M_S = 1e-4
+
+
+@cache
+def unit_drag() -> NodeForce:
+    """Return the drag on surface nodes in a fluid of density one; it is linear in the density."""
+
+    def air_drag(x: ca.SX, v: ca.SX, at: AtNode) -> ca.SX:
+        speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
+        return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
+
+    return NodeForce.of(air_drag, name="air drag")
+
+
+def placed_unit_drag(nodes: Nodes, volume_m3: Array) -> PlacedForce:
+    """Return `unit_drag` on those nodes of a body that have a share of its surface.
+
+    Parameters
+    ----------
+    nodes : Nodes
+    volume_m3 : (n,)
+        Lumped volume of every node of the body, those of obstacles included.
+    """
+    on_surface = np.flatnonzero(surface_of(nodes)[0] > 0)
+    no_constants = np.zeros(0, dtype=np.int64)
+    return PlacedForce.on(unit_drag(), nodes, on_surface, volume_m3, no_constants)

@@ -1,0 +1,623 @@
+"""Stress-free shape of a body whose mesh was made while it hung or stood under its own weight.
+
+The mesh Y is then an equilibrium shape. The stress-free positions X of its nodes are the solution
+of the inverse equilibrium (Govindjee & Mihalic 1996)
+
+    f(Y; X, θ) + M(θ) g = 0 at free nodes,   X = Y at the nodes that were held,
+
+with the elastic force f = −∂Ψ/∂x, the gravity g in the axes of the mesh, and masses M that are
+those of the mesh: mass is conserved. X depends on the elastic constants and on free densities. By
+the implicit function theorem, with the residual r, ∂X/∂θ = −(∂r/∂X)⁻¹ ∂r/∂θ.
+
+The kernels keep Y as the computational reference. With G = ∂X/∂Y at a quadrature point, the
+material's deformation gradient is F = (∂x/∂Y) G⁻¹ and the point's volume V det G, see
+`RestPoint`. G and its derivatives by θ are data of the points, so that a force and all its
+derivatives are those of the complete model, whatever uses them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike
+from scipy.sparse.linalg import splu
+
+from ..arrays import Array, Index
+from ..errors import InputError, SimulationError
+from .materials import Material
+from .mesh import Nodes
+from .regions import BodyPart
+from .rest_point import RestPoint
+from .selection import Selection
+
+# Stress-free shapes that a body keeps, by the constants that these depend on: those of an iterate,
+# of its neighbours in a difference, and of the iterate before.
+SHAPES_KEPT = 16
+# Relative step of the differences of ∂X/∂θ that give ∂²X/∂θ²: the cube root of the rounding error.
+DIFFERENCE = 1e-5
+LARGEST_GRAVITY_M_S2 = 1e4
+# Relative change of a constant up to which a solution is sought from the latest one.
+NEAR = 0.2
+
+
+@dataclass(frozen=True)
+class InverseOptions:
+    """Limits of Newton's method for the inverse equilibrium.
+
+    Attributes
+    ----------
+    tolerance : float
+        Largest entry of a last Newton step over the body's size. Convergence is quadratic, so that
+        the step that follows would be at the rounding error.
+    iterations : int
+        Newton steps for one share of the weight.
+    halvings : int
+        How often a step is halved, and how often the share of the weight that is added.
+    load_steps : int
+        Attempts with a share of the weight.
+    least_volume_ratio : float
+        Smallest det G of an admissible iterate; elements are inverted at zero.
+    """
+
+    tolerance: float = 1e-9
+    iterations: int = 15
+    halvings: int = 6
+    load_steps: int = 25
+    least_volume_ratio: float = 0.02
+
+
+OPTIONS = InverseOptions()
+
+
+class RestShapeError(SimulationError):
+    """No stress-free shape was found whose equilibrium under gravity is the mesh.
+
+    Parameters
+    ----------
+    message : str
+        What failed and what to change.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message, 0.0)
+        self.args = (message,)
+
+    def __str__(self) -> str:
+        return self.message
+
+    def __reduce__(self) -> tuple[type[RestShapeError], tuple[str]]:  # type: ignore[override]
+        return type(self), (self.message,)
+
+
+@dataclass(frozen=True, eq=False)
+class UnderGravity:
+    """How a body hung or stood while its mesh was made: the mesh is that equilibrium shape.
+
+    Parameters
+    ----------
+    nodes : Selection or (k,) node numbers
+        The nodes that were held, such as those in a clamp or on a table.
+    gravity_m_s2 : (3,) array, default (0, 0, -9.81)
+        Gravity in the axes of the mesh: its direction is the pose of the scan.
+
+    Raises
+    ------
+    InputError
+        If gravity is not three finite numbers, or is zero or larger than 10⁴ m/s².
+    """
+
+    nodes: Selection | ArrayLike
+    gravity_m_s2: ArrayLike = (0.0, 0.0, -9.81)
+
+    def __post_init__(self) -> None:
+        try:
+            gravity = np.array(self.gravity_m_s2, dtype=float)
+        except (TypeError, ValueError):
+            gravity = np.zeros(0)
+        valid = gravity.shape == (3,) and bool(np.isfinite(gravity).all())
+        if not valid or not 0 < np.linalg.norm(gravity) <= LARGEST_GRAVITY_M_S2:
+            raise InputError(
+                f"found {self.gravity_m_s2!r}; expected the gravity of the scan [x, y, z] in the "
+                f"axes of the mesh, not zero and at most {LARGEST_GRAVITY_M_S2:g} m/s²; of a mesh "
+                'that is free of stress state rest_shape = "stress_free"',
+                where="scan.gravity_m_s2",
+            )
+        gravity.setflags(write=False)
+        object.__setattr__(self, "gravity_m_s2", gravity)
+
+    def held_nodes(self, nodes: Nodes) -> Index:
+        """Return the held nodes, sorted.
+
+        Raises
+        ------
+        InputError
+            If there are none, if a node does not exist, or if the held nodes lie on one line.
+        """
+        if isinstance(self.nodes, Selection):
+            chosen = self.nodes.resolve(nodes)
+        else:
+            chosen = np.unique(np.asarray(self.nodes, dtype=np.int64))
+        count = len(nodes.points_m)
+        if not chosen.size or chosen[0] < 0 or chosen[-1] >= count:
+            raise InputError(
+                f"found {chosen.size} nodes; expected numbers of the {count} nodes of the body",
+                where="scan.nodes",
+            )
+        points_m = nodes.points_m[chosen]
+        spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
+        if len(spread) < 2 or spread[1] <= 1e-9 * max(spread[0], 1e-300):
+            raise InputError(
+                f"found {chosen.size} nodes on one line, about which the body could turn; expected "
+                "all nodes that were held during the scan, three or more",
+                where="scan.nodes",
+            )
+        return chosen
+
+
+@dataclass(frozen=True, eq=False)
+class RestShape:
+    """Stress-free positions at one θ.
+
+    Attributes
+    ----------
+    positions_m : (n, 3) X
+    by_input : (k, n, 3) ∂X by each input
+    """
+
+    positions_m: Array
+    by_input: Array
+
+
+@lru_cache(32)
+def _point_stress(material: Material, averages: bool, slopes: bool) -> ca.Function:
+    """Kirchhoff stress per volume of the mesh at a point, and its derivatives if `slopes`.
+
+    Inputs: G (9,), column after column, the mean m of det G over the element, and the constants
+    (c,) of the material. With F = G⁻¹, or F = (det G / m)^⅓ G⁻¹ where the element averages the
+    dilatation, the stress is det G · ∂ψ/∂F Fᵀ (9,). Derivatives: by G (9, 9), m (9,), θ (9, c).
+    """
+    own, mean = ca.SX.sym("G", 9), ca.SX.sym("mean")
+    theta, strain = ca.SX.sym("theta", len(material.constants)), ca.SX.sym("F", 9)
+    G = ca.reshape(own, 3, 3)
+    F = ca.inv_minor(G)
+    if averages:
+        F = (ca.det(G) / mean) ** (1 / 3) * F
+    piola = ca.gradient(material.psi(ca.reshape(strain, 3, 3), theta), strain)
+    piola = ca.reshape(ca.substitute(piola, strain, ca.vec(F)), 3, 3)
+    stress = ca.vec(ca.det(G) * piola @ F.T)
+    outputs = [stress]
+    if slopes:
+        outputs += [ca.jacobian(stress, each) for each in (own, mean, theta)]
+    dense = [ca.densify(output) for output in outputs]
+    return ca.Function("inverse_stress", [own, mean, theta], dense, {"cse": True})
+
+
+@dataclass(frozen=True, eq=False)
+class _PartForces:
+    """Elastic force of the cells of one part at the mesh, with its derivatives.
+
+    Attributes
+    ----------
+    dofs : (E, d) dofs of the cells
+    force_n : (E, d)
+    by_position : (E, d, d) derivative by X, rows are those of the force; empty without slopes
+    by_theta : (E, d, c) derivative by the constants of the material; empty without slopes
+    """
+
+    dofs: Index
+    force_n: Array
+    by_position: Array
+    by_theta: Array
+
+
+def _part_forces(
+    cells: Index,
+    geometry: Array,
+    positions_m: Array,
+    constants: Array,
+    *,
+    material: Material,
+    averages: bool,
+    slopes: bool,
+) -> _PartForces:
+    """Return the elastic forces of cells at the mesh, where X is `positions_m` (n, 3)."""
+    count, points = geometry.shape[:2]
+    shape_slopes = geometry[..., :-1].reshape(count, points, -1, 3)
+    volumes = geometry[..., -1]
+    shares = volumes / volumes.sum(axis=1)[:, None]
+    # (E, q, column, row) of G.
+    G = np.einsum("ean,eqai->eqin", positions_m[cells], shape_slopes)
+    ratios = np.linalg.det(G)
+    mean = np.einsum("eq,eq->e", shares, ratios)
+    of_points = G.reshape(count * points, 9).T
+    function = _point_stress(material, averages, slopes)
+    outputs = function(of_points, np.repeat(mean, points)[None], constants)
+    outputs = [np.array(each) for each in (outputs if slopes else [outputs])]
+    stress = outputs[0].T.reshape(count, points, 3, 3)
+    size = 3 * cells.shape[1]
+    dofs = (3 * cells[:, :, None] + np.arange(3)).reshape(count, size)
+    if averages:
+        _average_pressure(stress[..., None], shares)
+    force = -np.einsum("eq,eqaj,eqji->eai", volumes, shape_slopes, stress).reshape(count, size)
+    if not slopes:
+        none = np.zeros((0, size, 0))
+        return _PartForces(dofs, force, none, none)
+    by_G = outputs[1].reshape(9, count, points, 9).transpose(1, 2, 0, 3)
+    by_G = by_G.reshape(count, points, 3, 3, 3, 3)
+    by_X = np.einsum("eqjilk,eqbl->eqjibk", by_G, shape_slopes, optimize=True)
+    by_theta = outputs[3].reshape(9, count, points, -1).transpose(1, 2, 0, 3)
+    by_theta = by_theta.reshape(count, points, 3, 3, -1)
+    by_X = by_X.reshape(count, points, 3, 3, size)
+    if averages:
+        weights = shares * ratios
+        mean_by_X = np.einsum("eq,eqkl,eqbl->ebk", weights, np.linalg.inv(G), shape_slopes)
+        by_mean = outputs[2].T.reshape(count, points, 3, 3)
+        by_X = by_X + by_mean[..., None] * mean_by_X.reshape(count, 1, 1, 1, size)
+        _average_pressure(by_X, shares)
+        _average_pressure(by_theta, shares)
+    pulled = -volumes[..., None, None] * shape_slopes
+    matrices = np.einsum("eqaj,eqjim->eaim", pulled, by_X, optimize=True)
+    columns = np.einsum("eqaj,eqjic->eaic", pulled, by_theta, optimize=True)
+    return _PartForces(
+        dofs, force, matrices.reshape(count, size, size), columns.reshape(count, size, -1)
+    )
+
+
+def _average_pressure(stress: Array, shares: Array) -> None:
+    """Replace the pressure of stresses (E, q, 3, 3, any) by its mean over the cell, in place."""
+    own = np.einsum("eqiim->eqm", stress) / 3
+    change = np.einsum("eq,eqm->em", shares, own)[:, None] - own
+    for axis in range(3):
+        stress[:, :, axis, axis] += change
+
+
+@dataclass(frozen=True, eq=False)
+class _Assembled:
+    """Elastic force (3n,) at the mesh, and its derivatives by X (3n, 3n) and inputs (3n, k)."""
+
+    force_n: Array
+    by_position: sp.csc_array
+    by_theta: Array
+
+
+class InverseEquilibrium:
+    """Solver of the inverse equilibrium of a body, which keeps its latest solutions.
+
+    Parameters
+    ----------
+    body : Body
+        With `scan`; `body` imports this module, hence no annotation.
+
+    Attributes
+    ----------
+    places : (k,) the entries of θ that the stress-free shape depends on
+    layout : RestPoint
+    """
+
+    def __init__(self, body: Any) -> None:
+        assert body.scan is not None
+        self.body = body
+        self.points_m: Array = body.nodes.points_m
+        self.gravity_m_s2 = np.asarray(body.scan.gravity_m_s2, dtype=float)
+        size = self.points_m.size
+        held = body.scan.held_nodes(body.nodes)
+        self.free: Index = np.setdiff1d(np.arange(size), (3 * held[:, None] + np.arange(3)).ravel())
+        self.places: Index = np.array([*body.elastic_places, *body.density_places], dtype=np.int64)
+        self.layout = RestPoint(len(self.places), body.element.mean_dilatation)
+        self._shapes: dict[bytes, RestShape] = {}
+        self._data: dict[tuple[bytes, bool], list[Array]] = {}
+        self._size_m = float(np.linalg.norm(np.ptp(self.points_m, axis=0)))
+
+    def shape(self, theta: ArrayLike) -> RestShape:
+        """Return the stress-free shape at θ (k,), with its derivatives.
+
+        Raises
+        ------
+        RestShapeError
+            If there is none near the mesh.
+        """
+        constants = np.asarray(theta, dtype=float)
+        key = constants[self.places].tobytes()
+        if key not in self._shapes:
+            found = self._solved(constants)
+            while len(self._shapes) >= SHAPES_KEPT:
+                self._shapes.pop(next(iter(self._shapes)), None)
+            self._shapes[key] = found
+        return self._shapes[key]
+
+    def second_derivatives(self, theta: ArrayLike) -> Array:
+        """Return ∂²X by the pairs of inputs of the layout, (pairs, n, 3), by differences of ∂X."""
+        constants, columns = np.asarray(theta, dtype=float), []
+        for place in self.places:
+            step = DIFFERENCE * max(abs(float(constants[place])), 1e-12)
+            ends = []
+            for way in (step, -step):
+                moved = constants.copy()
+                moved[place] += way
+                ends.append(self.shape(moved).by_input)
+            columns.append((ends[0] - ends[1]) / (2 * step))
+        pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.pairs]
+        return np.array(pairs).reshape(-1, *self.points_m.shape)
+
+    def point_data(self, theta: ArrayLike, second: bool = False) -> list[Array]:
+        """Return for each part of the body what its points are given, (1, cells · q · count).
+
+        Parameters
+        ----------
+        theta : (k,)
+        second : bool
+            With second derivatives; they are zero otherwise.
+        """
+        key = np.asarray(theta, dtype=float)[self.places].tobytes(), second
+        if key not in self._data:
+            shape = self.shape(theta)
+            fields = [shape.positions_m, *shape.by_input]
+            if second:
+                fields += [*self.second_derivatives(theta)]
+            else:
+                fields += [np.zeros_like(self.points_m)] * len(self.layout.pairs)
+            while len(self._data) >= 2:
+                self._data.pop(next(iter(self._data)), None)
+            self._data[key] = self._of_points(fields)
+        return self._data[key]
+
+    def places_of_points(self, part: int) -> Index:
+        """Return where in the data of a part, by its number, those of points are (E, q, any)."""
+        count, points = self._parts[part][1].shape[:2]
+        size = self.layout.count
+        return np.arange(count * points * size).reshape(count, points, size)
+
+    def weight_slope(self, theta: ArrayLike) -> Array:
+        """Return the change (n, 3) of X for a relative change of gravity, to first order."""
+        constants = np.asarray(theta, dtype=float)
+        at = self._assembled(self.shape(constants).positions_m, constants, slopes=True)
+        factor = self._factor(at.by_position)
+        if factor is None:
+            raise RestShapeError(self._failure(constants, 1.0))
+        return self._step(factor, self._weight_n(constants))
+
+    def data_of(self, positions_m: Array) -> list[Array]:
+        """Return what the points are given where X is `positions_m`, whatever θ."""
+        others = self.layout.inputs + len(self.layout.pairs)
+        return self._of_points([positions_m, *[np.zeros_like(positions_m)] * others])
+
+    def _of_points(self, fields: Sequence[Array]) -> list[Array]:
+        """Gradients of X and of its derivatives at the points of each part."""
+        layout, found = self.layout, []
+        for cells, geometry in self._parts:
+            slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
+            # (cells, q, columns of G, rows of G): column after column.
+            columns = [np.einsum("ean,eqai->eqin", f[cells], slopes) for f in fields]
+            values = np.stack([c.reshape(*c.shape[:2], 9) for c in columns], axis=2)
+            if layout.mean_dilatation:
+                values = np.concatenate([values, self._stretches(values, geometry)], axis=3)
+            found.append(np.ascontiguousarray(values).reshape(1, -1))
+        return found
+
+    def _stretches(self, values: Array, geometry: Array) -> Array:
+        """Ρ with its derivatives (E, q, 1 + k + pairs, 1), from those of G (E, q, …, 9)."""
+        layout, shares = self.layout, geometry[..., -1] / geometry[..., -1].sum(axis=1)[:, None]
+        matrices = values.reshape(*values.shape[:3], 3, 3)
+        inverse = np.linalg.inv(matrices[:, :, 0])
+        ratios = np.linalg.det(matrices[:, :, 0])
+        # The determinants d with derivatives: d_i = d tr A_i, d_ij = d (tr A_i tr A_j − tr A_i A_j
+        # + tr A_ij), with A = G⁻¹ ∂G.
+        relative = np.einsum("eqab,eqkbc->eqkac", inverse, matrices[:, :, 1:])
+        traces = np.trace(relative, axis1=3, axis2=4)
+        k = layout.inputs
+        first = ratios[..., None] * traces[..., :k]
+        second = [
+            ratios
+            * (
+                traces[..., i] * traces[..., j]
+                - np.einsum("eqab,eqba->eq", relative[:, :, i], relative[:, :, j])
+                + traces[..., k + number]
+            )
+            for number, (i, j) in enumerate(layout.pairs)
+        ]
+        whole = np.concatenate([ratios[..., None], first, np.stack(second, axis=-1)], axis=-1)
+        mean = np.broadcast_to(np.einsum("eq,eqk->ek", shares, whole)[:, None], whole.shape)
+        return (self._logarithm(whole) - self._logarithm(mean))[..., None]
+
+    def _logarithm(self, values: Array) -> Array:
+        """Ln of a number with its derivatives (…, 1 + k + pairs)."""
+        k, found = self.layout.inputs, np.empty_like(values)
+        found[..., 0] = np.log(values[..., 0])
+        found[..., 1 : k + 1] = values[..., 1 : k + 1] / values[..., :1]
+        for number, (i, j) in enumerate(self.layout.pairs):
+            here = k + 1 + number
+            product = found[..., 1 + i] * found[..., 1 + j]
+            found[..., here] = values[..., here] / values[..., 0] - product
+        return found
+
+    @cached_property
+    def _parts(self) -> list[tuple[Index, Array]]:
+        """Cells and geometry of each part, in the order of its kernels."""
+        return [self.body.laid_out(part) for part in self.body.parts]
+
+    # Newton's method ------------------------------------------------------------------------
+
+    def _solved(self, theta: Array) -> RestShape:
+        weight = self._weight_n(theta)
+        near = self._predicted(theta)
+        x = None if near is None else self._newton(near, theta, weight)
+        if x is None:
+            x = self._under_growing_weight(theta, weight)
+        force = self._assembled(x, theta, slopes=True)
+        by_theta = force.by_theta
+        for column, slope in self.body.mass_slopes.items():
+            place = self.places.tolist().index(column)
+            gravity = np.tile(self.gravity_m_s2, len(self.points_m))
+            by_theta[:, place] += slope[: self.points_m.size] * gravity
+        factor = self._factor(force.by_position)
+        if factor is None:
+            raise RestShapeError(self._failure(theta, 1.0))
+        by_input = np.zeros((len(self.places), self.points_m.size))
+        by_input[:, self.free] = -factor.solve(by_theta[self.free]).T
+        return RestShape(x, by_input.reshape(-1, *self.points_m.shape))
+
+    def _predicted(self, theta: Array) -> Array | None:
+        """Return X at θ to first order, from the latest solution; None where that is far off."""
+        if not self._shapes:
+            return None
+        key, shape = next(reversed(self._shapes.items()))
+        known, wanted = np.frombuffer(key), theta[self.places]
+        change = wanted - known
+        if (np.abs(change) > NEAR * np.abs(known)).any():
+            return None
+        moved = shape.positions_m + np.tensordot(change, shape.by_input, axes=1)
+        return moved if self._is_admissible(moved) else None
+
+    def _under_growing_weight(self, theta: Array, weight_n: Array) -> Array:
+        """Solve under shares of the weight that grow to one, from the mesh."""
+        x, reached, step = self.points_m.copy(), 0.0, 1.0
+        for _ in range(OPTIONS.load_steps):
+            share = min(1.0, reached + step)
+            found = self._newton(x, theta, share * weight_n)
+            if found is None:
+                step /= 2
+                if step < 0.5**OPTIONS.halvings:
+                    break
+                continue
+            x, reached = found, share
+            if reached == 1.0:
+                return x
+        raise RestShapeError(self._failure(theta, reached))
+
+    def _weight_n(self, theta: Array) -> Array:
+        mass_kg = self.body.mass_of_dofs(theta)[: self.points_m.size]
+        return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
+
+    def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
+        """Solve at a given weight from (n, 3); None where Newton's method does not converge.
+
+        A step is accepted where the next one, by the same factors, is shorter (Deuflhard's natural
+        monotonicity test), and no element is nearly inverted.
+        """
+        x = start.copy()
+        for _ in range(OPTIONS.iterations):
+            at = self._assembled(x, theta, slopes=True)
+            factor = self._factor(at.by_position)
+            if factor is None:
+                return None
+            step = self._step(factor, at.force_n + weight_n)
+            length = float(np.linalg.norm(step))
+            if not np.isfinite(length):
+                return None
+            if np.abs(step).max() <= OPTIONS.tolerance * self._size_m:
+                # Quadratic convergence: what this step leaves is at the rounding error.
+                last = x + step
+                return last if self._is_admissible(last) else None
+            share = 1.0
+            for _ in range(OPTIONS.halvings):
+                trial = x + share * step
+                if self._is_admissible(trial):
+                    after = self._assembled(trial, theta, slopes=False).force_n
+                    next_step = self._step(factor, after + weight_n)
+                    if np.linalg.norm(next_step) <= (1 - share / 4) * length:
+                        break
+                share /= 2
+            else:
+                return None
+            x = trial
+        return None
+
+    def _step(self, factor: Any, residual_n: Array) -> Array:
+        """Newton step (n, 3) by factors of ∂r/∂X."""
+        step = np.zeros(self.points_m.size)
+        step[self.free] = -factor.solve(residual_n[self.free])
+        return step.reshape(self.points_m.shape)
+
+    def _factor(self, by_position: sp.csc_array) -> Any:
+        """LU factors of ∂r/∂X at the free dofs; None where it is singular."""
+        matrix = sp.csc_array(by_position[self.free][:, self.free])
+        try:
+            return splu(matrix)
+        except RuntimeError:
+            return None
+
+    def _is_admissible(self, positions_m: Array) -> bool:
+        """Whether no element of the stress-free shape is inverted, or nearly so."""
+        for cells, geometry in self._parts:
+            slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
+            gradients = np.einsum("ean,eqai->eqni", positions_m[cells], slopes)
+            if np.linalg.det(gradients).min() < OPTIONS.least_volume_ratio:
+                return False
+        return True
+
+    def _assembled(self, positions_m: Array, theta: Array, slopes: bool) -> _Assembled:
+        """Elastic forces at the mesh where X is `positions_m` (n, 3)."""
+        size = self.points_m.size
+        force, by_theta = np.zeros(size), np.zeros((size, len(self.places)))
+        by_position = sp.csc_array((size, size))
+        places = {int(place): number for number, place in enumerate(self.places)}
+        body = self.body
+        for part, start, (cells, geometry) in zip(
+            body.parts, body.starts, self._parts, strict=False
+        ):
+            elastic = len(part.material.constants)
+            found = _part_forces(
+                cells,
+                geometry,
+                positions_m,
+                theta[start : start + elastic],
+                material=part.material,
+                averages=body.element.mean_dilatation,
+                slopes=slopes,
+            )
+            dofs = found.dofs
+            force += np.bincount(dofs.ravel(), found.force_n.ravel(), size)
+            if not slopes:
+                continue
+            shape = found.by_position.shape
+            rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
+            columns = np.broadcast_to(dofs[:, None, :], shape).ravel()
+            entries = sp.coo_array((found.by_position.ravel(), (rows, columns)), (size, size))
+            by_position = by_position + sp.csc_array(entries)
+            for number in range(elastic):
+                values = found.by_theta[..., number].ravel()
+                by_theta[:, places[start + number]] += np.bincount(dofs.ravel(), values, size)
+        return _Assembled(force, by_position, by_theta)
+
+    def _failure(self, theta: Array, reached: float) -> str:
+        moduli = ", ".join(
+            f"{name + ': ' if name else ''}λ {lam:.4g} Pa, μ {mu:.4g} Pa"
+            for name, (lam, mu) in self.body.lame(theta).items()
+        )
+        return (
+            "found no stress-free shape whose equilibrium under gravity is the mesh, with "
+            f"{moduli} and {self.body.mass_of_dofs(theta)[::3].sum():.4g} kg: elements would be "
+            f"inverted beyond {reached:.0%} of the weight; expected a body that bears its weight "
+            "as it was scanned: check gravity_m_s2 and nodes of the scan, the mass, the unit of "
+            "the mesh, and give stiffer guesses"
+        )
+
+
+def require_supported(parts: Sequence[BodyPart]) -> None:
+    """Refuse a body whose stress-free shape cannot be found.
+
+    Raises
+    ------
+    InputError
+        For fields and branches of memory.
+    """
+    for part in parts:
+        if part.field is not None:
+            raise InputError(
+                f"found rest_shape = 'under_gravity' and a field of {part.field_name}; expected "
+                "constants that are the same within each region: leave the field out, or state "
+                "rest_shape = 'stress_free'",
+                where="rest_shape",
+            )
+        if part.prony:
+            raise InputError(
+                "found rest_shape = 'under_gravity' and a material with memory (prony); expected "
+                "one without: leave the branches out, or state rest_shape = 'stress_free'",
+                where="rest_shape",
+            )

@@ -1,0 +1,254 @@
+"""How far a simulated motion is from a recording, in units and in stated standard deviations.
+
+For forward simulations of fitted recordings, and for predictions of others. A prediction is judged
+beside two yardsticks: the same prediction with the nuisance parameters of the fitted recordings
+(blind), and the copy of a fitted recording's measurements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..arrays import Array, root_mean
+from ..methods.solution import Solution, reading_rms, wrench_rms
+from ..program.depth_comparison import DepthError
+from ..program.segment import Segment
+from ..recording import Experiment
+from ..recording.clock import TIME_TOLERANCE_S
+
+
+@dataclass(frozen=True)
+class PredictionError:
+    """Differences between a prediction and the measurements; None of what is not measured.
+
+    Attributes
+    ----------
+    rms_m, max_m : float or None
+        Distance of the markers from their measurements.
+    wrench_rms_n, wrench_rms_nm : float or None
+        Root mean square of the components of force and torque.
+    reading_rms : mapping of name to float, or None
+        Of readings of one's own, in their units.
+    depth : mapping of the camera's name to DepthError, or None
+    """
+
+    rms_m: float | None = None
+    max_m: float | None = None
+    wrench_rms_n: float | None = None
+    wrench_rms_nm: float | None = None
+    reading_rms: Mapping[str, float] | None = None
+    depth: Mapping[str, DepthError] | None = None
+
+
+@dataclass(frozen=True)
+class CopyError:
+    """Differences between a recording and the measurements of another one.
+
+    Attributes
+    ----------
+    copied : str
+        The name of the fitted recording that is nearest.
+    error : PredictionError
+    """
+
+    copied: str
+    error: PredictionError
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Differences between a prediction and the measurements of one kind, in stated σ.
+
+    Attributes
+    ----------
+    what : str
+        What is measured, for people.
+    stated : str
+        What states σ in the problem.
+    sigmas : float
+        Root mean square of the differences over σ.
+    tame_sigmas : float
+        The same by which a prediction is judged: of depth without wild points, see `DepthError`.
+    numbers : int
+        How many numbers were measured.
+    size : str
+        The root mean square in a unit, for people; empty if it is not one number.
+    """
+
+    what: str
+    stated: str
+    sigmas: float
+    tame_sigmas: float
+    numbers: int
+    size: str = ""
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What a simulation predicts of a recording, as its instruments would read it.
+
+    Attributes
+    ----------
+    markers_m : (T, M, 3)
+    wrenches : sequence of (S, 6)
+    readings : mapping of name to (S, m)
+    depth : mapping of the camera's name to DepthError
+    """
+
+    markers_m: Array
+    wrenches: Sequence[Array] = ()
+    readings: Mapping[str, Array] = field(default_factory=dict)
+    depth: Mapping[str, DepthError] = field(default_factory=dict)
+
+
+def prediction_error(experiment: Experiment, predicted: Predicted) -> PredictionError:
+    """Compare a prediction with the measurements of its recording."""
+    apart_m = np.linalg.norm(predicted.markers_m - experiment.markers.positions_m, axis=2)
+    present_m = apart_m[experiment.markers.present]
+    force_n, torque_nm = wrench_rms(experiment, predicted.wrenches)
+    return PredictionError(
+        rms_m=root_mean(present_m**2) if present_m.size else None,
+        max_m=float(present_m.max()) if present_m.size else None,
+        wrench_rms_n=force_n,
+        wrench_rms_nm=torque_nm,
+        reading_rms=reading_rms(experiment, predicted.readings) or None,
+        depth=dict(predicted.depth) or None,
+    )
+
+
+def misfits(experiment: Experiment, predicted: Predicted) -> list[Misfit]:
+    """Compare a prediction with the noise of each instrument that measured anything."""
+    found = []
+    markers = experiment.markers
+    if markers.present.any():
+        apart_m = (predicted.markers_m - markers.positions_m)[markers.present]
+        sigma_m = np.broadcast_to(markers.sigma_m, markers.present.shape)[markers.present]
+        rms_m = root_mean(np.sum(apart_m**2, axis=1))
+        ratio = apart_m / sigma_m[:, None]
+        found.append(_misfit("the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"))
+    for read, sensor in zip(predicted.wrenches, experiment.wrenches, strict=True):
+        ratio = (read - sensor.values) / sensor.sigmas
+        found.append(_misfit("the wrench", "sigma_n", ratio))
+    for gauge in experiment.readings:
+        ratio = (predicted.readings[gauge.name] - gauge.measured) / gauge.sigma
+        found.append(_misfit(gauge.name, "its sigma", ratio))
+    for name, error in predicted.depth.items():
+        if error.rms_m is not None:
+            size = f"{1e3 * error.rms_m:.3g} mm RMS"
+            what = f"the depth of {name}"
+            found.append(
+                Misfit(what, "its sigma_m", error.sigmas, error.tame_sigmas, error.points, size)
+            )
+    return found
+
+
+def _misfit(what: str, stated: str, ratio: Array, size: str = "") -> Misfit:
+    """Return the misfit of differences over σ, NaN where nothing is measured or known."""
+    known = ratio[np.isfinite(ratio)]
+    sigmas = root_mean(known**2)
+    return Misfit(what, stated, sigmas, sigmas, known.size, size)
+
+
+# Blind predictions --------------------------------------------------------------------------------
+
+
+def blind_phi(segment: Segment, solution: Solution) -> Array:
+    """Return the nuisance parameters (k,) of a recording as the fitted recordings have them.
+
+    Each is the mean over the fitted recordings that have one of the same label, such as the place
+    of a marker by its name, and zero, the mean of its prior, where none has: nothing of the
+    recording's own measurements is used.
+
+    Parameters
+    ----------
+    segment : Segment
+        Of the recording to be predicted.
+    solution : Solution
+        Of the fitted recordings.
+    """
+    nuisance, places = segment.nuisance, segment.markers.place_places
+    known: dict[str, list[float]] = {}
+    for part in solution.parts:
+        for entry, _, value in part.segment.nuisance.valued(part.phi):
+            known.setdefault(entry.label, []).append(value)
+    phi = np.zeros(nuisance.size)
+    for k, entry in enumerate(nuisance.entries):
+        phi[k] = np.mean(known.get(entry.label, [0.0])) / entry.sigma
+    start_m = segment.places_m(np.zeros(nuisance.size))
+    for number in segment.chart.estimated.tolist():
+        name = segment.experiment.markers.names[number]
+        here = [
+            part.segment.places_m(part.phi)[part.segment.experiment.markers.names.index(name)]
+            for part in solution.parts
+            if name in part.segment.experiment.markers.names
+        ]
+        if here:
+            along_m = segment.chart.sigma_m[number] * segment.chart.axes[number]
+            way_m = np.mean(here, axis=0) - start_m[number]
+            phi[places[number]] = np.linalg.pinv(along_m) @ way_m
+    return phi
+
+
+# Copies of other recordings -----------------------------------------------------------------------
+
+
+def copy_error(experiment: Experiment, fitted: Iterable[Experiment]) -> CopyError | str:
+    """Return how well the nearest fitted recording's measurements predict a recording.
+
+    Measurements are compared sample by sample, at equal times after the start.
+
+    Returns
+    -------
+    CopyError or str
+        Or why there is none: no fitted recording has the same instruments and times.
+    """
+    reasons, found = {}, []
+    for other in fitted:
+        reason = _difference(experiment, other)
+        if reason:
+            reasons[other.name] = reason
+            continue
+        readings = {gauge.name: gauge.measured for gauge in other.readings}
+        order = [other.markers.names.index(name) for name in experiment.markers.names]
+        known_m = np.where(other.markers.present[..., None], other.markers.positions_m, np.nan)
+        both = experiment.markers.present & other.markers.present[:, order]
+        apart_m = np.linalg.norm(known_m[:, order] - experiment.markers.positions_m, axis=2)[both]
+        force_n, torque_nm = wrench_rms(experiment, [each.values for each in other.wrenches])
+        error = PredictionError(
+            rms_m=root_mean(apart_m**2) if apart_m.size else None,
+            max_m=float(apart_m.max()) if apart_m.size else None,
+            wrench_rms_n=force_n,
+            wrench_rms_nm=torque_nm,
+            reading_rms=reading_rms(experiment, readings) or None,
+        )
+        found.append(CopyError(other.name, error))
+    if not found:
+        said = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        return f"no fitted recording can be copied ({said})"
+    return min(found, key=lambda each: each.error.rms_m or each.error.wrench_rms_n or np.inf)
+
+
+def _difference(experiment: Experiment, other: Experiment) -> str:
+    """Return why another recording's measurements do not predict a recording; "" if they do."""
+    own, others = experiment.markers, other.markers
+    if not (own.samples or experiment.wrenches or experiment.readings):
+        return "points of depth cameras have no counterparts"
+    if set(own.names) != set(others.names):
+        return "other markers"
+    if len(experiment.wrenches) != len(other.wrenches):
+        return "other wrenches"
+    if [g.name for g in experiment.readings] != [g.name for g in other.readings]:
+        return "other readings"
+    times = [(experiment.t_s, other.t_s)] if own.samples else []
+    times += [(a.t_s, b.t_s) for a, b in zip(experiment.wrenches, other.wrenches, strict=True)]
+    times += [(a.times, b.times) for a, b in zip(experiment.readings, other.readings, strict=True)]
+    starts_s = experiment.t_s[0], other.t_s[0]
+    for here_s, there_s in times:
+        if len(here_s) != len(there_s):
+            return f"{len(there_s)} samples instead of {len(here_s)}"
+        if np.abs((here_s - starts_s[0]) - (there_s - starts_s[1])).max() > TIME_TOLERANCE_S:
+            return "other times"
+    return ""

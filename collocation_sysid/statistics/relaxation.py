@@ -1,0 +1,289 @@
+"""Fits near an answer with one assumption relaxed, and how far the estimates move in them.
+
+An assumption that is relaxed joins the linearised fit as one more nuisance parameter, or several:
+its prior has the deviation of the uncertainty budget, or a multiple of it, and its slope is how the
+residuals change where the assumption is off, see `considered`. Used by `routine_probes` in every
+solve and by `probes` where a deeper check is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ..arrays import Array
+from ..fem.constants import is_mode, is_modulus
+from ..program.collocation import Collocation, Part
+from .assumptions import Fitted
+from .budget import BudgetLine
+from .considered import Changes, assumed
+from .estimates import Estimate
+from .linearised import Derived, LinearisedFit, best_step, least_squares
+from .scatter import TELLING
+from .uncertainty import ErrorModel, Uncertainty, uncertainty_of
+
+DRIFT = "stiffness_drift"
+# Share of the range of the load by which it may return in a static recording that still counts as
+# monotonic: measured displacements scatter.
+RETURN = 0.02
+# Fewest samples of a static recording in which the load can return.
+FEWEST_SAMPLES = 3
+Kind = Literal["window", "recording", "assumption"]
+
+
+@dataclass(frozen=True)
+class Move:
+    """The change of an estimate in a refit.
+
+    Attributes
+    ----------
+    value, std_error : float
+        The estimate of the refit, and its standard error.
+    change : float
+        From the fit of all data to the refit.
+    of_statistical95, of_combined95 : float or None
+        The same over the half widths of the statistical and of the combined interval of the fit;
+        None where there is no such interval.
+    """
+
+    value: float
+    std_error: float
+    change: float
+    of_statistical95: float | None
+    of_combined95: float | None
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One refit.
+
+    Attributes
+    ----------
+    kind : {"window", "recording", "assumption"}
+    name : str
+        The window, the recording, or the assumption with its component.
+    chi_squared : float
+        Decrease of χ², with the σ stated and with priors.
+    moves : mapping of estimate to Move
+        Of the estimates that the refit determines.
+    size, size_error : float or None
+        Of a relaxed assumption, in its unit: how far it is off, and the standard error of that.
+    told : tuple of str
+        What is significant. Of a part of the data: the estimates that differ. Of an assumption: its
+        name.
+    routine : bool
+        Whether this is one of the probes of every solve, with one linear step.
+    relevance : float or None
+        Of an assumption: the largest change of an estimate by it, in half widths of the statistical
+        interval, see `relevance`.
+    """
+
+    kind: Kind
+    name: str
+    chi_squared: float
+    moves: Mapping[str, Move]
+    size: float | None = None
+    size_error: float | None = None
+    told: tuple[str, ...] = ()
+    routine: bool = False
+    relevance: float | None = None
+
+    def is_beyond(self, limit: float) -> bool:
+        """Whether the size of a relaxed assumption exceeds `limit` of its standard errors."""
+        if self.size is None or not self.size_error:
+            return False
+        return abs(self.size) > limit * self.size_error
+
+
+@dataclass(frozen=True, eq=False)
+class Answered:
+    """A fit at its answer, with what probes need to know of it.
+
+    Attributes
+    ----------
+    collocation : Collocation
+    z : (variables,) the answer
+    fit : LinearisedFit
+    errors : ErrorModel
+    statistical : mapping of name to Estimate
+        Values of the fit, with intervals for the noise alone.
+    budget : mapping of name to BudgetLine
+    deviations : mapping of all assumptions and nuisance parameters to their deviations
+    changes : Changes
+        Of the residuals by these assumptions, see `probed_changes`.
+    """
+
+    collocation: Collocation
+    z: Array
+    fit: LinearisedFit
+    errors: ErrorModel
+    statistical: Mapping[str, Estimate]
+    budget: Mapping[str, BudgetLine]
+    deviations: Mapping[str, float | None]
+    changes: Changes
+
+    def found(self, fit: LinearisedFit, p: Array) -> Uncertainty:
+        """Return estimates and error bars of another fit, at its parameters p."""
+        q = p[: fit.shared]
+        constants = (segment.constants for segment in self.collocation.segments)
+        fit = replace(fit, derived=Derived.of(constants, q))
+        return uncertainty_of(fit, self.collocation.parameters, q, self.errors)
+
+    def moves(self, found: Uncertainty) -> dict[str, Move]:
+        """Return the changes of the estimates that a refit determines, by name."""
+        went = {}
+        for name, each in {**found.estimates, **found.derived}.items():
+            error, joint = each.statistical_std_error, self.statistical[name]
+            if error and error < TELLING * abs(each.value):
+                change = each.value - joint.value
+                combined95 = self.budget[name].combined95 if name in self.budget else None
+                of_statistical = _share(change, joint.statistical95)
+                of_combined = _share(change, combined95)
+                went[name] = Move(each.value, error, change, of_statistical, of_combined)
+        return went
+
+    @property
+    def p(self) -> Array:
+        """All parameters at the answer."""
+        return self.collocation.parameters_of(self.z)
+
+
+def _share(change: float, interval: tuple[float, float] | None) -> float | None:
+    """Return a change over the half width of an interval; None without one."""
+    return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
+
+
+# Columns of assumptions ---------------------------------------------------------------------------
+
+
+def probed_changes(
+    collocation: Collocation,
+    z: Array,
+    deviations: Mapping[str, float | None],
+    changes: Changes | None = None,
+) -> Changes:
+    """Return how residuals change by each assumption that the data can test.
+
+    In a static recording whose load only rises, or only falls, "stiffer at the end" and "stiffer at
+    large strain" are the same, so that a wrong law of the material would look like a drift: there
+    the column of the drift is zero. Where the load returns, or the recording is dynamic, it stays.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) the answer
+    deviations : mapping of assumption or nuisance parameter to its deviation, None if exact
+    changes : Changes, optional
+        What `assumed` returns for these deviations, if that is known.
+    """
+    known = assumed(collocation, z, deviations) if changes is None else changes
+    columns = [k for k, name in enumerate(known.names) if name == DRIFT]
+    if not columns:
+        return known
+    blocks = iter(known.blocks)
+    masked = []
+    for part in collocation.parts(z):
+        hidden = part.segment.experiment.static and has_monotonic_load(part, collocation)
+        for _ in part.segment.readings:
+            change = next(blocks)
+            if hidden:
+                change = change.copy()
+                change[..., columns] = 0.0
+            masked.append(change)
+    return Changes(known.names, masked)
+
+
+def has_monotonic_load(part: Part, collocation: Collocation) -> bool:
+    """Whether the internal forces of a static recording only grow, or only shrink, in time."""
+    load_n = np.linalg.norm(Fitted(part, collocation.parameters).internal_n(), axis=1)
+    if len(load_n) < FEWEST_SAMPLES:
+        return True
+    steps = np.diff(load_n)
+    slack = RETURN * float(np.ptp(load_n))
+    return bool((steps >= -slack).all() or (steps <= slack).all())
+
+
+def with_freedom(
+    fit: LinearisedFit, changes: Changes, name: str, widening: float = 1.0
+) -> LinearisedFit:
+    """Return a fit in which an assumption is one more nuisance parameter, or several of its name.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+    changes : Changes
+        Each off by its deviation, which is the unit of the new parameters.
+    name : str
+    widening : float
+        Standard deviation of the prior of the new parameters, in these deviations.
+    """
+    columns = [k for k, other in enumerate(changes.names) if other == name]
+    blocks = []
+    for block, change in zip(fit.blocks, changes.blocks, strict=True):
+        more = change[..., columns] * (block.weight * block.seen)[..., None]
+        blocks.append(replace(block, slope=np.concatenate([block.slope, more], axis=3)))
+    count = len(columns)
+    return replace(
+        fit,
+        blocks=tuple(blocks),
+        names=(*fit.names, *(f"{name} {k}" for k in range(count))),
+        prior_residual=np.append(fit.prior_residual, np.zeros(count)),
+        prior_slope=np.append(fit.prior_slope, np.full(count, 1 / widening)),
+        at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
+    )
+
+
+def relaxed_probe(at: Answered, name: str, wide: LinearisedFit, p: Array) -> Probe:
+    """Return the best of a fit with one assumption relaxed, by one linear step.
+
+    Parameters
+    ----------
+    at : Answered
+    name : str
+        The assumption.
+    wide : LinearisedFit
+        Of `with_freedom`, linearised at p.
+    p : (p,) all parameters without those of the assumption
+
+    Returns
+    -------
+    Probe
+        Its size is that of the most significant amplitude, if there are several. `told` is empty.
+    """
+    first, step = len(at.fit.names), best_step(wide)
+    after, own = wide.after(step), step[first:]
+    found = at.found(after, p + step[:first])
+    before, left = least_squares(at.fit), least_squares(after)
+    falls = before.loss(np.zeros(first)) - left.loss(np.zeros(len(step)))
+    unit = at.deviations[assumption_of(name)] or 1.0
+    errors = np.array([*found.nuisance.values()][first - wide.shared :])
+    worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
+    probe = Probe("assumption", name, falls, at.moves(found))
+    probe = replace(probe, size=float(unit * own[worst]), size_error=float(unit * errors[worst]))
+    return replace(probe, relevance=relevance(at, probe))
+
+
+def relevance(at: Answered, probe: Probe) -> float:
+    """Return the largest change of an estimate, in half widths of its statistical interval.
+
+    Of a drift, half of it counts as a change of the moduli too: so far is the stiffness at either
+    end of a recording from the one that is reported for all of it.
+    """
+    shares = [0.0]
+    for name, move in probe.moves.items():
+        if move.of_statistical95 is None or is_mode(name):
+            continue
+        shares.append(abs(move.of_statistical95))
+        interval = at.statistical[name].statistical95
+        if probe.name == DRIFT and is_modulus(name) and interval is not None:
+            half_width = max((interval[1] - interval[0]) / 2, 1e-300)
+            shares.append(abs(0.5 * (probe.size or 0.0) * move.value) / half_width)
+    return max(shares)
+
+
+def assumption_of(name: str) -> str:
+    """Return the name of an assumption without its component."""
+    return name.partition(" ")[0]

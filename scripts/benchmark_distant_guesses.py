@@ -1,0 +1,133 @@
+"""Interior point from distant initial guesses, and from the answer of reduced space.
+
+A soft bar (90 nodes, 91 samples) is clamped at one end and swung. Its nine markers have unknown
+places, the nuisance parameters are those that are estimated by default, the number of time steps
+per sample is chosen by the run, and the four parameters are guessed wrong by factors of 3, 3, 3.6
+and 3. Prints processor time, iterations of IPOPT (of all solves together, where the run solves
+again with more steps), and the largest distance of a parameter's logarithm from reduced space's.
+
+    python scripts/benchmark_distant_guesses.py                    # the full size, all cases
+    python scripts/benchmark_distant_guesses.py --cells 5 2 2 --samples 41 --cases distant warm
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from synthetic import Swing
+
+from collocation_sysid import pipeline
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.model.parameters import Unknown
+from collocation_sysid.problem import Problem
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
+
+TRUTH = {"lambda_pa": 1300.0, "mu_pa": 870.0, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
+# By how much the initial guesses are wrong.
+FACTORS = {"lambda_pa": 1 / 3, "mu_pa": 1 / 3, "gamma_r_s": 3.6, "gamma_m_1_s": 3.0}
+BOUNDS = {
+    "lambda_pa": (1.0, 1e6),
+    "mu_pa": (1.0, 1e6),
+    "gamma_r_s": (1e-5, 1.0),
+    "gamma_m_1_s": (1e-3, 100.0),
+}
+SIZE_M = (0.22, 0.035, 0.05)
+DENSITY_KG_M3 = 95.0
+STEP_S = 0.01
+NOISE_M = 5e-4
+MARKERS = 9
+SEED = 1
+# "none": without nuisance parameters; "distant": with those by default; "warm": the same, from the
+# run folder of reduced space.
+CASES = ("none", "distant", "warm")
+
+
+def bar(divisions: Sequence[int], samples: int, *, ideal: bool) -> Problem:
+    """Return the soft bar with noisy markers of unknown places and distant guesses.
+
+    Parameters
+    ----------
+    divisions : tuple of int
+        Cells of the mesh along the three edges; (9, 2, 2) has 90 nodes.
+    samples : int
+        Camera frames, `STEP_S` apart.
+    ideal : bool
+        Without nuisance parameters, and with markers at known places.
+    """
+    body = Body(box_mesh(SIZE_M, divisions), density_kg_m3=DENSITY_KG_M3)
+    motion = Swing(
+        duration_s=(samples - 1) * STEP_S,
+        amplitude_m=(0.03, 0.04, 0.03),
+        amplitude_rad=(0.2, 0.3, 0.3),
+        frequency_hz=(1.1, 1.4, 1.7),
+        rise_s=0.3,
+        start=Rotation.identity(),
+    )
+    poses = motion.poses(STEP_S)
+    held = np.flatnonzero(body.nodes_m[:, 0] < 1e-9)
+    free = np.flatnonzero(body.nodes_m[:, 0] >= 1e-9)
+    random = np.random.default_rng(SEED)
+    places_m = body.nodes_m[np.sort(random.choice(free, MARKERS, replace=False))]
+    markers = Markers(poses.t_s, np.zeros((samples, MARKERS, 3)), NOISE_M, places_m=places_m)
+    experiment = Experiment(body, poses.t_s, [Grasp(held, poses)], markers, name="soft bar")
+    tracks = simulate(experiment, TRUTH, timestep_s=STEP_S / 8).markers_m
+    tracks = tracks + NOISE_M * random.normal(size=tracks.shape)
+    if ideal:
+        described = replace(with_markers(experiment, tracks), nuisance=Nuisance.none())
+    else:
+        unplaced = Markers(poses.t_s, tracks, NOISE_M, markers.names)
+        described = replace(experiment, markers=unplaced, nuisance=Nuisance())
+    guesses = {name: Unknown(value * FACTORS[name], *BOUNDS[name]) for name, value in TRUTH.items()}
+    return Problem([described], guesses, scheme="midpoint")
+
+
+def measured(case: str, divisions: Sequence[int], samples: int) -> None:
+    """Solve one of `CASES` by reduced space and by interior point, and print what both took."""
+    problem = bar(divisions, samples, ideal=case == "none")
+    began_s = time.process_time()
+    reference = pipeline.run(problem, ReducedSpace(), seek_causes=False)
+    reference_s = time.process_time() - began_s
+    with tempfile.TemporaryDirectory() as folder:
+        start = reference.save(Path(folder) / "reduced-space") if case == "warm" else None
+        began_s = time.process_time()
+        found = pipeline.run(problem, InteriorPoint(), start=start, seek_causes=False)
+        found_s = time.process_time() - began_s
+    solution = found.solution
+    off = np.log([solution.parameters[n] / reference.solution.parameters[n] for n in TRUTH])
+    print(
+        f"{case}: {solution.status.value}, {solution.iterations} iterations of IPOPT, "
+        f"{solution.collocation.substeps} steps a sample, {found_s:.1f} s of processor time; "
+        f"reduced space {reference.solution.iterations} sweeps, {reference_s:.1f} s; "
+        f"log parameters differ by {np.abs(off).max():.1e}",
+        flush=True,
+    )
+    for note in solution.notes:
+        print(f"    {note}")
+
+
+def main() -> None:
+    """Print what the cases take that the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cells", nargs=3, type=int, default=[9, 2, 2], help="of the mesh")
+    parser.add_argument("--samples", type=int, default=91)
+    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=CASES)
+    arguments = parser.parse_args()
+    for case in arguments.cases:
+        measured(case, arguments.cells, arguments.samples)
+
+
+if __name__ == "__main__":
+    main()
