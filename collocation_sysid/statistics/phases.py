@@ -267,13 +267,13 @@ def _chain(
         factor = np.linalg.cholesky(information)
         right = -np.r_[of_p, phase @ constant]
         half = solve_triangular(factor, right, lower=True)
-        return solve_triangular(factor, half, lower=True, trans="T"), factor
+        return np.asarray(solve_triangular(factor.T, half)), np.asarray(factor)
 
     def drawn() -> tuple[Array, Array]:
         """Mean and a draw of (δp, s)."""
         mean, factor = conditional()
         noise = rng.normal(size=len(mean))
-        return mean, mean + solve_triangular(factor, noise, lower=True, trans="T")
+        return mean, mean + np.asarray(solve_triangular(factor.T, noise))
 
     def change(signs: Array) -> Array:
         """−ln of the posterior's ratio (E,) if each phase flips."""
