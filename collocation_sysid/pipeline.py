@@ -12,6 +12,7 @@ import numpy as np
 
 from .display import plain_text
 from .errors import InputError, SimulationError
+from .fem.two_phase import TwoPhaseModes
 from .methods.solution import Method, Solution, Status, Watch
 from .methods.start import marched
 from .methods.workers import workers_of
@@ -141,7 +142,10 @@ def run(
     say = log or (lambda _: None)
     solution = solve(problem, method, watch, start, scheduler)
     bodies = (segment.body for segment in solution.collocation.segments)
-    problem = problem.with_lengths({k: v for body in bodies for k, v in body.lengths_m.items()})
+    fields = {part.field_name: part.field for b in bodies for part in b.parts if part.field}
+    problem = problem.with_lengths({name: field.length_m for name, field in fields.items()})
+    phases = {n: f for n, f in fields.items() if isinstance(f, TwoPhaseModes)}
+    problem = problem.with_fields(phases) if phases else problem
     answer = Run(problem, solution, {}, None)
     missing = "no forward simulation has checked the answer, and there are no error bars"
     try:

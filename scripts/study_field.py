@@ -47,6 +47,7 @@ class Twin:
     amplitude: float = 0.5
     markers: int = 48
     steps: int = 40
+    prior: str = "smooth"
 
 
 def stiff_cells(kind: str, mesh: cs.TetMesh) -> NDArray[np.bool_]:
@@ -84,7 +85,8 @@ def problem_of(twin: Twin, seed: int) -> tuple[cs.Problem, Array]:
     values = {"young_pa": YOUNG_PA, "stiff.young_pa": twin.ratio * YOUNG_PA, **BESIDE}
     known = {n: v for n, v in values.items() if regions or not n.startswith("stiff")}
     made = cs.simulate(hung(true, twin.markers, twin.steps), known, "midpoint", substeps=1)
-    field = cs.Field(twin.length_m, modes=twin.modes, amplitude=twin.amplitude)
+    amplitude = twin.amplitude if twin.prior == "smooth" else None
+    field = cs.Field(twin.length_m, modes=twin.modes, amplitude=amplitude, prior=twin.prior)
     sought = hung(Body(mesh, density_kg_m3=1000.0, field=field), twin.markers, twin.steps)
     noise = np.random.default_rng(seed).normal(size=made.markers_m.shape)
     experiment = cs.with_markers(sought, made.markers_m + SIGMA_M * noise)
@@ -99,6 +101,10 @@ TWINS = (
     Twin("the same, 12 markers", "half", 2.0, 0.04, 60, markers=12),
     Twin("stiff ball, twice", "ball", 2.0, 0.03, 80),
     Twin("stiff ball, three times", "ball", 3.0, 0.03, 80),
+    Twin("half three times, two phases", "half", 3.0, 0.04, 60, prior="two-phase"),
+    Twin("ball three times, two phases", "ball", 3.0, 0.03, 80, prior="two-phase"),
+    Twin("ball five times, two phases", "ball", 5.0, 0.03, 80, prior="two-phase"),
+    Twin("even, two phases", "none", 1.0, 0.04, 60, prior="two-phase"),
     Twin("even", "none", 1.0, 0.04, 60),
     Twin("half, amplitude 0.1", "half", 2.0, 0.04, 60, 0.1),
     Twin("half, length 0.4 m", "half", 2.0, 0.4, 60),
@@ -106,8 +112,19 @@ TWINS = (
 )
 
 
-def found_of(twin: Twin, seed: int) -> tuple[FieldEstimate, Array, cs.TetMesh, float]:
-    """Its field with error bars, the truth, the mesh, and the seconds of processor time."""
+@dataclass(frozen=True)
+class Found:
+    """An answer: its field with error bars, the truth, the mesh, the seconds of processor time."""
+
+    field: FieldEstimate
+    truth: Array
+    mesh: cs.TetMesh
+    took_s: float
+    contrast95: tuple[float, float] | None
+
+
+def found_of(twin: Twin, seed: int) -> Found:
+    """Return the answer of a twin."""
     problem, truth = problem_of(twin, seed)
     began = time.process_time()
     solution = cs.solve(problem)
@@ -116,14 +133,16 @@ def found_of(twin: Twin, seed: int) -> tuple[FieldEstimate, Array, cs.TetMesh, f
     known = covariance(collocation, solution.z)
     body = collocation.segments[0].body
     (field,) = fields_of(body, collocation.parameters, solution.q, known)
-    return field, truth, body.mesh, took_s
+    estimate = known.estimates.get("contrast")
+    return Found(field, truth, body.mesh, took_s, estimate and estimate.statistical95)
 
 
 def told(twin: Twin, seeds: range) -> str:
     """A row of the table: means over twins."""
     rows, said = [], set[str]()
     for seed in seeds:
-        field, truth, mesh, took_s = found_of(twin, seed)
+        found = found_of(twin, seed)
+        field, truth, mesh, took_s = found.field, found.truth, found.mesh, found.took_s
         low, high = np.log(field.ci95)
         held = (low < truth) & (truth < high)
         stiff, log = stiff_cells(twin.kind, mesh), np.log(field.value)
@@ -133,15 +152,19 @@ def told(twin: Twin, seeds: range) -> str:
         share, width = field.told.mean(), np.median(field.deviation)
         error = np.sqrt(np.mean((log - truth) ** 2))
         inside = held[field.told].mean() if field.told.any() else np.nan
-        rows.append(
-            (share, inside, held.mean(), error, width, ratio, step_mm, field.identified, took_s)
-        )
+        within = held[stiff].mean() if stiff.any() else np.nan
+        counts = field.identified, took_s, within
+        rows.append((share, inside, held.mean(), error, width, ratio, step_mm, *counts))
+        if found.contrast95 is not None:
+            lower, upper = found.contrast95
+            said |= {f"contrast {lower:.3g} to {upper:.3g}"}
         said |= {concern.code for concern in field.concerns}
         said |= {f"length {field.modes.length_m:g}"} if isinstance(twin.length_m, tuple) else set()
     mean = np.mean(rows, axis=0)
     cells = (
         f"{mean[0]:.0%}", f"{mean[1]:.1%}", f"{mean[2]:.1%}", f"{mean[3]:.3f}", f"{mean[4]:.3f}",
         f"{mean[5]:.2f}", f"{mean[6]:.1f}", f"{mean[7]:.0f} of {twin.modes}", f"{mean[8]:.0f}",
+        f"{mean[9]:.1%}",
     )  # fmt: skip
     return f"| {twin.name} | {' | '.join(cells)} | {', '.join(sorted(said))} |"
 
@@ -189,9 +212,10 @@ def main() -> None:
         cost()
         return
     print(
-        "| twin | told | held of these | held of all | error | ± | ratio | step mm | shapes | s | |"
+        "| twin | told | held of these | held of all | error | ± | ratio | step mm | shapes | s | "
+        "held inside | |"
     )
-    print("|---|" + "---|" * 10)
+    print("|---|" + "---|" * 11)
     for twin in TWINS:
         if options.only in twin.name:
             print(told(twin, range(options.twins)), flush=True)

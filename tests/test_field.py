@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from collocation_sysid.fem.constants import MU
 from collocation_sysid.fem.field import FieldModes, Laplacian
 from collocation_sysid.fem.refinement import refined
 from collocation_sysid.result.pictures.field import field_picture
-from collocation_sysid.result.replay import read_run
+from collocation_sysid.result.replay import GROUPS, LAYOUT, WRENCH, read_run
 from collocation_sysid.runs.check.body import body_finding
 from collocation_sysid.runs.forward_simulation import roll_out
 from collocation_sysid.statistics.considered import assumed
@@ -396,6 +397,12 @@ def test_a_run_folder_has_the_field_in_every_element(tmp_path):
     assert (stored[:, 0] < stored[:, 2]).all()
     frame = (tmp_path / "run" / "frames" / "frame_0000.vtu").read_text()
     assert 'Name="young_pa_over_prior"' in frame
+    with np.load(tmp_path / "run" / "trajectory.npz") as arrays:
+        documented = documented_arrays()
+        for name in arrays.files:
+            assert name in documented or f"{name.partition('_')[0]}_NAME" in documented, name
+        assert "field_young_pa" in arrays.files
+        np.testing.assert_array_equal(arrays["field_young_pa"], stored)
     said = str(run)
     assert "field_1" not in said
     assert "E from " in said
@@ -403,6 +410,23 @@ def test_a_run_folder_has_the_field_in_every_element(tmp_path):
     untold[:, 3] = 1.0
     told, pale = (field_picture(replay, "young_pa", values) for values in (stored, untold))
     assert _brightness(pale) > _brightness(told) + 0.1
+
+
+def documented_arrays() -> set[str]:
+    """Names of the arrays of trajectory.npz in the table of docs/howto/field.md."""
+    page = (Path(__file__).parent.parent / "docs/howto/field.md").read_text(encoding="utf-8")
+    rows = page.partition("## Arrays")[2].partition("\n#")[0].splitlines()
+    cells = [row.split("|")[1] for row in rows if row.startswith("| `")]
+    return {name for cell in cells for name in re.findall("`([^`]+)`", cell)}
+
+
+def test_the_documented_arrays_are_those_that_a_run_may_have():
+    documented = documented_arrays()
+    missing = {*LAYOUT, "residuals_m", "part_names", "marker_names", "static"} - documented
+    assert not missing
+    fronts = {f"{front}NAME" for front in GROUPS.values()} | {f"{WRENCH}K"}
+    assert fronts <= documented
+    assert documented <= {*LAYOUT, "residuals_m", "part_names", "marker_names", "static", *fronts}
 
 
 def _brightness(figure: Figure) -> float:

@@ -31,7 +31,7 @@ from ..errors import InputError
 from .air import placed_unit_drag
 from .constants import DENSITY, Constant
 from .discretisation import Discretisation
-from .field import Field
+from .field import Field, FieldModes
 from .materials import Damping, Energy, Material, Prony
 from .memory import Past
 from .mesh import TetMesh
@@ -41,6 +41,7 @@ from .regions import BodyPart, Model, Region, Theta, parts_of
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
 from .selection import Selection
 from .stress import Stresses
+from .two_phase import PhaseSamples, TwoPhaseModes
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +295,27 @@ class Body(Discretisation):
             tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
         )
 
+    @property
+    def phase_samples(self) -> tuple[PhaseSamples, ...]:
+        """Draws of the phases of its two-phase fields, where there is an answer."""
+        fields = (part.field for part in self.parts)
+        return tuple(
+            field.samples
+            for field in fields
+            if isinstance(field, TwoPhaseModes) and field.samples is not None
+        )
+
+    def with_fields(self, fields: Mapping[str, FieldModes]) -> Body:
+        """Return the same body with other fields, by the names of their constants.
+
+        Fields that are not named stay.
+        """
+        return self.with_parts(
+            tuple(
+                replace(part, field=fields.get(part.field_name, part.field)) for part in self.parts
+            )
+        )
+
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
         """The same body, whose parts of the same cells have other constants."""
         other = copy(self)
@@ -531,7 +553,9 @@ class Body(Discretisation):
         by_velocity[:, self.pattern.diagonal] -= drag
         by_theta = by_theta.reshape(len(x), size, -1)
         for number, own in self._of_fields("linearisation", rows):
-            self.spreads[number].nodal(own["by_theta"], by_theta[:, :, self.mode_places[number]])
+            here, spread = self.mode_places[number], self.spreads[number]
+            slopes = spread.field.slopes(np.asarray(theta)[here])
+            spread.nodal(own["by_theta"], slopes, by_theta[:, :, here])
         for column, slope in self._drag_slopes(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
             by_theta[:, :, column] += -slope * v
@@ -597,16 +621,19 @@ class Body(Discretisation):
         theta_theta = theta_theta.reshape(len(x), k, k)
         for number, own in self._of_fields("curvature", rows):
             here, spread = self.mode_places[number], self.spreads[number]
-            spread.nodal(own["position_theta"], x_theta[:, :, here])
-            spread.nodal(own["velocity_theta"], v_theta[:, :, here])
-            by_theta[:, here] = own["gradient_theta"] @ spread.shapes
+            coefficients = np.asarray(theta)[here]
+            slopes = spread.field.slopes(coefficients)
+            spread.nodal(own["position_theta"], slopes, x_theta[:, :, here])
+            spread.nodal(own["velocity_theta"], slopes, v_theta[:, :, here])
+            by_theta[:, here] = own["gradient_theta"] @ slopes
             first, points = self.starts[number], self.parts[number].of_points
-            twice = own["theta_theta"].reshape(len(x), len(spread.shapes), -1)
-            mixed = np.einsum("tek,em->tkm", twice[:, :, :points], spread.shapes)
+            twice = own["theta_theta"].reshape(len(x), len(slopes), -1)
+            mixed = np.einsum("tek,em->tkm", twice[:, :, :points], slopes)
             theta_theta[:, first : first + points, here] = mixed
             theta_theta[:, here, first : first + points] = mixed.swapaxes(1, 2)
-            bent = twice[:, :, points, None] * spread.shapes
-            theta_theta[:, here, here] = spread.shapes.T @ bent
+            bent = twice[:, :, points, None] * slopes
+            by_coefficients = spread.field.curvature(coefficients, own["gradient_theta"])
+            theta_theta[:, here, here] = slopes.T @ bent + by_coefficients
         for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
             self._spread_stiffening(values, carried)
         if carried is not None:

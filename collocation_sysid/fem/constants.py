@@ -97,6 +97,8 @@ FRICTION = Constant(
 )
 # Of a field, see `field`: how much of its first shape, of its second and so on.
 MODE = Constant("field", "", "share of a shape", (-1e3, 1e3), "linear", 1.0, 0.0)
+# Of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
+CONTRAST = Constant("contrast", "contrast", "inclusion over surroundings", (0.02, 50.0), usual=1.0)
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
 )
@@ -123,6 +125,7 @@ KNOWN: Mapping[str, Constant] = {
         DENSITY,
         MASS,
         FRICTION,
+        CONTRAST,
         INSTANTANEOUS,
     )
 }

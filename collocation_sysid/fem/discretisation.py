@@ -140,7 +140,7 @@ class Discretisation(Model):
         field = self.parts[number].stress_field
         if field is None:
             return carried
-        logs = (field.shapes @ np.asarray(theta)[self.mode_places[number]])[None]
+        logs = field.logarithms(np.asarray(theta)[self.mode_places[number]])[None]
         if carried is None:
             return logs
         return np.hstack([carried, np.broadcast_to(logs, (len(carried), logs.shape[1]))])
@@ -152,7 +152,7 @@ class Discretisation(Model):
         for number, part in enumerate(self.parts):
             if part.stress_field is not None:
                 cells, _ = self.laid_out(part)
-                found[number] = Spread(part.stress_field.shapes, dofs_of(cells), self.pattern.size)
+                found[number] = Spread(part.stress_field, dofs_of(cells), self.pattern.size)
         return found
 
     def laid_out(self, part: BodyPart) -> tuple[Index, Array]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -39,6 +39,11 @@ from .mesh import TetMesh
 ALL_MODULI = YOUNG.name
 # Random signs that tell a trace.
 PROBES = 50
+# Prior standard deviation of the logarithm of the contrast of two phases: a factor of e.
+TWO_PHASE_AMPLITUDE = 1.0
+SMOOTH: Literal["smooth"] = "smooth"
+TWO_PHASE: Literal["two-phase"] = "two-phase"
+Prior = Literal["smooth", "two-phase"]
 Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))]
 
 
@@ -58,13 +63,18 @@ class Field:
         How many shapes make up the field; one more costs what one more right-hand side does.
     amplitude : float, optional
         How much it differs: the prior standard deviation of the logarithm, 0.5 by default; of a
-        density that over its stated value, 0.3 by default.
+        density that over its stated value, 0.3 by default. With prior = "two-phase", the prior
+        standard deviation of the logarithm of the contrast, 1 by default.
+    prior : {"smooth", "two-phase"}
+        "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
+        between them; the parameter contrast is the ratio of inclusions to surroundings.
     """
 
     length_m: float | tuple[float, ...] = key(Lengths)
     parameter: str = key(Text, default=ALL_MODULI)
     modes: int = key(AtLeastOne, default=40)
     amplitude: float | None = key(Positive | None, default=None)
+    prior: Prior = key(Prior, default=SMOOTH)
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
@@ -74,6 +84,8 @@ class Field:
     @property
     def deviation(self) -> float:
         """The amplitude or its default: a density, unlike a logarithm, could fall below zero."""
+        if self.prior == TWO_PHASE:
+            return self.amplitude or TWO_PHASE_AMPLITUDE
         return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
 
 
@@ -204,6 +216,24 @@ class FieldModes:
         laplacian = Laplacian.of(mesh, cells, field.modes)
         return cls(field, laplacian, tuple(scaled), field.lengths_m[0], mesh.volumes_m3[cells])
 
+    def logarithms(self, coefficients: Array) -> Array:
+        """Return ln c − ln c̄ (E,) in every cell, from the coefficients (k,) of `constants`."""
+        return self.shapes @ coefficients
+
+    def slopes(self, coefficients: Array) -> Array:
+        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,)."""
+        return self.shapes
+
+    def curvature(self, coefficients: Array, weights: Array) -> Array:
+        """Return Σ weights · ∂² of `logarithms` by the coefficients, (T, k, k).
+
+        Parameters
+        ----------
+        coefficients : (k,)
+        weights : (T, E) of the cells
+        """
+        return np.zeros((len(weights), len(coefficients), len(coefficients)))
+
     @cached_property
     def share(self) -> float:
         """What of the variance these shapes have."""
@@ -247,17 +277,17 @@ class FieldModes:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Adds up over cells what changes with the logarithm in each, mode by mode.
+    """Sums over cells of what changes with the logarithm of the constant in each cell.
 
     Attributes
     ----------
-    shapes : (E, m)
+    field : FieldModes
     dofs : (E, d) of the nodes of each cell
     size : int
         Number of dofs of all.
     """
 
-    shapes: Array
+    field: FieldModes
     dofs: Index
     size: int
 
@@ -269,10 +299,17 @@ class Spread:
         numbers = np.arange(1, rows.size + 1)
         return sp.csr_array((numbers, (rows, columns)), shape=(self.size, cells))
 
-    def nodal(self, values: Array, out: Array) -> None:
-        """(T, size, m) of (T, E · d)."""
+    def nodal(self, values: Array, slopes: Array, out: Array) -> None:
+        """Write derivatives of nodal values by the coefficients of the field to `out`.
+
+        Parameters
+        ----------
+        values : (T, E · d) derivatives by the logarithm in each cell
+        slopes : (E, k) derivatives of these logarithms by the coefficients
+        out : (T, size, k)
+        """
         known = self._incidence
         order = known.data - 1
         for value, own in zip(values, out, strict=True):
             matrix = sp.csr_array((value[order], known.indices, known.indptr), known.shape)
-            own[:] = matrix @ self.shapes
+            own[:] = matrix @ slopes

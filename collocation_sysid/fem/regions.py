@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError, hint_at
-from .constants import DENSITY, GAMMA_M, MASS, Constant, is_mode
-from .field import Field, FieldModes
+from .constants import CONTRAST, DENSITY, GAMMA_M, MASS, Constant, is_mode
+from .field import TWO_PHASE, Field, FieldModes
 from .materials import Damping, Energy, Material, Prony, as_branches, as_damping, as_material
 from .mesh import TetMesh
 from .moduli import Source, elastic_names, source_of
 from .node_force import NodeForce
 from .selection import Selection
+from .two_phase import TwoPhaseModes
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,12 @@ class BodyPart:
         of_memory = [constant for branch in self.prony for constant in branch.constants]
         law = (*self.material.constants, *self.damping.constants, *of_memory, GAMMA_M)
         law = (*law, DENSITY) if self.free_density else law
-        return law if self.field is None else (*law, *self.field.constants)
+        return (*law, *self.field_constants)
+
+    @property
+    def field_constants(self) -> tuple[Constant, ...]:
+        """Constants of the field, the last ones of the part; none without a field."""
+        return () if self.field is None else self.field.constants
 
     @property
     def of_law(self) -> int:
@@ -177,7 +183,8 @@ def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
     if field is None:
         return part
     law = (*part.material.constants, *part.damping.constants)
-    return replace(part, field=FieldModes.of(field, mesh, part.cells, law))
+    kind = TwoPhaseModes if field.prior == TWO_PHASE else FieldModes
+    return replace(part, field=kind.of(field, mesh, part.cells, law))
 
 
 def _densities(
@@ -316,7 +323,9 @@ class Model:
             source_of(
                 part.name,
                 part.material,
-                [c for c in part.constants[len(part.material.constants) :] if not is_mode(c.name)],
+                part.constants[
+                    len(part.material.constants) : len(part.constants) - len(part.field_constants)
+                ],
                 known,
             )
             for part in self.parts
@@ -325,7 +334,7 @@ class Model:
     def used_names(self, known: Sequence[str]) -> set[str]:
         """Those of the names that are known which give its constants."""
         own = {name for source in self.sources(known) for name in source.names.values()}
-        own.update(self.mode_names)
+        own.update(self.mode_names, self.contrasts)
         further = (force.constants for force in self.forces)
         return own.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
@@ -353,10 +362,9 @@ class Model:
             if source.names.get(DENSITY.name) == MASS.name:
                 found[DENSITY.name] *= part.per_mass_1_m3
             # A field that nothing is said of is as its mean everywhere.
-            theta += [
-                values.get(part.full_name(c.name), 0.0) if is_mode(c.name) else found[c.name]
-                for c in part.constants
-            ]
+            own = part.constants[: len(part.constants) - len(part.field_constants)]
+            theta += [found[constant.name] for constant in own]
+            theta += [values.get(part.full_name(c.name), c.usual) for c in part.field_constants]
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
                 raise InputError(
@@ -406,10 +414,19 @@ class Model:
         """Of the shares of shapes of fields."""
         return tuple(name for name in self.constants if is_mode(name))
 
+    @property
+    def contrasts(self) -> dict[str, float]:
+        """Prior deviations of the logarithms of the contrasts of two-phase fields, by name."""
+        return {
+            part.full_name(CONTRAST.name): part.field.field.deviation
+            for part in self.parts
+            if part.field and part.field.field.prior == TWO_PHASE
+        }
+
     @cached_property
     def mode_places(self) -> list[slice]:
         """Where in θ those of each part are."""
-        counts = (part.field.field.modes if part.field else 0 for part in self.parts)
+        counts = (len(part.field_constants) for part in self.parts)
         ends = self.starts[1:]
         return [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
 

@@ -138,7 +138,8 @@ class Stresses:
                 for k, j in zip(*np.nonzero(theta_q[first : first + count]), strict=True):
                     found[:, j, here] += theta_q[first + k, j] * by_constant[:, k]
                 if field:
-                    logs = field.shapes @ theta_q[body.mode_places[number]]
+                    own = body.mode_places[number]
+                    logs = field.slopes(theta[own]) @ theta_q[own]
                     for j in np.flatnonzero(logs.any(axis=0)):
                         of_points = np.tile(np.repeat(logs[:, j], body.geometry.shape[1]), 6)
                         found[:, j, here] += of_points * by_constant[:, count]

@@ -126,6 +126,22 @@ class Update:
         return f"Update(t = {self.t_s:.4g} s: {found}; {self.trust.verdict})"
 
 
+def _require_phases(problem: Problem) -> None:
+    """Refuse a two-phase field without phases, which no stream can search for.
+
+    Raises
+    ------
+    InputError
+        If there is one.
+    """
+    for name, modes in problem.two_phase_fields.items():
+        if not modes.has_phases:
+            raise InputError(
+                f"the phases of {name} are not known, and are not searched for while live; "
+                "expected the problem of an answer, `cs.run(problem).problem`, or prior = 'smooth'"
+            )
+
+
 class Estimator:
     """Estimates a problem's parameters from frames, one after another.
 
@@ -151,6 +167,7 @@ class Estimator:
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.problem, self.options, self.clock = problem, options, clock
+        _require_phases(problem)
         self.model = Model.of(problem)
         model, self.names = self.model, self.model.experiment.markers.names
         far_m, around = FAR * model.size_m, model.samples_around

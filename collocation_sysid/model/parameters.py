@@ -167,6 +167,11 @@ class Parameter:
         return value if self.scale == "log" else self.unit
 
 
+# Where the search for the contrast of two phases starts if nothing is known of it: where it is 1,
+# the loss does not depend on where the phases are.
+FIRST_CONTRAST = 2.0
+
+
 def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
     """A parameter as stated, completed by what its constant says.
 
@@ -259,10 +264,28 @@ class Parameters:
         return cls(tuple(parameter(name, value) for name, value in given.items()))
 
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
-        """With the shares of the shapes of fields, of which no word was said."""
+        """Return these and the coefficients and contrasts of fields that are not stated.
+
+        A stated contrast without a prior gets that of its field.
+        """
+        bodies = tuple(bodies)
         names = dict.fromkeys(name for body in bodies for name in body.mode_names)
-        further = (parameter(name, Unknown(0.0)) for name in names if name not in self.names)
-        return Parameters((*self.items, *further))
+        priors = {
+            name: (1.0, deviation) for body in bodies for name, deviation in body.contrasts.items()
+        }
+        own = (
+            replace(item, prior=priors[item.name])
+            if item.name in priors and item.prior is None and not item.fixed
+            else item
+            for item in self.items
+        )
+        contrasts = (
+            parameter(name, Unknown(FIRST_CONTRAST, prior=prior))
+            for name, prior in priors.items()
+            if name not in self.names
+        )
+        modes = (parameter(name, Unknown(0.0)) for name in names if name not in self.names)
+        return Parameters((*own, *contrasts, *modes))
 
     def fixed_at(self, values: Mapping[str, float]) -> Parameters:
         """Those of these names, all with these values."""

@@ -12,6 +12,8 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, located
 from ..fem.body import Body
+from ..fem.field import FieldModes
+from ..fem.two_phase import TwoPhaseModes
 from ..methods import METHODS, require_method
 from ..methods.interior_point import InteriorPoint
 from ..methods.solution import Method
@@ -156,6 +158,33 @@ class Problem:
         bodies = {id(body): body.with_lengths(lengths_m) for body in self.bodies}
         return replace(
             self, experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments]
+        )
+
+    @property
+    def two_phase_fields(self) -> dict[str, TwoPhaseModes]:
+        """Two-phase fields of its bodies, by the names of their constants."""
+        return {
+            part.field_name: part.field
+            for body in self.bodies
+            for part in body.parts
+            if isinstance(part.field, TwoPhaseModes)
+        }
+
+    def with_fields(self, fields: Mapping[str, FieldModes]) -> Problem:
+        """Return the same problem with other fields, by the names of their constants.
+
+        Parameters that no longer belong to a field of any body are left out, and those of the
+        fields that are not stated are added.
+        """
+        bodies = {id(body): body.with_fields(fields) for body in self.bodies}
+        lost = {n for b in self.bodies for n in (*b.mode_names, *b.contrasts)}
+        lost -= {n for b in bodies.values() for n in (*b.mode_names, *b.contrasts)}
+        return replace(
+            self,
+            experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments],
+            parameters=Parameters(
+                tuple(item for item in self.parameters.items if item.name not in lost)
+            ),
         )
 
     @property

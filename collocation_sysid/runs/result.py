@@ -11,6 +11,7 @@ from ..display import short
 from ..errors import InputError
 from ..fem.constants import is_mode, symbol_of, unit_of
 from ..fem.field import FieldShapes
+from ..fem.two_phase import PhaseFinding
 from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
 from ..program.depth_comparison import DepthError
@@ -137,6 +138,8 @@ class FoundField:
     identified : int or None
         How many independent shapes the data tell.
     likelier : mapping of length in metres to the logarithm of how much likelier it is
+    phases : PhaseFinding or None
+        Contrast and volume of the inclusion of a two-phase field; None of a smooth one.
     """
 
     shapes: FieldShapes
@@ -144,6 +147,7 @@ class FoundField:
     share_told: float | None
     identified: int | None
     likelier: Mapping[str, float]
+    phases: PhaseFinding | None = None
 
     def sentence(self, name: str) -> str:
         """What it is, in a line."""
@@ -151,6 +155,14 @@ class FoundField:
         said = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
         if self.identified is None or self.share_told is None:
             return said
+        if self.phases is not None:
+            lower, contrast, upper = self.phases.contrast
+            least_m3, volume_m3, most_m3 = self.phases.volume_m3
+            return (
+                f"{said}: two phases, contrast {contrast:.3g} ({lower:.3g} to {upper:.3g}), "
+                f"inclusion {1e6 * volume_m3:.3g} cm³ ({1e6 * least_m3:.3g} to "
+                f"{1e6 * most_m3:.3g}); the phase of {self.share_told:.0%} of the volume is known"
+            )
         shapes = f"{self.identified} of {self.shapes.modes} shapes of its field"
         told = f"{self.share_told:.0%} of the volume better than the prior by half"
         beside = [f"details above {short(1e3 * self.shapes.detail_m)} mm"]

@@ -25,6 +25,7 @@ from ..statistics.fields import fields_by_information
 from ..statistics.linearised import values_of
 from .check.cost import require_memory
 from .several_starts import best_start
+from .two_phases import solve_two_phases
 from .warm_start import Earlier
 
 # How a search ends that went astray; another start may help.
@@ -95,6 +96,8 @@ def _likeliest(
     An answer tells, to first order, which of them that is, see `statistics.fields`; with that it is
     solved again from there, until it is the likeliest by its own answer or one that was tried.
     """
+    if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
+        return solve_two_phases(problem, start, solved)
     solution, tried = solved(problem, start), [problem.lengths_m]
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     if all(len(field.field.lengths_m) == 1 for field in fields):

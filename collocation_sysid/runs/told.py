@@ -153,10 +153,10 @@ def _field(found: FieldEstimate) -> FoundField:
     modes, volumes_m3 = found.modes, found.modes.volumes_m3
     ends, told = (float(found.value.min()), float(found.value.max())), found.told
     if not np.isfinite(found.deviation).all():
-        return FoundField(modes.told, ends, None, None, {})
+        return FoundField(modes.told, ends, None, None, {}, found.phases)
     share = float(volumes_m3[told].sum() / volumes_m3.sum())
     likelier = {f"{each:g}": found.likelier(each) for each in modes.field.lengths_m}
-    return FoundField(modes.told, ends, share, found.identified, likelier)
+    return FoundField(modes.told, ends, share, found.identified, likelier, found.phases)
 
 
 def _recordings(answer: Answer) -> dict[str, RecordingsAgreement] | None:

@@ -337,6 +337,12 @@ TOPICS: Mapping[str, Topic] = {
         {
             "amplitude": "{name} differs more from place to place than its field allows for: the "
             "data want an amplitude of about {likely:.2g}, not {stated:.2g}",
+            "one-phase": "the data do not show two materials: the contrast of {name} is "
+            "{median:.3g} ({lower:.3g} to {upper:.3g}), which contains 1; take prior = 'smooth' or "
+            "no field",
+            "phases": "two phases of {name} do not describe the body: χ² per measurement is "
+            "{misfit:.3g}, with a smooth field {smooth:.3g}; more than two materials, or one that "
+            "changes gradually: take prior = 'smooth', or regions",
             "negative": "{name} is not above zero in {below} of {elements} elements, down to "
             "{least:.3g}: lower the amplitude of its field, {stated:.2g}, or raise its length_m",
             "shapes": "the {modes} shapes of the field of {name} have only {share:.0%} of its "

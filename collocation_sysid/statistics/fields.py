@@ -15,7 +15,8 @@ another length or amplitude, the data would be more likely, to first order, by
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -26,6 +27,7 @@ from ..arrays import Array, Index
 from ..fem.body import Body
 from ..fem.field import ALL_MODULI, FieldModes
 from ..fem.moduli import engineering
+from ..fem.two_phase import PhaseFinding, TwoPhaseModes
 from ..model.generated import Generated
 from ..model.parameters import NOTHING, Parameters, ThetaMap
 from ..program.collocation import Collocation
@@ -40,7 +42,32 @@ TOLD = 0.5
 LIKELIER = 3.0
 # Of error bars' variance over the prior's: more is not told by data and prior.
 WIDER = 1.1
+# By this factor χ² per measurement of two phases is above that of a smooth field, or of noise,
+# where two phases do not describe the body: chance moves it by a few per cent.
+WORSE = 1.1
+# Ends of a 95 % interval, as quantiles.
+ENDS = (0.025, 0.975)
 AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+
+
+def phase_concerns(phases: PhaseFinding, name: str) -> list[Concern]:
+    """Return what speaks against two phases: no contrast, or a smooth field that fits better.
+
+    Parameters
+    ----------
+    phases : PhaseFinding
+    name : str
+        The constant, with its region in front.
+    """
+    found: list[Concern] = []
+    lower, median, upper = phases.contrast
+    if lower <= 1 <= upper:
+        ends = {"name": name, "lower": lower, "median": median, "upper": upper}
+        found.append(Concern("field/one-phase", data=ends))
+    if phases.misfit > WORSE * max(1.0, phases.smooth_misfit):
+        both = {"name": name, "misfit": phases.misfit, "smooth": phases.smooth_misfit}
+        found.append(Concern("field/phases", data=both))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +85,11 @@ class FieldEstimate:
         without error bars
     stated : float or None
         A density as stated, which the deviation is a share of.
+    ends : (lower, upper) or None
+        Ends (k,) of the 95 % intervals where they follow from samples; None where they follow from
+        the deviation.
+    phases : PhaseFinding or None
+        Of a two-phase field; None of a smooth one.
     quantile : float
         Half width of the 95 % intervals, in deviations.
     shares : (m,) a
@@ -73,10 +105,14 @@ class FieldEstimate:
     shares: Array
     covariance: Array
     stated: float | None = None
+    ends: tuple[Array, Array] | None = None
+    phases: PhaseFinding | None = None
 
     @property
     def ci95(self) -> tuple[Array, Array]:
         """(k,) lower and upper ends of the 95 % intervals."""
+        if self.ends is not None:
+            return self.ends
         if self.stated is not None:
             away = self.quantile * self.deviation * self.stated
             return self.value - away, self.value + away
@@ -86,7 +122,8 @@ class FieldEstimate:
     @property
     def over_prior(self) -> Array:
         """(k,) deviation over that of the prior about the mean."""
-        return self.deviation / self.modes.field.deviation
+        prior = self.modes.field.deviation if self.phases is None else self.phases.deviation
+        return self.deviation / prior
 
     @property
     def told(self) -> NDArray[np.bool_]:
@@ -124,7 +161,7 @@ class FieldEstimate:
 
     def likelier(self, length_m: float | None = None, factor: float = 1.0) -> float:
         """Ln Z(D) − ln Z(I) with another length, or with the amplitude times a factor."""
-        if self._beyond_prior or length_m == self.modes.length_m:
+        if self.phases is not None or self._beyond_prior or length_m == self.modes.length_m:
             return 0.0
         size = len(self.shares)
         prior = factor**2 * np.eye(size)
@@ -143,6 +180,8 @@ class FieldEstimate:
     @property
     def concerns(self) -> list[Concern]:
         """A density that none has; an amplitude too small, or a length too long, by the data."""
+        if self.phases is not None:
+            return phase_concerns(self.phases, self.name)
         amplitude, said = self.modes.field.deviation, dict[str, dict[str, float]]()
         best = max(AMPLITUDES, key=lambda factor: self.likelier(factor=factor))
         if best > 1 and self.likelier(factor=best) > LIKELIER:
@@ -176,30 +215,71 @@ def fields_of(
             continue
         here = body.mode_places[number]
         mean, slopes = _mean(constants, number, modes).slopes(q, NOTHING)
-        local, stated = mean[0] + modes.shapes @ theta[here], None
+        local, stated = mean[0] + modes.logarithms(theta[here]), None
         if part.stress_field is None:
             stated = part.density_kg_m3
-        gradient = slopes + modes.shapes @ by_q[here]
+        gradient = slopes + modes.slopes(theta[here]) @ by_q[here]
         # What is at a bound has no variance: it is taken for known.
         used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
         own = gradient[:, used]
         variance = np.einsum("ei,ij,ej->e", own, covariance[np.ix_(used, used)], own)
         deviation = np.sqrt(variance + modes.left_out**2)
         free = [names.index(name) for name in [*body.constants][here] if name in names]
-        found.append(
-            FieldEstimate(
-                part.field_name,
-                modes,
-                part.cells,
-                np.exp(local) if stated is None else stated * local,
-                deviation if known is not None else np.full_like(deviation, np.nan),
-                quantile,
-                theta[here],
-                covariance[np.ix_(free, free)],
-                stated,
-            )
+        values = np.exp(local) if stated is None else stated * local
+        estimate = FieldEstimate(
+            name=part.field_name,
+            modes=modes,
+            cells=part.cells,
+            value=values,
+            deviation=deviation if known is not None else np.full_like(deviation, np.nan),
+            quantile=quantile,
+            shares=theta[here],
+            covariance=covariance[np.ix_(free, free)],
+            stated=stated,
         )
+        if isinstance(modes, TwoPhaseModes):
+            contrast = theta[here.stop - 1]
+            estimate = _with_phases(estimate, modes, float(contrast))
+        found.append(estimate)
     return found
+
+
+def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float) -> FieldEstimate:
+    """Return the estimate of a two-phase field with the intervals of its samples.
+
+    Quantiles of the samples, so that an element at the boundary has an interval from one phase to
+    the other. Without samples the phases count as known.
+
+    Parameters
+    ----------
+    contrast : float
+        The contrast of the answer.
+    """
+    samples = modes.samples
+    if samples is None or not np.isfinite(estimate.deviation).all():
+        return estimate
+    lower, upper = np.exp(np.quantile(samples.logarithms, ENDS, axis=0))
+    # Half of the elements of either phase would differ by half the contrast's logarithm.
+    typical = np.log(contrast) ** 2 / 4 + samples.contrasts.var() / 2
+    finding = PhaseFinding(
+        contrast=_quantiles(np.exp(samples.contrasts)),
+        volume_m3=_quantiles(samples.volumes_m3),
+        deviation=float(np.sqrt(typical)),
+        misfit=samples.misfit,
+        smooth_misfit=samples.smooth_misfit,
+    )
+    return replace(
+        estimate,
+        deviation=samples.logarithms.std(axis=0),
+        ends=(np.minimum(lower, estimate.value), np.maximum(upper, estimate.value)),
+        phases=finding,
+    )
+
+
+def _quantiles(values: Array) -> tuple[float, float, float]:
+    """Return lower end, median and upper end of the 95 % interval of samples."""
+    lower, median, upper = np.quantile(values, [ENDS[0], 0.5, ENDS[1]])
+    return float(lower), float(median), float(upper)
 
 
 def fields_by_information(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
@@ -211,6 +291,28 @@ def fields_by_information(collocation: Collocation, z: Array) -> dict[str, Field
         for field in fields_of(body, collocation.parameters, z[:nq], known):
             found.setdefault(field.name, field)
     return found
+
+
+def mean_logarithm(
+    body: Body, parameters: Parameters, q: Array, *, number: int, names: Sequence[str]
+) -> tuple[float, Array]:
+    """Return the logarithm of the mean of a part's field, and its slopes by some parameters.
+
+    Parameters
+    ----------
+    body : Body
+    parameters : Parameters
+    q : (nq,)
+    number : int
+        Index of the part.
+    names : sequence of str
+        Names of the estimated parameters by which the slopes are, in their order.
+    """
+    modes = body.parts[number].field
+    assert modes is not None
+    mean, slopes = _mean(ThetaMap(parameters, body), number, modes).slopes(q, NOTHING)
+    free = [item.name for item in parameters.free]
+    return float(mean[0]), slopes.reshape(-1)[[free.index(name) for name in names]]
 
 
 def _mean(constants: ThetaMap, number: int, modes: FieldModes) -> Generated:

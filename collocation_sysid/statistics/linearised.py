@@ -218,6 +218,9 @@ class LinearisedFit:
         Parameters that ended at a bound.
     derived : Derived
         What follows from the shared parameters.
+    of_phases : (shared, shared) or None
+        Covariance that unknown phases of a two-phase field add to that of the shared parameters,
+        in the solver's coordinates; None without such a field.
     """
 
     blocks: tuple[FitBlock, ...]
@@ -227,6 +230,7 @@ class LinearisedFit:
     prior_slope: Array
     at_bound: Mask
     derived: Derived = field(default_factory=lambda: Derived({}, {}))
+    of_phases: Array | None = None
 
     @property
     def measurements(self) -> int:
@@ -301,7 +305,21 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         prior_slope=prior_slope,
         at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
         derived=Derived.of((s.constants for s in collocation.segments), p[: collocation.nq]),
+        of_phases=_covariance_by_phases(collocation),
     )
+
+
+def _covariance_by_phases(collocation: Collocation) -> Array | None:
+    """Return what unknown phases add to the covariance (nq, nq) of q; None if there are none."""
+    names = [item.name for item in collocation.parameters.free]
+    found: Array | None = None
+    for body in dict.fromkeys(segment.body for segment in collocation.segments):
+        for samples in body.phase_samples:
+            places = [k for k, name in enumerate(samples.names) if name in names]
+            own = [names.index(samples.names[k]) for k in places]
+            found = np.zeros((len(names), len(names))) if found is None else found
+            found[np.ix_(own, own)] += samples.deviations[np.ix_(places, places)]
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -257,6 +257,9 @@ def _error_bars(
         widens = (after > CONSEQUENCE**2 * before).any()
         if asked.errors == "autocorrelated" or kind != "given" or widens:
             covariance, freedom, used = persistent, of_few, "autocorrelated"
+    if fit.of_phases is not None:
+        covariance = covariance.copy()
+        covariance[: fit.shared, : fit.shared] += fit.of_phases
     return covariance, student_ppf(0.975, freedom), ErrorBasis(kind, used, level, seen, outliers)
 
 

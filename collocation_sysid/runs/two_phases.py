@@ -1,0 +1,380 @@
+"""Solving a problem whose field has two phases: a smooth field first, then phases and parameters.
+
+1. The problem with a smooth field in place of the two phases is solved.
+2. At that answer the measurements are linearised in the logarithm of every element, and phases are
+   drawn from their posterior, see `statistics.phases`.
+3. With the likelier phase of every element the problem is solved for the contrast and all other
+   parameters by the method that was asked for. 2 and 3 repeat from there until no more than a
+   small share of the volume changes its phase.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..arrays import Array, Index
+from ..errors import InputError
+from ..fem.body import Body
+from ..fem.constants import CONTRAST, mode
+from ..fem.two_phase import ElementLogarithms, PhaseSamples, TwoPhaseModes, inclusion
+from ..methods.solution import Solution
+from ..problem import Problem
+from ..program.charts import Chart
+from ..program.collocation import Collocation
+from ..recording.experiment import Experiment
+from ..statistics.fields import mean_logarithm
+from ..statistics.linearised import LinearisedFit, information, linearised_fit
+from ..statistics.phases import (
+    USUAL,
+    ElementInformation,
+    Faces,
+    PhaseDraws,
+    draw_phases,
+    start_phases,
+)
+from .warm_start import Earlier
+
+Solved = Callable[[Problem, str | Path | Earlier | None], Solution]
+
+# Elements of a two-phase field: the sampler has two dense matrices of their square.
+MOST_ELEMENTS = 4000
+# Rounds of phases and parameters at most.
+ROUNDS = 6
+# Phases are final where less than this share of the inclusion's volume changes in a round.
+SETTLED = 0.02
+# An inclusion of fewer elements is noise of a single element.
+FEWEST_ELEMENTS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The two-phase field of a problem.
+
+    Attributes
+    ----------
+    name : str
+        Name of its constant, with the region in front.
+    contrast : str
+        Name of the contrast.
+    modes : TwoPhaseModes
+    number : int
+        Index of the part in the body.
+    elements : tuple of str
+        Names of the coefficients of `ElementLogarithms`.
+    """
+
+    name: str
+    contrast: str
+    modes: TwoPhaseModes
+    number: int
+    elements: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _SmoothFit:
+    """Fit of the smooth field.
+
+    Attributes
+    ----------
+    chi_squared : float
+    misfit : float
+        χ² per measurement.
+    determined : float
+        Number of parameters and shapes that the data determine; one that a prior determines counts
+        in part.
+    """
+
+    chi_squared: float
+    misfit: float
+    determined: float
+
+    def lack_of_fit(self, chi_squared: float) -> float:
+        """Return T of `statistics.phases`, at least one, of an answer with this χ²."""
+        return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
+
+
+def _smooth_fit(fit: LinearisedFit) -> _SmoothFit:
+    return _SmoothFit(fit.chi_squared, _misfit(fit), information(fit).fitted)
+
+
+def solve_two_phases(
+    problem: Problem, start: str | Path | Earlier | None, solved: Solved
+) -> Solution:
+    """Solve a problem with a two-phase field; the answer's body has the phases and their samples.
+
+    Parameters
+    ----------
+    problem : Problem
+        With exactly one two-phase field.
+    start : str, Path or Earlier, optional
+        Where the solve with the smooth field starts.
+    solved : callable
+        Solves a problem without a two-phase search.
+
+    Raises
+    ------
+    InputError
+        For several two-phase fields, or too many elements.
+    """
+    search = _search_of(problem)
+    solution = solved(problem.with_fields({search.name: search.modes.smooth}), start)
+    if not solution.status.converged:
+        return solution
+    smooth = _smooth_fit(linearised_fit(solution.collocation, solution.z))
+    at_smooth = _linearised(problem, search, solution)
+    phase = start_phases(at_smooth.data(1.0), at_smooth.faces, search.modes.volumes_m3)
+    best: Solution | None = None
+    at_best = at_smooth
+    rounds = 0
+    for _ in range(ROUNDS):
+        candidate = _solved_with(problem, search, phase, Earlier.of(best or solution), solved)
+        if not candidate.status.converged and best is None:
+            return candidate
+        rounds += 1
+        if not candidate.status.converged:
+            break
+        at_candidate = _linearised(problem, search, candidate)
+        if best is not None and at_candidate.fit.chi_squared >= at_best.fit.chi_squared:
+            break
+        best = candidate
+        at_best = at_candidate
+        draws = draw_phases(at_best.data(1.0), at_best.faces, phase)
+        following = _likelier(draws.probability)
+        volumes_m3 = search.modes.volumes_m3
+        if volumes_m3 @ np.abs(following - phase) < SETTLED * (volumes_m3 @ phase):
+            break
+        phase = following
+    assert best is not None
+    final = _phase_of(best, search)
+    temperature = smooth.lack_of_fit(at_best.fit.chi_squared)
+    # The whole posterior is tempered, its prior too: with the data alone tempered the prior would
+    # shrink inclusions.
+    settings = replace(USUAL, face_nats=USUAL.face_nats / temperature)
+    draws = draw_phases(at_best.data(temperature), at_best.faces, final, settings)
+    samples = _samples(draws, at_best.fit, search, best)
+    best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
+    note = (
+        f"two phases of {search.name}: started from a smooth field (χ² per measurement "
+        f"{smooth.misfit:.3g}), {rounds} rounds of phases and parameters; the inclusion has "
+        f"{int(final.sum())} of {len(final)} elements; samples are of a posterior tempered by "
+        f"{temperature:.3g}, the lack of fit per shape of the smooth field"
+    )
+    return replace(best, notes=(note, *best.notes))
+
+
+def _phase_of(solution: Solution, search: _Search) -> Array:
+    """Return the phases (E,) of a solution."""
+    modes = _body_of(solution, search).parts[search.number].field
+    assert isinstance(modes, TwoPhaseModes)
+    return modes.phase
+
+
+def _body_of(solution: Solution, search: _Search) -> Body:
+    segments = solution.collocation.segments
+    return next(s.body for s in segments if search.name in s.body.lengths_m)
+
+
+def _solved_with(
+    problem: Problem, search: _Search, phase: Array, earlier: Earlier, solved: Solved
+) -> Solution:
+    """Solve with given phases, from the parameters of an earlier answer."""
+    own = replace(search.modes, phase=phase)
+    return solved(problem.with_fields({search.name: own}), earlier)
+
+
+def _search_of(problem: Problem) -> _Search:
+    fields = problem.two_phase_fields
+    if len(fields) > 1:
+        raise InputError(
+            f"{len(fields)} two-phase fields ({', '.join(fields)}); expected one: give the others "
+            "prior = 'smooth', or regions"
+        )
+    ((name, modes),) = fields.items()
+    if len(modes.phase) > MOST_ELEMENTS:
+        raise InputError(
+            f"the two-phase field of {name} has {len(modes.phase)} elements; expected at most "
+            f"{MOST_ELEMENTS}: take a coarser mesh, or a region around the inclusion"
+        )
+    parts = next(body.parts for body in problem.bodies if name in body.lengths_m)
+    number = next(k for k, part in enumerate(parts) if part.field_name == name)
+    part = parts[number]
+    elements = tuple(part.full_name(mode(k).name) for k in range(len(modes.phase)))
+    return _Search(name, part.full_name(CONTRAST.name), modes, number, elements)
+
+
+def _likelier(probability: Array) -> Array:
+    """Return the likelier phase (E,) of every element; neither phase is left empty."""
+    found = inclusion(probability).astype(float)
+    order = np.argsort(probability)
+    if found.sum() < FEWEST_ELEMENTS:
+        found[order[-FEWEST_ELEMENTS:]] = 1.0
+    elif found.sum() > len(found) - FEWEST_ELEMENTS:
+        found[order[:FEWEST_ELEMENTS]] = 0.0
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Measurements linearised in the logarithm of every element.
+
+    Attributes
+    ----------
+    fit : LinearisedFit
+    columns : (E,) of the elements in the fit
+    base : (E,) logarithms over the mean where they are linearised
+    faces : Faces
+    deviation : float
+        Prior standard deviation of the logarithm of the contrast.
+    """
+
+    fit: LinearisedFit
+    columns: Index
+    base: Array
+    faces: Faces
+    deviation: float
+
+    def data(self, temperature: float) -> ElementInformation:
+        """Return the normal equations, with the measurements' over the temperature T."""
+        return _information(
+            self.fit,
+            self.columns,
+            base=self.base,
+            deviation=self.deviation,
+            temperature=temperature,
+        )
+
+
+def _linearised(problem: Problem, search: _Search, solution: Solution) -> _Linearised:
+    """Return the measurements linearised at a solution in the logarithm of every element."""
+    body = _body_of(solution, search)
+    part = body.parts[search.number]
+    assert part.field is not None
+    theta = body.theta(solution.parameters)
+    base = part.field.logarithms(theta[body.mode_places[search.number]])
+    elements = ElementLogarithms.about(search.modes, base)
+    fit = _by_elements(problem.with_fields({search.name: elements}), solution, search)
+    return _Linearised(
+        fit=fit,
+        columns=_columns(fit, search),
+        base=base,
+        faces=Faces.of(body.mesh, part.cells),
+        deviation=search.modes.field.deviation,
+    )
+
+
+def _columns(fit: LinearisedFit, search: _Search) -> Index:
+    """Return the columns of the elements' logarithms in a fit."""
+    places = {name: k for k, name in enumerate(fit.names)}
+    return np.array([places[name] for name in search.elements])
+
+
+def _samples(
+    draws: PhaseDraws, fit: LinearisedFit, search: _Search, solution: Solution
+) -> PhaseSamples:
+    """Return draws of the phases as samples of the logarithms in the elements."""
+    others = np.delete(np.arange(len(fit.names)), _columns(fit, search))
+    shared = [int(k) for k in others if k < fit.shared]
+    names = tuple(fit.names[k] for k in shared)
+    mean, slopes = mean_logarithm(
+        _body_of(solution, search),
+        solution.collocation.parameters,
+        solution.q,
+        number=search.number,
+        names=names,
+    )
+    by_parameters = draws.changes[:, : len(shared)] @ slopes
+    means = np.column_stack([draws.means[:, : len(shared)], draws.means[:, -1]])
+    return PhaseSamples(
+        logarithms=mean + by_parameters[:, None] + draws.contrasts[:, None] * draws.phases,
+        contrasts=draws.contrasts,
+        volumes_m3=draws.phases @ search.modes.volumes_m3,
+        names=(*names, search.contrast),
+        deviations=np.atleast_2d(np.cov(means, rowvar=False)),
+        misfit=_misfit(fit),
+        smooth_misfit=np.nan,
+    )
+
+
+def _by_elements(problem: Problem, solution: Solution, search: _Search) -> LinearisedFit:
+    """Return the fit at a solution, by the coefficients of the elements too, which are zero."""
+    found = solution.collocation
+    elements = set(search.elements)
+    collocation = replace(
+        found,
+        experiments=problem.experiments,
+        parameters=problem.parameters,
+        charts=_charts(found, problem.experiments),
+        explicit=False,
+    )
+    p, positions = found.unpack(solution.z)
+    values = dict(zip((item.name for item in found.parameters.free), p, strict=False))
+    q = [
+        0.0 if item.name in elements else values[item.name] for item in collocation.parameters.free
+    ]
+    both = np.concatenate([q, p[found.nq :]])
+    return linearised_fit(collocation, collocation.pack(both, positions))
+
+
+def _misfit(fit: LinearisedFit) -> float:
+    """χ² per measurement."""
+    return fit.chi_squared / max(1, fit.measurements)
+
+
+def _information(
+    fit: LinearisedFit, of_z: Array, *, base: Array, deviation: float, temperature: float
+) -> ElementInformation:
+    """Return the normal equations, with the columns `of_z` those of the elements."""
+    size = len(fit.names)
+    normal = np.zeros((size, size))
+    score = np.zeros(size)
+    for block in fit.blocks:
+        residual, slope, _ = block.channels
+        flat = slope.reshape(residual.size, size)
+        normal += flat.T @ flat
+        score += flat.T @ residual.ravel()
+    normal /= temperature
+    score /= temperature
+    of_p = np.delete(np.arange(size), of_z)
+    priors = fit.prior_slope[of_p]
+    return ElementInformation(
+        of_p=normal[np.ix_(of_p, of_p)] + np.diag(priors**2),
+        mixed=normal[np.ix_(of_z, of_p)],
+        of_z=normal[np.ix_(of_z, of_z)],
+        score_p=score[of_p] + priors * fit.prior_residual[of_p],
+        score_z=score[of_z],
+        base=base,
+        deviation=deviation,
+    )
+
+
+def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
+    """Return the solution whose body has the samples of the phases."""
+    collocation = solution.collocation
+    bodies: dict[int, Body] = {}
+    for body in dict.fromkeys(segment.body for segment in collocation.segments):
+        fields = {
+            part.field_name: replace(part.field, samples=samples)
+            for part in body.parts
+            if isinstance(part.field, TwoPhaseModes)
+        }
+        bodies[id(body)] = body.with_fields(fields)
+    experiments = [
+        replace(each, body=bodies.get(id(each.body), each.body)) for each in collocation.experiments
+    ]
+    charts = _charts(collocation, experiments)
+    return replace(
+        solution, collocation=replace(collocation, experiments=experiments, charts=charts)
+    )
+
+
+def _charts(collocation: Collocation, experiments: Sequence[Experiment]) -> dict[str, Chart]:
+    """Return where recordings are read, for bodies that differ in their fields only."""
+    bodies = {experiment.name: experiment.body for experiment in experiments}
+    return {
+        segment.experiment.name: replace(segment.chart, body=bodies[segment.experiment.name])
+        for segment in collocation.segments
+    }
