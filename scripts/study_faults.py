@@ -158,7 +158,8 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
     collocation, z = solution.collocation, solution.z
     found = covariance(collocation, z)
-    changes = changed_residuals(collocation, z, [(row, row.sigma) for row in assumed])
+    deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
+    changes = changed_residuals(collocation, z, deviations)
     fit = linearised_fit(collocation, z)
     sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
     lines = budget(sources, found, {}, problem.parameters)
@@ -276,9 +277,9 @@ def drawn(names: Sequence[str]) -> Callable[..., Pair]:
         off = {}
         for row in (row for row in ASSUMPTIONS if row.name in names):
             for name in row.components:
-                way = rng.standard_normal()
+                size = (row.sigma or 0.0) * rng.standard_normal()
                 # No coefficient of the air is below zero.
-                off[name] = max(row.sigma * way, -0.99) if row.name in AIR else row.sigma * way
+                off[name] = max(size, -0.99) if row.name in AIR else size
         values = {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
         return wrong(experiment, values, off), experiment
 

@@ -24,6 +24,7 @@ from synthetic import swing
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.field import Prior
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.statistics.fields import FieldEstimate, fields_of
 from collocation_sysid.statistics.uncertainty import covariance
@@ -47,7 +48,7 @@ class Twin:
     amplitude: float = 0.5
     markers: int = 48
     steps: int = 40
-    prior: str = "smooth"
+    prior: Prior = "smooth"
 
 
 def stiff_cells(kind: str, mesh: cs.TetMesh) -> NDArray[np.bool_]:

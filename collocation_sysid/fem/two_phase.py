@@ -64,6 +64,8 @@ class PhaseFinding:
         known: each phase as likely.
     misfit, smooth_misfit : float
         χ² per measurement of the answer, and of the smooth field before it.
+    elements : int
+        Number of elements of the smaller phase.
     """
 
     contrast: tuple[float, float, float]
@@ -71,6 +73,7 @@ class PhaseFinding:
     deviation: float
     misfit: float
     smooth_misfit: float
+    elements: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +113,7 @@ class TwoPhaseModes(FieldModes):
                 "lengths to choose from are for prior = 'smooth'"
             )
         found = super().of(field, mesh, cells, law)
+        assert isinstance(found, cls)
         return replace(found, phase=np.zeros(len(cells)))
 
     @property

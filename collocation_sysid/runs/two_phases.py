@@ -325,7 +325,7 @@ def _misfit(fit: LinearisedFit) -> float:
 
 
 def _information(
-    fit: LinearisedFit, of_z: Array, *, base: Array, deviation: float, temperature: float
+    fit: LinearisedFit, of_z: Index, *, base: Array, deviation: float, temperature: float
 ) -> ElementInformation:
     """Return the normal equations, with the columns `of_z` those of the elements."""
     size = len(fit.names)

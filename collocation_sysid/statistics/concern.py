@@ -340,6 +340,9 @@ TOPICS: Mapping[str, Topic] = {
             "one-phase": "the data do not show two materials: the contrast of {name} is "
             "{median:.3g} ({lower:.3g} to {upper:.3g}), which contains 1; take prior = 'smooth' or "
             "no field",
+            "few": "the smaller phase of {name} has only {elements} elements: with fewer than "
+            "{fewest} the contrast was found too low and its interval too narrow; refine the mesh "
+            "there",
             "phases": "two phases of {name} do not describe the body: χ² per measurement is "
             "{misfit:.3g}, with a smooth field {smooth:.3g}; more than two materials, or one that "
             "changes gradually: take prior = 'smooth', or regions",

@@ -267,7 +267,8 @@ def _chain(
         factor = np.linalg.cholesky(information)
         right = -np.r_[of_p, phase @ constant]
         half = solve_triangular(factor, right, lower=True)
-        return np.asarray(solve_triangular(factor.T, half)), np.asarray(factor)
+        mean: Array = solve_triangular(factor.T, half)
+        return mean, np.asarray(factor, dtype=float)
 
     def drawn() -> tuple[Array, Array]:
         """Mean and a draw of (δp, s)."""
