@@ -30,10 +30,11 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
 from collocation_sysid.methods.scan import usual_constants
 from collocation_sysid.model.parameters import Unknown
-from collocation_sysid.problem import Problem
+from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.problem.recording import refuse_other_scale
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers
+from collocation_sysid.statistics.assumptions import Assumptions
 from collocation_sysid.statistics.causes import likely_causes
 from collocation_sysid.statistics.plausible import oddities
 
@@ -110,6 +111,8 @@ def subject(reason: str) -> str:
 def judged(fault: str, seed: int) -> Outcome:
     """Verdict on one twin; "refused" where the problem is not even read or solved."""
     problem, truth = swung(seed)
+    # Nothing but the stated fault is unlike the twin: its systematic effects are none.
+    problem = replace(problem, uncertainty=UncertaintyOptions(assumptions=Assumptions.exact()))
     try:
         if fault != "none":
             problem = FAULTS[fault](problem, np.random.default_rng((seed, *fault.encode())))
