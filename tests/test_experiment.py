@@ -46,6 +46,7 @@ def experiment(**changes) -> Experiment:
     body: Any = SimpleNamespace(
         nodes_m=NODES, nodes=SimpleNamespace(points_m=NODES), frames=np.zeros((0, 4), dtype=int)
     )
+    body.parts = [SimpleNamespace(name="", density_kg_m3=1000.0)]
     body.with_frames = lambda *_: body
     fields: dict[str, Any] = {
         "name": "swing",

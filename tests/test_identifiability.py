@@ -63,7 +63,7 @@ def test_what_is_fixed_well_and_badly_is_told_with_its_interval():
 def test_wide_intervals_are_told_by_their_factor(deviation, said):
     sentence, *_ = verdicts(uncertainty(spread([deviation, 0.01, 0.02, 0.05])))
     assert "lambda_pa only to " in sentence
-    assert f"{said} (95 %)" in sentence
+    assert f"{said} (95 %, statistical)" in sentence
 
 
 def test_an_unidentifiable_parameter_is_called_so_and_has_no_standard_error():
@@ -95,7 +95,9 @@ def test_confounded_parameters_are_told_by_the_combination_that_is_fixed():
     # Deviation of the sum of two logarithms: 0.15 √(2 (1 − 0.99)).
     assert f"to ±{100 * np.expm1(Z95 * 0.15 * np.sqrt(0.02)):.2g} %" in sentence
     assert "alone" not in sentence  # another note says how well each is known
-    assert "young_pa only to ±34 % and poisson only to ±40 % (95 %)" in verdicts(found)[0]
+    assert (
+        "young_pa only to ±34 % and poisson only to ±40 % (95 %, statistical)" in verdicts(found)[0]
+    )
     for name in ENGINEERING:
         assert found.estimates[name].statistical_std_error is None
         assert "confounded with" in (found.estimates[name].reason or "")

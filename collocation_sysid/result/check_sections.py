@@ -56,8 +56,8 @@ def _body_section(body: BodyFinding) -> Table:
             "mesh": f"{body.nodes:,} nodes, {body.elements:,} {body.element}; edges "
             f"{low:.3g} to {high:.3g} mm (mean {mean:.3g})",
             "quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}",
-            "rest shape": _rest_shape(body),
         }
+        | ({} if body.rest_shape == "stress_free" else {"rest shape": _rest_shape(body)})
         | {
             f"field of {symbol_of(name)}": f"{each.modes} shapes with {each.share:.0%} of the "
             f"variance, of length {1e3 * each.length_m:.3g} mm; details above "
@@ -68,9 +68,7 @@ def _body_section(body: BodyFinding) -> Table:
 
 
 def _rest_shape(body: BodyFinding) -> str:
-    """Return what is known of the stress-free shape."""
-    if body.rest_shape == "stress_free":
-        return "the mesh is free of stress"
+    """Return what is known of the stress-free shape, which is not the mesh."""
     if body.rest_shape is None:
         return "not stated: see object.rest_shape"
     if np.isnan(body.rest_shape_change_m):

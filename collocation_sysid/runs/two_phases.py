@@ -51,7 +51,7 @@ FEWEST_ELEMENTS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _PhaseSearch:
     """The two-phase field of a problem.
 
     Attributes
@@ -166,27 +166,27 @@ def solve_two_phases(
     return replace(best, notes=(note, *best.notes))
 
 
-def _phase_of(solution: Solution, search: _Search) -> Array:
+def _phase_of(solution: Solution, search: _PhaseSearch) -> Array:
     """Return the phases (E,) of a solution."""
     modes = _body_of(solution, search).parts[search.number].field
     assert isinstance(modes, TwoPhaseModes)
     return modes.phase
 
 
-def _body_of(solution: Solution, search: _Search) -> Body:
+def _body_of(solution: Solution, search: _PhaseSearch) -> Body:
     segments = solution.collocation.segments
     return next(s.body for s in segments if search.name in s.body.lengths_m)
 
 
 def _solved_with(
-    problem: Problem, search: _Search, phase: Array, earlier: Earlier, solved: Solved
+    problem: Problem, search: _PhaseSearch, phase: Array, earlier: Earlier, solved: Solved
 ) -> Solution:
     """Solve with given phases, from the parameters of an earlier answer."""
     own = replace(search.modes, phase=phase)
     return solved(problem.with_fields({search.name: own}), earlier)
 
 
-def _search_of(problem: Problem) -> _Search:
+def _search_of(problem: Problem) -> _PhaseSearch:
     fields = problem.two_phase_fields
     if len(fields) > 1:
         raise InputError(
@@ -203,7 +203,7 @@ def _search_of(problem: Problem) -> _Search:
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
     part = parts[number]
     elements = tuple(part.full_name(mode(k).name) for k in range(len(modes.phase)))
-    return _Search(name, part.full_name(CONTRAST.name), modes, number, elements)
+    return _PhaseSearch(name, part.full_name(CONTRAST.name), modes, number, elements)
 
 
 def _likelier(probability: Array) -> Array:
@@ -248,7 +248,7 @@ class _Linearised:
         )
 
 
-def _linearised(problem: Problem, search: _Search, solution: Solution) -> _Linearised:
+def _linearised(problem: Problem, search: _PhaseSearch, solution: Solution) -> _Linearised:
     """Return the measurements linearised at a solution in the logarithm of every element."""
     body = _body_of(solution, search)
     part = body.parts[search.number]
@@ -266,14 +266,14 @@ def _linearised(problem: Problem, search: _Search, solution: Solution) -> _Linea
     )
 
 
-def _columns(fit: LinearisedFit, search: _Search) -> Index:
+def _columns(fit: LinearisedFit, search: _PhaseSearch) -> Index:
     """Return the columns of the elements' logarithms in a fit."""
     places = {name: k for k, name in enumerate(fit.names)}
     return np.array([places[name] for name in search.elements])
 
 
 def _samples(
-    draws: PhaseDraws, fit: LinearisedFit, search: _Search, solution: Solution
+    draws: PhaseDraws, fit: LinearisedFit, search: _PhaseSearch, solution: Solution
 ) -> PhaseSamples:
     """Return draws of the phases as samples of the logarithms in the elements."""
     others = np.delete(np.arange(len(fit.names)), _columns(fit, search))
@@ -299,7 +299,7 @@ def _samples(
     )
 
 
-def _by_elements(problem: Problem, solution: Solution, search: _Search) -> LinearisedFit:
+def _by_elements(problem: Problem, solution: Solution, search: _PhaseSearch) -> LinearisedFit:
     """Return the fit at a solution, by the coefficients of the elements too, which are zero."""
     found = solution.collocation
     elements = set(search.elements)

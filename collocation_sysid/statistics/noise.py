@@ -171,7 +171,7 @@ def _stated_noise(block: FitBlock, slope: Array) -> Array:
     slope : (T, 3M, r) array
         In units of what is known.
     """
-    rows = slope.reshape(-1, slope.shape[2])
+    rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
     left = max(1.0, block.measurements - float(np.trace(share)))
     factor = max(1.0, float(np.sum(block.residual**2)) / shortened(block) / left)
