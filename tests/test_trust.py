@@ -274,7 +274,8 @@ def test_an_answer_that_did_not_converge_is_doubtful():
 @pytest.mark.long
 def test_strict_fails_where_the_verdict_is_doubtful(tmp_path):
     file = write_problem(tmp_path, {"swing": 25})
-    method = settings("solver.method=reduced-space", "transcription.scheme=midpoint")
+    precise = "experiment.swing.markers.sigma_m=2e-4"
+    method = settings("solver.method=reduced-space", "transcription.scheme=midpoint", precise)
     wrong = settings("experiment.swing.gravity_m_s2=[0.0, -9.81, 0.0]")
     out = ("--out", tmp_path / "run")
     assert run_command("solve", file, *method, "--strict", *out).code == 0

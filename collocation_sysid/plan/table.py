@@ -172,7 +172,9 @@ def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, floa
         interval = None if estimate is None else estimate.combined95
         row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
         if name in truth:
-            row[f"error_{name}"] = None if value is None else abs(value / truth[name] - 1)
+            # Methods are compared by the optimum that they find, not by its correction.
+            optimum = value if estimate is None or estimate.optimum is None else estimate.optimum
+            row[f"error_{name}"] = None if optimum is None else abs(optimum / truth[name] - 1)
     return row
 
 

@@ -31,9 +31,11 @@ noise_m = np.random.default_rng(1).normal(scale=1e-3, size=clean_m.shape)
 recording = cs.with_markers(swing, clean_m + noise_m)
 
 # %%
-# Poisson's ratio is taken as known; the rest is found, without a guess.
+# Poisson's ratio is taken as known; the rest is found, without a guess. Of a simulated recording
+# nothing but the noise is uncertain; of a real one leave the last argument out.
 unknown = {"young_pa": cs.Unknown(), "gamma_r_s": cs.Unknown(), "gamma_m_1_s": cs.Unknown()}
-run = cs.run(cs.Problem([recording], {"poisson": 0.3, **unknown}))
+exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
+run = cs.run(cs.Problem([recording], {"poisson": 0.3, **unknown}, uncertainty=exact))
 print(run.table())
 low, high = run.interval("young_pa")
 assert low < truth["young_pa"] < high
