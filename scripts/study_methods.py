@@ -70,8 +70,12 @@ gravity_m_s2 = [0.0, 0.0, -9.81]
 file = "swing_markers.csv"
 reference_m = REFERENCES
 
+[environment]
+air_density_kg_m3 = "none"
+
 [transcription]
 scheme = "midpoint"
+substeps = 1
 
 [rollout]
 integrator = "scheme"

@@ -82,6 +82,13 @@ def write_problem(folder: Path, steps: dict[str, int], validation: str = "") -> 
     return file
 
 
+def state_vacuum(file: Path) -> Path:
+    """State in a problem file that it has no air, for processes that have the usual default."""
+    vacuum = '\n[environment]\nair_density_kg_m3 = "none"\n'
+    file.write_text(file.read_text() + vacuum)
+    return file
+
+
 # Editing: each returns an edit of a problem's folder ----------------------------------------------
 
 

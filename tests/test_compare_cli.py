@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 from matplotlib.image import imread
-from problem_files import TRUTH, Outcome, run_command, write_problem
+from problem_files import TRUTH, Outcome, run_command, state_vacuum, write_problem
 from results_small import a_result
 from rich.console import Console
 
@@ -78,7 +78,7 @@ def drawn(folder: Path) -> set[str]:
 def compared(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """Two methods from two starts, and the same command once more."""
     folder = tmp_path_factory.mktemp("compared")
-    file = write_problem(folder, {"swing": 6})
+    file = state_vacuum(write_problem(folder, {"swing": 6}))
     out = folder / "study"
     command = ["compare", file, "--methods", ",".join(METHODS), "--starts", 2, "--spread", 2]
     command += ["--workers", 2, "--out", out, *KNOWN]

@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from problem_files import TRUTH, contents, pictures_drawn, run_command, settings, write_problem
+from problem_files import (
+    TRUTH,
+    contents,
+    pictures_drawn,
+    run_command,
+    settings,
+    state_vacuum,
+    write_problem,
+)
 
 import collocation_sysid as cs
 from collocation_sysid.runs.warm_start import Earlier
@@ -22,7 +30,7 @@ UNGUESSED = settings(*(f"parameters.{name}={{}}" for name in TRUTH))
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny problem, solved without a guess into "run"."""
     place = tmp_path_factory.mktemp("unguessed")
-    file = write_problem(place, {"swing": 30})
+    file = state_vacuum(write_problem(place, {"swing": 30}))
     options = [*UNGUESSED, "--method", "reduced-space"]
     with pictures_drawn():
         outcome = run_command("solve", file, "--out", place / "run", *options)
