@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -59,10 +59,7 @@ def parse_materials(text: str) -> tuple[str, ...]:
     InputError
         For an unknown name, with the one that was probably meant.
     """
-    names = each_once(text)
-    for name in names or ("",):
-        require_among(name, MATERIALS, None, "--materials", "some")
-    return names
+    return _each_among(text, MATERIALS, "--materials")
 
 
 def parse_dampings(text: str) -> tuple[str, ...]:
@@ -73,9 +70,20 @@ def parse_dampings(text: str) -> tuple[str, ...]:
     InputError
         For an unknown name, with the one that was probably meant.
     """
+    return _each_among(text, DAMPINGS, "--damping")
+
+
+def _each_among(text: str, known: Iterable[str], option: str) -> tuple[str, ...]:
+    """Return names separated by commas, each once, all of which are known to the option.
+
+    Raises
+    ------
+    InputError
+        For an unknown name or none, with the one that was probably meant.
+    """
     names = each_once(text)
     for name in names or ("",):
-        require_among(name, DAMPINGS, None, "--damping", "some")
+        require_among(name, known, None, option, "some")
     return names
 
 

@@ -92,7 +92,7 @@ class Predicted:
 
     Attributes
     ----------
-    markers_m : (T, M, 3)
+    markers_m : (T, M, 3), NaN where nothing is predicted
     wrenches : sequence of (S, 6)
     readings : mapping of name to (S, m)
     depth : mapping of the camera's name to DepthError
@@ -105,9 +105,9 @@ class Predicted:
 
 
 def prediction_error(experiment: Experiment, predicted: Predicted) -> PredictionError:
-    """Compare a prediction with the measurements of its recording."""
+    """Compare a prediction with the measurements of its recording, where both are known."""
     apart_m = np.linalg.norm(predicted.markers_m - experiment.markers.positions_m, axis=2)
-    present_m = apart_m[experiment.markers.present]
+    present_m = apart_m[experiment.markers.present & np.isfinite(apart_m)]
     force_n, torque_nm = wrench_rms(experiment, predicted.wrenches)
     return PredictionError(
         rms_m=root_mean(present_m**2) if present_m.size else None,
@@ -211,20 +211,14 @@ def copy_error(experiment: Experiment, fitted: Iterable[Experiment]) -> CopyErro
         if reason:
             reasons[other.name] = reason
             continue
-        readings = {gauge.name: gauge.measured for gauge in other.readings}
         order = [other.markers.names.index(name) for name in experiment.markers.names]
         known_m = np.where(other.markers.present[..., None], other.markers.positions_m, np.nan)
-        both = experiment.markers.present & other.markers.present[:, order]
-        apart_m = np.linalg.norm(known_m[:, order] - experiment.markers.positions_m, axis=2)[both]
-        force_n, torque_nm = wrench_rms(experiment, [each.values for each in other.wrenches])
-        error = PredictionError(
-            rms_m=root_mean(apart_m**2) if apart_m.size else None,
-            max_m=float(apart_m.max()) if apart_m.size else None,
-            wrench_rms_n=force_n,
-            wrench_rms_nm=torque_nm,
-            reading_rms=reading_rms(experiment, readings) or None,
+        copy = Predicted(
+            markers_m=known_m[:, order],
+            wrenches=[each.values for each in other.wrenches],
+            readings={gauge.name: gauge.measured for gauge in other.readings},
         )
-        found.append(CopyError(other.name, error))
+        found.append(CopyError(other.name, prediction_error(experiment, copy)))
     if not found:
         said = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
         return f"no fitted recording can be copied ({said})"

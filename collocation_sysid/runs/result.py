@@ -18,7 +18,7 @@ from ..program.depth_comparison import DepthError
 from ..program.touches import Rubbing
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Coordinate, Estimate
-from ..statistics.numerical import NumericalError
+from ..statistics.numerical import NumericalError, known_kinds
 from ..statistics.relaxation import Probe
 from ..statistics.trust import Trust
 from ..statistics.uncertainty import Place
@@ -408,10 +408,7 @@ class Result:
     @property
     def covers(self) -> tuple[str, ...]:
         """Which discretisation errors the combined intervals contain: "step", "mesh"."""
-        errors = self.numerical_errors.values()
-        of_step = any(error.step is not None for error in errors)
-        of_mesh = any(error.mesh is not None for error in errors)
-        return (*["step"] * of_step, *["mesh"] * of_mesh)
+        return known_kinds(self.numerical_errors.values())
 
     @property
     def numerical_errors(self) -> dict[str, NumericalError]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.parameters import Parameters
-from .combined import NORMAL_95, Interval, combine
+from .combined import NORMAL_95, Interval, combine, widened
 from .considered import Changes
 from .distributions import student_ppf
 from .estimates import Coordinate, Estimate
@@ -63,14 +63,12 @@ class BudgetLine:
         total = known + deviation**2
         shares = {name: share * known / total for name, share in self.shares.items()}
         shares[source] = deviation**2 / total
-        centre = at.at(self.value)
-        below = float(np.hypot(centre - low, NORMAL_95 * deviation))
-        above = float(np.hypot(high - centre, NORMAL_95 * deviation))
+        least, most = widened((low, high), at.at(self.value), deviation)
         return BudgetLine(
             self.value,
             _ranked(shares),
-            (at.value(centre - below), at.value(centre + above)),
-            (below + above) / 2 / NORMAL_95 / at.slope(self.value),
+            (at.value(least), at.value(most)),
+            (most - least) / 2 / NORMAL_95 / at.slope(self.value),
             float(np.hypot(self.systematic, deviation)),
             self.known_effect,
         )

@@ -111,11 +111,28 @@ def combine(
     if error is not None and error.interval95 is not None:
         low, high = map(at.at, error.interval95)
         low, high = low + known_effect, high + known_effect
-    below = float(np.hypot(centre - low, NORMAL_95 * systematic))
-    above = float(np.hypot(high - centre, NORMAL_95 * systematic))
-    combined95 = _interval(at, centre - below, centre + above, bounds)
-    deviation = (below + above) / 2 / NORMAL_95 / at.slope(at.value(centre))
+    low, high = widened((low, high), centre, systematic)
+    combined95 = _interval(at, low, high, bounds)
+    deviation = (high - low) / 2 / NORMAL_95 / at.slope(at.value(centre))
     return CombinedEstimate(value, spread, statistical95, deviation, combined95, correction)
+
+
+def widened(ends: Interval, centre: float, deviation: float) -> Interval:
+    """Return a 95 % interval with one more independent contribution, added in quadrature.
+
+    Parameters
+    ----------
+    ends : (lower, upper)
+        The interval, in the coordinate of the estimate.
+    centre : float
+        The estimate in that coordinate, from which either side is measured.
+    deviation : float
+        Standard deviation of the contribution in that coordinate.
+    """
+    low, high = ends
+    below = float(np.hypot(centre - low, NORMAL_95 * deviation))
+    above = float(np.hypot(high - centre, NORMAL_95 * deviation))
+    return centre - below, centre + above
 
 
 def _within(bounds: Interval, value: float) -> float:

@@ -75,11 +75,6 @@ class Coordinate:
         lowest = min(values)
         return cls(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
 
-    @property
-    def range(self) -> tuple[float, float]:
-        """What values it has."""
-        return -np.inf if self.linear and not self.odds else 0.0, 0.5 if self.odds else np.inf
-
     def slope(self, value: float) -> float:
         """Its derivative by the value."""
         if self.odds:

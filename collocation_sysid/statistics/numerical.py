@@ -27,7 +27,7 @@ with the p-th power of their number.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 
@@ -70,6 +70,14 @@ class NumericalError:
     mesh_order: float | None
     extrapolated: float
     interval95: tuple[float, float] | None
+
+
+def known_kinds(errors: Iterable[NumericalError]) -> tuple[str, ...]:
+    """Return which discretisation errors are known of some estimate: "step", "mesh"."""
+    known = tuple(errors)
+    of_step = any(error.step is not None for error in known)
+    of_mesh = any(error.mesh is not None for error in known)
+    return (*["step"] * of_step, *["mesh"] * of_mesh)
 
 
 @dataclass(frozen=True)
@@ -115,16 +123,29 @@ class Refinement:
     @property
     def holds(self) -> tuple[str, ...]:
         """What its intervals hold: the noise, and of "step" and "mesh" what is known."""
-        of_step = any(error.step is not None for error in self.errors.values())
-        of_mesh = any(error.mesh is not None for error in self.errors.values())
-        return ("noise", *["step"] * of_step, *["mesh"] * of_mesh)
+        return ("noise", *known_kinds(self.errors.values()))
 
-    def worst(self, estimates: Mapping[str, Estimate]) -> tuple[str, float]:
-        """The estimate that is moved by most of its standard errors, and by how many."""
+    def worst(
+        self,
+        estimates: Mapping[str, Estimate],
+        std_errors: Mapping[str, float | None] | None = None,
+    ) -> tuple[str, float]:
+        """Return the estimate that is moved by most of its standard errors, and by how many.
+
+        Parameters
+        ----------
+        estimates : mapping of name to Estimate
+            Before the correction of the discretisation error.
+        std_errors : mapping of name to float or None, optional
+            Standard errors to compare with; the statistical ones of `estimates` by default.
+            Estimates without one are left out.
+        """
+        if std_errors is None:
+            std_errors = {name: each.statistical_std_error for name, each in estimates.items()}
         moves = {
             name: abs(estimates[name].value - error.extrapolated) / spread
             for name, error in self.errors.items()
-            if (spread := estimates[name].statistical_std_error)
+            if (spread := std_errors.get(name))
         }
         # Moduli that move alike differ by rounding: the first is the parameter itself.
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))

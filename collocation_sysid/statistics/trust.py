@@ -217,13 +217,7 @@ def numerical_concerns(
     """
     if refinement is None:
         return []
-    corrections = {
-        name: abs(error.extrapolated - optimum[name].value) / uncertainty
-        for name, error in refinement.errors.items()
-        if (uncertainty := combined_std_errors.get(name))
-    }
-    # Moduli with the same relative correction differ by rounding: the first is the parameter.
-    worst, largest = max(corrections.items(), key=lambda item: round(item[1], 6), default=("", 0.0))
+    worst, largest = refinement.worst(optimum, combined_std_errors)
     if largest <= MOVED:
         return []
     value = optimum[worst].value
