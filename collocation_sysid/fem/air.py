@@ -13,6 +13,7 @@ depend on shape and motion; they are true to some 40 %, see `statistics.assumpti
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -43,7 +44,7 @@ def unit_drag() -> NodeForce:
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
         return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
 
-    return NodeForce.of(air_drag, name="air drag")
+    return replace(NodeForce.of(air_drag, name="air drag"), compiled=True)
 
 
 def placed_unit_drag(nodes: Nodes, volume_m3: Array) -> PlacedForce:

@@ -16,7 +16,9 @@ import scipy.sparse as sp
 from ..arrays import Array, Index
 from .pattern import SymmetricPattern, dofs_of
 
-MOST_KEPT = 24
+# Matrices that are kept: of the last eight choices of instances an operator, its transpose, and
+# those that add the symmetric and the skew part of the slopes.
+MOST_KEPT = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +60,13 @@ class ForcePoints:
 
     def vectors(self, x: Array, chosen: Index | None = None) -> Array:
         """Y (3L, T, i) of x (T, 3n), of all instances or of chosen ones."""
-        found = self._of(chosen) @ x.T
+        found = self._some("operator", chosen) @ x.T
         return found.reshape(len(found) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
 
     def summed(self, forces: Array, chosen: Index | None = None) -> Array:
         """(T, 3n) from the forces (3L, T, i) on the vectors."""
         flat = forces.transpose(2, 0, 1).reshape(len(forces) * forces.shape[2], forces.shape[1])
-        return (self._of(chosen).T @ flat).T
+        return (self._some("transposed operator", chosen) @ flat).T
 
     def add_entries(
         self,
@@ -84,10 +86,6 @@ class ForcePoints:
         values = np.moveaxis(values, 0, 2).reshape(values.shape[1], onto.shape[1])
         to[:, places[touched]] += (onto @ values.T).T / 2
 
-    def _of(self, chosen: Index | None) -> sp.csr_array:
-        """Rows of the operator."""
-        return self._some("operator", chosen)
-
     def _some(self, what: str, chosen: Index | None) -> Any:
         """Of a matrix what belongs to chosen instances; that of the last few choices is kept."""
         key = what, None if chosen is None else chosen.tobytes()
@@ -97,6 +95,8 @@ class ForcePoints:
             if what == "operator":
                 rows = slice(None) if chosen is None else _each(chosen, self.dofs)
                 self._kept[key] = self._operator[rows]
+            elif what == "transposed operator":
+                self._kept[key] = self._some("operator", chosen).T
             else:
                 whole: Any = self._onto_skew if what == "skew" else self._onto_couplings
                 if chosen is not None:

@@ -83,6 +83,9 @@ class NodeForce:
         So many numbers of a node or face are carried from evaluation to evaluation, such as how far
         a dashpot has crept: then ``law(x, v, before, at, **constants) -> (force, after)``, where
         `before` (carries,) are those of the evaluation before, zero at the start.
+    compiled : bool
+        Whether the law is compiled to native code, which must have all of its operations; for laws
+        that are evaluated in every step of most problems.
     """
 
     name: str
@@ -91,6 +94,7 @@ class NodeForce:
     nodes: Selection | Index | None = None
     on: On = "nodes"
     carries: int = 0
+    compiled: bool = False
 
     @classmethod
     def of(

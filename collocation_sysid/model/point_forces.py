@@ -349,7 +349,7 @@ class PointForces(Pointwise):
 @lru_cache(maxsize=32)
 def generated(force: NodeForce, dofs: int) -> Generated:
     """Its law with derivatives at so many dofs; those of the last few are kept."""
-    return Generated(force.expression, force.inputs(dofs), DATA)
+    return Generated(force.expression, force.inputs(dofs), DATA, compiled=force.compiled)
 
 
 def air_drag(experiment: Experiment, t_s: Array) -> tuple[PointForces, ...]:
