@@ -1,14 +1,15 @@
-"""The air around a body: what it lifts, what of it moves along, and how it drags at the surface.
+"""Forces of the air around a body: buoyancy, added mass and drag.
 
-A body of volume V in air of density ρ_a that rests is under three forces besides its weight:
+Air of density ρ_a at rest exerts three forces on a body of volume V:
 
 - buoyancy −ρ_a V g, exactly;
 - the inertia of the air that moves with the body, c_m ρ_a V a, where c_m is ½ for a sphere;
-- drag −½ ρ_a c_d A |v| v on each surface element, where A is the area that faces the motion. Of a
-  convex body that is a quarter of its surface on average over directions (Cauchy).
+- drag −½ ρ_a c_d A |v| v on each surface element, where A is the area that faces the motion. For a
+  convex body A is a quarter of its surface on average over directions (Cauchy).
 
-V is the volume of the undeformed body, lumped at its nodes as mass is. The coefficients c_m and c_d
-depend on shape and motion; they are true to some 40 %, see `statistics.assumptions`.
+V is the volume of the undeformed body, lumped at its nodes like the mass. The coefficients c_m and
+c_d depend on shape and motion; they are accurate to some 40 %, see `statistics.assumptions`. This
+module provides the constants and the drag force; `model.weight` applies buoyancy and added mass.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ SMOOTH_BELOW_M_S = 1e-4
 
 @cache
 def unit_drag() -> NodeForce:
-    """Return the drag on surface nodes in a fluid of density one; it is linear in the density."""
+    """Return the drag on surface nodes in a fluid of density 1 kg/m³; drag is linear in the
+    density.
+    """
 
     def air_drag(x: ca.SX, v: ca.SX, at: AtNode) -> ca.SX:
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
@@ -48,13 +51,13 @@ def unit_drag() -> NodeForce:
 
 
 def placed_unit_drag(nodes: Nodes, volume_m3: Array) -> PlacedForce:
-    """Return `unit_drag` on those nodes of a body that have a share of its surface.
+    """Return `unit_drag` on the nodes of a body that have a share of its surface.
 
     Parameters
     ----------
     nodes : Nodes
     volume_m3 : (n,)
-        Lumped volume of every node of the body, those of obstacles included.
+        Lumped volume of every node of the body, including nodes of obstacle frames.
     """
     on_surface = np.flatnonzero(surface_of(nodes)[0] > 0)
     no_constants = np.zeros(0, dtype=np.int64)

@@ -1,16 +1,17 @@
-"""A deformable body: mesh, material and mass, and its forces and derivatives over all timesteps.
+"""Deformable body: mesh, materials and masses, with internal forces and derivatives at many states.
 
-Signs: Ψ(x) elastic energy, f_e = −∂Ψ/∂x, K = ∂²Ψ/∂x² = −∂f_e/∂x, and the internal force
+Signs: Ψ(x) is the elastic energy, f_e = −∂Ψ/∂x the elastic force, K = ∂²Ψ/∂x² = −∂f_e/∂x the
+stiffness, and the internal force is
 
-    f(x, v; θ) = f_e(x) + f_d(x, v) − γ_m M v,   f_d = −γ_r K(x) v for Rayleigh's damping law.
+    f(x, v; θ) = f_e(x) + f_d(x, v) − γ_m M v,   with f_d = −γ_r K(x) v for Rayleigh's damping law.
 
-The slopes of a damping law that is a stress, not a potential, are not symmetric: their skew parts
-are arrays of their own, which are empty, (T, 0), where no part of the body has any.
+For a damping law that is a stress, not a potential, ∂f/∂x is not symmetric. Skew parts are separate
+arrays, which are empty, (T, 0), if no part of the body has any.
 
-A body is the sum of its parts, one for each region, see `regions`; θ holds the constants of each
-part in turn: its material's, its damping law's, those of its memory, its γ_m, and its density where
-that is free. What a body with memory brings from the past, see `memory`, is given beside x and v;
-without it, it has relaxed.
+A body is the sum of its parts, one for each region, see `regions`. The vector θ holds the constants
+of each part in turn: those of its material, of its damping law and of its memory, γ_m, and the
+density if it is free. The internal variables of a body with memory, see `memory`, are given beside
+x and v; without them the memory has relaxed.
 """
 
 from __future__ import annotations
@@ -46,17 +47,24 @@ from .two_phase import PhaseSamples, TwoPhaseModes
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """The internal force and its first derivatives at T states; m = `pattern.entries`.
+    """Forces and their first derivatives at T states; m = `pattern.entries`.
 
     Attributes
     ----------
-    force : (T, 3n) f(x, v; θ) [N]
-    by_position : (T, m) lower triangles of ∂f/∂x, its symmetric part; for Rayleigh's damping
-        −K − γ_r D_vK [N/m]
-    by_velocity : (T, m) lower triangles of ∂f/∂v; for Rayleigh's −γ_r K − γ_m M [N·s/m]
-    by_theta : (T, 3n, k) ∂f/∂θ
-    by_position_skew : (T, m) lower triangles of the skew part of ∂f/∂x, or (T, 0)
-    by_velocity_skew : the same of ∂f/∂v: only forces of users have some, such as gyroscopic ones
+    force : (T, 3n)
+        Forces f(x, v; θ) [N].
+    by_position : (T, m)
+        Lower triangles of the symmetric part of ∂f/∂x [N/m]; with Rayleigh damping −K − γ_r D_vK.
+    by_velocity : (T, m)
+        Lower triangles of the symmetric part of ∂f/∂v [N·s/m]; with Rayleigh damping −γ_r K − γ_m
+        M.
+    by_theta : (T, 3n, k)
+        Derivatives ∂f/∂θ, or by all k inputs.
+    by_position_skew : (T, m) or (T, 0)
+        Lower triangles of the skew part of ∂f/∂x; empty if it is zero.
+    by_velocity_skew : (T, m) or (T, 0)
+        Lower triangles of the skew part of ∂f/∂v; only custom forces have one, such as gyroscopic
+        forces.
     """
 
     force: Array
@@ -69,16 +77,22 @@ class Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """Second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states.
+    """First derivatives by θ and second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states.
 
     Attributes
     ----------
-    position_position, position_velocity : (T, m) lower triangles, of the symmetric part
+    position_position, position_velocity : (T, m)
+        Lower triangles of the symmetric parts of ∂²φ/∂x² and ∂²φ/∂x∂v.
     position_theta, velocity_theta : (T, 3n, k)
+        Mixed derivatives by positions or velocities and θ.
     theta_theta : (T, k, k)
-    theta : (T, k) first derivative ∂φ/∂θ
-    position_velocity_skew : (T, m) lower triangles of the skew part of ∂²φ/∂x∂v, or (T, 0)
-    velocity_velocity : (T, m) lower triangles, or (T, 0): only forces of users have some
+        Second derivatives by θ.
+    theta : (T, k)
+        First derivatives ∂φ/∂θ, which the chain rule needs.
+    position_velocity_skew : (T, m) or (T, 0)
+        Lower triangles of the skew part of ∂²φ/∂x∂v; empty if it is zero.
+    velocity_velocity : (T, m) or (T, 0)
+        Lower triangles of ∂²φ/∂v²; only external forces have some.
     """
 
     position_position: Array
@@ -92,59 +106,68 @@ class Curvature:
 
 
 class Body(Discretisation):
-    """A tetrahedral finite-element body.
+    """Deformable body of tetrahedral finite elements.
 
     Parameters
     ----------
     mesh : TetMesh
     material : str, Material or callable, default "neo-hookean"
-        A name in `materials.MATERIALS`, or an energy function ``(F, **constants) -> ψ`` in CasADi
-        SX, see `Material.of`.
-    density_kg_m3, mass_kg : float
-        Exactly one of them. Regions may have densities of their own; the mass is that of all.
+        Name in `materials.MATERIALS`, or energy function ``(F, **constants) -> ψ`` in CasADi SX,
+        see `Material.of`.
+    density_kg_m3 : float, optional
+        Density of all regions without a density. Give either this or `mass_kg`.
     element : str, default "tet4"
-        A name in `elements.ELEMENTS`. "tet10" puts a node on every edge of the mesh: some eight
-        times the unknowns, and far better in bending. "tet10-p0" also averages the dilatation over
-        each element: right up to a Poisson's ratio of 0.4999.
+        Name in `elements.ELEMENTS`. "tet10" adds a node on every edge of the mesh: about eight
+        times as many unknowns, and much more accurate in bending. "tet10-p0" also averages the
+        dilatation over each element: accurate up to a Poisson's ratio of 0.4999.
+    mass_kg : float, optional
+        Mass of the whole body, regions included.
     damping : str or Damping, default "kelvin-voigt"
-        A name in `damping.DAMPINGS`; "rayleigh" is the paper's law.
+        Name in `materials.DAMPINGS`; "rayleigh" is the law of the paper.
     regions : sequence of Region
-        Parts that differ.
+        Parts with different properties.
     prony : sequence of str or Prony
         Names of the branches of the material's memory.
     forces : sequence of NodeForce
-        Of the user's own, on its nodes, such as the drag of the air.
+        Custom forces on its nodes or faces.
     field : Field, optional
-        A constant that differs from place to place within what no region claims.
+        Constant that varies in space, outside all regions.
     rest_shape : UnderGravity or "stress_free", optional
-        How the body was held while its mesh was made: the stress-free shape is then found, see
-        `rest_shape`. "stress_free": the mesh is. By default it counts as such, but the budget of
-        the intervals includes that it may be a shape under gravity.
+        UnderGravity: how the body was held while its mesh was made; the stress-free shape is then
+        computed, see `rest_shape`. "stress_free": the mesh is the stress-free shape. None: as
+        "stress_free", but the budget of the intervals includes that the mesh may be a shape under
+        gravity, unless it was generated from stated lengths.
     evaluator : {"auto", "simd", "casadi"}
-        How element kernels are evaluated, see `batched`. "auto" takes CasADi's map, with a note,
-        for a material that vector code cannot evaluate.
+        Evaluator of the element kernels, see `kernels`. "auto" uses CasADi's map, with a note, for
+        a material that vector code cannot evaluate.
     threads : int, optional
-        Threads for evaluations over several timesteps; the available cores by default.
+        Number of threads for evaluations at several time steps; the available cores by default.
 
     Attributes
     ----------
     parts : tuple of BodyPart
-        What no region claims, then the regions.
+        The cells outside all regions, if any, then the regions.
     constants : dict of name to Constant
-        What θ holds, in its order.
-    nodes_m : (n, 3) undeformed node positions
-        The mesh's nodes, then, for quadratic elements, the middle of each of `mesh.edges`, then
-        `frames`.
-    frames : (k, 4) nodes of obstacles, see `with_frames`
-    cells : (E, nodes per element) node numbers
-    node_mass : (n,) lumped mass, of the densities as stated [kg]
-    pattern : SymmetricPattern of K
+        Definitions of the entries of θ, in their order.
+    nodes_m : (n, 3)
+        Undeformed node positions: nodes of the mesh, then, for quadratic elements, the middle of
+        each of `mesh.edges`, then `frames`.
+    frames : (k, 4)
+        Indices of the nodes of obstacle frames, see `with_frames`.
+    cells : (E, nodes per element)
+        Node indices of each element.
+    node_mass : (n,)
+        Lumped masses with the stated densities [kg].
+    pattern : SymmetricPattern
+        Sparsity pattern of K.
+    has_stated_mass : bool
+        Whether `mass_kg` was given.
 
     Raises
     ------
     InputError
-        For unknown names, a mass that is not positive, regions that overlap, a material that
-        "simd" cannot evaluate, or a scan of a body with memory or a field.
+        For unknown names, a mass that is not positive, regions that overlap, a material that "simd"
+        cannot evaluate, or `UnderGravity` with a memory or a field.
     """
 
     def __init__(
@@ -177,7 +200,7 @@ class Body(Discretisation):
         if self.scan is not None:
             require_supported(parts)
         super().__init__(parts, tuple(forces), mesh, element, evaluator, threads)
-        # (3n,) of each part.
+        # Lumped volume of every dof (3n,) for each part.
         self._lumped_m3 = [np.repeat(self._lumped(part), 3) for part in self.parts]
         self.has_stated_mass = mass_kg is not None
         self.node_mass: Array = self._weighed([p.density_kg_m3 for p in self.parts])[::3]
@@ -191,16 +214,18 @@ class Body(Discretisation):
 
     @property
     def scan(self) -> UnderGravity | None:
-        """How the body was held while its mesh was made, where that is stated."""
+        """Gravity and held nodes of the scan of the mesh; None if the mesh counts as
+        stress-free.
+        """
         return self.rest_shape if isinstance(self.rest_shape, UnderGravity) else None
 
     @cached_property
     def inverse(self) -> InverseEquilibrium | None:
-        """Solver of the stress-free shape; none where the mesh is free of stress."""
+        """Solver of the stress-free shape; None if the mesh is stress-free."""
         return None if self.scan is None else InverseEquilibrium(self)
 
     def unreachable(self, theta: Theta) -> str | None:
-        """Return why there is no stress-free shape at θ and what helps, None where there is one."""
+        """Return why there is no stress-free shape at θ, with a remedy; None if there is one."""
         if self.inverse is None:
             return None
         try:
@@ -210,29 +235,40 @@ class Body(Discretisation):
         return None
 
     def stress_free_geometry(self, theta: Theta) -> Array:
-        """Return shape gradients and volumes (E, q, 3·nodes + 1) in the stress-free shape at θ."""
+        """Return shape gradients and volumes (E, q, 3·nodes + 1) of the stress-free shape at θ."""
         if self.inverse is None:
             return self.geometry
         return self._geometry_at(self.inverse.shape(theta).positions_m)
 
     def with_stress_free(self, positions_m: Array) -> Body:
-        """Return the same body, free of stress where its nodes are at (n, 3), of the same mass."""
+        """Return this body with the same masses and another stress-free shape.
+
+        Parameters
+        ----------
+        positions_m : (n, 3)
+            Stress-free positions of the nodes.
+        """
         other = copy(self)
         other.geometry = self._geometry_at(positions_m)
         other.rest_shape = "stress_free"
         for name in ("inverse", "stresses"):
             vars(other).pop(name, None)
-        other._evaluators, other._framed = {}, {}
+        other._evaluators = {}
+        other._framed = {}
         return other
 
     def _geometry_at(self, positions_m: Array) -> Array:
-        """Shape gradients and volumes where nodes are at (n, 3) instead of where the mesh is."""
+        """Return shape gradients and volumes with nodes at other positions (n, 3) than in the
+        mesh.
+        """
         count, points = self.geometry.shape[:2]
         slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
         G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
-        own = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(count, points, -1)
+        gradients = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(
+            count, points, -1
+        )
         volumes = self.geometry[..., -1:] * np.linalg.det(G)[..., None]
-        return np.concatenate([own, volumes], axis=2)
+        return np.concatenate([gradients, volumes], axis=2)
 
     def stress_free_mesh(self, theta: Theta) -> TetMesh:
         """Return the mesh in its stress-free shape at θ (k,), with straight sides.
@@ -240,7 +276,7 @@ class Body(Discretisation):
         Raises
         ------
         RestShapeError
-            If there is none whose equilibrium under gravity is the mesh.
+            If no stress-free shape has the mesh as its equilibrium under gravity.
         """
         if self.inverse is None:
             return self.mesh
@@ -252,29 +288,35 @@ class Body(Discretisation):
 
     @property
     def density_places(self) -> list[int]:
-        """Where in θ the densities that are free are."""
+        """Indices in θ of the free densities."""
         pairs = zip(self.parts, self._gamma_places, strict=True)
         return [place + 1 for part, place in pairs if part.free_density]
 
     def __getstate__(self) -> dict[str, Any]:
-        # Kernels are of this process, and what follows from the rest is found anew.
-        kept = {n: v for n, v in vars(self).items() if n not in self._following}
-        return kept | {"_evaluators": {}, "_framed": {}}
+        # Kernels belong to this process, and cached properties are computed again.
+        state = {n: v for n, v in vars(self).items() if n not in self._following}
+        return state | {"_evaluators": {}, "_framed": {}}
 
     @property
     def _following(self) -> set[str]:
-        """Names of what is kept and follows from the rest."""
+        """Names of the cached properties that have been computed."""
         return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
     def _lumped(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
-        """(n,) lumped volume of a part, or of shares (E,) of its cells."""
+        """Return the lumped volume (n,) of a part, or of given fractions (E,) of its cells [m³]."""
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
         np.add.at(volume, self.cells[part.cells], volumes_m3[:, None] * self.element.mass_shares)
         return volume
 
     def with_free_densities(self, parts: Collection[str]) -> Body:
-        """The same body, with the densities of the parts of these names among its constants."""
+        """Return this body with the densities of exactly these parts among its constants.
+
+        Parameters
+        ----------
+        parts : collection of str
+            Names of the parts; "" for the cells outside all regions.
+        """
         free = tuple(
             part
             if (part.name in parts) == part.free_density
@@ -285,11 +327,13 @@ class Body(Discretisation):
 
     @property
     def lengths_m(self) -> dict[str, float]:
-        """Of its fields, by the names of their constants."""
+        """Correlation lengths of the fields, by the names of their constants."""
         return {part.field_name: part.field.length_m for part in self.parts if part.field}
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Body:
-        """The same body, with fields of other lengths by the names of their constants."""
+        """Return this body with other correlation lengths, by the names of the fields'
+        constants.
+        """
         fields = (part.field and part.field.at(lengths_m[part.field_name]) for part in self.parts)
         return self.with_parts(
             tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
@@ -297,7 +341,7 @@ class Body(Discretisation):
 
     @property
     def phase_samples(self) -> tuple[PhaseSamples, ...]:
-        """Draws of the phases of its two-phase fields, where there is an answer."""
+        """Posterior samples of the phases of two-phase fields; empty before a solution is known."""
         fields = (part.field for part in self.parts)
         return tuple(
             field.samples
@@ -306,7 +350,7 @@ class Body(Discretisation):
         )
 
     def with_fields(self, fields: Mapping[str, FieldModes]) -> Body:
-        """Return the same body with other fields, by the names of their constants.
+        """Return this body with other fields, by the names of their constants.
 
         Fields that are not named stay.
         """
@@ -317,21 +361,32 @@ class Body(Discretisation):
         )
 
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
-        """The same body, whose parts of the same cells have other constants."""
+        """Return this body with other parts, which have the same cells as before."""
         other = copy(self)
         for name in self._following - {"pattern", "shape_gradients", "part_of_cells"}:
             vars(other).pop(name, None)
         Model.__init__(other, parts, self.forces, self.frictions)
-        other._evaluators, other._framed = {}, {}
+        other._evaluators = {}
+        other._framed = {}
         return other
 
     def with_frames(
         self, count: int, rubs: bool = False, frictions: tuple[Constant, ...] = ()
     ) -> Body:
-        """The same body and frames of so many obstacles: four nodes each that no cell has.
+        """Return this body with the frames of obstacles: four further nodes each, which no cell
+        has.
 
-        They are at `frame_m`, behind all others. `rubs` is whether slopes of contact have
-        a skew part, and `frictions` are the coefficients that are parameters.
+        The nodes are at `frame_m`, after all others, and have no mass. Bodies with frames are
+        cached.
+
+        Parameters
+        ----------
+        count : int
+            Number of obstacles.
+        rubs : bool
+            Whether derivatives of the contact forces have a skew part.
+        frictions : tuple of Constant
+            Friction coefficients that are parameters.
         """
         key = count, rubs, frictions
         if key == (len(self.frames), self.rubs, self.frictions):
@@ -341,8 +396,10 @@ class Body(Discretisation):
             for name in self._following - {"part_of_cells", "frame_m"}:
                 vars(other).pop(name, None)
             Model.__init__(other, self.parts, self.forces, frictions)
-            other.rubs, other._evaluators = rubs, {}
-            first, added = len(self.nodes.points_m), np.tile(self.frame_m, (count, 1))
+            other.rubs = rubs
+            other._evaluators = {}
+            first = len(self.nodes.points_m)
+            added = np.tile(self.frame_m, (count, 1))
             other.frames = first + np.arange(4 * count).reshape(count, 4)
             other.nodes_m = np.vstack([self.nodes.points_m, added])
             other._lumped_m3 = [
@@ -354,75 +411,81 @@ class Body(Discretisation):
 
     @cached_property
     def frame_m(self) -> Array:
-        """(4, 3) undeformed places of an obstacle's frame: its origin, and ends of its axes."""
-        low, high = self.nodes.points_m.min(axis=0), self.nodes.points_m.max(axis=0)
+        """Undeformed positions (4, 3) of an obstacle's frame: its origin and the ends of its axes
+        [m].
+        """
+        low = self.nodes.points_m.min(axis=0)
+        high = self.nodes.points_m.max(axis=0)
         axes = np.vstack([np.zeros(3), np.eye(3) * (high - low).min() / 4])
         return (low + high) / 2 + axes
 
     @cached_property
     def stresses(self) -> Stresses:
-        """Those of the parts with memory, point by point."""
+        """Stresses at the quadrature points of the parts with memory."""
         return Stresses(self)
 
     @cached_property
     def elastic_places(self) -> list[int]:
-        """Where in θ what stress depends on is: constants of the materials, and fields."""
-        found: list[int] = []
+        """Indices in θ on which the stress depends: constants of the materials, and of fields."""
+        indices: list[int] = []
         for part, start, modes in zip(self.parts, self.starts, self.mode_places, strict=False):
-            found += [*range(start, start + len(part.material.constants))]
-            found += [*range(modes.start, modes.stop)] if part.stress_field else []
-        return found
+            indices += [*range(start, start + len(part.material.constants))]
+            indices += [*range(modes.start, modes.stop)] if part.stress_field else []
+        return indices
 
     @property
     def mass_kg(self) -> float:
-        """Total mass, of the densities as stated."""
+        """Total mass with the stated densities [kg]."""
         return float(self.node_mass.sum())
 
     @cached_property
     def mass_slopes(self) -> dict[int, Array]:
-        """∂M/∂ρ (3n,) of each density that is free [m³], by its place in θ, and those by the shares
-        of the shapes of a density's field [kg].
+        """Derivatives of the mass of every dof (3n,), by the index in θ.
+
+        These are ∂M/∂ρ [m³] for free densities, and the derivatives by the coefficients of the
+        field of a density [kg].
         """
         return {place: slope for own in self._mass_slopes for place, slope in own.items()}
 
     @cached_property
     def _mass_slopes(self) -> list[dict[int, Array]]:
-        """The same part by part."""
-        found: list[dict[int, Array]] = []
+        """Derivatives of the masses for each part."""
+        slopes: list[dict[int, Array]] = []
         places = zip(self._gamma_places, self.mode_places, strict=True)
         for part, (gamma, modes), volume in zip(self.parts, places, self._lumped_m3, strict=True):
-            found.append({gamma + 1: volume} if part.free_density else {})
+            slopes.append({gamma + 1: volume} if part.free_density else {})
             if part.field is not None and part.stress_field is None:
                 shares = part.density_kg_m3 * part.field.shapes.T
                 lumped = (np.repeat(self._lumped(part, share), 3) for share in shares)
-                found[-1] |= dict(zip(range(modes.start, modes.stop), lumped, strict=True))
-        return found
+                slopes[-1] |= dict(zip(range(modes.start, modes.stop), lumped, strict=True))
+        return slopes
 
     def densities(self, theta: Theta) -> list[float]:
-        """Of each part [kg/m³]; of a field the mean."""
+        """Return the density of each part at θ [kg/m³]; the mean where the density is a field."""
         return [
             float(theta[place + 1]) if part.free_density else part.density_kg_m3
             for part, place in zip(self.parts, self._gamma_places, strict=True)
         ]
 
     def mass_of_dofs(self, theta: Theta) -> Array:
-        """(3n,) lumped mass of every degree of freedom [kg]."""
+        """Return the lumped mass (3n,) of every degree of freedom at θ [kg]."""
         if not self.mass_slopes:
             return self.dof_mass
         return np.sum(self._masses(theta), axis=0)
 
     def massless(self, theta: Theta) -> str | None:
-        """What is wrong, and what helps, where a node's mass is not above zero."""
+        """Return a message with a remedy if a node's mass at θ is not positive; None otherwise."""
         if not self.mass_slopes:
             return None
         masses = np.array(self._masses(theta))[:, ::3]
-        # Those of obstacles have none.
+        # Nodes of obstacle frames have no mass.
         total = np.where(self.dof_volume_m3[::3] > 0, masses.sum(axis=0), np.inf)
         node = int(total.argmin())
         if total[node] > 0:
             return None
         part = self.parts[masses[:, node].argmin()]
-        density, remedy = part.full_name(DENSITY.name), "give a density above zero"
+        density = part.full_name(DENSITY.name)
+        remedy = "give a density above zero"
         if part.field is not None and part.stress_field is None:
             remedy = "lower the amplitude of its field to 0.3 or less, or its field_1, field_2, …"
         return (
@@ -431,71 +494,82 @@ class Body(Discretisation):
         )
 
     def _masses(self, theta: Theta) -> list[Array]:
-        """(3n,) of each part."""
-        found = []
-        for part, volume, own in zip(self.parts, self._lumped_m3, self._mass_slopes, strict=True):
-            stated = 0.0 if part.free_density else part.density_kg_m3
-            found.append(sum((theta[k] * slope for k, slope in own.items()), stated * volume))
-        return found
+        """Return the mass of every dof (3n,) for each part [kg]."""
+        masses = []
+        for part, volume, slopes in zip(
+            self.parts, self._lumped_m3, self._mass_slopes, strict=True
+        ):
+            density = 0.0 if part.free_density else part.density_kg_m3
+            masses.append(sum((theta[k] * slope for k, slope in slopes.items()), density * volume))
+        return masses
 
     def _weighed(self, densities: Sequence[float]) -> Array:
-        """(3n,) mass of every dof."""
+        """Return the mass of every dof (3n,) for given densities of the parts [kg]."""
         return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
 
     @cached_property
     def placed_forces(self) -> tuple[PlacedForce, ...]:
-        """Those of users, where they are."""
-        volume, first, found = self.dof_volume_m3[::3], self.starts[-1], []
+        """Custom forces on their nodes or faces."""
+        volume = self.dof_volume_m3[::3]
+        first = self.starts[-1]
+        placed = []
         for force in self.forces:
             columns = first + np.arange(len(force.constants))
             first += len(columns)
-            chosen = np.arange(len(self.nodes_m)) if force.nodes is None else force.nodes
-            chosen = self.select(chosen) if isinstance(chosen, Selection) else np.unique(chosen)
-            found.append(PlacedForce.on(force, self.nodes, chosen, volume, columns))
-        return tuple(found)
+            nodes = np.arange(len(self.nodes_m)) if force.nodes is None else force.nodes
+            nodes = self.select(nodes) if isinstance(nodes, Selection) else np.unique(nodes)
+            placed.append(PlacedForce.on(force, self.nodes, nodes, volume, columns))
+        return tuple(placed)
 
     @cached_property
     def unit_air_drag(self) -> PlacedForce:
-        """Drag on the surface in a fluid of density one, see `air`."""
+        """Drag on the surface in a fluid of density 1 kg/m³, see `air`."""
         return placed_unit_drag(self.nodes, self.dof_volume_m3[::3])
 
     @property
     def dof_volume_m3(self) -> Array:
-        """(3n,) lumped volume of every degree of freedom."""
+        """Lumped volume (3n,) of every degree of freedom [m³]."""
         return np.sum(self._lumped_m3, axis=0)
 
     @cached_property
     def dof_mass(self) -> Array:
-        """(3n,) lumped mass of every degree of freedom, of the densities as stated [kg]."""
+        """Lumped mass (3n,) of every degree of freedom with the stated densities [kg]."""
         return np.repeat(self.node_mass, 3)
 
     def joined_with(self, couplings: Sequence[SymmetricPattern]) -> Joined:
-        """The mesh graph, other couplings, and those of the forces of users."""
-        own = (placed.points.couplings for placed in self.placed_forces)
-        return Joined.of((self.pattern, *couplings, *own))
+        """Return the union of the mesh graph, other couplings and the couplings of custom
+        forces.
+        """
+        custom = (placed.points.couplings for placed in self.placed_forces)
+        return Joined.of((self.pattern, *couplings, *custom))
 
     # One state ------------------------------------------------------------------------------
 
     def energy(self, positions: ArrayLike, **constants: float) -> float:
-        """Elastic energy Ψ [J] at (n, 3) node positions [m].
+        """Return the elastic energy Ψ [J] at (n, 3) node positions [m].
 
-        The constants are the material's, or moduli in their place: ``young_pa=1e4, poisson=0.3``.
+        The constants are those of the material, or moduli in their place: ``young_pa=1e4,
+        poisson=0.3``.
         """
         x = self._state(positions)
         return float(self._evaluate("energy", [x], self.elastic(constants))[0, 0])
 
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
-        """Elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m]; see `energy`."""
+        """Return the elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m].
+
+        See `energy` for the constants.
+        """
         x = self._state(positions)
         force = self._evaluate("force", [x, np.zeros_like(x)], self.elastic(constants))
         return force.reshape(-1, 3)
 
     def stiffness(self, positions: ArrayLike, **constants: float) -> sp.csc_array:
-        """Stiffness K = ∂²Ψ/∂x², (3n, 3n) sparse [N/m]; row 3i + j is coordinate j of node i.
+        """Return the stiffness K = ∂²Ψ/∂x², sparse (3n, 3n) [N/m], at (n, 3) node positions [m].
 
-        See `energy` for the constants.
+        Row 3i + j is coordinate j of node i. See `energy` for the constants.
         """
-        x, theta = self._state(positions), self.elastic(constants)
+        x = self._state(positions)
+        theta = self.elastic(constants)
         return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta).by_position[0])
 
     # Many states ----------------------------------------------------------------------------
@@ -508,16 +582,18 @@ class Body(Discretisation):
         tied_kg: Array | None = None,
         carried: Past | None = None,
     ) -> Array:
-        """Internal force f(x, v; θ), (T, 3n) [N].
+        """Return the internal force f(x, v; θ), (T, 3n) [N].
 
         Parameters
         ----------
         positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
-        theta : (k,) in the order of `constants`
+            Positions [m] and velocities [m/s].
+        theta : (k,)
+            Constants in the order of `constants`.
         tied_kg : (3n,) or (T, 3n), optional
-            What γ_m damps besides the body's own mass.
+            Tied masses, which γ_m damps beside the mass of the body.
         carried : Past, optional
-            What the states of a body with memory bring from the past; nothing by default.
+            Internal variables of a body with memory; zero overstress by default.
         """
         x, v = self._states(positions, velocities)
         internal = self._evaluate("force", [x, v], theta, carried=carried)
@@ -532,30 +608,43 @@ class Body(Discretisation):
         tied_kg: Array | None = None,
         carried: Past | None = None,
     ) -> Linearisation:
-        """Internal force and first derivatives at T states, see `Linearisation` and `force`.
+        """Return the internal force and its first derivatives at T states, see `force`.
 
-        They are those at a given H; its own derivatives are the memory's.
+        The internal variables of a memory are held fixed; `viscoelasticity` provides their
+        derivatives.
 
-        The result's arrays are views of `out` (T, `linearisation_width`) when it is given.
+        Parameters
+        ----------
+        positions, velocities : (T, n, 3), (T, 3n) or one state (n, 3)
+        theta : (k,)
+            Constants in the order of `constants`.
+        out : (T, linearisation_width), optional
+            Memory for the result, whose arrays are views of it.
+        tied_kg : (3n,) or (T, 3n), optional
+            Tied masses, which γ_m damps beside the mass of the body.
+        carried : Past, optional
+            Internal variables of a body with memory; zero overstress by default.
         """
         x, v = self._states(positions, velocities)
         rows = self._evaluate("linearisation", [x, v], theta, out, carried)
-        size, entries = self.pattern.size, self.pattern.entries
+        size = self.pattern.size
+        entries = self.pattern.entries
         width = len(self.constants) * size
         # Slices: `numpy.split` takes as long as the elements of a small body.
         ends = list(accumulate([0, size, entries, entries, width]))
-        whole = self._width_without_fields("linearisation")
+        end = self._width_without_fields("linearisation")
         force, by_position, by_velocity, by_theta, skew = (
-            rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], whole], strict=True)
+            rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], end], strict=True)
         )
         drag = self._drag(theta, tied_kg)
         force -= drag * v
         by_velocity[:, self.pattern.diagonal] -= drag
         by_theta = by_theta.reshape(len(x), size, -1)
-        for number, own in self._of_fields("linearisation", rows):
-            here, spread = self.mode_places[number], self.spreads[number]
-            slopes = spread.field.slopes(np.asarray(theta)[here])
-            spread.nodal(own["by_theta"], slopes, by_theta[:, :, here])
+        for number, outputs in self._of_fields("linearisation", rows):
+            columns = self.mode_places[number]
+            spread = self.spreads[number]
+            slopes = spread.field.slopes(np.asarray(theta)[columns])
+            spread.nodal(outputs["by_theta"], slopes, by_theta[:, :, columns])
         for column, slope in self._drag_slopes(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
             by_theta[:, :, column] += -slope * v
@@ -563,13 +652,30 @@ class Body(Discretisation):
         return Linearisation(force, by_position, by_velocity, by_theta, skew, skew[:, :0])
 
     def _of_fields(self, name: str, rows: Array) -> Iterator[tuple[int, dict[str, Array]]]:
-        """Of each part with a field, what its cells add by the logarithm, by output."""
+        """Yield the index of each part with a field, and the outputs by the logarithm of each cell.
+
+        Parameters
+        ----------
+        name : str
+            Kernel: "linearisation" or "curvature".
+        rows : (T, width)
+            Result of the kernel.
+        """
         places = self.of_cells(name)
         for number in self.spreads:
             yield number, {out: rows[:, at] for (of, out), at in places.items() if of == number}
 
     def _spread_stiffening(self, by_theta: Array, carried: Past | None) -> None:
-        """Turn ∂f/∂s (…, k), in the column of a part's first branch, into those by its memory."""
+        """Replace derivatives by the stiffening s by derivatives by the memory's constants, in
+        place.
+
+        Parameters
+        ----------
+        by_theta : (…, k)
+            Derivatives; that by s is in the column of a part's first branch.
+        carried : Past or None
+            Provides ds/dθ; None for zero.
+        """
         for first, columns in self._memory_columns:
             if carried is None:
                 by_theta[..., columns] = 0.0
@@ -579,7 +685,7 @@ class Body(Discretisation):
 
     @cached_property
     def _memory_columns(self) -> list[tuple[int, slice]]:
-        """The first and all of the places in θ of each part's branches."""
+        """Index in θ of each part's first branch constant, and the slice of all of them."""
         firsts = [s + p.of_law for p, s in zip(self.parts, self.starts, strict=False)]
         counts = [2 * len(part.prony) for part in self.parts]
         return [(f, slice(f, f + n)) for f, n in zip(firsts, counts, strict=True) if n]
@@ -594,20 +700,37 @@ class Body(Discretisation):
         tied_kg: Array | None = None,
         carried: Past | None = None,
     ) -> Curvature:
-        """Second derivatives of wᵀ f + σ·S at T states, see `Curvature`, `Past` and `force`.
+        """Return the second derivatives of wᵀ f + σ·S at T states, see `Curvature` and `force`.
 
-        `weights` are like `positions`. H counts as given.
+        The internal variables of a memory are held fixed.
+
+        Parameters
+        ----------
+        positions, velocities, weights : (T, n, 3), (T, 3n) or one state (n, 3)
+            `weights` are the weights w of the forces.
+        theta : (k,)
+            Constants in the order of `constants`.
+        out : (T, curvature_width), optional
+            Memory for the result, whose arrays are views of it.
+        tied_kg : (3n,) or (T, 3n), optional
+            Tied masses, which γ_m damps beside the mass of the body.
+        carried : Past, optional
+            Internal variables of a body with memory and the weights σ of the stress S.
         """
         x, v, w = self._states(positions, velocities, weights)
         if self.remembers:
             carried = carried or self.memory.nothing(len(x))
-            own = carried.stress_weights
-            own = np.zeros_like(carried.overstress) if own is None else own
-            both = replace(carried, overstress=np.hstack([carried.overstress, own]))
-            rows = self._evaluate("curvature", [x, v, w], theta, out, both)
+            stress_weights = carried.stress_weights
+            if stress_weights is None:
+                stress_weights = np.zeros_like(carried.overstress)
+            # The kernel reads H and σ as one row.
+            past = replace(carried, overstress=np.hstack([carried.overstress, stress_weights]))
+            rows = self._evaluate("curvature", [x, v, w], theta, out, past)
         else:
             rows = self._evaluate("curvature", [x, v, w], theta, out)
-        size, entries, k = self.pattern.size, self.pattern.entries, len(self.constants)
+        size = self.pattern.size
+        entries = self.pattern.entries
+        k = len(self.constants)
         xx, xv, x_theta, v_theta, theta_theta, by_theta, skew = np.split(
             rows[:, : self._width_without_fields("curvature")],
             np.cumsum([entries, entries, k * size, k * size, k * k, k]),
@@ -619,21 +742,25 @@ class Body(Discretisation):
             v_theta[:, :, column] += drag
             by_theta[:, column] += np.einsum("ti,ti->t", drag, v)
         theta_theta = theta_theta.reshape(len(x), k, k)
-        for number, own in self._of_fields("curvature", rows):
-            here, spread = self.mode_places[number], self.spreads[number]
-            coefficients = np.asarray(theta)[here]
+        for number, outputs in self._of_fields("curvature", rows):
+            field_columns = self.mode_places[number]
+            spread = self.spreads[number]
+            coefficients = np.asarray(theta)[field_columns]
             slopes = spread.field.slopes(coefficients)
-            spread.nodal(own["position_theta"], slopes, x_theta[:, :, here])
-            spread.nodal(own["velocity_theta"], slopes, v_theta[:, :, here])
-            by_theta[:, here] = own["gradient_theta"] @ slopes
-            first, points = self.starts[number], self.parts[number].of_points
-            twice = own["theta_theta"].reshape(len(x), len(slopes), -1)
-            mixed = np.einsum("tek,em->tkm", twice[:, :, :points], slopes)
-            theta_theta[:, first : first + points, here] = mixed
-            theta_theta[:, here, first : first + points] = mixed.swapaxes(1, 2)
-            bent = twice[:, :, points, None] * slopes
-            by_coefficients = spread.field.curvature(coefficients, own["gradient_theta"])
-            theta_theta[:, here, here] = slopes.T @ bent + by_coefficients
+            spread.nodal(outputs["position_theta"], slopes, x_theta[:, :, field_columns])
+            spread.nodal(outputs["velocity_theta"], slopes, v_theta[:, :, field_columns])
+            by_theta[:, field_columns] = outputs["gradient_theta"] @ slopes
+            first = self.starts[number]
+            points = self.parts[number].of_points
+            second_by_theta = outputs["theta_theta"].reshape(len(x), len(slopes), -1)
+            mixed = np.einsum("tek,em->tkm", second_by_theta[:, :, :points], slopes)
+            theta_theta[:, first : first + points, field_columns] = mixed
+            theta_theta[:, field_columns, first : first + points] = mixed.swapaxes(1, 2)
+            weighted_slopes = second_by_theta[:, :, points, None] * slopes
+            by_coefficients = spread.field.curvature(coefficients, outputs["gradient_theta"])
+            theta_theta[:, field_columns, field_columns] = (
+                slopes.T @ weighted_slopes + by_coefficients
+            )
         for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
             self._spread_stiffening(values, carried)
         if carried is not None:
@@ -641,32 +768,33 @@ class Body(Discretisation):
                 bends = carried.bends[:, columns, columns]
                 theta_theta[:, columns, columns] += by_theta[:, first, None, None] * bends
         self._spread_stiffening(by_theta[:, None], carried)
-        for gamma, own in zip(self._gamma_places, self._mass_slopes, strict=True):
-            for place, slope in own.items():
+        for gamma, mass_slopes in zip(self._gamma_places, self._mass_slopes, strict=True):
+            for place, slope in mass_slopes.items():
                 mixed = -np.einsum("ti,ti,i->t", w, v, slope)
                 theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = mixed
-        none = np.zeros((len(x), 0))
-        return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew, none)
+        empty = np.zeros((len(x), 0))
+        return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew, empty)
 
     @cached_property
     def _gamma_places(self) -> list[int]:
-        """Place of each part's γ_m in θ; its density follows where it is free."""
+        """Index in θ of each part's γ_m; the density follows where it is free."""
         starts = zip(self.parts, self.starts, strict=False)
         return [start + part.of_gamma_m for part, start in starts]
 
     @cached_property
     def tied_shares(self) -> dict[int, Array]:
-        """Place of each part's γ_m in θ, and its share (3n,) in what is tied to a dof."""
+        """Index in θ of each part's γ_m, and the part's fraction (3n,) of the mass at each dof."""
         return dict(zip(self._gamma_places, self._tied_shares, strict=True))
 
     def tied_drag(self, theta: Theta) -> Array:
-        """(3n,) γ_m of what is tied to every dof [1/s]."""
+        """Return the mass-proportional damping rate γ_m (3n,) of tied masses at every dof [1/s]."""
         return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
 
     def _damped(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
-        """Place of each part's γ_m in θ, and the mass (3n,) or (T, 3n) that it damps.
+        """Yield index in θ of each part's γ_m, and the mass (3n,) or (T, 3n) damped by it.
 
-        Mass that is tied to a node is damped as the part's own there, by its share as stated.
+        A tied mass is damped like the node to which it is tied, in proportion to the stated masses
+        of the parts that share the node.
         """
         for k, damped in enumerate(self._masses(theta)):
             if tied_kg is not None:
@@ -675,18 +803,20 @@ class Body(Discretisation):
 
     @cached_property
     def _tied_shares(self) -> list[Array]:
-        """(3n,) share of each part in the mass of every dof, as stated."""
+        """Fraction (3n,) of each part in the stated mass at every dof."""
         parts = zip(self.parts, self._lumped_m3, strict=True)
-        whole_kg = np.where(self.dof_mass == 0, 1.0, self.dof_mass)  # frames have none
-        return [part.density_kg_m3 * volume / whole_kg for part, volume in parts]
+        total_kg = np.where(self.dof_mass == 0, 1.0, self.dof_mass)  # frames have none
+        return [part.density_kg_m3 * volume / total_kg for part, volume in parts]
 
     def _drag(self, theta: Theta, tied_kg: Array | None) -> Array:
-        """(3n,) or (T, 3n) of f = −drag v by mass-proportional damping [N·s/m]."""
+        """Return the mass-proportional damping (3n,) or (T, 3n) of f = −drag v [N·s/m]."""
         # `numpy.sum` of a list takes longer than the products.
         return reduce(np.add, (theta[k] * mass for k, mass in self._damped(theta, tied_kg)))
 
     def _drag_slopes(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
-        """Places in θ, and the slopes of that by them."""
+        """Yield indices in θ and the derivatives of the mass-proportional damping by these
+        entries.
+        """
         yield from self._damped(theta, tied_kg)
         for gamma, own in zip(self._gamma_places, self._mass_slopes, strict=True):
             yield from ((place, theta[gamma] * slope) for place, slope in own.items())

@@ -1,7 +1,8 @@
-"""The constants that terms of the model declare: what they are called, and what values make sense.
+"""Names, units, symbols and admissible values of the constants of the model.
 
-A term names each constant with its unit, as the problem file does: ``mu_pa``, ``gamma_r_s``. The
-constant of a named region has the region in front, ``core.mu_pa``.
+Each term of the model (material, damping law, field, …) declares its constants as `Constant`. A
+name ends with its unit, as in the problem file: ``mu_pa``, ``gamma_r_s``. The constant of a named
+region is preceded by the region: ``core.mu_pa``.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Literal
 
 Scale = Literal["log", "linear"]
 
-# Units by the ending of a name, longest first.
+# Unit by the suffix of a name, longest suffix first.
 _UNITS = {
     "_kg_m3": "kg/m³",
     "_m_s2": "m/s²",
@@ -26,28 +27,29 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Constant:
-    """One constant of a term.
+    """Definition of one constant of the model.
 
     Attributes
     ----------
     name : str
-        With its unit.
+        Name with unit.
     symbol : str
-        For tables and pictures; the name without its unit by default.
+        Symbol for tables and plots; the name without its unit by default.
     meaning : str
-        In a few words.
+        Short description.
     bounds : (lower, upper)
-        Of an estimate for which the problem gives none: wide enough for foams and rubbers alike.
+        Bounds of an estimate if the problem states none: wide enough for foams and rubbers.
     scale : {"log", "linear"}
-        Whether the constant is a positive number whose logarithm is estimated, or any number.
+        Whether the constant is positive and its logarithm is estimated, or its value of any sign.
     typical : float or None
-        What a linear one may change by in a step, where its guess does not tell.
+        Typical change of a linear constant in one step of the solver; None to use its guess.
     usual : float or None
-        Value in a soft foam or rubber, where there is no guess; moduli follow the stiffness.
+        Value in a soft foam or rubber, used without a guess; None if there is none. Moduli follow
+        the stiffness instead, see `usual_value`.
     below : float
-        Values are less than this.
+        Upper limit, exclusive.
     at_least : float
-        Smallest value of a linear one.
+        Smallest admissible value of a linear constant.
     """
 
     name: str
@@ -62,7 +64,7 @@ class Constant:
 
     @property
     def least(self) -> float:
-        """Smallest value that makes sense."""
+        """Smallest admissible value."""
         return 0.0 if self.scale == "log" else self.at_least
 
 
@@ -82,22 +84,22 @@ GENT_LIMIT = Constant("gent_limit", "J_m", "largest Ī₁ − 3", (1e-2, 1e4), u
 CHAIN_STRETCH = Constant(
     "chain_stretch", "λ_m", "stretch at which the chains lock", (1.01, 100.0), usual=5.0
 )
-# Of a branch of the memory, whose name goes in front: ``prony_1.share``.
+# Constants of a branch of the memory, preceded by the name of the branch: ``prony_1.share``.
 SHARE = Constant(
     "share", "g", "stiffness that relaxes, over the long-term one", (0.0, 20.0), "linear", 0.1, 0.1,
     at_least=0.0,
 )  # fmt: skip
 TAU = Constant("tau_s", "τ", "relaxation time", (1e-4, 1e3), usual=0.3)
 DENSITY = Constant("density_kg_m3", "ρ", "density", (1.0, 1e5))
-# In place of the densities of all parts, which keep their ratios.
+# Total mass, which replaces the densities of all parts; their ratios are kept.
 MASS = Constant("mass_kg", "m", "mass of the whole body", (1e-6, 1e3))
-# Of an obstacle; names end with it, ``table_friction``.
+# Friction coefficient of an obstacle, preceded by the obstacle's name: ``table_friction``.
 FRICTION = Constant(
     "friction", "friction", "coefficient of friction", (0.0, 2.0), "linear", 0.1, 0.3, at_least=0.0
 )
-# Of a field, see `field`: how much of its first shape, of its second and so on.
+# Coefficient of a shape of a field, see `field`; names are field_1, field_2, ….
 MODE = Constant("field", "", "share of a shape", (-1e3, 1e3), "linear", 1.0, 0.0)
-# Of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
+# Contrast of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
 CONTRAST = Constant("contrast", "contrast", "inclusion over surroundings", (0.02, 50.0), usual=1.0)
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", "Young's modulus at once, before anything has relaxed"
@@ -132,65 +134,77 @@ KNOWN: Mapping[str, Constant] = {
 
 
 def bare(name: str) -> str:
-    """The name of a constant without its region."""
+    """Return the name of a constant without its region."""
     return name.rpartition(".")[2]
 
 
 def unit_of(name: str) -> str:
-    """The unit that a name ends with, "" if none."""
+    """Return the unit with which a name ends, or "" if it has none."""
     return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
 
 
 def symbol_of(name: str) -> str:
-    """How a constant is written: its symbol, and its region behind."""
-    region, _, own = name.rpartition(".")
-    symbol = KNOWN[own].symbol if own in KNOWN else without_unit(own)
+    """Return the symbol of a constant, followed by its region if it has one."""
+    region, _, name_in_region = name.rpartition(".")
+    symbol = (
+        KNOWN[name_in_region].symbol if name_in_region in KNOWN else without_unit(name_in_region)
+    )
     return f"{symbol} {region}".strip()
 
 
 def with_unit(name: str) -> str:
-    """Symbol and unit of a constant, as at the head of its row."""
+    """Return symbol and unit of a constant, as in the heading of a table row."""
     return f"{symbol_of(name)} {unit_of(name)}".strip()
 
 
 def constant_named(name: str) -> Constant:
-    """The known constant of this name, or one of which nothing but the name is known."""
-    own = bare(name)
-    if own not in KNOWN and own.endswith(f"_{FRICTION.name}"):
-        return replace(FRICTION, name=own, symbol=own.replace("_", " "))
-    return replace(MODE, name=own) if is_mode(own) else KNOWN.get(own, Constant(own))
+    """Return the known constant of this name, or one with default properties if it is unknown."""
+    bare_name = bare(name)
+    if bare_name not in KNOWN and bare_name.endswith(f"_{FRICTION.name}"):
+        return replace(FRICTION, name=bare_name, symbol=bare_name.replace("_", " "))
+    return (
+        replace(MODE, name=bare_name)
+        if is_mode(bare_name)
+        else KNOWN.get(bare_name, Constant(bare_name))
+    )
 
 
 def mode(number: int) -> Constant:
-    """The share of a shape of a field."""
+    """Return the constant for the coefficient of a shape of a field, by the shape's index."""
     return replace(MODE, name=f"{MODE.name}_{number + 1}")
 
 
 def is_mode(name: str) -> bool:
-    """Whether a constant is the share of a shape of a field."""
+    """Return whether a constant is the coefficient of a shape of a field."""
     word, _, number = bare(name).rpartition("_")
     return word == MODE.name and number.isdigit()
 
 
 def is_modulus(name: str) -> bool:
-    """Whether a constant scales with the stiffness of its material."""
+    """Return whether a constant scales with the stiffness of its material."""
     return unit_of(name) == "Pa"
 
 
 def is_density(name: str) -> bool:
-    """Whether a parameter of this name gives a density."""
+    """Return whether a parameter of this name determines a density: a density or the total mass."""
     return bare(name) in (DENSITY.name, MASS.name)
 
 
 def is_damping(name: str) -> bool:
-    """Whether a constant is one of the dampings, of which bodies at rest tell nothing."""
+    """Return whether a constant is γ_r or γ_m, which bodies at rest do not determine."""
     return bare(name) in (GAMMA_R.name, GAMMA_M.name)
 
 
 def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | None:
-    """A sensible value of a constant in a material of given stiffness; None where none is known.
+    """Return a plausible value of a constant in a material of given stiffness; None if unknown.
 
-    A modulus that is not known by name has the size of the shear modulus.
+    A modulus that is not known by name gets the size of the shear modulus.
+
+    Parameters
+    ----------
+    name : str
+    young_pa, poisson : float
+        Young's modulus and Poisson's ratio of the material.
     """
     if not is_modulus(name):
         return constant_named(name).usual
@@ -208,5 +222,5 @@ def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | Non
 
 
 def without_unit(name: str) -> str:
-    """A name without the unit that it ends with."""
+    """Return a name without the unit with which it ends."""
     return next((name.removesuffix(e) for e in _UNITS if name.endswith(e)), name)

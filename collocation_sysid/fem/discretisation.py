@@ -1,4 +1,9 @@
-"""Parts of a body in finite elements, and the kernels of their laws over all elements."""
+"""Finite-element discretisation of a body: kernels of the laws of its parts over all elements.
+
+`Discretisation` is the base class of `body.Body`. It builds evaluators of the element kernels and
+lays their outputs out in one row for each time step; `Body` splits these rows into forces and
+derivatives.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +29,7 @@ from .regions import BodyPart, Model, Theta
 from .rest_shape import InverseEquilibrium
 from .selection import Selection
 
-# The outputs that have columns for θ: one more, cell by cell, for the logarithm of a field.
+# Outputs with columns for θ; a field adds derivatives by the logarithm of each cell.
 BY_FIELD = {
     "linearisation": ("by_theta",),
     "curvature": ("position_theta", "velocity_theta", "theta_theta", "gradient_theta"),
@@ -32,12 +37,27 @@ BY_FIELD = {
 
 
 class Discretisation(Model):
-    """A mesh of elements with quadrature points, and evaluators of what is summed over them.
+    """Mesh of elements with quadrature points, and evaluators of sums over elements.
 
     Parameters
     ----------
     parts, forces : see `Model`
     mesh, element, evaluator, threads : see `Body`
+
+    Attributes
+    ----------
+    nodes : Nodes
+        Nodes of the elements.
+    nodes_m : (n, 3)
+        Undeformed node positions, including obstacle frames.
+    frames : (k, 4)
+        Indices of the nodes of obstacle frames.
+    rubs : bool
+        Whether derivatives of contact forces have a skew part.
+    cells : (E, nodes per element)
+        Node indices of each element.
+    geometry : (E, q, 3·nodes + 1)
+        Shape gradients and volumes, see `elements.reference_geometry`.
     """
 
     def __init__(
@@ -74,40 +94,48 @@ class Discretisation(Model):
     def select(self, selection: Selection) -> Index:
         """Return the nodes of a `selection.Selection`, sorted.
 
-        Boxes and balls act on all nodes. Indices and point arrays are of the mesh's nodes; a node
-        on an edge is selected when both of the edge's ends are.
+        Boxes and balls select from all nodes. Indices and point arrays refer to nodes of the mesh;
+        a node on an edge is selected if both ends of the edge are.
 
         Raises
         ------
         InputError
-            If there are none.
+            If no node is selected.
         """
         return selection.resolve(self.nodes)
 
     @property
     def evaluator(self) -> str:
-        """How element kernels are evaluated: "simd" or "casadi"."""
+        """Evaluator of the element kernels: "simd" or "casadi"."""
         return self._choice.name
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Why it is not "simd", if the material is to blame."""
+        """Reasons why the evaluator is not "simd", if the material is the cause."""
         return self._choice.notes
 
     def make_evaluator(self, batch: Batch) -> Evaluator:
-        """Build the evaluator of a batch of this body's material."""
+        """Build the evaluator of a batch with the chosen kind of evaluator."""
         return self._choice.make(batch)
 
     @cached_property
     def part_of_cells(self) -> Index:
-        """(E,) number of the part that each cell belongs to."""
+        """Index of the part to which each cell belongs (E,)."""
         numbers = np.zeros(len(self.cells), dtype=np.int64)
         for k, part in enumerate(self.parts):
             numbers[part.cells] = k
         return numbers
 
     def law(self, number: int, memory: bool = False) -> Law:
-        """What the points of a part obey."""
+        """Return the law of the quadrature points of a part.
+
+        Parameters
+        ----------
+        number : int
+            Index of the part.
+        memory : bool
+            Whether to include the memory of the material.
+        """
         part = self.parts[number]
         scaled = part.field.scaled if part.field else ()
         rest = self.inverse.layout if self.inverse else None
@@ -115,25 +143,39 @@ class Discretisation(Model):
 
     @cached_property
     def inverse(self) -> InverseEquilibrium | None:
-        """Solver of the stress-free shape; none where the mesh is free of stress."""
+        """Solver of the stress-free shape; None if the mesh is stress-free."""
         return None
 
     def point_constants(self, number: int, theta: Theta) -> Array:
-        """Return what θ gives the points of a part.
+        """Return the constants of the quadrature points of a part at θ.
 
-        With a stress-free shape, the changes of its inputs follow: zero, as it is solved at θ.
+        For a stress-free shape that is not the mesh, changes of its inputs follow; they are zero,
+        because the shape has been computed at this θ.
         """
-        own = np.asarray(self.split(theta)[number], dtype=float)[: self.parts[number].of_points]
+        part_constants = np.asarray(self.split(theta)[number], dtype=float)[
+            : self.parts[number].of_points
+        ]
         changes = np.zeros(self.inverse.layout.inputs if self.inverse else 0)
-        return np.concatenate([own, changes])
+        return np.concatenate([part_constants, changes])
 
     def brought(
         self, number: int, theta: Theta, carried: Array | None = None, second: bool = False
     ) -> Array | None:
-        """Return what the points of a part carry (T, any), then the logarithms of its field.
+        """Return the data of the quadrature points of a part, or None if they have none.
 
-        Of a stress-free shape that is not the mesh its data (1, any) at θ, if `second` with second
-        derivatives; such a body has neither memory nor field.
+        These are the internal variables (T, any), followed by the logarithms of a field; for a
+        stress-free shape that is not the mesh its data (1, any), since such a body has neither
+        memory nor field.
+
+        Parameters
+        ----------
+        number : int
+            Index of the part.
+        theta : (k,)
+        carried : (T, any), optional
+            Internal variables of the points.
+        second : bool
+            Whether to include second derivatives of the stress-free shape.
         """
         if self.inverse is not None:
             return self.inverse.point_data(theta, second)[number]
@@ -147,39 +189,48 @@ class Discretisation(Model):
 
     @cached_property
     def spreads(self) -> dict[int, Spread]:
-        """How the fields of parts add up, by the number of the part."""
-        found = {}
+        """Assembly of derivatives by fields, by the index of the part."""
+        assemblies = {}
         for number, part in enumerate(self.parts):
             if part.stress_field is not None:
                 cells, _ = self.laid_out(part)
-                found[number] = Spread(part.stress_field, dofs_of(cells), self.pattern.size)
-        return found
+                assemblies[number] = Spread(part.stress_field, dofs_of(cells), self.pattern.size)
+        return assemblies
 
     def laid_out(self, part: BodyPart) -> tuple[Index, Array]:
-        """Return the elements of a part and their geometry, as its kernels have them."""
-        cells, geometry = self.cells[part.cells], self.geometry[part.cells]
+        """Return the elements of a part and their geometry, with nodes in the order of its
+        kernels.
+        """
+        cells = self.cells[part.cells]
+        geometry = self.geometry[part.cells]
         if part.damping.stress is None:
             return cells, geometry
-        # So that an element's lower triangles are parts of the whole's: of a skew matrix, the
-        # other triangle has another sign.
+        # Ascending nodes make an element's lower triangle part of the global one: in a skew
+        # matrix, the other triangle has the opposite sign.
         return in_ascending_order(cells, geometry)
 
     def of_cells(self, name: str) -> dict[tuple[int, str], slice]:
-        """Where, in a timestep's row, slopes by the logarithms of fields in each cell are.
+        """Return the slices of a result row that hold derivatives by the logarithm of each cell.
 
-        By the number of the part and the output; of each cell d numbers of a vector, or one, and of
-        ∂²φ/∂θ² those with each θ of the points, the logarithm's, and the first again.
+        The keys are the index of the part and the output. Each cell has d numbers of a vector, or
+        one; for ∂²φ/∂θ² those with each θ of the points, with the logarithm, and the first again.
+
+        Parameters
+        ----------
+        name : str
+            Kernel.
         """
-        start, places = self._width_without_fields(name), {}
+        start = self._width_without_fields(name)
+        slices = {}
         for number, spread in self.spreads.items():
             cells, dofs = spread.dofs.shape
-            twice = 2 * self.parts[number].of_points + 1
-            sizes = {"theta_theta": twice, "gradient_theta": 1}
+            theta_theta_size = 2 * self.parts[number].of_points + 1
+            sizes = {"theta_theta": theta_theta_size, "gradient_theta": 1}
             for output in BY_FIELD.get(name, ()):
                 size = cells * sizes.get(output, dofs)
-                places[number, output] = slice(start, start + size)
+                slices[number, output] = slice(start, start + size)
                 start += size
-        return places
+        return slices
 
     @property
     def remembers(self) -> bool:
@@ -188,34 +239,37 @@ class Discretisation(Model):
 
     @cached_property
     def memory(self) -> PointLayout:
-        """What the points of the parts with memory carry."""
-        first = [s + p.of_law for p, s in zip(self.parts, self.starts, strict=False)]
-        return PointLayout(self.parts, first, self.geometry.shape[1], len(self.constants))
+        """Layout of the internal variables of the parts with memory."""
+        first_indices = [s + p.of_law for p, s in zip(self.parts, self.starts, strict=False)]
+        return PointLayout(self.parts, first_indices, self.geometry.shape[1], len(self.constants))
 
     @cached_property
     def unsymmetric(self) -> bool:
-        """Whether the slopes of the force have a skew part."""
+        """Whether derivatives of the forces have a skew part."""
         laws = any(part.damping.stress is not None for part in self.parts)
         return laws or self.rubs or any(f.turns or f.spins for f in self.forces)
 
     @cached_property
     def pattern(self) -> SymmetricPattern:
-        """Sparsity of the stiffness matrix."""
+        """Sparsity pattern of the stiffness matrix."""
         return SymmetricPattern.of_cells(self.cells, len(self.nodes_m))
 
     @cached_property
     def linearisation_width(self) -> int:
-        """Length of one timestep's row of `linearise`."""
+        """Length of one time step's row of `linearise`."""
         return self._width("linearisation")
 
     @cached_property
     def curvature_width(self) -> int:
-        """Length of one timestep's row of `curvature`."""
+        """Length of one time step's row of `curvature`."""
         return self._width("curvature")
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
-        """J = det F at every quadrature point, (T, E, q); not positive means inverted."""
-        nodes, (count, points) = len(self.nodes_m), self.geometry.shape[:2]
+        """Return J = det F at every quadrature point (T, E, q); elements with J ≤ 0 are
+        inverted.
+        """
+        nodes = len(self.nodes_m)
+        count, points = self.geometry.shape[:2]
         x = self._states(positions)[0].reshape(-1, nodes, 3)
         by_node = np.ascontiguousarray(x.transpose(1, 2, 0)).reshape(nodes, -1)
         slopes = (self.shape_gradients @ by_node).reshape(3, count * points, 3, len(x))
@@ -241,7 +295,13 @@ class Discretisation(Model):
     # Assembly -------------------------------------------------------------------------------
 
     def _states(self, *fields: ArrayLike) -> list[Array]:
-        """Every field as (T, 3n); native code relies on their shapes."""
+        """Return every node field as (T, 3n), contiguous; native code relies on these shapes.
+
+        Raises
+        ------
+        InputError
+            If a field does not fit the nodes, or numbers of states differ.
+        """
         nodes = len(self.nodes_m)
         arrays = [np.ascontiguousarray(field, dtype=float) for field in fields]
         for array in arrays:
@@ -253,6 +313,7 @@ class Discretisation(Model):
         return [array.reshape(-1, 3 * nodes) for array in arrays]
 
     def _state(self, positions: ArrayLike) -> Array:
+        """Return one state as (1, 3n); an `InputError` if there are several."""
         states = self._states(positions)[0]
         if len(states) != 1:
             raise InputError(
@@ -268,6 +329,20 @@ class Discretisation(Model):
         out: Array | None = None,
         carried: Past | None = None,
     ) -> Array:
+        """Evaluate a kernel on all parts and add up the results (T, width).
+
+        Parameters
+        ----------
+        name : str
+            Kernel in `expressions.KERNELS`.
+        fields : sequence of (T, 3n)
+            Node fields that the kernel needs: x, v, w.
+        theta : (k,)
+        out : (T, width), optional
+            Memory for the result; overwritten.
+        carried : Past, optional
+            Internal variables of a body with memory; zero by default.
+        """
         if len(theta) != len(self.constants):
             raise InputError(
                 f"{len(theta)} constants given, expected {len(self.constants)}: "
@@ -287,22 +362,25 @@ class Discretisation(Model):
         for k, evaluate in enumerate(self._evaluators[name]):
             values = self.point_constants(k, theta)
             if not self.parts[k].prony or name == "energy":
-                own = self.brought(k, theta, second=name == "curvature")
-                evaluate(fields, values, out, self.threads, k > 0, own)
+                point_data = self.brought(k, theta, second=name == "curvature")
+                evaluate(fields, values, out, self.threads, k > 0, point_data)
                 continue
             past = carried or self.memory.nothing(len(out))
             for rows, values[-1] in past.runs(k):
-                here = [field[rows] for field in fields]
-                own = self.brought(k, theta, past.overstress[rows])
-                evaluate(here, values, out[rows], self.threads, k > 0, own)
+                row_fields = [field[rows] for field in fields]
+                point_data = self.brought(k, theta, past.overstress[rows])
+                evaluate(row_fields, values, out[rows], self.threads, k > 0, point_data)
         return out
 
     def _width(self, name: str) -> int:
+        """Return the length of a result row of a kernel."""
         ends = (place.stop for place in self.of_cells(name).values())
         return max(ends, default=self._width_without_fields(name))
 
     def _width_without_fields(self, name: str) -> int:
-        k, size = len(self.constants), self.pattern.size
+        """Return the length of a result row without derivatives by the logarithms of fields."""
+        k = len(self.constants)
+        size = self.pattern.size
         entries = (2 + self.unsymmetric) * self.pattern.entries
         return {
             "energy": 1,
@@ -312,23 +390,27 @@ class Discretisation(Model):
         }[name]
 
     def _batch(self, name: str, number: int) -> Batch:
-        """Lay a part's outputs out in one row: vectors, lower triangles, columns for all of θ."""
+        """Return the batch of a kernel and part: where each output goes in the result row.
+
+        A row holds vectors, lower triangles, and columns for all of θ.
+        """
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[name](self.element, self.law(number, memory))
         cells, geometry = self.laid_out(part)
         vector, lower = element_destinations(self.pattern, cells)
-        total, count = len(self.constants), len(cells)
+        total = len(self.constants)
+        count = len(cells)
         # γ_m and the density come after the constants of the points and need no elements.
         columns = self.starts[number] + np.arange(part.of_points)
         if self.inverse is not None:
-            # What changes with an input changes so with the entry of θ that it is.
+            # The inputs of the stress-free shape are entries of θ.
             columns = np.concatenate([columns, self.inverse.places])
         by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
         square = (columns[:, None] + total * columns).ravel()
-        whole = np.zeros((count, 1), dtype=np.int64)
+        first_entry = np.zeros((count, 1), dtype=np.int64)
         places = {
-            "energy": (whole, 1),
+            "energy": (first_entry, 1),
             "force": (vector, self.pattern.size),
             "by_position": (lower, self.pattern.entries),
             "by_velocity": (lower, self.pattern.entries),
@@ -344,18 +426,22 @@ class Discretisation(Model):
         }
         used = {output: places[output] for output in kernel.contractions}
         starts = np.cumsum([0] + [length for _, length in used.values()])
-        laid = {
+        positions = {
             output: place + start
             for (output, (place, _)), start in zip(used.items(), starts, strict=False)
         }
-        for (of, output), here in self.of_cells(name).items():
-            if of == number:
-                own = np.arange(here.start, here.stop).reshape(count, -1)
-                laid[output] = _with_own(laid[output], own, output, part.of_points)
-        destinations = np.hstack(list(laid.values()))
-        carried, width = np.zeros((count, geometry.shape[1], 0), dtype=np.int64), 0
+        for (part_index, output), field_slice in self.of_cells(name).items():
+            if part_index == number:
+                field_positions = np.arange(field_slice.start, field_slice.stop).reshape(count, -1)
+                positions[output] = _with_own(
+                    positions[output], field_positions, output, part.of_points
+                )
+        destinations = np.hstack(list(positions.values()))
+        carried = np.zeros((count, geometry.shape[1], 0), dtype=np.int64)
+        width = 0
         if memory:
-            places_of, width = self.memory.of_part(number), self.memory.width
+            places_of = self.memory.of_part(number)
+            width = self.memory.width
             sets = 2 if name == "curvature" else 1
             carried = np.concatenate([places_of + k * width for k in range(sets)], axis=-1)
             width *= sets
@@ -364,16 +450,35 @@ class Discretisation(Model):
             carried = np.concatenate([carried, logs], axis=-1)
         if self.inverse is not None:
             carried = self.inverse.places_of_points(number)
-        own = carried if carried.shape[-1] else None
-        return Batch(kernel, cells, geometry, destinations, self._width(name), own)
+        return Batch(
+            kernel,
+            cells,
+            geometry,
+            destinations,
+            self._width(name),
+            carried=carried if carried.shape[-1] else None,
+        )
 
 
 def _with_own(places: Index, own: Index, output: str, constants: int) -> Index:
-    """(E, …) where columns by θ go, and those by the logarithm in each cell, (E, …) of its own."""
+    """Return the positions (E, …) of derivatives by θ and by the logarithm of each cell.
+
+    Parameters
+    ----------
+    places : (E, any)
+        Positions of derivatives by θ.
+    own : (E, any)
+        Positions of derivatives by the logarithm, one set for each cell.
+    output : str
+    constants : int
+        Number of constants of the points.
+    """
     if output != "theta_theta":
         return np.hstack([places, own])
-    count, size = len(places), constants + 1
-    whole = np.empty((count, size, size), dtype=np.int64)
-    whole[:, :-1, :-1] = places.reshape(count, constants, constants)
-    whole[:, -1], whole[:, :-1, -1] = own[:, :size], own[:, size:]
-    return whole.reshape(count, -1)
+    count = len(places)
+    size = constants + 1
+    positions = np.empty((count, size, size), dtype=np.int64)
+    positions[:, :-1, :-1] = places.reshape(count, constants, constants)
+    positions[:, -1] = own[:, :size]
+    positions[:, :-1, -1] = own[:, size:]
+    return positions.reshape(count, -1)

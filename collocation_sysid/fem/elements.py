@@ -1,10 +1,10 @@
 """Finite elements as table entries: shape functions, quadrature and mass lumping.
 
-A new element is a new entry of `ELEMENTS`; kernels, assembly and marker embedding read the
-table and know nothing else about the element.
+Use `element_named` to look an element up. A new element is a new entry of `ELEMENTS`; kernels,
+assembly and marker embedding read only this table.
 
 The quadratic tetrahedron has four corners and a node on each edge, in VTK's order. Its shape
-functions and lumping are those of straight sides, where each mid node lies halfway.
+functions and lumping assume straight sides, with each mid node in the middle of its edge.
 """
 
 from __future__ import annotations
@@ -38,13 +38,18 @@ MASS_SHARES = np.repeat([1 / 36, 4 / 27], [4, 6])
 
 
 def shape_functions(barycentric: Array) -> Array:
-    """L_a (2 L_a − 1) at the corners, 4 L_a L_b at the mid nodes: (k, 4) to (k, 10)."""
+    """Return the quadratic shape functions (k, 10) at barycentric points (k, 4).
+
+    They are L_a (2 L_a − 1) at the corners and 4 L_a L_b at the mid nodes.
+    """
     L = np.asarray(barycentric, dtype=float)
     return np.hstack([L * (2 * L - 1), 4 * L[:, _FROM] * L[:, _TO]])
 
 
 def shape_gradients(barycentric: Array) -> Array:
-    """Derivatives of the shape functions by L: (k, 4) to (k, 10, 4)."""
+    """Return the derivatives (k, 10, 4) of the quadratic shape functions at barycentric points (k,
+    4).
+    """
     L = np.asarray(barycentric, dtype=float)
     mid = np.arange(len(EDGES))
     gradients = np.zeros((len(L), 10, 4))
@@ -56,7 +61,7 @@ def shape_gradients(barycentric: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """A tetrahedral element in barycentric coordinates L = (L0, L1, L2, L3), ΣL = 1.
+    """Tetrahedral element in barycentric coordinates L = (L0, L1, L2, L3), ΣL = 1.
 
     Attributes
     ----------
@@ -67,16 +72,19 @@ class Element:
         (k, 4) barycentric points to (k, nodes) values.
     shape_gradients : callable
         (k, 4) barycentric points to (k, nodes, 4) derivatives with respect to L.
-    points, weights : ndarray
-        Quadrature, (q, 4) barycentric and (q,) fractions of the volume (they sum to one).
-    mass_shares : ndarray
-        (nodes,) share of the element's mass lumped at each node, all positive, sum one.
+    points : (q, 4)
+        Quadrature points in barycentric coordinates.
+    weights : (q,)
+        Quadrature weights as fractions of the volume; their sum is one.
+    mass_shares : (nodes,)
+        Fraction of the element's mass lumped at each node: all positive, sum one.
     meshio_type : str
         Cell name for writing files.
     edges : tuple of pairs
-        For each node after the corners, the two corners that it lies halfway between.
+        For each node after the corners, the two corners between which it lies halfway.
     mean_dilatation : bool
-        Whether the material feels the mean dilatation of the element, see `mean_dilatation`.
+        Whether the material is evaluated at the mean dilatation of the element, see
+        `mean_dilatation`.
     """
 
     name: str
@@ -118,7 +126,7 @@ ELEMENTS: dict[str, Element] = {
         mass_shares=np.full(4, 0.25),
         meshio_type="tetra",
     ),
-    # Bends without locking; what is chosen for it, and why, stands above.
+    # Bends without locking; quadrature and mass lumping are justified above.
     "tet10": _TET10,
     # One pressure for its ten nodes: keeps its volume without locking, however incompressible.
     "tet10-p0": replace(_TET10, name="tet10-p0", mean_dilatation=True),
@@ -126,12 +134,12 @@ ELEMENTS: dict[str, Element] = {
 
 
 def element_named(name: str) -> Element:
-    """Look an element up in the table.
+    """Return the element of this name in `ELEMENTS`.
 
     Raises
     ------
     InputError
-        If there is none of that name.
+        If there is no such element.
     """
     if name not in ELEMENTS:
         raise InputError(f"no element {name!r}; available: {', '.join(ELEMENTS)}")
@@ -139,18 +147,20 @@ def element_named(name: str) -> Element:
 
 
 def reference_geometry(points_m: Array, cells: NDArray[np.int64], element: Element) -> Array:
-    """Shape gradients and volumes at every quadrature point of the undeformed mesh.
+    """Return shape gradients and volumes at every quadrature point of the undeformed mesh.
 
     Parameters
     ----------
-    points_m : (n, 3) undeformed node positions
-    cells : (E, nodes) node numbers, corners first; sides are straight
+    points_m : (n, 3)
+        Undeformed node positions.
+    cells : (E, nodes)
+        Node indices, corners first; sides are straight.
     element : Element
 
     Returns
     -------
     (E, q, 3 * nodes + 1) ndarray
-        ∂N_a/∂X_j at column 3a + j, then the point's share of the volume [m³].
+        ∂N_a/∂X_j at column 3a + j, then the volume assigned to the point [m³].
     """
     corners = points_m[cells[:, :4]]
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)  # columns are edge vectors

@@ -1,18 +1,18 @@
-"""A constant that differs from place to place: the logarithm is a mean and modes of a prior.
+"""Constants that vary in space: the logarithm is a mean plus shapes with a smooth random prior.
 
-The prior of the logarithm about its mean has the correlation exp(−r/l) between places r apart, that
-of Matérn's family whose smoothness is ½: it is the solution of a stochastic differential equation
-on the mesh (Lindgren, Rue & Lindström 2011). With the eigenpairs λ_i, v_i of the mass-weighted
-Laplacian, free at the surface,
+Use `Field` to declare such a constant; `FieldModes` evaluates it. The prior of the logarithm about
+its mean has the correlation exp(−r/l) between places at a distance r, which is Matérn's family with
+smoothness ½: it is the solution of a stochastic differential equation on the mesh (Lindgren, Rue &
+Lindström 2011). With the eigenpairs λ_i, v_i of the mass-weighted Laplacian, free at the surface,
 
     ln c(X) = ln c̄ + Σ a_i φ_i(X),   φ_i ∝ v_i / (1/l² + λ_i),   a_i ~ N(0, 1),
 
-scaled so that the prior has the same deviation, the amplitude, everywhere. The v that is the same
-everywhere is left out: it is the mean. What finer shapes than these m would add is a share of the
-variance that belongs to the interval of every element, see `FieldModes.left_out`.
+scaled so that the prior has the same deviation, the amplitude, everywhere. The constant eigenvector
+is omitted: it is the mean. Shapes beyond the first m have a share of the variance that is included
+in the interval of every element, see `FieldModes.left_out`.
 
-Of a density, stated as ρ_s, not the logarithm is such a field but ρ / ρ_s: masses are linear in
-what is estimated, and it differs little within a material.
+For a density with the stated value ρ_s the field is ρ / ρ_s instead of the logarithm: masses are
+linear in the coefficients, and densities vary little within a material.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from .constants import DENSITY, YOUNG, Constant, is_modulus, mode
 from .elements import ELEMENTS, reference_geometry
 from .mesh import TetMesh
 
-# What Young's modulus stands for: the moduli of a material all follow it.
+# Parameter of a field of stiffness: all moduli of the material vary with it.
 ALL_MODULI = YOUNG.name
-# Random signs that tell a trace.
+# Number of random sign vectors for the estimate of a trace (Hutchinson's estimator).
 PROBES = 50
 # Prior standard deviation of the logarithm of the contrast of two phases: a factor of e.
 TWO_PHASE_AMPLITUDE = 1.0
@@ -49,22 +49,22 @@ Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByFor
 
 @stated
 class Field:
-    """A stiffness, density or another constant that differs from place to place within a material.
+    """Stiffness, density or another constant that varies in space within a material.
 
     Parameters
     ----------
     parameter : str
-        The constant: of the material or its damping law; young_pa is all moduli of a material;
+        Constant of the material or its damping law; young_pa stands for all moduli of a material;
         density_kg_m3.
     length_m : float or list
-        Over which distance it changes: the correlation of places so far apart is 1/e. Of several
-        the likeliest is taken.
+        Correlation length: places at this distance have the correlation 1/e. Of several lengths the
+        most likely one is used.
     modes : int
-        How many shapes make up the field; one more costs what one more right-hand side does.
+        Number of shapes of the field; one more costs as much as one more right-hand side.
     amplitude : float, optional
-        How much it differs: the prior standard deviation of the logarithm, 0.5 by default; of a
-        density that over its stated value, 0.3 by default. With prior = "two-phase", the prior
-        standard deviation of the logarithm of the contrast, 1 by default.
+        Prior standard deviation of the logarithm, 0.5 by default; for a density that of the ratio
+        to its stated value, 0.3 by default. With prior = "two-phase", the prior standard deviation
+        of the logarithm of the contrast, 1 by default.
     prior : {"smooth", "two-phase"}
         "smooth": the logarithm is a normal field. "two-phase": two materials with a boundary
         between them; the parameter contrast is the ratio of inclusions to surroundings.
@@ -78,12 +78,16 @@ class Field:
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
-        """Those to choose from."""
+        """Correlation lengths to choose from [m]."""
         return self.length_m if isinstance(self.length_m, tuple) else (self.length_m,)
 
     @property
     def deviation(self) -> float:
-        """The amplitude or its default: a density, unlike a logarithm, could fall below zero."""
+        """Prior standard deviation: the amplitude, or its default.
+
+        The default of a density is smaller, because a density, unlike a logarithm, could become
+        negative.
+        """
         if self.prior == TWO_PHASE:
             return self.amplitude or TWO_PHASE_AMPLITUDE
         return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
@@ -91,14 +95,19 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class Laplacian:
-    """The smoothest shapes of some cells.
+    """Lowest eigenpairs of the mass-weighted Laplacian on some cells.
 
     Attributes
     ----------
-    values : (m,) λ [1/m²]
-    vectors : (m, E) v in the middle of each cell
-    matrix : (n, n) with the eigenvalues λ, of the nodes and scaled by the roots of their masses
-    basis : (n, m + 1) its eigenvectors, that which is the same everywhere included
+    values : (m,)
+        Eigenvalues λ [1/m²], without that of the constant eigenvector.
+    vectors : (m, E)
+        Eigenvectors v at the centre of each cell.
+    matrix : (n, n)
+        Matrix with the eigenvalues λ: Laplacian of the nodes, scaled by the square roots of their
+        masses.
+    basis : (n, m + 1)
+        Eigenvectors of this matrix, including the constant one.
     """
 
     values: Array
@@ -108,63 +117,88 @@ class Laplacian:
 
     @classmethod
     def of(cls, mesh: TetMesh, cells: Index, count: int) -> Laplacian:
-        """The first of those that are not the same everywhere.
+        """Return the lowest eigenpairs after the constant eigenvector.
+
+        Parameters
+        ----------
+        mesh : TetMesh
+        cells : (k,) int
+            Indices of the cells.
+        count : int
+            Number m of eigenpairs.
 
         Raises
         ------
         InputError
-            If there are fewer.
+            If the cells have too few nodes.
         """
-        nodes, own = np.unique(mesh.tetrahedra[cells], return_inverse=True)
-        size, own = len(nodes), own.reshape(-1, 4)
+        nodes, local_nodes = np.unique(mesh.tetrahedra[cells], return_inverse=True)
+        size = len(nodes)
+        local_nodes = local_nodes.reshape(-1, 4)
         if not count + 2 < size:
             raise InputError(f"modes is {count}; expected at most {size - 3}, with {size} nodes")
-        geometry = reference_geometry(mesh.points_m[nodes], own, ELEMENTS["tet4"])[:, 0]
-        slopes, volumes = geometry[:, :-1].reshape(-1, 4, 3), geometry[:, -1]
+        geometry = reference_geometry(mesh.points_m[nodes], local_nodes, ELEMENTS["tet4"])[:, 0]
+        slopes = geometry[:, :-1].reshape(-1, 4, 3)
+        volumes = geometry[:, -1]
         stiffness = volumes[:, None, None] * slopes @ slopes.swapaxes(1, 2)
-        places = np.repeat(own, 4, axis=1).ravel(), np.tile(own, 4).ravel()
-        mass = np.bincount(own.ravel(), np.repeat(volumes / 4, 4), size)
+        places = np.repeat(local_nodes, 4, axis=1).ravel(), np.tile(local_nodes, 4).ravel()
+        mass = np.bincount(local_nodes.ravel(), np.repeat(volumes / 4, 4), size)
         root = sp.diags_array(1 / np.sqrt(mass))
         matrix = (root @ sp.csc_array((stiffness.ravel(), places), (size, size)) @ root).tocsc()
-        # A little below zero, where it can be factorised. The start makes it repeatable.
-        shift, start = -1e-3 * volumes.sum() ** (-2 / 3), np.random.default_rng(0).normal(size=size)
+        # A shift slightly below zero makes the matrix regular; a fixed start makes it repeatable.
+        shift = -1e-3 * volumes.sum() ** (-2 / 3)
+        start = np.random.default_rng(0).normal(size=size)
         values, basis = eigsh(matrix, count + 1, sigma=shift, v0=start)
         # A body of several pieces has more than one that is constant on each of them.
-        order, alike = np.argsort(values), np.sqrt(mass / mass.sum())
-        values, basis = values[order], basis[:, order]
+        order = np.argsort(values)
+        constant_vector = np.sqrt(mass / mass.sum())
+        values = values[order]
+        basis = basis[:, order]
         constant = np.flatnonzero(values < 1e-9 * values[-1])
-        turn = np.column_stack([basis[:, constant].T @ alike, np.eye(len(constant))])
-        basis[:, constant] = basis[:, constant] @ np.linalg.qr(turn)[0]
+        combination = np.column_stack(
+            [basis[:, constant].T @ constant_vector, np.eye(len(constant))]
+        )
+        basis[:, constant] = basis[:, constant] @ np.linalg.qr(combination)[0]
         basis *= np.sign(basis[np.abs(basis).argmax(axis=0), np.arange(count + 1)])
-        vectors = (root @ basis[:, 1:])[own].mean(axis=1).T
+        vectors = (root @ basis[:, 1:])[local_nodes].mean(axis=1).T
         return cls(np.maximum(values[1:], 0.0), vectors, matrix, basis)
 
     def weights(self, length_m: float) -> Array:
-        """(m,) deviation of the share of each v."""
+        """Return the prior deviations (m,) of the coefficients of the eigenvectors, up to a
+        factor.
+        """
         return 1 / (1 / length_m**2 + self.values)
 
     def share(self, length_m: float) -> float:
-        """What of the variance these shapes have, of all but that which is the same everywhere."""
-        size, own = len(self.basis), (self.weights(length_m) ** 2).sum()
+        """Return the share of the prior variance of these eigenvectors, without the constant one.
+
+        The trace that this needs is estimated with `PROBES` random sign vectors of a fixed seed.
+        """
+        size = len(self.basis)
+        own_variance = (self.weights(length_m) ** 2).sum()
         # The trace of a square is how far random signs are stretched on average.
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(size, PROBES))
         finer = signs - self.basis @ (self.basis.T @ signs)
         operator = (self.matrix + sp.eye_array(size) / length_m**2).tocsc()
-        return float(own / (own + (splu(operator).solve(finer) ** 2).sum() / PROBES))
+        return float(
+            own_variance / (own_variance + (splu(operator).solve(finer) ** 2).sum() / PROBES)
+        )
 
 
 @dataclass(frozen=True)
 class FieldShapes:
-    """What the shapes of a field can show.
+    """Resolution of a field by its shapes.
 
     Attributes
     ----------
     modes : int
+        Number of shapes.
     length_m, amplitude : float
+        Correlation length and prior standard deviation.
     share : float
-        What of its variance they have; the rest is of finer ones.
+        Share of the prior variance that the shapes represent; finer shapes have the rest.
     detail_m : float
-        Half the shortest wave length.
+        Half the shortest wavelength.
     """
 
     modes: int
@@ -176,16 +210,19 @@ class FieldShapes:
 
 @dataclass(frozen=True, eq=False)
 class FieldModes:
-    """A field as the body evaluates it.
+    """Shapes of a field, evaluated in every cell of a part.
 
     Attributes
     ----------
     field : Field
     laplacian : Laplacian
     scaled : tuple of int
-        Which constants of the material and the damping law follow it; none of a density.
+        Indices of the constants of material and damping law that the field multiplies; empty for a
+        density.
     length_m : float
+        Correlation length in use.
     volumes_m3 : (E,)
+        Volumes of the cells.
     """
 
     field: Field
@@ -196,12 +233,21 @@ class FieldModes:
 
     @classmethod
     def of(cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]) -> FieldModes:
-        """Those of a field of some cells, of constants of material and damping law.
+        """Return the shapes of a field on some cells.
+
+        Parameters
+        ----------
+        field : Field
+        mesh : TetMesh
+        cells : (E,) int
+            Indices of the cells.
+        law : tuple of Constant
+            Constants of the material and of the damping law.
 
         Raises
         ------
         InputError
-            If none of these is the field's.
+            If the field's parameter is not one of these constants, all moduli, or the density.
         """
         names = [constant.name for constant in law]
         moduli = [k for k, name in enumerate(names) if is_modulus(name)]
@@ -225,66 +271,75 @@ class FieldModes:
         return self.shapes
 
     def curvature(self, coefficients: Array, weights: Array) -> Array:
-        """Return Σ weights · ∂² of `logarithms` by the coefficients, (T, k, k).
+        """Return the weighted sum over cells of the second derivatives of `logarithms`, (T, k, k).
+
+        It is zero here, because the logarithms are linear in the coefficients.
 
         Parameters
         ----------
         coefficients : (k,)
-        weights : (T, E) of the cells
+        weights : (T, E)
+            Weights of the cells.
         """
         return np.zeros((len(weights), len(coefficients), len(coefficients)))
 
     @cached_property
     def share(self) -> float:
-        """What of the variance these shapes have."""
+        """Share of the prior variance that the shapes represent."""
         return self.laplacian.share(self.length_m)
 
     @property
     def left_out(self) -> float:
-        """Deviation of the logarithm by what finer shapes would add."""
+        """Standard deviation of the logarithm due to finer shapes, which are omitted."""
         return self.field.deviation * float(np.sqrt(1 - self.share))
 
     @cached_property
     def shapes(self) -> Array:
-        """φ (E, m) of the cells."""
-        weighed = self.laplacian.weights(self.length_m)[:, None] * self.laplacian.vectors
+        """Shapes φ (E, m) in the cells."""
+        unscaled = self.laplacian.weights(self.length_m)[:, None] * self.laplacian.vectors
         deviation = self.field.deviation * np.sqrt(self.share)
-        return (deviation * weighed / np.linalg.norm(weighed, axis=0)).T
+        return (deviation * unscaled / np.linalg.norm(unscaled, axis=0)).T
 
     @property
     def constants(self) -> tuple[Constant, ...]:
-        """The a."""
+        """Constants of the coefficients a."""
         return tuple(mode(k) for k in range(self.field.modes))
 
     @property
     def told(self) -> FieldShapes:
-        """The same in numbers."""
+        """Resolution of the field, for reports."""
         detail_m = float(np.pi / np.sqrt(self.laplacian.values[-1]))
-        own = self.field.modes, self.length_m, self.field.deviation
-        return FieldShapes(*own, self.share, detail_m)
+        return FieldShapes(
+            modes=self.field.modes,
+            length_m=self.length_m,
+            amplitude=self.field.deviation,
+            share=self.share,
+            detail_m=detail_m,
+        )
 
     def split_in_eight(self) -> FieldModes:
-        """The same field of a mesh whose cells are cut in eight."""
+        """Return this field on a mesh whose cells are split into eight."""
         vectors = np.repeat(self.laplacian.vectors, 8, axis=1)
         volumes_m3 = np.repeat(self.volumes_m3 / 8, 8)
-        whole = replace(self.laplacian, vectors=vectors)
-        return replace(self, laplacian=whole, volumes_m3=volumes_m3)
+        laplacian = replace(self.laplacian, vectors=vectors)
+        return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
 
     def at(self, length_m: float) -> FieldModes:
-        """The same of another length."""
+        """Return this field with another correlation length [m]."""
         return replace(self, length_m=length_m)
 
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Sums over cells of what changes with the logarithm of the constant in each cell.
+    """Assembly of derivatives by the logarithm of each cell into derivatives by the coefficients.
 
     Attributes
     ----------
     field : FieldModes
-    dofs : (E, d) of the nodes of each cell
+    dofs : (E, d)
+        Dofs of the nodes of each cell.
     size : int
-        Number of dofs of all.
+        Number of dofs of the body.
     """
 
     field: FieldModes
@@ -293,9 +348,10 @@ class Spread:
 
     @cached_property
     def _incidence(self) -> sp.csr_array:
-        """(size, E), with the number of each entry."""
-        cells, own = self.dofs.shape
-        rows, columns = self.dofs.ravel(), np.repeat(np.arange(cells), own)
+        """Sparse matrix (size, E) from cells to dofs; its values number its entries, from 1 on."""
+        cells, dofs_per_cell = self.dofs.shape
+        rows = self.dofs.ravel()
+        columns = np.repeat(np.arange(cells), dofs_per_cell)
         numbers = np.arange(1, rows.size + 1)
         return sp.csr_array((numbers, (rows, columns)), shape=(self.size, cells))
 
@@ -304,12 +360,17 @@ class Spread:
 
         Parameters
         ----------
-        values : (T, E · d) derivatives by the logarithm in each cell
-        slopes : (E, k) derivatives of these logarithms by the coefficients
+        values : (T, E · d)
+            Derivatives by the logarithm of each cell.
+        slopes : (E, k)
+            Derivatives of these logarithms by the coefficients.
         out : (T, size, k)
+            Result; overwritten.
         """
-        known = self._incidence
-        order = known.data - 1
-        for value, own in zip(values, out, strict=True):
-            matrix = sp.csr_array((value[order], known.indices, known.indptr), known.shape)
-            own[:] = matrix @ slopes
+        incidence = self._incidence
+        order = incidence.data - 1
+        for value, derivatives in zip(values, out, strict=True):
+            matrix = sp.csr_array(
+                (value[order], incidence.indices, incidence.indptr), incidence.shape
+            )
+            derivatives[:] = matrix @ slopes

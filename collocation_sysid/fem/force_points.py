@@ -1,7 +1,8 @@
-"""Where forces act that are laws of a few vectors: of nodes, or of points between them.
+"""Instances at which laws of a few vectors act: nodes, or points between nodes.
 
 An instance has L vectors y_l = Σ_a m[l, a] x_a of its K nodes: the nodes themselves, or a point of
-a face with what it meets. Forces on the vectors act on the nodes with the same weights.
+a face and what it touches. Forces on the vectors act on the nodes with the same weights. Use
+`ForcePoints` to gather vectors from node positions and to assemble forces and matrices.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import scipy.sparse as sp
 from ..arrays import Array, Index
 from .pattern import SymmetricPattern, dofs_of
 
-# Matrices that are kept: of the last eight choices of instances an operator, its transpose, and
-# those that add the symmetric and the skew part of the slopes.
+# Number of cached matrices: four for each of the latest eight choices of instances, namely the
+# operator, its transpose, and the assembly of the symmetric and of the skew parts.
 MOST_KEPT = 32
 
 
@@ -27,10 +28,12 @@ class ForcePoints:
 
     Attributes
     ----------
-    nodes : (i, K) of each
-    mix : (i, L, K) m
+    nodes : (i, K)
+        Node indices of each instance.
+    mix : (i, L, K)
+        Weights m of the nodes in each vector.
     node_count : int
-        Of the body.
+        Number of nodes of the body.
     """
 
     nodes: Index
@@ -39,7 +42,7 @@ class ForcePoints:
 
     @classmethod
     def of_nodes(cls, nodes: Index, node_count: int) -> ForcePoints:
-        """Instances (i, K) that take nodes as they are."""
+        """Return instances (i, K) whose vectors are the node positions."""
         count = nodes.shape[1]
         return cls(nodes, np.broadcast_to(np.eye(count), (len(nodes), count, count)), node_count)
 
@@ -50,21 +53,36 @@ class ForcePoints:
 
     @property
     def dofs(self) -> int:
-        """Numbers 3L that a law takes."""
+        """Number 3L of coordinates of the vectors of an instance."""
         return 3 * self.mix.shape[1]
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
-        """What the nodes of each join."""
+        """Pairs of dofs coupled by the nodes of an instance."""
         return SymmetricPattern.of_cells(self.nodes, self.node_count)
 
     def vectors(self, x: Array, chosen: Index | None = None) -> Array:
-        """Y (3L, T, i) of x (T, 3n), of all instances or of chosen ones."""
-        found = self._some("operator", chosen) @ x.T
-        return found.reshape(len(found) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
+        """Return the vectors y (3L, T, i) of node positions x (T, 3n).
+
+        Parameters
+        ----------
+        x : (T, 3n)
+            Positions, or velocities for ẏ.
+        chosen : array of int, optional
+            Indices of the instances; all by default.
+        """
+        stacked = self._some("operator", chosen) @ x.T
+        return stacked.reshape(len(stacked) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
 
     def summed(self, forces: Array, chosen: Index | None = None) -> Array:
-        """(T, 3n) from the forces (3L, T, i) on the vectors."""
+        """Return the nodal forces (T, 3n) of forces (3L, T, i) on the vectors.
+
+        Parameters
+        ----------
+        forces : (3L, T, i)
+        chosen : array of int, optional
+            Indices of the instances; all by default.
+        """
         flat = forces.transpose(2, 0, 1).reshape(len(forces) * forces.shape[2], forces.shape[1])
         return (self._some("transposed operator", chosen) @ flat).T
 
@@ -76,18 +94,40 @@ class ForcePoints:
         chosen: Index | None = None,
         skew: bool = False,
     ) -> None:
-        """Add to (T, any) at places (m,) lower triangles on the couplings, from (3L, 3L, T, i).
+        """Add matrices of the instances to lower triangles on the couplings, in place.
 
-        Half of the sum of each block with its transpose, or with `skew` of the difference.
+        The symmetric part of each block is added, i.e. half of its sum with its transpose, or with
+        `skew` the skew part, half of the difference.
+
+        Parameters
+        ----------
+        to : (T, any)
+            Shared array; modified.
+        places : (m,) int
+            Columns of `to` of the entries of `couplings`.
+        blocks : (3L, 3L, T, i)
+            Matrices of the instances.
+        chosen : array of int, optional
+            Indices of the instances; all by default.
+        skew : bool
         """
         columns, rows = np.triu_indices(len(blocks))
         values = blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
-        onto, touched = self._some("skew" if skew else "couplings", chosen)
-        values = np.moveaxis(values, 0, 2).reshape(values.shape[1], onto.shape[1])
-        to[:, places[touched]] += (onto @ values.T).T / 2
+        assembly, nonempty = self._some("skew" if skew else "couplings", chosen)
+        values = np.moveaxis(values, 0, 2).reshape(values.shape[1], assembly.shape[1])
+        to[:, places[nonempty]] += (assembly @ values.T).T / 2
 
     def _some(self, what: str, chosen: Index | None) -> Any:
-        """Of a matrix what belongs to chosen instances; that of the last few choices is kept."""
+        """Return the columns or rows of a matrix that belong to chosen instances; the latest are
+        cached.
+
+        Parameters
+        ----------
+        what : {"operator", "transposed operator", "couplings", "skew"}
+            For the last two, the rows that are not empty are returned with their indices.
+        chosen : array of int or None
+            Indices of the instances; None for all.
+        """
         key = what, None if chosen is None else chosen.tobytes()
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
@@ -98,31 +138,33 @@ class ForcePoints:
             elif what == "transposed operator":
                 self._kept[key] = self._some("operator", chosen).T
             else:
-                whole: Any = self._onto_skew if what == "skew" else self._onto_couplings
+                matrix: Any = self._onto_skew if what == "skew" else self._onto_couplings
                 if chosen is not None:
-                    whole = whole[:, _each(chosen, self.dofs * (self.dofs + 1) // 2)]
+                    matrix = matrix[:, _each(chosen, self.dofs * (self.dofs + 1) // 2)]
                 # Of few instances most rows are empty.
-                is_touched = np.bincount(whole.indices, minlength=whole.shape[0]) > 0
-                number, touched = np.cumsum(is_touched) - 1, np.flatnonzero(is_touched)
-                parts = whole.data, number[whole.indices], whole.indptr
-                shape = len(touched), whole.shape[1]
-                self._kept[key] = sp.csc_array(parts, shape=shape), touched
+                is_nonempty = np.bincount(matrix.indices, minlength=matrix.shape[0]) > 0
+                number = np.cumsum(is_nonempty) - 1
+                nonempty = np.flatnonzero(is_nonempty)
+                parts = matrix.data, number[matrix.indices], matrix.indptr
+                shape = len(nonempty), matrix.shape[1]
+                self._kept[key] = sp.csc_array(parts, shape=shape), nonempty
         return self._kept[key]
 
     @cached_property
     def _kept(self) -> dict[tuple[str, bytes | None], Any]:
+        """Cached matrices by kind and instances, filled on demand."""
         return {}
 
     @cached_property
     def _operator(self) -> sp.csr_array:
-        """(i · 3L, 3n)."""
+        """Sparse matrix (i · 3L, 3n) from node positions to vectors."""
         instance, local, node, weight = self.pairs
         shape = self.count * self.dofs, 3 * self.node_count
         return sp.csr_array((weight, (instance * self.dofs + local, node)), shape=shape)
 
     @cached_property
     def pairs(self) -> tuple[Index, Index, Index, Array]:
-        """(P,) instance, number among 3L, dof, and weight, of all that are not zero."""
+        """Instance, coordinate among 3L, dof and weight of all nonzero weights, (P,) each."""
         instance, vector, place = np.nonzero(self.mix)
         weight = self.mix[instance, vector, place]
         axes = np.arange(3)
@@ -132,42 +174,56 @@ class ForcePoints:
 
     @cached_property
     def _onto_couplings(self) -> sp.csc_array:
+        """Matrix that sums symmetric parts of instances into the couplings."""
         return self._onto(skew=False)
 
     @cached_property
     def _onto_skew(self) -> sp.csc_array:
+        """Matrix that sums skew parts of instances into the couplings."""
         return self._onto(skew=True)
 
     def _onto(self, skew: bool) -> sp.csc_array:
-        """What sums lower triangles (i, d(d + 1)/2), column after column, into the entries."""
+        """Return the matrix that sums lower triangles (i, d(d + 1)/2) into the entries of the
+        couplings.
+
+        The lower triangles are stacked column after column.
+        """
         instance, local, dof, weight = self.pairs
         order = np.argsort(instance, kind="stable")
-        instance, local, dof = instance[order], local[order], dof[order]
+        instance = instance[order]
+        local = local[order]
+        dof = dof[order]
         weight = weight[order]
         starts = np.searchsorted(instance, np.arange(self.count + 1))
-        sizes, found = np.diff(starts), []
+        sizes = np.diff(starts)
+        parts = []
         for size in np.unique(sizes):
             # (k, size) pairs of each instance that has so many.
-            here = np.flatnonzero(sizes == size)
-            at = starts[here][:, None] + np.arange(size)
-            a, b = np.repeat(np.arange(size), size), np.tile(np.arange(size), size)
-            row: Index = dof[at[:, a]]
-            column: Index = dof[at[:, b]]
-            kept = np.nonzero(row >= column)
-            first, second = at[:, a][kept], at[:, b][kept]
-            r, s = local[first], local[second]
+            instances_of_size = np.flatnonzero(sizes == size)
+            pairs = starts[instances_of_size][:, None] + np.arange(size)
+            a = np.repeat(np.arange(size), size)
+            b = np.tile(np.arange(size), size)
+            row: Index = dof[pairs[:, a]]
+            column: Index = dof[pairs[:, b]]
+            lower_pairs = np.nonzero(row >= column)
+            first = pairs[:, a][lower_pairs]
+            second = pairs[:, b][lower_pairs]
+            r = local[first]
+            s = local[second]
             value = weight[first] * weight[second]
             if skew:
                 value = np.where(r < s, -value, value)
-            d, low, high = self.dofs, np.minimum(r, s), np.maximum(r, s)
+            d = self.dofs
+            low = np.minimum(r, s)
+            high = np.maximum(r, s)
             lower = low * d - low * (low - 1) // 2 + high - low
-            place = self.couplings.position(row[kept], column[kept])
-            found.append((place, instance[first] * (d * (d + 1) // 2) + lower, value))
-        places, sources, values = map(np.concatenate, zip(*found, strict=True))
+            place = self.couplings.position(row[lower_pairs], column[lower_pairs])
+            parts.append((place, instance[first] * (d * (d + 1) // 2) + lower, value))
+        places, sources, values = map(np.concatenate, zip(*parts, strict=True))
         shape = self.couplings.entries, self.count * self.dofs * (self.dofs + 1) // 2
         return sp.csc_array((values, (places, sources)), shape=shape)
 
 
 def _each(chosen: Index, size: int) -> Index:
-    """Numbers of all that belongs to chosen instances."""
+    """Return the indices of all entries of chosen instances with `size` entries each."""
     return (chosen[:, None] * size + np.arange(size)).ravel()

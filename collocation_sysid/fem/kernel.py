@@ -1,14 +1,14 @@
-"""Kernels: what the quadrature points of an element contribute, as CasADi functions.
+"""Kernels: contributions of the quadrature points of an element, as CasADi functions.
 
-Up to the last product with the shape gradients a kernel knows only F, Ḟ and the like, the symbols
-of a `QuadraturePoint`: 9 or 9 × 9 numbers whatever the element, its *pieces*. How they meet the
-shape gradients is told by a `Contraction`, which an evaluator may do in loops: written out for ten
-nodes it is most of the instructions.
+Before the product with the shape gradients a kernel depends only on F, Ḟ and similar gradients, the
+symbols of a `QuadraturePoint`: 9 or 9 × 9 numbers for any element, called its *pieces*. A
+`Contraction` states how pieces are multiplied with the shape gradients. Evaluators do this in
+loops: written out for ten nodes it would be most of the instructions.
 
-Most kernels are one sum over the points. In others a point needs to know of the whole element, such
-as its volume. They have earlier `Phase`s, each a sum over the points of its own, and a coupling:
-with A (3·nodes, m) holding the node vectors so summed, it adds A C to an output that is contracted
-to node vectors, and the lower triangle of A D Aᵀ to one that is a matrix.
+Most kernels are one sum over the points. In others a point depends on quantities of the whole
+element, such as its volume. These have earlier `Phase`s, each with its sum over the points, and a
+coupling: with the summed node vectors as columns of A (3·nodes, m), it adds A C to an output that
+is contracted to node vectors, and the lower triangle of A D Aᵀ to an output that is a matrix.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ import casadi as ca
 from .elements import Element
 from .rest_point import RestPoint
 
-# What becomes of a piece: nothing; (9, k), conjugate to F, to (3·nodes, k); or a symmetric (9, 9)
-# to the lower triangle of (3·nodes, 3·nodes).
+# Product of a piece with the shape gradients. "none": no product; "nodes": from (9, k), conjugate
+# to F, to (3·nodes, k); "pairs": from a symmetric (9, 9) to the lower triangle of
+# (3·nodes, 3·nodes).
 Contraction = Literal["none", "nodes", "pairs"]
 # Inputs that differ between the points of an element.
 OF_POINTS = ("geometry", "carried")
@@ -36,11 +37,11 @@ class Phase:
     Attributes
     ----------
     pieces : casadi.Function
-        Of the fields, geometry, θ, what a point carries if it has a memory and, unless it is the
-        first phase, one vector of all outputs of earlier phases that are not contracted; one
-        output for each piece.
+        One output for each piece. Inputs are the fields, geometry, θ, the internal variables of the
+        point if it has any, and, except in the first phase, one vector of all uncontracted outputs
+        of earlier phases.
     contractions : dict of str to Contraction
-        For each output.
+        Contraction of each output.
     """
 
     pieces: ca.Function
@@ -48,12 +49,12 @@ class Phase:
 
     @property
     def nodes(self) -> int:
-        """Nodes per element."""
+        """Number of nodes per element."""
         return self.pieces.nnz_in(0) // 3
 
     @cached_property
     def function(self) -> ca.Function:
-        """What one point contributes, contractions written out."""
+        """Contribution of one point, with the contractions written out."""
         sx = self.pieces
         names = sx.name_in()
         inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
@@ -66,12 +67,22 @@ class Phase:
         return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
 
     def over_points(self, *inputs: Any) -> list[Any]:
-        """The sums, each in one column; what differs between points has a column for each."""
+        """Return the sums over the points, each in one column.
+
+        Inputs that differ between the points, see `OF_POINTS`, have one column for each point.
+        """
         names = self.pieces.name_in()
-        own = {k: ca.horzsplit(inputs[k]) for k, name in enumerate(names) if name in OF_POINTS}
-        count = len(own[names.index("geometry")])
+        point_columns = {
+            k: ca.horzsplit(inputs[k]) for k, name in enumerate(names) if name in OF_POINTS
+        }
+        count = len(point_columns[names.index("geometry")])
         points = [
-            self.function.call([own[k][p] if k in own else each for k, each in enumerate(inputs)])
+            self.function.call(
+                [
+                    point_columns[k][p] if k in point_columns else each
+                    for k, each in enumerate(inputs)
+                ]
+            )
             for p in range(count)
         ]
         return [sum(outputs[1:], outputs[0]) for outputs in zip(*points, strict=True)]
@@ -79,17 +90,20 @@ class Phase:
 
 @dataclass(frozen=True, eq=False)
 class PointKernel:
-    """What the quadrature points of an element contribute.
+    """Contribution of the quadrature points of an element, summed.
 
     Attributes
     ----------
-    pieces, contractions
-        Of the last phase, whose outputs are the kernel's.
+    pieces : casadi.Function
+        Pieces of the last phase, whose outputs are those of the kernel.
     fields : tuple of str
-        Names of the inputs that come first, each 3·nodes long.
+        Names of the first inputs, each 3·nodes long.
+    contractions : dict of str to Contraction
+        Contraction of each output.
     earlier : tuple of Phase
+        Phases before the last one.
     coupled : dict of str to Contraction
-        Further outputs of the pieces, which are summed for the coupling alone.
+        Further outputs of the last phase, which are summed for the coupling only.
     coupling : casadi.Function, optional
         C or D for each output, sparse, from the vector of all uncontracted sums: those of the
         earlier phases, then of `coupled`.
@@ -104,35 +118,40 @@ class PointKernel:
 
     @property
     def carried(self) -> int:
-        """How many numbers a point carries from the past."""
+        """Number of internal variables and other data of a point."""
         names = self.pieces.name_in()
         return self.pieces.nnz_in(names.index("carried")) if "carried" in names else 0
 
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
-        """All of them, the last one included."""
+        """All phases, the last one included."""
         return (*self.earlier, Phase(self.pieces, self.contractions | self.coupled))
 
     @cached_property
     def source(self) -> str:
-        """What tells it from others."""
+        """Serialised expressions and contractions, which identify the kernel."""
         functions = [phase.pieces for phase in self.phases]
         functions += [self.coupling] if self.coupling else []
         contractions = f"{[phase.contractions for phase in self.phases]}"
         return contractions + " ".join(function.serialize() for function in functions)
 
     def element_function(self, points: int) -> ca.Function:
-        """The sum over an element, of fields, geometry (3·nodes + 1, points), θ and the like."""
+        """Return the sum over an element of `points` points as a CasADi function.
+
+        Its inputs are the fields, geometry (3·nodes + 1, points), θ and, if any, data of the
+        points.
+        """
         names = self.phases[0].pieces.name_in()
         inputs = [ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)]
         for place in (k for k, name in enumerate(names) if name in OF_POINTS):
             inputs[place] = ca.MX.sym(names[place], self.pieces.size1_in(place), points)
         size = 3 * self.phases[0].nodes
-        sums, vectors = ca.MX(0, 1), ca.MX(size, 0)
+        sums = ca.MX(0, 1)
+        vectors = ca.MX(size, 0)
         outputs: list[ca.MX] = []
         for phase in self.phases:
-            found = phase.over_points(*inputs, *([sums] if sums.numel() else []))
-            for key, total in zip(phase.contractions, found, strict=True):
+            totals = phase.over_points(*inputs, *([sums] if sums.numel() else []))
+            for key, total in zip(phase.contractions, totals, strict=True):
                 if key in self.contractions:
                     outputs.append(total)
                 elif phase.contractions[key] == "none":
@@ -141,24 +160,28 @@ class PointKernel:
                     vectors = ca.horzcat(vectors, ca.reshape(total, size, -1))
         if self.coupling:
             couplings = self.coupling.call([sums])
-            hows = self.contractions.values()
+            contractions = self.contractions.values()
             outputs = [
-                _coupled(*each, vectors) for each in zip(outputs, couplings, hows, strict=True)
+                _coupled(*each, vectors)
+                for each in zip(outputs, couplings, contractions, strict=True)
             ]
         return ca.Function(self.pieces.name(), inputs, outputs, names, list(self.contractions))
 
 
 def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
-    """(nodes, 3) shape gradients."""
+    """Return the shape gradients (nodes, 3) from the geometry of a point."""
     return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
 
 
 def mirrored(matrix: ca.SX) -> ca.SX:
-    """A matrix that is known to be symmetric, half of which need not be computed."""
+    """Return a matrix that is known to be symmetric from its lower triangle, to save
+    computations.
+    """
     return ca.tril2symm(ca.tril(ca.densify(matrix)))
 
 
 def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
+    """Return an output with the contribution of the coupling, see the module."""
     if how == "none":
         return output
     if how == "nodes":
@@ -168,6 +191,7 @@ def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -
 
 
 def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
+    """Return a piece multiplied with the shape gradients (nodes, 3)."""
     if how == "none":
         return piece
     nodes = gradients.shape[0]
@@ -179,35 +203,38 @@ def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
     for b in range(nodes):
         rows = half[3 * b : 3 * b + 3, :].T
         blocks = [_at_node(rows, gradients[a, :]) for a in range(b, nodes)]
-        whole = ca.vertcat(*blocks)
-        columns += [whole[j:, j] for j in range(3)]
+        column_block = ca.vertcat(*blocks)
+        columns += [column_block[j:, j] for j in range(3)]
     return ca.vertcat(*columns)
 
 
 def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
-    """Columns of (9, k), conjugate to F, times one node's shape gradient: (3, k)."""
+    """Return the columns of (9, k), conjugate to F, times the shape gradient of one node: (3,
+    k).
+    """
     columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
     return ca.horzcat(*columns)
 
 
-# A derivative of a scalar: by none, one or two of x, v and θ, θ last.
+# Variables of a derivative of a scalar: none, one or two of "x", "v" and "theta", "theta" last.
 By = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Derivative:
-    """A derivative of a scalar, as a summand of an output.
+    """Derivative of a scalar, as a summand of an output.
 
     Attributes
     ----------
     scalar : SX
-        In the symbols of a `QuadraturePoint`.
-    by : By
+        Scalar in the symbols of a `QuadraturePoint`.
+    by : tuple of str
+        Variables: none, one or two of "x", "v" and "theta", the last one last.
     part : {"whole", "symmetric", "skew"}
-        Of a second derivative by fields; one that is taken whole is known to be symmetric.
+        Part of a second derivative by fields; "whole" requires that it is symmetric.
     known : SX, optional
-        The derivative by the fields' gradients, where nothing stretches, in a shorter form than
-        differentiation finds.
+        Shorter expression of the derivative by the gradients of the fields, for elements that do
+        not average the dilatation.
     """
 
     scalar: ca.SX
@@ -217,12 +244,14 @@ class Derivative:
 
     @property
     def contraction(self) -> Contraction:
-        """What becomes of its piece: it has as many node indices as fields."""
-        hows: tuple[Contraction, ...] = ("none", "nodes", "pairs")
-        return hows[len(self.by) - self.by.count("theta")]
+        """Contraction of its piece: as many node indices as variables that are fields."""
+        contractions: tuple[Contraction, ...] = ("none", "nodes", "pairs")
+        return contractions[len(self.by) - self.by.count("theta")]
 
     def of(self, piece: ca.SX) -> ca.SX:
-        """What is taken of the (9, 9) piece of a second derivative by fields, any other whole."""
+        """Return the stated part of the (9, 9) piece of a second derivative by fields; others
+        unchanged.
+        """
         if self.contraction != "pairs":
             return piece
         if self.part == "whole":
@@ -233,9 +262,9 @@ class Derivative:
         return (piece.T - piece) / 2
 
 
-# The terms of each output.
+# Derivatives that are summed in each output.
 Outputs = dict[str, tuple[Derivative, ...]]
-# For each output its contraction, and its piece in the symbols of a `QuadraturePoint`.
+# Contraction and piece, in the symbols of a `QuadraturePoint`, of each output.
 Pieces = dict[str, tuple[Contraction, ca.SX]]
 
 
@@ -246,22 +275,23 @@ class QuadraturePoint:
     Attributes
     ----------
     nodes : int
+        Number of nodes of the element.
     fields : dict of str to SX
-        (3·nodes,) of x and, where they are needed, v and w.
+        Node fields (3·nodes,): x and, if needed, v and w.
     geometry, theta : SX
         See `expressions`.
     gradients : dict of str to SX
-        Of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column (9): F, Ḟ and W.
+        Gradients of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column (9,): F, Ḟ and W.
     stretches : tuple of SX
-        Where the element averages the dilatation, the logarithm m of the stretch that does so and,
+        If the element averages the dilatation: the logarithm m of the stretch that does so and,
         with v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
     carried : SX
-        What the point brings from the past, see `memory`; with a field, the logarithm comes last.
+        Internal variables of the point, see `memory`; with a field, its logarithm comes last.
     scaled : tuple of int
-        Places in θ of the constants that a field multiplies, see `field`.
+        Indices in θ of the constants that a field multiplies, see `field`.
     rest : RestPoint, optional
-        Layout of the stress-free shape, where that is not the mesh, see `rest_shape`: its numbers
-        are the last ones carried, and the changes of its inputs the last entries of θ.
+        Layout of a stress-free shape that is not the mesh, see `rest_shape`: its data are the last
+        ones of `carried`, and the changes of its inputs the last entries of θ.
     """
 
     nodes: int
@@ -284,7 +314,22 @@ class QuadraturePoint:
         scaled: tuple[int, ...] = (),
         rest: RestPoint | None = None,
     ) -> QuadraturePoint:
-        """A point of an element, with θ of so many constants, that carries so many numbers."""
+        """Return the symbols of a quadrature point of an element.
+
+        Parameters
+        ----------
+        element : Element
+        constants : int
+            Length of θ.
+        *fields : str
+            Node fields: "x", and if needed "v" and "w".
+        carried : int
+            Number of internal variables.
+        scaled : tuple of int
+            Indices in θ of the constants that a field multiplies.
+        rest : RestPoint, optional
+            Layout of the data of the stress-free shape.
+        """
         stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
         return cls(
             element.nodes,
@@ -300,37 +345,37 @@ class QuadraturePoint:
 
     @property
     def constants(self) -> ca.SX:
-        """θ as it is here."""
-        here = ca.SX(self.theta)
+        """Constants θ at this point, multiplied by the field."""
+        constants = ca.SX(self.theta)
         for place in self.scaled:
-            here[place] *= ca.exp(self.carried[-1])
-        return here
+            constants[place] *= ca.exp(self.carried[-1])
+        return constants
 
     @property
     def varied(self) -> ca.SX:
-        """What derivatives by "theta" are by: θ, and the logarithm of the field."""
+        """Variables of derivatives by "theta": θ, and the logarithm of the field."""
         return ca.vertcat(self.theta, self.carried[-1]) if self.scaled else self.theta
 
     @property
     def brought(self) -> ca.SX:
-        """What is carried but the logarithm of the field."""
+        """Internal variables, i.e. the data of the point without the logarithm of the field."""
         return self.carried[:-1] if self.scaled else self.carried
 
     @property
     def mesh_volume(self) -> ca.SX:
-        """The point's share of the element's volume in the mesh."""
+        """Volume assigned to the point in the mesh [m³]."""
         return self.geometry[3 * self.nodes]
 
     @property
     def volume(self) -> ca.SX:
-        """The point's share of the element's volume free of stress."""
+        """Volume assigned to the point in the stress-free shape [m³]."""
         if self.rest is None:
             return self.mesh_volume
         return self.mesh_volume * ca.det(ca.reshape(self._rest_values[:9], 3, 3))
 
     @property
     def _rest_values(self) -> ca.SX:
-        """Numbers of the stress-free shape here, see `RestPoint`."""
+        """Values of the stress-free shape at this point, see `RestPoint`."""
         assert self.rest is not None
         data = self.carried[self.carried.numel() - self.rest.count :]
         changes = self.theta[self.theta.numel() - self.rest.inputs :]
@@ -338,7 +383,10 @@ class QuadraturePoint:
 
     @property
     def felt(self) -> ca.SX:
-        """The deformation gradient that the material feels, (3, 3)."""
+        """Deformation gradient at which the material is evaluated (3, 3).
+
+        It includes the averaged dilatation and the stress-free shape.
+        """
         F = ca.reshape(self.gradients["x"], 3, 3)
         stretch = self.stretches[0] if self.stretches else None
         if self.rest is not None:
@@ -350,32 +398,32 @@ class QuadraturePoint:
 
     @property
     def strain(self) -> ca.SX:
-        """What of an energy changes with x: F and m."""
+        """Symbols of an energy that depend on x: F and m."""
         return ca.vertcat(self.gradients["x"], *self.stretches[:1])
 
     @property
     def strain_rate(self) -> ca.SX:
-        """Its derivative along v."""
+        """Symbols of the derivative of `strain` along v."""
         return ca.vertcat(self.gradients["v"], *self.stretches[1:2])
 
     @property
     def felt_rate(self) -> ca.SX:
-        """The derivative along v of the deformation gradient that the material feels, (9,)."""
+        """Derivative of `felt` along v, stacked (9,)."""
         return ca.jtimes(ca.vec(self.felt), self.strain, self.strain_rate)
 
     @property
     def felt_weight(self) -> ca.SX:
-        """Its derivative along w."""
-        along = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
-        return ca.jtimes(ca.vec(self.felt), self.strain, along)
+        """Derivative of `felt` along w, stacked (9,)."""
+        weights = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
+        return ca.jtimes(ca.vec(self.felt), self.strain, weights)
 
     def along_w(self, scalar: ca.SX) -> ca.SX:
-        """Derivative of a scalar of x and v by x, along w."""
+        """Return the derivative of a scalar of x and v by x along w."""
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
         return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.stretches[2:]))
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
-        """A derivative of a scalar, by the fields' gradients for the fields."""
+        """Return a derivative of a scalar, where fields stand for their gradients."""
         inputs = [self.varied if name == "theta" else self.gradients[name] for name in by]
         if not inputs:
             return scalar
@@ -384,7 +432,17 @@ class QuadraturePoint:
         return ca.jacobian(ca.gradient(scalar, inputs[0]), inputs[1])
 
     def phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
-        """A phase of these pieces, which may depend on sums of earlier ones."""
+        """Return a phase with these pieces.
+
+        Parameters
+        ----------
+        name : str
+            Name of the CasADi function.
+        pieces : dict
+            Contraction and piece of each output.
+        sums : SX, optional
+            Symbols of the sums of earlier phases on which the pieces depend.
+        """
         inputs = {**self.fields, "geometry": self.geometry, "theta": self.theta}
         if self.carried.numel():
             inputs["carried"] = self.carried

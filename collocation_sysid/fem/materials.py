@@ -1,23 +1,22 @@
-"""Laws of materials in CasADi SX, each with its constants: energy, damping, branches of memory.
+"""Material laws in CasADi SX, each with its constants: energies, damping laws and Prony branches.
 
 A `Material` is a function ``energy(F, **constants) -> ψ`` [J/m³] of the 3 × 3 deformation gradient
-with ψ(I) = 0 and no stress at F = I. Its constants are the function's arguments. Any such function
-is one: `Material.of(function)`, or pass it to `Body`.
+with ψ(I) = 0 and no stress at F = I. Its constants are the arguments of the function. To use a
+custom energy, call `Material.of(function)` or pass the function to `Body`.
 
-Those written in (λ, μ) have the small-strain stiffness of linear elasticity with these. Those
-written in isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂ have the volumetric term
-½ κ (J − 1)². Ogden's is left out: its derivatives by principal stretches are not exact where
-stretches coincide.
+Energies in (λ, μ) have the small-strain stiffness of linear elasticity with these constants.
+Energies in the isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂ have the volumetric term ½ κ
+(J − 1)². Ogden's is omitted: its derivatives by principal stretches are not exact where stretches
+coincide.
 
-A `Damping` law is a potential or a stress of the rate of deformation. "kelvin-voigt" and "material"
-are objective and dissipate at any strain, with viscosities by the small-strain Lamé constants: the
-former is a viscous fluid in the current shape, the latter is viscous in the rate of the Green
-strain.
-Rayleigh's is the same at small strain, but it also resists that a stretched body turns, and feeds
-energy in where the stiffness is not positive.
+A `Damping` law is a potential or a stress that depends on the rate of deformation. "kelvin-voigt"
+and "material" are objective and dissipate at any strain, with viscosities proportional to the
+small-strain Lamé constants: the former is a viscous fluid in the current shape, the latter is
+viscous in the rate of the Green strain. Rayleigh's law agrees with both at small strain, but it
+also damps the rotation of a stretched body, and adds energy where the stiffness is not positive
+definite.
 
-Beside it the mass of a region is damped by γ_m, see `body`. What branches of memory do is told in
-`memory`.
+Mass-proportional damping γ_m is part of `body`, the evolution of Prony branches part of `memory`.
 """
 
 from __future__ import annotations
@@ -39,13 +38,13 @@ from .kernel import mirrored
 T = TypeVar("T")
 Energy = Callable[..., ca.SX]
 
-# Share of the stiffness that energy and stress of an undeformed material may be off by.
+# Largest energy and stress of an undeformed material, as a fraction of its stiffness: rounding.
 AT_REST = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A strain-energy density and the constants that it needs.
+    """Strain-energy density with its constants.
 
     Attributes
     ----------
@@ -53,7 +52,7 @@ class Material:
     energy : callable
         ``energy(F, **constants) -> ψ``.
     constants : tuple of Constant
-        In the order of θ.
+        Constants in the order of θ.
     """
 
     name: str
@@ -62,52 +61,59 @@ class Material:
 
     @classmethod
     def of(cls, energy: Energy, name: str = "", *constants: Constant) -> Material:
-        """A material of a function; its arguments after F name the constants.
+        """Return a material from an energy function; its arguments after F are the constants.
 
         Parameters
         ----------
         energy : callable
             ``energy(F, mu_pa, …) -> ψ`` in CasADi operations.
         name : str, optional
-            The function's by default.
+            Name of the material; that of the function by default.
         *constants : Constant
-            Bounds, symbols and scales where the names alone do not tell.
+            Definitions of constants whose bounds, symbols or scales do not follow from the names.
 
         Raises
         ------
         InputError
-            If it has no constants, or the undeformed material has energy or stress.
+            If the function has no constants, or the undeformed material has energy or stress.
         """
         name = name or getattr(energy, "__name__", "energy").replace("_", "-")
-        told = {constant.name: constant for constant in constants}
+        definitions = {constant.name: constant for constant in constants}
         arguments = _arguments(energy)
         if not arguments:
             raise InputError(
                 f"material {name!r} has no constants; expected a function of the deformation "
                 "gradient and named constants, such as energy(F, lambda_pa, mu_pa)"
             )
-        if unused := sorted(set(told) - set(arguments)):
+        if unused := sorted(set(definitions) - set(arguments)):
             raise InputError(
                 f"material {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
             )
-        material = cls(name, energy, tuple(told.get(a) or constant_named(a) for a in arguments))
+        material = cls(
+            name, energy, tuple(definitions.get(a) or constant_named(a) for a in arguments)
+        )
         material._check_at_rest()
         return material
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
-        """The energy density with the constants given as a vector, in their order."""
+        """Return the energy density as an expression, from the constants as a vector in their
+        order.
+        """
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
         return ca.SX(self.energy(F, **named))
 
     @cached_property
     def lame(self) -> ca.Function:
-        """Small-strain (λ, μ) from the constants: C₁₁₂₂ and C₁₂₁₂ at F = I."""
-        F, values = ca.SX.sym("F", 9), ca.SX.sym("values", len(self.constants))
+        """Function from the constants to the small-strain (λ, μ): C₁₁₂₂ and C₁₂₁₂ at F = I."""
+        F = ca.SX.sym("F", 9)
+        values = ca.SX.sym("values", len(self.constants))
         psi = self.psi(ca.reshape(F, 3, 3), values)
         return ca.Function("lame", [values], [lame_constants(psi, F)])
 
     def _check_at_rest(self) -> None:
-        F, values = ca.SX.sym("F", 9), ca.SX.sym("values", len(self.constants))
+        """Raise an `InputError` unless energy and stress vanish at F = I."""
+        F = ca.SX.sym("F", 9)
+        values = ca.SX.sym("values", len(self.constants))
         try:
             psi = self.psi(ca.reshape(F, 3, 3), values)
             tangent, stress = ca.hessian(psi, F)
@@ -117,39 +123,46 @@ class Material:
                 "function of CasADi operations that returns one energy density"
             ) from error
         law = ca.Function("law", [F, values], [psi, stress, tangent])
-        some = [float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1])) for c in self.constants]
-        energy, force, stiffness = (o.full() for o in law(np.eye(3).ravel(), some))
-        size = np.abs(stiffness).max()
+        sample_values = [
+            float(np.sqrt(max(c.bounds[0], 1e-3) * c.bounds[1])) for c in self.constants
+        ]
+        energy, force, stiffness = (o.full() for o in law(np.eye(3).ravel(), sample_values))
+        scale = np.abs(stiffness).max()
         for what, unit, found in (("energy", "J/m³", energy), ("stress", "Pa", force)):
             worst = np.abs(found).max()
-            if not worst <= AT_REST * size:
+            if not worst <= AT_REST * scale:
                 raise InputError(
                     f"material {self.name!r} has the {what} {worst:.3g} {unit} undeformed, with "
-                    f"{self._said(some)}; expected none at F = I: subtract it"
+                    f"{self._said(sample_values)}; expected none at F = I: subtract it"
                 )
 
     def _said(self, values: list[float]) -> str:
+        """Return the constants with given values as text."""
         return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
 
 
 def lame_constants(psi: ca.SX, F: ca.SX) -> ca.SX:
-    """Small-strain (λ, μ), C₁₁₂₂ and C₁₂₁₂ at F = I, of an energy density of F stacked (9,)."""
+    """Return the small-strain (λ, μ), C₁₁₂₂ and C₁₂₁₂ at F = I, of an energy density of F stacked
+    (9,).
+    """
     tangent, _ = ca.hessian(psi, F)
     entries = ca.vertcat(tangent[0, 4], tangent[1, 1])
     return ca.simplify(ca.substitute(entries, F, ca.SX(ca.DM(np.eye(3).ravel()))))
 
 
 def neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3) (Bonet & Wood 2008, eq. 6.27)."""
+    """Neo-Hookean energy ψ = ½ λ (ln J)² − μ ln J + ½ μ (tr C − 3) (Bonet & Wood 2008, eq.
+    6.27).
+    """
     log_j = ca.log(ca.det(F))
     return 0.5 * lambda_pa * log_j**2 - mu_pa * log_j + 0.5 * mu_pa * (ca.sumsqr(F) - 3)
 
 
 def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """ψ = ½ μ (tr C − 3) − μ (J − 1) + ½ (λ + μ)(J − 1)², finite also for inverted elements.
+    """Stable neo-Hookean energy ψ = ½ μ (tr C − 3) − μ (J − 1) + ½ (λ + μ)(J − 1)².
 
-    Smith, de Goes & Kim 2018, eq. 13, with λ + μ in place of λ so that the small-strain
-    limit is linear elasticity with (λ, μ).
+    It is finite for inverted elements, too (Smith, de Goes & Kim 2018, eq. 13, with λ + μ in place
+    of λ, so that the small-strain limit is linear elasticity with (λ, μ)).
     """
     j = ca.det(F)
     return (
@@ -160,53 +173,66 @@ def stable_neo_hookean(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
 
 
 def st_venant_kirchhoff(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """ψ = ½ λ (tr E)² + μ E:E with the Green strain E = ½ (C − I). Softens in compression."""
+    """St. Venant–Kirchhoff energy ψ = ½ λ (tr E)² + μ E:E with the Green strain E = ½ (C − I).
+
+    It softens in compression.
+    """
     strain = 0.5 * (F.T @ F - ca.SX.eye(3))
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
 
 
 def linear_elastic(F: ca.SX, lambda_pa: ca.SX, mu_pa: ca.SX) -> ca.SX:
-    """ψ = ½ λ (tr ε)² + μ ε:ε with ε = sym F − I. Small rotations only: it resists turning."""
+    """Linear elastic energy ψ = ½ λ (tr ε)² + μ ε:ε with ε = sym F − I.
+
+    For small rotations only, because it resists rotation.
+    """
     strain = 0.5 * (F + F.T) - ca.SX.eye(3)
     return 0.5 * lambda_pa * ca.trace(strain) ** 2 + mu_pa * ca.sumsqr(strain)
 
 
 def mooney_rivlin(F: ca.SX, c10_pa: ca.SX, c01_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
-    """ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + U; μ = 2 (C₁₀ + C₀₁) (Bonet & Wood 2008, sec. 6.5)."""
+    """Mooney–Rivlin energy ψ = C₁₀ (Ī₁ − 3) + C₀₁ (Ī₂ − 3) + U, with μ = 2 (C₁₀ + C₀₁).
+
+    See Bonet & Wood 2008, sec. 6.5.
+    """
     first, second = _isochoric_invariants(F)
     return c10_pa * (first - 3) + c01_pa * (second - 3) + _volumetric(F, kappa_pa)
 
 
 def yeoh(F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX) -> ca.SX:
-    """ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3; μ = 2 C₁₀ (Yeoh 1993)."""
-    past = _isochoric_invariants(F)[0] - 3
-    return past * (c10_pa + past * (c20_pa + past * c30_pa)) + _volumetric(F, kappa_pa)
+    """Yeoh's energy ψ = Σ_i C_i0 (Ī₁ − 3)^i + U, i = 1 … 3, with μ = 2 C₁₀ (Yeoh 1993)."""
+    excess = _isochoric_invariants(F)[0] - 3
+    return excess * (c10_pa + excess * (c20_pa + excess * c30_pa)) + _volumetric(F, kappa_pa)
 
 
 def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
-    """ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U: no stretch has an Ī₁ beyond 3 + J_m (Gent 1996)."""
-    room = 1 - (_isochoric_invariants(F)[0] - 3) / gent_limit
-    # By way of the root also the slopes are no numbers beyond it: a solver that looks at forces
-    # alone would settle there.
-    return -mu_pa * gent_limit * ca.log(ca.sqrt(room)) + _volumetric(F, kappa_pa)
+    """Gent's energy ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U; Ī₁ < 3 + J_m for every stretch (Gent
+    1996).
+    """
+    remaining = 1 - (_isochoric_invariants(F)[0] - 3) / gent_limit
+    # The square root makes the derivatives NaN beyond the limit, too; otherwise a solver that
+    # evaluates forces alone could converge there.
+    return -mu_pa * gent_limit * ca.log(ca.sqrt(remaining)) + _volumetric(F, kappa_pa)
 
 
 def arruda_boyce(F: ca.SX, mu_pa: ca.SX, chain_stretch: ca.SX, kappa_pa: ca.SX) -> ca.SX:
-    """ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U, five terms of the inverse Langevin function.
+    """Arruda–Boyce energy ψ = C Σ_i α_i λ_m^(2−2i) (Ī₁^i − 3^i) + U.
 
-    C is such that μ is the shear modulus at small strain (Arruda & Boyce 1993, eq. 22).
+    Five terms of the inverse Langevin function; C is such that μ is the shear modulus at small
+    strain (Arruda & Boyce 1993, eq. 22).
     """
     first = _isochoric_invariants(F)[0]
-    series, slope = ca.SX(0), ca.SX(0)
-    for i, share in enumerate((1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1):
-        weight = share / chain_stretch ** (2 * i - 2)
+    series = ca.SX(0)
+    slope = ca.SX(0)
+    for i, coefficient in enumerate((1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750), start=1):
+        weight = coefficient / chain_stretch ** (2 * i - 2)
         series += weight * (first**i - 3**i)
         slope += 2 * weight * i * 3 ** (i - 1)
     return mu_pa * series / slope + _volumetric(F, kappa_pa)
 
 
 def _isochoric_invariants(F: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Ī₁ and Ī₂."""
+    """Return the isochoric invariants Ī₁ and Ī₂."""
     C = F.T @ F
     first = ca.trace(C)
     second = 0.5 * (first**2 - ca.sumsqr(C))
@@ -215,16 +241,16 @@ def _isochoric_invariants(F: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def _volumetric(F: ca.SX, kappa_pa: ca.SX) -> ca.SX:
-    """U = ½ κ (J − 1)²."""
+    """Return the volumetric energy U = ½ κ (J − 1)²."""
     return 0.5 * kappa_pa * (ca.det(F) - 1) ** 2
 
 
 def _arguments(energy: Energy) -> list[str]:
-    """Names of the constants of an energy function: its arguments after F."""
+    """Return the names of the constants of an energy function: its arguments after F."""
     return list(inspect.signature(energy).parameters)[1:]
 
 
-# Made without `Material.of`, whose check would cost every start-up; the tests check them.
+# Built without `Material.of`, whose check would slow down every start; the tests check them.
 MATERIALS: dict[str, Material] = {
     name: Material(name, energy, tuple(map(constant_named, _arguments(energy))))
     for name, energy in {
@@ -241,12 +267,13 @@ MATERIALS: dict[str, Material] = {
 
 
 def as_material(given: str | Energy | Material) -> Material:
-    """A material from a name in `MATERIALS`, an energy function, or itself.
+    """Return a material from its name in `MATERIALS`, from an energy function, or the given
+    material.
 
     Raises
     ------
     InputError
-        If there is none of that name, or see `Material.of`.
+        If there is no material of that name; for a function see `Material.of`.
     """
     if isinstance(given, Material):
         return given
@@ -254,6 +281,15 @@ def as_material(given: str | Energy | Material) -> Material:
 
 
 def _named(kind: str, name: str, table: Mapping[str, T]) -> T:
+    """Return the entry of a table by name, or raise an `InputError` that lists the known names.
+
+    Parameters
+    ----------
+    kind : str
+        What the table holds, for the message.
+    name : str
+    table : mapping
+    """
     if name not in table:
         raise InputError(f"no {kind} {name!r}; available: {', '.join(table)}{hint_at(name, table)}")
     return table[name]
@@ -261,13 +297,13 @@ def _named(kind: str, name: str, table: Mapping[str, T]) -> T:
 
 Potential = Callable[..., ca.SX]
 Stress = Callable[..., tuple[ca.SX, ca.SX]]
-# Where the entries of Aᵀ stand in A, both stacked column after column.
+# Indices in A of the entries of Aᵀ, both stacked column after column.
 TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
 
 
 @dataclass(frozen=True, eq=False)
 class Damping:
-    """A damping law.
+    """Damping law: a potential, or a stress.
 
     Attributes
     ----------
@@ -275,12 +311,12 @@ class Damping:
     constants : tuple of Constant
     potential : callable, optional
         ``potential(psi, F, rate, **constants)`` → a density ψ_d linear in the rate Ḟ, from the
-        energy's as an expression in F. The first Piola–Kirchhoff stress of the damping is
-        ∂ψ_d/∂F, and ∂²ψ_d/∂F∂Ḟ must be symmetric. F and Ḟ are stacked (9,); where an element
-        averages the dilatation, its volume and the rate of that follow them.
+        energy density psi as an expression in F. The first Piola–Kirchhoff stress of the damping is
+        ∂ψ_d/∂F, and ∂²ψ_d/∂F∂Ḟ must be symmetric. F and Ḟ are stacked (9,); if an element averages
+        the dilatation, m and its rate follow them.
     stress : callable, optional
-        In its place, ``stress(psi, F, rate, **constants)`` → that stress P_v (9,), and ∂P_v/∂F
-        (9, 9), which need not be symmetric. P_v must be linear in Ḟ, and ∂P_v/∂Ḟ symmetric.
+        Instead of a potential: ``stress(psi, F, rate, **constants)`` → the stress P_v (9,) and
+        ∂P_v/∂F (9, 9), which need not be symmetric. P_v must be linear in Ḟ, and ∂P_v/∂Ḟ symmetric.
     """
 
     name: str
@@ -290,17 +326,20 @@ class Damping:
 
 
 def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """P_v = F S_v, S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹ with η = γ_r μ, ζ = γ_r λ.
+    """Kelvin–Voigt damping P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹; return P_v and
+    ∂P_v/∂F.
 
-    That is the Kirchhoff stress 2η d + ζ (tr d) 1 of the rate of deformation d, the symmetric part
-    of L = Ḟ F⁻¹: what it dissipates, 2η d:d + ζ (tr d)², is positive whatever F.
+    The viscosities are η = γ_r μ and ζ = γ_r λ. This is the Kirchhoff stress 2η d + ζ (tr d) 1 of
+    the rate of deformation d, the symmetric part of L = Ḟ F⁻¹; its dissipation 2η d:d + ζ (tr d)²
+    is positive for any F.
     """
     stiffness, _ = ca.hessian(psi, F)
-    # A linear material knows no difference between the shapes.
+    # A linear material does not distinguish the deformed from the undeformed shape.
     if not ca.depends_on(stiffness, F):
         return gamma_r_s * mirrored(stiffness) @ rate, ca.SX(9, 9)
     lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
-    one, inverse = ca.SX.eye(3), ca.inv_minor(ca.reshape(F, 3, 3))
+    one = ca.SX.eye(3)
+    inverse = ca.inv_minor(ca.reshape(F, 3, 3))
     L = ca.reshape(rate, 3, 3) @ inverse
     P = (shear * (L + L.T) + lame * ca.trace(L) * one) @ inverse.T
     stress = ca.vec(P)
@@ -310,11 +349,12 @@ def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[c
 
 
 def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """P_v = F S_v, S_v = γ_r (λ tr(Ė) I + 2μ Ė) with the rate Ė of the Green strain.
+    """Damping in material form, P_v = F S_v with S_v = γ_r (λ tr(Ė) I + 2μ Ė); return P_v and
+    ∂P_v/∂F.
 
-    S_v : Ė = γ_r (λ (tr Ė)² + 2μ Ė:Ė) is positive whatever F. Its half is the potential D of the
-    stress, P_v = ∂D/∂Ḟ. Of St. Venant and Kirchhoff's material S_v is γ_r times the rate of the
-    elastic second Piola–Kirchhoff stress.
+    Ė is the rate of the Green strain. S_v : Ė = γ_r (λ (tr Ė)² + 2μ Ė:Ė) is positive for any F;
+    half of it is the potential D of the stress, P_v = ∂D/∂Ḟ. For a St. Venant–Kirchhoff material
+    S_v is γ_r times the rate of the elastic second Piola–Kirchhoff stress.
     """
     stiffness, _ = ca.hessian(psi, F)
     if not ca.depends_on(stiffness, F):  # a linear material does not distinguish the shapes
@@ -329,7 +369,7 @@ def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[
 
 
 def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
-    """γ_r ∂ψ/∂F:Ḟ, which makes the damping force −γ_r K(x) v."""
+    """Rayleigh damping as the potential γ_r ∂ψ/∂F:Ḟ, which gives the damping force −γ_r K(x) v."""
     return gamma_r_s * ca.jtimes(psi, F, rate)
 
 
@@ -341,24 +381,24 @@ DAMPINGS: dict[str, Damping] = {
 
 
 def as_damping(given: str | Damping) -> Damping:
-    """A damping law from a name in `DAMPINGS`, or itself.
+    """Return a damping law from its name in `DAMPINGS`, or the given law.
 
     Raises
     ------
     InputError
-        If there is none of that name.
+        If there is no damping law of that name.
     """
     return given if isinstance(given, Damping) else _named("damping", given, DAMPINGS)
 
 
 @dataclass(frozen=True)
 class Prony:
-    """A branch of the memory: a spring of `share` times the stiffness, behind a dashpot.
+    """Branch of the memory: a spring of `share` times the stiffness in series with a dashpot.
 
     Attributes
     ----------
     name : str
-        Stands before the names of its constants: ``prony_1.share``, ``prony_1.tau_s``.
+        Prefix of the names of its constants: ``prony_1.share``, ``prony_1.tau_s``.
     """
 
     name: str
@@ -372,18 +412,18 @@ class Prony:
 
     @property
     def constants(self) -> tuple[Constant, Constant]:
-        """Its share g and its relaxation time τ."""
+        """Constants of the branch: its share g and its relaxation time τ."""
         share, tau = (replace(c, name=f"{self.name}.{c.name}") for c in (SHARE, TAU))
         return share, tau
 
 
 def as_branches(given: Sequence[str | Prony]) -> tuple[Prony, ...]:
-    """Branches from their names, or themselves.
+    """Return Prony branches from their names, or the given branches.
 
     Raises
     ------
     InputError
-        For a name that cannot be one, or is there twice.
+        For an invalid name, or a name that occurs twice.
     """
     if isinstance(given, str):
         raise InputError(f"prony is {given!r}; expected a sequence of names")

@@ -1,29 +1,31 @@
-"""Elements that average the dilatation, so that they do not lock near incompressibility.
+"""Kernels of elements that average the dilatation, which do not lock near incompressibility.
 
-Their material feels F* = eᵐ F with m = ⅓ ln(J̄/J), J̄ = v/V, the element's current volume over its
-undeformed one (Nagtegaal, Parks & Rice 1974; Simo, Taylor & Pister 1985). For ψ_iso(J^−⅓ F) + U(J)
-the energy is Σ_q V_q ψ_iso + V U(J̄); for any other it has the same limit under refinement.
+The material of such an element is evaluated at F* = eᵐ F with m = ⅓ ln(J̄/J) and J̄ = v/V, the
+current volume of the element over its undeformed volume (Nagtegaal, Parks & Rice 1974; Simo, Taylor
+& Pister 1985). For ψ_iso(J^−⅓ F) + U(J) the energy is Σ_q V_q ψ_iso + V U(J̄); any other energy has
+the same limit under refinement.
 
-A scalar of the element is then Σ_q g(F_q, Ḟ_q, W_q, m_q; θ). Here s = Σ_q σ(F_q, Ḟ_q, W_q) are v,
-its derivative along the velocities, and those of both along w; m their likes of ⅓ ln(J̄/J); and
+A scalar of the element is then Σ_q g(F_q, Ḟ_q, W_q, m_q; θ). The sums s = Σ_q σ(F_q, Ḟ_q, W_q) are
+v, its derivative along the velocities, and the derivatives of both along w; m are the same
+derivatives of ⅓ ln(J̄/J), and
 
-    m_q = n(s, V) − n(σ_q, V_q),   n = ⅓ ln(v/V) and its likes.
+    m_q = n(s, V) − n(σ_q, V_q),   with n = ⅓ ln(v/V) and its derivatives.
 
-By the chain rule, twice, and with α, β any of x and v, the scalar's derivatives are Σ_q of those at
-fixed s, and with Γ = Σ_q ∂g/∂m
+By the chain rule, with α and β any of x and v and with Γ = Σ_q ∂g/∂m, the derivatives of the scalar
+are Σ_q of those at fixed s, and
 
-    Γ ∂n/∂s ∂s/∂α                                                           of the first, and
-    (Σ_q ∂²g/∂α∂m) ∂n/∂s ∂s/∂β + its transpose of α and β
-        + ∂s/∂α [∂n/∂s (Σ_q ∂²g/∂m²) ∂n/∂s + Γ ∂²n/∂s²] ∂s/∂β + Γ ∂n/∂s ∂²s/∂α∂β   of the second.
+    Γ ∂n/∂s ∂s/∂α                                                           for first derivatives,
+    (Σ_q ∂²g/∂α∂m) ∂n/∂s ∂s/∂β + its transpose with α and β exchanged
+        + ∂s/∂α [∂n/∂s (Σ_q ∂²g/∂m²) ∂n/∂s + Γ ∂²n/∂s²] ∂s/∂β + Γ ∂n/∂s ∂²s/∂α∂β   for second ones.
 
-So two phases go before the last, for s and for Γ. The node vectors coupled are ∂s/∂x and
-Σ_q ∂²g/∂x∂m; those of s by v are among them, since what of s is a rate along v changes with v as
-that which it is the rate of changes with x. Of a g that is an energy, or its derivative along v,
-those by v are too; of a power that is dissipated Σ_q ∂²g/∂v∂m is another one.
+So two phases precede the last one, for s and for Γ. The coupled node vectors are ∂s/∂x and
+Σ_q ∂²g/∂x∂m. They include the derivatives of s by v: an entry of s that is a rate depends on v as
+the entry of which it is the rate depends on x. For a g that is an energy, or its derivative along
+v, they include those of g by v, too; for a dissipated power Σ_q ∂²g/∂v∂m is a further vector.
 
-Of an element only the mean dilatation and the 4 · 5 distortions at its points are resisted: alone,
-it does not resist the three conformal motions that leave its volume as it is. Four elements whose
-centroids are not in a plane do.
+An element resists only the mean dilatation and the 4 · 5 distortions at its points: a single
+element does not resist the three conformal motions that preserve its volume. Four elements whose
+centroids are not in a plane resist them.
 """
 
 from __future__ import annotations
@@ -37,14 +39,23 @@ from .kernel import By, Derivative, Outputs, Pieces, PointKernel, QuadraturePoin
 
 
 def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKernel:
-    """The kernel of derivatives of scalars that depend on `QuadraturePoint.stretches`."""
+    """Return the kernel of derivatives of scalars that depend on `QuadraturePoint.stretches`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the kernel.
+    point : QuadraturePoint
+    outputs : dict
+        Derivatives that are summed in each output.
+    """
     shape = _Shape.of(point)
     chains = _chains(shape, outputs)
     order = max(len(term.by) for terms in outputs.values() for term in terms)
-    own: Pieces = {}
+    output_pieces: Pieces = {}
     for key, terms in outputs.items():
-        found = [term.of(chains[id(term.scalar)].piece(term.by)) for term in terms]
-        own[key] = terms[0].contraction, sum(found[1:], found[0])
+        summands = [term.of(chains[id(term.scalar)].piece(term.by)) for term in terms]
+        output_pieces[key] = terms[0].contraction, sum(summands[1:], summands[0])
     slopes: Pieces = {}
     if order:
         slopes = {chain.key("slopes"): ("none", chain.by_stretch) for chain in chains.values()}
@@ -55,11 +66,11 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Poi
         earlier.append(point.phase("slopes", shape.at_sums(slopes), sums))
         sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
         coupled = {key: p for chain in chains.values() for key, p in chain.second().items()}
-    last = point.phase(name, shape.at_sums(own | coupled), sums)
+    last = point.phase(name, shape.at_sums(output_pieces | coupled), sums)
     return PointKernel(
         last.pieces,
         tuple(point.fields),
-        {key: last.contractions[key] for key in own},
+        {key: last.contractions[key] for key in output_pieces},
         tuple(earlier),
         {key: last.contractions[key] for key in coupled},
         _coupling(shape, chains, outputs, order) if order else None,
@@ -68,7 +79,18 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Poi
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """What stretches a point: V and s as symbols of sums, σ, and n of σ."""
+    """Volumes that determine the stretch of a point.
+
+    Attributes
+    ----------
+    point : QuadraturePoint
+    volume : SX
+        Symbol of the sum V.
+    volumes : SX
+        Symbols of the sums s.
+    own_volumes : SX
+        Contribution σ of the point to s.
+    """
 
     point: QuadraturePoint
     volume: ca.SX
@@ -77,24 +99,25 @@ class _Shape:
 
     @classmethod
     def of(cls, point: QuadraturePoint) -> _Shape:
+        """Return the volumes of a quadrature point and symbols of their sums."""
         F, *rates = point.gradients.values()
-        own = point.mesh_volume * ca.det(ca.reshape(F, 3, 3))
+        volumes = point.mesh_volume * ca.det(ca.reshape(F, 3, 3))
         for rate in rates:
-            own = ca.vertcat(own, ca.jtimes(own, F, rate))
-        return cls(point, ca.SX.sym("volume"), ca.SX.sym("volumes", len(point.stretches)), own)
+            volumes = ca.vertcat(volumes, ca.jtimes(volumes, F, rate))
+        return cls(point, ca.SX.sym("volume"), ca.SX.sym("volumes", len(point.stretches)), volumes)
 
     @property
     def stretches(self) -> ca.SX:
-        """Their symbols m."""
+        """Symbols m of the stretches, as one vector."""
         return ca.vertcat(*self.point.stretches)
 
     @property
     def count(self) -> int:
-        """Number of s."""
+        """Number of sums s."""
         return self.volumes.numel()
 
     def at_sums(self, pieces: Pieces) -> Pieces:
-        """Pieces with m put in."""
+        """Return pieces with m replaced by its expression in the sums."""
         m = _stretches(self.volumes, self.volume)
         m -= _stretches(self.own_volumes, self.point.mesh_volume)
         return {
@@ -103,7 +126,13 @@ class _Shape:
         }
 
     def first(self, order: int) -> Pieces:
-        """V, s and, to couple, ∂s/∂x."""
+        """Return the pieces V, s and, for derivatives, ∂s/∂x of the first phase.
+
+        Parameters
+        ----------
+        order : int
+            Highest order of the derivatives.
+        """
         sums: Pieces = {
             "volume": ("none", self.point.mesh_volume),
             "volumes": ("none", self.own_volumes),
@@ -113,11 +142,11 @@ class _Shape:
         return sums
 
     def own_by(self, field: str) -> ca.SX:
-        """∂σ by F or its like."""
+        """Return ∂σ by the gradient of a field."""
         return ca.jacobian(self.own_volumes, self.point.gradients[field])
 
     def as_by_x(self, field: str) -> ca.SX:
-        """∂s/∂field = this ∂s/∂x."""
+        """Return the matrix B with ∂s/∂field = B ∂s/∂x."""
         if field == "x":
             return ca.SX.eye(self.count)
         # Every second one is the rate of the one before.
@@ -127,9 +156,19 @@ class _Shape:
 
 @dataclass(frozen=True, eq=False)
 class _Chain:
-    """A scalar g in the symbols of a point, and Γ as a symbol of sums.
+    """Scalar g in the symbols of a point, with the chain rule through the stretches.
 
-    `fields` are those whose Σ_q ∂²g/∂field∂m are coupled.
+    Attributes
+    ----------
+    shape : _Shape
+    scalar : SX
+        Scalar g.
+    number : int
+        Index of the scalar, for names of sums.
+    slopes : SX
+        Symbols of the sum Γ.
+    fields : tuple of str
+        Fields whose Σ_q ∂²g/∂field∂m are coupled node vectors.
     """
 
     shape: _Shape
@@ -139,16 +178,18 @@ class _Chain:
     fields: tuple[str, ...]
 
     def key(self, name: str) -> str:
-        """The name of a sum that is this scalar's."""
+        """Return the name of a sum of this scalar."""
         return f"{name}_{self.number}"
 
     @cached_property
     def by_stretch(self) -> ca.SX:
-        """∂g/∂m."""
+        """Derivatives ∂g/∂m."""
         return ca.gradient(self.scalar, self.shape.stretches)
 
     def second(self) -> Pieces:
-        """Σ_q of what couples in second derivatives: ∂²g by (m, m), (m, θ) and (field, m)."""
+        """Return the pieces whose sums couple in second derivatives: ∂²g by (m, m), (m, θ), (field,
+        m).
+        """
         by_m = ca.jacobian(self.by_stretch, self.shape.stretches)
         pieces: Pieces = {
             self.key("second"): ("none", ca.vec(mirrored(by_m))),
@@ -163,8 +204,9 @@ class _Chain:
         return pieces
 
     def piece(self, by: By) -> ca.SX:
-        """A derivative at fixed s, and Γ ∂n/∂s ∂²σ/∂α∂β."""
-        shape, point = self.shape, self.shape.point
+        """Return the piece of a derivative: at fixed s, and Γ ∂n/∂s ∂²σ/∂α∂β."""
+        shape = self.shape
+        point = self.shape.point
         nodal = [field for field in by if field != "theta"]
         if not nodal:
             return point.derivative(self.scalar, by)
@@ -175,33 +217,33 @@ class _Chain:
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
         by_s, _ = _slopes(shape.volumes, shape.volume, self.slopes)
-        by_own, bent_by_own = _slopes(shape.own_volumes, point.mesh_volume, self.by_stretch)
-        bent = ca.jacobian(
+        by_own, second_by_own = _slopes(shape.own_volumes, point.mesh_volume, self.by_stretch)
+        second_volumes = ca.jacobian(
             ca.gradient(ca.dot(weights, shape.own_volumes), point.gradients[alpha]),
             point.gradients[beta],
         )
-        weighed = by_s.T @ self.slopes - by_own.T @ self.by_stretch
+        weight_values = by_s.T @ self.slopes - by_own.T @ self.by_stretch
         return (
             self._lifted(alpha).T @ self._hessian(alpha, beta) @ self._lifted(beta)
-            - shape.own_by(alpha).T @ bent_by_own @ shape.own_by(beta)
-            + ca.substitute(bent, weights, weighed)
+            - shape.own_by(alpha).T @ second_by_own @ shape.own_by(beta)
+            + ca.substitute(second_volumes, weights, weight_values)
         )
 
     def _lifted(self, field: str) -> ca.SX:
-        """∂(F, m)/∂F at fixed s, or its like for another field."""
+        """Return ∂(F, m)/∂F at fixed s, or the same for the gradient of another field."""
         by_own, _ = _slopes(self.shape.own_volumes, self.shape.point.mesh_volume, self.by_stretch)
         return ca.vertcat(ca.SX.eye(9), -by_own @ self.shape.own_by(field))
 
     def _hessian(self, alpha: str, beta: str) -> ca.SX:
-        """∂²g by (F, m) or its like for another field, twice."""
+        """Return the second derivatives of g by (gradient, m) of two fields."""
         gradients = self.shape.point.gradients
         first, second = (ca.vertcat(gradients[f], self.shape.stretches) for f in (alpha, beta))
-        found = ca.jacobian(ca.gradient(self.scalar, first), second)
-        return mirrored(found) if alpha == beta else found
+        hessian = ca.jacobian(ca.gradient(self.scalar, first), second)
+        return mirrored(hessian) if alpha == beta else hessian
 
 
 def _chains(shape: _Shape, outputs: Outputs) -> dict[int, _Chain]:
-    """Those of the scalars that have outputs, by their identity."""
+    """Return the chain rule of each scalar in the outputs, by the identity of the scalar."""
     terms = [term for those in outputs.values() for term in those]
     chains: dict[int, _Chain] = {}
     for term in terms:
@@ -218,18 +260,21 @@ def _chains(shape: _Shape, outputs: Outputs) -> dict[int, _Chain]:
 def _coupling(
     shape: _Shape, chains: dict[int, _Chain], outputs: Outputs, order: int
 ) -> ca.Function:
-    """C or D of each output; see `kernel`."""
-    count, constants = shape.count, shape.point.varied.numel()
+    """Return C or D of each output as a function of all sums, see `kernel`."""
+    count = shape.count
+    constants = shape.point.varied.numel()
     sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
-    blocks, seconds, by_thetas = {"volumes": slice(0, count)}, {}, {}
+    blocks = {"volumes": slice(0, count)}
+    seconds = {}
+    by_thetas = {}
     if order > 1:
         for key, chain in chains.items():
             seconds[key] = ca.SX.sym("second", count, count)
             by_thetas[key] = ca.SX.sym("slopes_by_theta", count, constants)
             sums += [ca.vec(seconds[key]), ca.vec(by_thetas[key])]
             for field in chain.fields:
-                first = count * len(blocks)
-                blocks[chain.key(field)] = slice(first, first + count)
+                start = count * len(blocks)
+                blocks[chain.key(field)] = slice(start, start + count)
     size = count * len(blocks)
     couplings = []
     for terms in outputs.values():
@@ -239,13 +284,13 @@ def _coupling(
             total = ca.SX(size, size if terms[0].contraction == "pairs" else width)
         for term in terms:
             chain = chains[id(term.scalar)]
-            by_s, bent = _slopes(shape.volumes, shape.volume, chain.slopes)
+            by_s, second_of_logarithm = _slopes(shape.volumes, shape.volume, chain.slopes)
             if term.contraction == "nodes":
-                along = shape.as_by_x(term.by[0])
+                relation = shape.as_by_x(term.by[0])
                 slopes = by_thetas[id(term.scalar)] if "theta" in term.by else chain.slopes
-                total[:count, :] += (by_s @ along).T @ slopes
+                total[:count, :] += (by_s @ relation).T @ slopes
             elif term.contraction == "pairs":
-                second = by_s.T @ seconds[id(term.scalar)] @ by_s + bent
+                second = by_s.T @ seconds[id(term.scalar)] @ by_s + second_of_logarithm
                 total += _of_pair(shape, chain, blocks, size, term, by_s, second)
         couplings.append(total)
     return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs))
@@ -260,24 +305,40 @@ def _of_pair(
     by_s: ca.SX,
     second: ca.SX,
 ) -> ca.SX:
-    """D of a second derivative by two fields, or of its symmetric or skew part."""
+    """Return D of a second derivative by two fields, or of its symmetric or skew part.
+
+    Parameters
+    ----------
+    shape : _Shape
+    chain : _Chain
+    blocks : dict
+        Slices of the coupled node vectors, by their names.
+    size : int
+        Number of coupled node vectors.
+    term : Derivative
+    by_s : SX
+        Derivative ∂n/∂s.
+    second : SX
+        Coupling of ∂s/∂α with ∂s/∂β.
+    """
     alpha, beta = term.by
-    of_alpha, of_beta = shape.as_by_x(alpha), shape.as_by_x(beta)
-    here = blocks["volumes"]
-    found = ca.SX(size, size)
-    found[here, here] = of_alpha.T @ second @ of_beta
-    found[blocks[chain.key(alpha)], here] = by_s @ of_beta
+    of_alpha = shape.as_by_x(alpha)
+    of_beta = shape.as_by_x(beta)
+    volume_block = blocks["volumes"]
+    coupling = ca.SX(size, size)
+    coupling[volume_block, volume_block] = of_alpha.T @ second @ of_beta
+    coupling[blocks[chain.key(alpha)], volume_block] = by_s @ of_beta
     if beta in chain.fields:
-        found[here, blocks[chain.key(beta)]] = of_alpha.T @ by_s.T
+        coupling[volume_block, blocks[chain.key(beta)]] = of_alpha.T @ by_s.T
     else:
-        found[here, blocks[chain.key(alpha)]] = of_beta.T @ by_s.T
+        coupling[volume_block, blocks[chain.key(alpha)]] = of_beta.T @ by_s.T
     if term.part == "whole":
-        return found
-    return (found + found.T if term.part == "symmetric" else found - found.T) / 2
+        return coupling
+    return (coupling + coupling.T if term.part == "symmetric" else coupling - coupling.T) / 2
 
 
 def _stretches(volumes: ca.SX, volume: ca.SX) -> ca.SX:
-    """What n is: ⅓ ln(v/V), its derivative along the velocities, and those of both along w."""
+    """Return n: ⅓ ln(v/V), its derivative along the velocities, and the derivatives along w."""
     s = ca.SX.sym("s", volumes.numel())
     n = ca.log(s[0] / volume) / 3
     for known in (1, 2):
@@ -287,9 +348,10 @@ def _stretches(volumes: ca.SX, volume: ca.SX) -> ca.SX:
 
 
 def _slopes(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """∂n/∂s, and Σ_k weights_k ∂²n_k/∂s²."""
-    s, c = ca.SX.sym("s", volumes.numel()), ca.SX.sym("c", volumes.numel())
+    """Return ∂n/∂s, and Σ_k weights_k ∂²n_k/∂s²."""
+    s = ca.SX.sym("s", volumes.numel())
+    c = ca.SX.sym("c", volumes.numel())
     n = _stretches(s, volume)
-    found = [ca.jacobian(n, s), ca.hessian(ca.dot(c, n), s)[0]]
-    first, second = ca.substitute(found, [s, c], [volumes, weights])
+    expressions = [ca.jacobian(n, s), ca.hessian(ca.dot(c, n), s)[0]]
+    first, second = ca.substitute(expressions, [s, c], [volumes, weights])
     return first, second

@@ -1,19 +1,21 @@
-"""Materials with memory: overstress in Prony branches, in the material's own frame.
+"""Viscoelastic memory: overstress in Prony branches, in the material's frame.
 
-Beside S, the second Piola–Kirchhoff stress of the long-term energy, each branch of a point bears Q,
+Beside the second Piola–Kirchhoff stress S of the long-term energy, each branch of a point has an
+overstress Q,
 
     dQ/dt + Q/τ = g dS/dt,
 
-which turns with the body. Between evaluation states h apart, S linear in time, exactly
+which rotates with the body. Between evaluation states at an interval h, with S linear in time,
 
-    Q_k = e Q_{k−1} + c (S_k − S_{k−1}),   e = exp(−h/τ),   c = g (τ/h) (1 − e).
+    Q_k = e Q_{k−1} + c (S_k − S_{k−1}),   e = exp(−h/τ),   c = g (τ/h) (1 − e)
 
-So with m_k = e_{k+1} Q_k − c_{k+1} S_k, six numbers of a point and branch, Q_k = m_{k−1} + c_k S_k.
-At given H = Σ m_{k−1} and s = Σ c_k, sums over branches, a step's stress (1 + s) S + H has the
-energy (1 + s) ψ + ½ H : FᵀF. (Simo & Hughes 1998, ch. 10.)
+holds exactly. With m_k = e_{k+1} Q_k − c_{k+1} S_k, six numbers for each point and branch,
+Q_k = m_{k−1} + c_k S_k. With the sums over branches H = Σ m_{k−1} and s = Σ c_k, the stress of a
+step (1 + s) S + H has the energy (1 + s) ψ + ½ H : FᵀF (Simo & Hughes 1998, ch. 10).
 
-What all points of a body carry is one row: part after part, and of each the entries xx, yy, zz, xy,
-xz, yz of all its points.
+The internal variables of all points of a body are one row: part after part, and for each part the
+entries xx, yy, zz, xy, xz, yz of all its points. `PointLayout` describes this row;
+`model.viscoelasticity` advances the memory in time.
 """
 
 from __future__ import annotations
@@ -32,16 +34,20 @@ from .regions import BodyPart
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """What the points of a body bring from the past into T states.
+    """Contribution of the memory to the forces at T states.
 
     Attributes
     ----------
-    overstress : (T, width) H [Pa]
-    stiffening : (T, parts) s of each part
-    slopes : (T, k) derivative of its part's s by each of θ
-    bends : (T, k, k) second derivatives; those by constants of different parts are zero
-    stress_weights : (T, width) σ, optional
-        What S counts besides in second derivatives.
+    overstress : (T, width)
+        Sum H of the internal variables [Pa].
+    stiffening : (T, parts)
+        Stiffening s of each part.
+    slopes : (T, k)
+        Derivative of the part's s by each entry of θ.
+    bends : (T, k, k)
+        Second derivatives of s; those by constants of different parts are zero.
+    stress_weights : (T, width), optional
+        Weights σ of S in second derivatives; None for zero.
     """
 
     overstress: Array
@@ -51,7 +57,13 @@ class Past:
     stress_weights: Array | None = None
 
     def runs(self, part: int) -> Iterator[tuple[slice, float]]:
-        """Rows that follow one another with the same s of a part, and that."""
+        """Yield slices of consecutive states with equal stiffening s of a part, and s.
+
+        Parameters
+        ----------
+        part : int
+            Index of the part.
+        """
         values = self.stiffening[:, part]
         starts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
         for start, stop in itertools.pairwise(starts):
@@ -61,18 +73,18 @@ class Past:
 
 @dataclass(frozen=True)
 class Branch:
-    """A branch as it is computed.
+    """Positions of a Prony branch in the arrays of a body.
 
     Attributes
     ----------
     part : int
-        Number of its part.
+        Index of its part.
     points : slice
-        Of what the body carries.
+        Columns in the row of the body, (…, width).
     own : slice
-        Of what all branches carry, one after the other.
+        Columns in the row of all branches, (…, all branches).
     share, tau : int
-        Places of g and τ in θ.
+        Indices of g and τ in θ.
     """
 
     part: int
@@ -84,12 +96,13 @@ class Branch:
 
 @dataclass(frozen=True, eq=False)
 class PointLayout:
-    """What the points of a body carry, in one row: the parts with memory in turn.
+    """Layout of the internal variables of a body in one row: the parts with memory in turn.
 
     Attributes
     ----------
     parts : tuple of BodyPart
-    first : (parts,) where the constants of each part's laws of memory begin in θ
+    first : (parts,)
+        Index in θ of the first memory constant of each part.
     points : int
         Quadrature points of an element.
     constants : int
@@ -103,7 +116,7 @@ class PointLayout:
 
     @cached_property
     def starts(self) -> list[int]:
-        """Where in the row each part begins, and where the last ends."""
+        """First column of each part in the row, and the length of the row."""
         sizes = [6 * self.points * len(p.cells) if p.prony else 0 for p in self.parts]
         return [0, *np.cumsum(sizes).tolist()]
 
@@ -113,58 +126,80 @@ class PointLayout:
         return self.starts[-1]
 
     def of_part(self, number: int) -> NDArray[np.int64]:
-        """(E, q, 6) where in the row the points of a part are."""
+        """Return the columns (E, q, 6) of the points of a part.
+
+        Parameters
+        ----------
+        number : int
+            Index of the part.
+        """
         cells = len(self.parts[number].cells)
-        own = np.arange(cells * self.points).reshape(cells, self.points, 1)
-        return self.starts[number] + own + cells * self.points * np.arange(6)
+        indices = np.arange(cells * self.points).reshape(cells, self.points, 1)
+        return self.starts[number] + indices + cells * self.points * np.arange(6)
 
     @cached_property
     def branches(self) -> list[Branch]:
-        """Those of all parts."""
-        found: list[Branch] = []
-        own = 0
+        """Branches of all parts, in the order of the parts."""
+        branches: list[Branch] = []
+        start = 0
         for number, part in enumerate(self.parts):
             points = slice(self.starts[number], self.starts[number + 1])
             for k in range(len(part.prony)):
-                here = slice(own, own + points.stop - points.start)
-                place = self.first[number] + 2 * k
-                found.append(Branch(number, points, here, place, place + 1))
-                own = here.stop
-        return found
+                columns = slice(start, start + points.stop - points.start)
+                first_constant = self.first[number] + 2 * k
+                branches.append(Branch(number, points, columns, first_constant, first_constant + 1))
+                start = columns.stop
+        return branches
 
     def borne(self, values: Array) -> Array:
-        """(…, all branches) what each branch's points have, of a row (…, width)."""
+        """Return values (…, all branches) for each branch from values (…, width) for each point."""
         parts = [values[..., branch.points] for branch in self.branches]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
 
     def summed(self, values: Array) -> Array:
-        """(…, width), its transpose: the sum of what branches (…, all branches) have of a point."""
+        """Return the sums (…, width) over the branches of each point: the transpose of `borne`.
+
+        Parameters
+        ----------
+        values : (…, all branches)
+        """
         if len(self.branches) == 1:
             return values
-        found = np.zeros((*values.shape[:-1], self.width))
+        sums = np.zeros((*values.shape[:-1], self.width))
         for branch in self.branches:
-            found[..., branch.points] += values[..., branch.own]
-        return found
+            sums[..., branch.points] += values[..., branch.own]
+        return sums
 
     def spread(self, values: Array) -> Array:
-        """Of all that a branch carries (…, all branches) what the branch has (branches, …)."""
+        """Return values (…, all branches) from one value for each branch (branches, …).
+
+        With a single branch the result has one column and is broadcast.
+        """
         if len(self.branches) == 1:
             return values[0][..., None]
         sizes = [branch.own.stop - branch.own.start for branch in self.branches]
         return np.moveaxis(np.repeat(values, sizes, axis=0), 0, -1)
 
     def totals(self, values: Array) -> Array:
-        """(branches, …) sums over all that a branch carries (…, all branches)."""
+        """Return the sums (branches, …) over all values (…, all branches) of each branch."""
         return np.stack([values[..., branch.own].sum(axis=-1) for branch in self.branches])
 
     def nothing(self, states: int) -> Past:
-        """What points that have relaxed bring into some states."""
+        """Return the contribution of a memory that has relaxed to this many states: all zero."""
         count = self.constants
         sizes = (self.width,), (len(self.parts),), (count,), (count, count)
         return Past(*(np.zeros((states, *size)) for size in sizes))
 
 
 def fading(share: Array, tau_s: Array, spacing_s: float) -> tuple[Array, Array]:
-    """E and c of branches over an interval [s] in which S changes evenly."""
+    """Return e and c of branches over an interval [s] in which S changes linearly.
+
+    Parameters
+    ----------
+    share, tau_s : array
+        Share g and relaxation time τ of the branches.
+    spacing_s : float
+        Length of the interval.
+    """
     ratio = spacing_s / tau_s
     return np.exp(-ratio), -share * np.expm1(-ratio) / ratio

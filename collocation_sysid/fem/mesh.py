@@ -1,6 +1,7 @@
-"""The tetrahedral mesh: made or read, cleaned and checked once, then never changed.
+"""Tetrahedral mesh of a body: generated or read, cleaned and checked once, then immutable.
 
-A body's `Nodes` are those of the mesh, then one halfway along each edge if the element asks.
+`TetMesh` holds the mesh. `Nodes` are the nodes of a body's elements: those of the mesh, then, for
+quadratic elements, one in the middle of each edge.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ from .surface import tetrahedralize_surface
 
 
 class NodeSelection(Protocol):
-    """What chooses nodes, see `selection`."""
+    """Selection of nodes, see `selection`."""
 
     def resolve(self, nodes: Nodes) -> np.ndarray:
-        """Return the selected nodes, sorted."""
+        """Return the indices of the selected nodes, sorted."""
         ...
 
 
@@ -46,10 +47,10 @@ _OUTWARD_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 @dataclass(frozen=True, eq=False)
 class TetMesh:
-    """A mesh of linear tetrahedra in metres; its arrays are read-only.
+    """Mesh of linear tetrahedra in metres; its arrays are read-only.
 
     The constructor drops nodes that are no element's corner and reverses negatively oriented
-    elements, and says so in `notes`. The order of the nodes and of the elements is kept.
+    elements, and reports this in `notes`. The order of nodes and elements is kept.
 
     Parameters
     ----------
@@ -58,9 +59,9 @@ class TetMesh:
     tetrahedra : (E, 4) integer array
         Nodes of each element, counted from 0.
     point_arrays : mapping of name to (n, ...) array, optional
-        Values per node, such as the 0/1 masks that a `Named` selection looks up.
+        Values per node, such as the 0/1 masks of `Named` selections.
     cell_arrays : mapping of name to (E, ...) array, optional
-        The same per element.
+        Values per element.
     face_sets : mapping of name to (k, 3) integer array, optional
         Corners of triangles, such as those of a cavity's wall.
     is_generated : bool, default False
@@ -69,17 +70,17 @@ class TetMesh:
     Attributes
     ----------
     file_index : (n,) int64
-        The number each node had before others were dropped; increasing.
+        Index of each node before others were dropped; increasing.
     file_node_count : int
-        How many nodes there were before any were dropped.
+        Number of nodes before any were dropped.
     notes : tuple of str
-        What was cleaned and what looks suspicious, in sentences.
+        Sentences about what was cleaned and what looks suspicious.
 
     Raises
     ------
     InputError
-        For wrong shapes, indices out of range, coordinates that are not finite, and elements
-        that are degenerate or given twice.
+        For wrong shapes, indices out of range, coordinates that are not finite, and elements that
+        are degenerate or given twice.
     """
 
     points_m: np.ndarray
@@ -102,27 +103,31 @@ class TetMesh:
         *,
         is_generated: bool = False,
     ) -> None:
-        given = checked_points(points_m)
-        elements = checked_tetrahedra(tetrahedra, len(given))
-        arrays = checked_arrays(point_arrays or {}, len(given), "point", "nodes")
-        of_cells = checked_arrays(cell_arrays or {}, len(elements), "cell", "elements")
-        points, elements, used, notes = cleaned(given, elements)
-        kept = np.full(len(given), -1)
-        kept[used] = np.arange(len(used))
-        faces = {name: kept[checked_faces(f, len(given))] for name, f in (face_sets or {}).items()}
+        raw_points = checked_points(points_m)
+        elements = checked_tetrahedra(tetrahedra, len(raw_points))
+        arrays = checked_arrays(point_arrays or {}, len(raw_points), "point", "nodes")
+        element_arrays = checked_arrays(cell_arrays or {}, len(elements), "cell", "elements")
+        points, elements, used, notes = cleaned(raw_points, elements)
+        new_index = np.full(len(raw_points), -1)
+        new_index[used] = np.arange(len(used))
+        faces = {
+            name: new_index[checked_faces(f, len(raw_points))]
+            for name, f in (face_sets or {}).items()
+        }
         self._set(
             points_m=_read_only(points),
             tetrahedra=_read_only(elements),
             point_arrays={name: _read_only(values[used]) for name, values in arrays.items()},
-            cell_arrays={name: _read_only(values) for name, values in of_cells.items()},
+            cell_arrays={name: _read_only(values) for name, values in element_arrays.items()},
             face_sets={name: _read_only(corners) for name, corners in faces.items()},
             file_index=_read_only(used),
-            file_node_count=len(given),
+            file_node_count=len(raw_points),
             notes=notes,
             is_generated=is_generated,
         )
 
     def _set(self, **values: Any) -> None:
+        """Set attributes of the frozen dataclass."""
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -131,31 +136,34 @@ class TetMesh:
 
     @classmethod
     def read(cls, path: str | Path, length_unit: str = "m") -> TetMesh:
-        """Read the tetrahedra of any file meshio knows; other cells are left out and noted.
+        """Read the tetrahedra of any file that meshio can read; other cells are omitted with a
+        note.
 
-        Quadratic tetrahedra are taken by their corners: the body's element decides about nodes
-        on edges. Slightly curved sides are straightened and noted.
+        Quadratic tetrahedra are reduced to their corners: the element of the body determines the
+        nodes on edges. Slightly curved sides are straightened, with a note.
 
         Point arrays of the file, and its point sets as boolean arrays, become `point_arrays`; cell
         arrays, cell sets and physical groups of the tetrahedra become `cell_arrays`. The nodes of
-        sets and groups, also of those of triangles, lines or points, become `point_arrays` too,
+        sets and groups, including those of triangles, lines or points, also become `point_arrays`,
         and their triangles `face_sets`.
 
         Parameters
         ----------
         path : str or Path
         length_unit : {"m", "cm", "mm", "um", "in"}
-            The unit of the file's coordinates.
+            Unit of the coordinates in the file.
 
         Raises
         ------
         InputError
-            If the file cannot be read, holds no tetrahedra, their sides are curved by more than
-            5 % of their length, or its mesh is refused.
+            If the file cannot be read, contains no tetrahedra, has sides curved by more than 5 % of
+            their length, or its mesh is invalid.
         """
-        points_m, tetrahedra, of_points, of_cells, faces, notes = read_tetrahedra(path, length_unit)
+        points_m, tetrahedra, point_arrays, cell_arrays, faces, notes = read_tetrahedra(
+            path, length_unit
+        )
         try:
-            mesh = cls(points_m, tetrahedra, of_points, of_cells, faces)
+            mesh = cls(points_m, tetrahedra, point_arrays, cell_arrays, faces)
         except InputError as error:
             raise error.located(path) from None
         mesh._set(notes=(*notes, *mesh.notes))
@@ -174,18 +182,18 @@ class TetMesh:
         Parameters
         ----------
         surface : str, Path or pair of arrays
-            An STL, OBJ or PLY file, or vertices (p, 3) and triangles (F, 3).
+            STL, OBJ or PLY file, or vertices (p, 3) and triangles (F, 3).
         edge_length_m : float
-            Wanted edge length in metres, whatever the surface's unit.
+            Desired edge length in metres, whatever the unit of the surface.
         length_unit : {"m", "cm", "mm", "um", "in"}
-            The unit of the surface's coordinates.
+            Unit of the surface's coordinates.
         cache : str or Path, optional
-            Folder that keeps the mesh, since meshing it again would give another one.
+            Folder in which the mesh is kept, since meshing again would give a different mesh.
 
         Raises
         ------
         InputError
-            If the file cannot be read, its surface is refused, or pytetwild is missing.
+            If the file cannot be read, its surface is invalid, or pytetwild is not installed.
         """
         if isinstance(surface, (str, Path)):
             path = surface
@@ -200,48 +208,49 @@ class TetMesh:
             raise error.located(path) from error.__cause__
 
     def write(self, path: str | Path) -> None:
-        """Write the mesh, in metres, to any format meshio knows by the file's ending."""
+        """Write the mesh, in metres, to any format that meshio knows by the file's extension."""
         write_tetrahedra(path, self.points_m, self.tetrahedra, self.point_arrays, self.cell_arrays)
 
     def select(self, selection: NodeSelection) -> np.ndarray:
         """Return the nodes of a `selection.Selection`, as sorted int64 indices.
 
-        Where a body's element has nodes between these, see `Body.select`.
+        For nodes on edges, which quadratic elements have, see `Body.select`.
         """
         return selection.resolve(Nodes.corners(self))
 
     @cached_property
     def volumes_m3(self) -> np.ndarray:
-        """Volume of each element, (E,), all positive."""
+        """Volume of each element (E,) [m³], all positive."""
         return _read_only(signed_volumes(self.points_m, self.tetrahedra))
 
     @cached_property
     def centres_m(self) -> np.ndarray:
-        """Centre of each element, (E, 3)."""
+        """Centre of each element (E, 3) [m]."""
         return _read_only(self.points_m[self.tetrahedra].mean(axis=1))
 
     @property
     def volume_m3(self) -> float:
-        """Volume of the whole mesh."""
+        """Volume of the whole mesh [m³]."""
         return float(self.volumes_m3.sum())
 
     @property
     def bounds_m(self) -> np.ndarray:
-        """Lowest and highest coordinates, (2, 3)."""
+        """Lowest and highest coordinates (2, 3) [m]."""
         return np.array([self.points_m.min(axis=0), self.points_m.max(axis=0)])
 
     @property
     def surface(self) -> np.ndarray:
-        """Boundary triangles, (F, 3) int64, counter-clockwise when seen from outside."""
+        """Boundary triangles (F, 3) int64, counter-clockwise as seen from outside."""
         return self._boundary[0]
 
     @property
     def surface_cells(self) -> np.ndarray:
-        """(F,) the element that each boundary triangle is a face of."""
+        """Index of the element to which each boundary triangle belongs (F,)."""
         return self._boundary[1]
 
     @cached_property
     def _boundary(self) -> tuple[np.ndarray, np.ndarray]:
+        """Boundary triangles and the indices of their elements."""
         faces, owners = boundary_of(self.tetrahedra)
         return _read_only(faces), _read_only(owners)
 
@@ -251,9 +260,9 @@ class TetMesh:
         return _read_only(unique_edges(self.tetrahedra))
 
     def middles(self, pairs: np.ndarray) -> np.ndarray:
-        """Numbers (…) that nodes halfway between pairs (…, 2) of corners have behind the corners.
+        """Return the indices (…) of the mid nodes between pairs (…, 2) of corners.
 
-        They are in the order of `edges`.
+        Mid nodes follow the corners, in the order of `edges`.
         """
         count = len(self.points_m)
         codes = np.sort(pairs, axis=-1) @ [count, 1]
@@ -268,15 +277,23 @@ class TetMesh:
         return digest.hexdigest()
 
     def quality(self) -> MeshQuality:
-        """Measure the elements."""
+        """Return edge lengths and mean ratios of the elements."""
         lengths = np.linalg.norm(np.diff(self.points_m[self.edges], axis=1), axis=2)
         ratios = mean_ratios(self.points_m, self.tetrahedra)
-        edges_m = lengths.min(), lengths.mean(), lengths.max()
-        return MeshQuality(*map(float, (*edges_m, ratios.min(), np.median(ratios))))
+        return MeshQuality(
+            edge_min_m=float(lengths.min()),
+            edge_mean_m=float(lengths.mean()),
+            edge_max_m=float(lengths.max()),
+            quality_min=float(ratios.min()),
+            quality_median=float(np.median(ratios)),
+        )
 
 
 def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
-    """Faces (F, 3) that no other cell has, counter-clockwise from outside, and whose they are."""
+    """Return the boundary faces (F, 3) of tetrahedra and the index (F,) of the element of each.
+
+    A boundary face belongs to one element only; it is counter-clockwise as seen from outside.
+    """
     faces = tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
     _, first, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
@@ -286,6 +303,7 @@ def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
+    """Return a contiguous array that cannot be modified; the array itself if it is contiguous."""
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array
@@ -293,15 +311,18 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Where nodes are, and which of them make up each element.
+    """Nodes of the elements of a body.
 
     Attributes
     ----------
     mesh : TetMesh
-        Its nodes are the corners and come first, with their numbers.
+        Mesh whose nodes are the corners; they come first, with the same indices.
     points_m : (n, 3)
+        Undeformed positions.
     cells : (E, nodes per element)
-    ends : (k, 2) the corners at the ends of each mid node's edge: rows of `mesh.edges`, or none
+        Node indices of each element.
+    ends : (k, 2)
+        Corners at the ends of the edge of each mid node: the rows of `mesh.edges`, or none.
     """
 
     mesh: TetMesh
@@ -311,12 +332,12 @@ class Nodes:
 
     @classmethod
     def corners(cls, mesh: TetMesh) -> Nodes:
-        """Only the mesh's own."""
+        """Return the nodes of the mesh only."""
         return cls(mesh, mesh.points_m, mesh.tetrahedra, np.empty((0, 2), dtype=np.int64))
 
     @classmethod
     def of_element(cls, mesh: TetMesh, element: Element) -> Nodes:
-        """All that the element has."""
+        """Return the nodes of a kind of element: corners, and mid nodes if it has any."""
         if not element.edges:
             return cls.corners(mesh)
         points = _read_only(np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)]))
@@ -324,11 +345,15 @@ class Nodes:
         return cls(mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges)
 
     def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Extend a choice of mesh nodes to mid nodes: chosen when both ends of the edge are."""
+        """Extend a mask of mesh nodes to mid nodes, which are selected if both ends of the edge
+        are.
+        """
         return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
 
     def on_faces(self, triangles: Index) -> Index:
-        """Nodes (F, 3) or (F, 6) of triangles of corners: then those on the edges ab, bc, ca."""
+        """Return the nodes (F, 3) or (F, 6) of triangles of corners, then those on the edges ab,
+        bc, ca.
+        """
         if not len(self.ends):
             return triangles
         pairs = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)

@@ -1,4 +1,7 @@
-"""What a tetrahedral mesh must satisfy, as arrays: checked, cleaned, refused, graded."""
+"""Checks of tetrahedral meshes given as arrays: validation, cleaning and quality.
+
+`mesh.TetMesh` applies these functions to every mesh.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +20,18 @@ from .elements import EDGES
 # single-precision file cannot tell the element from a flat one.
 DEGENERATE_RATIO = 1e-6
 
-# Beyond all bodies, but volumes are still numbers.
+# Largest accepted coordinate [m]: larger than any body, while volumes do not overflow.
 LARGEST_M = 1e50
 
-# How far a mid node may lie off the middle, in edge lengths: round-off of a file in single
-# precision, and what may be straightened without asking.
+# Largest offset of a mid node from the middle of its edge, in edge lengths, that is rounding of a
+# file in single precision.
 ROUND_OFF = 1e-5
+# Largest offset, in edge lengths, of sides that are straightened with a note.
 SLIGHTLY_CURVED = 0.05
 
 
 def checked_points(points_m: ArrayLike) -> np.ndarray:
-    """Return a float64 copy of (n, 3) coordinates."""
+    """Return a float64 copy of (n, 3) coordinates, or raise an `InputError`."""
     try:
         points = np.array(points_m, dtype=np.float64)
     except (TypeError, ValueError):
@@ -40,7 +44,10 @@ def checked_points(points_m: ArrayLike) -> np.ndarray:
 
 
 def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
-    """Return an int64 copy of (E, 4) node numbers, E > 0, all of them below `node_count`."""
+    """Return an int64 copy of (E, 4) node indices, or raise an `InputError`.
+
+    E must be positive and all indices below `node_count`.
+    """
     try:
         array = np.array(tetrahedra)
     except ValueError:
@@ -54,7 +61,7 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
-    """Return an int64 copy of (k, 3) node numbers, all of them below `node_count`."""
+    """Return an int64 copy of (k, 3) node indices below `node_count`, or raise an `InputError`."""
     array = np.array(faces)
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
         raise InputError(
@@ -65,7 +72,7 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
 
 
 def refuse_unknown_nodes(cells: np.ndarray, node_count: int) -> None:
-    """Refuse cells (E, k) with nodes that are not there."""
+    """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1."""
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
         hint = (
@@ -80,7 +87,18 @@ def refuse_unknown_nodes(cells: np.ndarray, node_count: int) -> None:
 def checked_arrays(
     arrays: Mapping[str, ArrayLike], count: int, kind: str, of: str
 ) -> dict[str, np.ndarray]:
-    """Return the arrays, each of which must have `count` values: as many as there are `of`."""
+    """Return named arrays whose first length is `count`, or raise an `InputError`.
+
+    Parameters
+    ----------
+    arrays : mapping of name to array
+    count : int
+        Required first length.
+    kind : str
+        "point" or "cell", for the message.
+    of : str
+        What is counted, for the message.
+    """
     checked = {name: np.asarray(values) for name, values in arrays.items()}
     for name, values in checked.items():
         if values.ndim == 0 or len(values) != count:
@@ -94,16 +112,17 @@ def checked_arrays(
 def cleaned(
     points_m: np.ndarray, tetrahedra: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Drop nodes that are no element's corner, reverse negatively oriented elements, keep orders.
+    """Drop nodes that are no element's corner and reverse negatively oriented elements; orders are
+    kept.
 
     Returns
     -------
     points_m : (n', 3) array
     tetrahedra : (E, 4) array
     used : (n',) int64
-        The number that each node had, increasing.
+        Previous index of each node, increasing.
     notes : tuple of str
-        What was cleaned and what looks suspicious, in sentences.
+        Sentences about what was cleaned and what looks suspicious.
 
     Raises
     ------
@@ -114,8 +133,8 @@ def cleaned(
     _refuse_non_finite(points_m, used)
     _refuse_duplicates(tetrahedra)
     _refuse_degenerate(points_m, tetrahedra)
-    kept = points_m[used]
-    oriented, reversed_elements = orient(kept, renumbered.reshape(-1, 4))
+    used_points = points_m[used]
+    oriented, reversed_elements = orient(used_points, renumbered.reshape(-1, 4))
     notes = []
     dropped = np.setdiff1d(np.arange(len(points_m)), used)
     if len(dropped):
@@ -128,7 +147,7 @@ def cleaned(
             f"{len(reversed_elements)} of {len(oriented)} elements had a negative volume and were "
             "re-oriented."
         )
-    return kept, oriented, used, (*notes, *_note_parts(kept, oriented))
+    return used_points, oriented, used, (*notes, *_note_parts(used_points, oriented))
 
 
 def orient(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,20 +159,30 @@ def orient(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np
 
 
 def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Volume of each tetrahedron, (E,) m³; positive if (x₁−x₀, x₂−x₀, x₃−x₀) is right-handed."""
+    """Return the volume of each tetrahedron (E,) [m³]; positive if x₁−x₀, x₂−x₀, x₃−x₀ is
+    right-handed.
+    """
     corner = points_m[tetrahedra]
     a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))
     return np.einsum("ei,ei->e", np.cross(a, b), c) / 6
 
 
 def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
-    """Pairs of nodes that share an element, (m, 2), each once, sorted."""
+    """Return the pairs of nodes that share an element, (m, 2), each once, sorted."""
     return np.unique(np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0)
 
 
 @dataclass(frozen=True)
 class MeshQuality:
-    """Lengths of a mesh's edges, and the mean ratios of its elements."""
+    """Edge lengths of a mesh and mean ratios of its elements.
+
+    Attributes
+    ----------
+    edge_min_m, edge_mean_m, edge_max_m : float
+        Shortest, mean and longest edge.
+    quality_min, quality_median : float
+        Smallest and median mean ratio, see `mean_ratios`.
+    """
 
     edge_min_m: float
     edge_mean_m: float
@@ -163,18 +192,22 @@ class MeshQuality:
 
 
 def mean_ratios(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """12 (3V)^(2/3) / Σ l² over an element's edges, (E,): 1 if regular, towards 0 if flat."""
-    volumes, squares = signed_volumes(points_m, tetrahedra), edge_lengths(points_m, tetrahedra) ** 2
+    """Return 12 (3V)^(2/3) / Σ l² over the edges of each element (E,): 1 if regular, near 0 if
+    flat.
+    """
+    volumes = signed_volumes(points_m, tetrahedra)
+    squares = edge_lengths(points_m, tetrahedra) ** 2
     return 12 * (3 * volumes) ** (2 / 3) / squares.sum(axis=1)
 
 
 def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """(E, 6) lengths of the elements' edges."""
+    """Return the lengths (E, 6) of the edges of the elements."""
     ends = points[tetrahedra[:, EDGES]]
     return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
 
 
 def _refuse_non_finite(points: np.ndarray, used: np.ndarray) -> None:
+    """Raise an `InputError` if a used node has coordinates that are not finite."""
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(
@@ -184,6 +217,7 @@ def _refuse_non_finite(points: np.ndarray, used: np.ndarray) -> None:
 
 
 def _refuse_duplicates(tetrahedra: np.ndarray) -> None:
+    """Raise an `InputError` if two elements have the same nodes."""
     _, first, inverse = np.unique(
         np.sort(tetrahedra, axis=1), axis=0, return_index=True, return_inverse=True
     )
@@ -197,6 +231,7 @@ def _refuse_duplicates(tetrahedra: np.ndarray) -> None:
 
 
 def _refuse_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
+    """Raise an `InputError` if an element has almost no volume."""
     volumes = np.abs(signed_volumes(points, tetrahedra))
     cubes = edge_lengths(points, tetrahedra).mean(axis=1) ** 3
     bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)
@@ -209,7 +244,9 @@ def _refuse_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
 
 
 def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
-    edges, n = unique_edges(tetrahedra), len(points)
+    """Return a note if the mesh consists of several unconnected parts; empty otherwise."""
+    edges = unique_edges(tetrahedra)
+    n = len(points)
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
     parts, label = connected_components(graph, directed=False)
     if parts == 1:
@@ -221,7 +258,7 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
 
 
 def straightened(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
-    """Notes on what is lost when quadratic tetrahedra are taken by their corners alone.
+    """Return notes on curved sides that are lost when quadratic tetrahedra are reduced to corners.
 
     Parameters
     ----------
@@ -231,33 +268,35 @@ def straightened(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Empty where all sides are straight.
+        Empty if all sides are straight.
 
     Raises
     ------
     InputError
-        If a node does not exist, or a mid node lies further off the middle than those of
-        slightly curved sides.
+        If a node does not exist, or sides are curved by more than `SLIGHTLY_CURVED`.
     """
     refuse_unknown_nodes(cells, len(points_m))
     start_of, end_of = np.array(EDGES).T
-    start, stop = points_m[cells[:, start_of]], points_m[cells[:, end_of]]
+    start = points_m[cells[:, start_of]]
+    stop = points_m[cells[:, end_of]]
     length = np.linalg.norm(stop - start, axis=2)
-    off = np.linalg.norm(points_m[cells[:, 4:]] - (start + stop) / 2, axis=2)
-    bad = np.argwhere(~(off <= SLIGHTLY_CURVED * length))
+    offset = np.linalg.norm(points_m[cells[:, 4:]] - (start + stop) / 2, axis=2)
+    bad = np.argwhere(~(offset <= SLIGHTLY_CURVED * length))
     if len(bad):
         e, k = bad[0]
-        a, b, mid = cells[e, start_of[k]], cells[e, end_of[k]], cells[e, 4 + k]
+        a = cells[e, start_of[k]]
+        b = cells[e, end_of[k]]
+        mid = cells[e, 4 + k]
         raise InputError(
-            f"quadratic element {e}: mid node {mid} lies {off[e, k]:.3g} m off the middle of the "
+            f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of the "
             f"edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at most "
             f"{SLIGHTLY_CURVED:.0%} of that ({len(bad)} such in all), since sides are taken as "
             "straight: refine the mesh, or save it with linear tetrahedra"
         )
-    curved = off > ROUND_OFF * length
+    curved = offset > ROUND_OFF * length
     if not curved.any():
         return ()
-    largest = (off[curved] / length[curved]).max()
+    largest = (offset[curved] / length[curved]).max()
     count = len(np.unique(cells[:, 4:][curved]))
     return (
         f"Curved sides were straightened: {count} mid nodes lie off the middle of their edges, "

@@ -1,4 +1,7 @@
-"""Mesh files, read and written through meshio: plain arrays in, plain arrays out."""
+"""Mesh files, read and written through meshio as plain arrays.
+
+`mesh.TetMesh.read` and `TetMesh.write` use these functions.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,13 @@ _SOLID_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 
 
 def length_in_metres(length_unit: str) -> float:
-    """Return the length of one "m", "cm", "mm", "um" or "in" in metres."""
+    """Return the length of one "m", "cm", "mm", "um" or "in" in metres.
+
+    Raises
+    ------
+    InputError
+        For an unknown unit.
+    """
     if length_unit not in METRES_PER_UNIT:
         known = ", ".join(f'"{unit}"' for unit in METRES_PER_UNIT)
         raise InputError(f"length unit {length_unit!r} is unknown; use one of {known}")
@@ -36,28 +45,28 @@ Arrays = dict[str, np.ndarray]
 def read_tetrahedra(
     path: str | Path, length_unit: str = "m"
 ) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
-    """Read the tetrahedra of a file, quadratic ones by their corners; other cells are left out.
+    """Read the tetrahedra of a file, quadratic ones by their corners; other cells are omitted.
 
     Returns
     -------
     points_m : (n, 3) float64
     tetrahedra : (E, 4)
-        E > 0.
+        Node indices; E > 0.
     point_arrays : dict of name to (n, ...) array
-        The file's point data, and as booleans its point sets and the nodes of its cell sets and
+        Point data of the file, and as booleans its point sets and the nodes of its cell sets and
         physical groups, whatever the dimension of their cells.
     cell_arrays : dict of name to (E, ...) array
-        The same of the tetrahedra.
+        Cell data, cell sets and physical groups of the tetrahedra.
     face_sets : dict of name to (k, 3) array
-        Triangles of the file, by their cell sets and physical groups, and the cell data that are 1
+        Triangles of the file, by their cell sets and physical groups, and by cell data that are 1
         on them and 0 on others.
     notes : tuple of str
-        Which cells were left out and which sides straightened, if any.
+        Sentences about omitted cells and straightened sides, if any.
 
     Raises
     ------
     InputError
-        If the file cannot be read, holds no tetrahedra, or their sides are strongly curved.
+        If the file cannot be read, contains no tetrahedra, or their sides are strongly curved.
     """
     metres = length_in_metres(length_unit)
     with _reading(path) as data:
@@ -67,6 +76,7 @@ def read_tetrahedra(
 def _tetrahedra(
     data: Any, metres: float
 ) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
+    """Return the same as `read_tetrahedra` from the data of meshio."""
     counts = _cell_counts(data)
     points_m = np.asarray(data.points, dtype=float) * metres
     blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
@@ -99,7 +109,7 @@ def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray
     Raises
     ------
     InputError
-        If the file cannot be read or holds no triangles.
+        If the file cannot be read or contains no triangles.
     """
     metres = length_in_metres(length_unit)
     with _reading(path) as data:
@@ -126,24 +136,24 @@ def write_tetrahedra(
     point_arrays: Mapping[str, np.ndarray] | None = None,
     cell_arrays: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write a mesh, in metres, to any format meshio knows by the file's ending."""
+    """Write a mesh, in metres, to any format that meshio knows by the file's extension."""
     import meshio  # slow to import
 
-    of_points: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
-    of_cells: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
-    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], of_points, of_cells)
+    point_data: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
+    cell_data: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
+    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data, cell_data)
     with _one_error(path, "written"):
         meshio.write(path, mesh)
 
 
 def _numbers(values: np.ndarray) -> np.ndarray:
-    """Few formats have a boolean type."""
+    """Return booleans as uint8, because few formats have a boolean type; other arrays unchanged."""
     return values.astype(np.uint8) if values.dtype == bool else values
 
 
 @contextlib.contextmanager
 def _reading(path: str | Path) -> Iterator[Any]:
-    """What meshio reads; a damaged file may also fail where that is taken apart."""
+    """Context of the data of meshio; errors in its body are also reported as those of the file."""
     import meshio  # slow to import
 
     if not Path(path).is_file():
@@ -154,13 +164,20 @@ def _reading(path: str | Path) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _one_error(path: str | Path, done: str) -> Iterator[None]:
-    """Turn whatever meshio does on a bad file into one InputError."""
+    """Context that turns any failure of meshio on an invalid file into one `InputError`.
+
+    Parameters
+    ----------
+    path : str or Path
+    done : {"read", "written"}
+        What is done with the file, for the message.
+    """
     # Its readers raise whatever their parsing trips over, print, warn, and may exit.
-    said = io.StringIO()
+    captured = io.StringIO()
     try:
         with (
-            contextlib.redirect_stdout(said),
-            contextlib.redirect_stderr(said),
+            contextlib.redirect_stdout(captured),
+            contextlib.redirect_stderr(captured),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
@@ -170,7 +187,7 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise
-        reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
+        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
         raise InputError(
             f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
             ".mesh and .inp are known, told by the file's ending",
@@ -179,6 +196,7 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
 
 
 def _point_sets(data: Any) -> dict[str, np.ndarray]:
+    """Return the point sets of a file as boolean arrays."""
     sets = {}
     for name, nodes in (data.point_sets or {}).items():
         sets[name] = np.zeros(len(data.points), dtype=bool)
@@ -187,7 +205,7 @@ def _point_sets(data: Any) -> dict[str, np.ndarray]:
 
 
 def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
-    """Cell sets as booleans, block by block."""
+    """Return the cell sets of a file as boolean arrays, block by block."""
     sets = {}
     for name, per_block in (data.cell_sets or {}).items():
         if name == "gmsh:bounding_entities":  # numbers of entities, not of cells
@@ -200,31 +218,35 @@ def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
 
 
 def _physical_groups(data: Any) -> dict[str, list[np.ndarray]]:
-    """Physical groups of a .msh file by name, as booleans block by block.
+    """Return the physical groups of a .msh file by name, as boolean arrays block by block.
 
-    One without a name is "physical_<tag>", and its dimension follows where others have its tag.
+    A group without a name is "physical_<tag>", followed by its dimension if other dimensions use
+    the tag.
     """
     tags = [np.asarray(block).ravel() for block in data.cell_data.get("gmsh:physical", ())]
     if not tags:
         return {}
     names = {tuple(map(int, key)): name for name, key in (data.field_data or {}).items()}
-    found: dict[tuple[int, int], list[np.ndarray]] = {}
+    masks: dict[tuple[int, int], list[np.ndarray]] = {}
     for dimension in range(4):
-        here = [np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)]
-        for tag in np.unique(np.concatenate(here)):
+        tags_of_dimension = [
+            np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)
+        ]
+        for tag in np.unique(np.concatenate(tags_of_dimension)):
             if tag > 0:
-                found[int(tag), dimension] = [block == tag for block in here]
-    nameless = Counter(tag for tag, dimension in found if (tag, dimension) not in names)
-    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in found.items()}
+                masks[int(tag), dimension] = [block == tag for block in tags_of_dimension]
+    nameless = Counter(tag for tag, dimension in masks if (tag, dimension) not in names)
+    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in masks.items()}
 
 
 def _called(tag: int, dimension: int, ambiguous: bool) -> str:
+    """Return the name of a physical group without a name."""
     kind = ("points", "lines", "surface", "volume")[dimension]
     return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
 
 
 def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
-    """Nodes of cells chosen block by block, as booleans."""
+    """Return the mask of the nodes of cells that are selected block by block."""
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
         chosen[np.asarray(block.data)[mask].ravel()] = True
@@ -232,31 +254,38 @@ def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
 
 
 def _of_tetrahedra(data: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The tetrahedra's part of arrays given block by block; those that are of none are left out."""
+    """Return the values on tetrahedra of arrays given block by block; all-false masks are
+    omitted.
+    """
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
-    kept = {}
+    selected = {}
     for name, per_block in arrays.items():
-        parts = [np.asarray(p) for p, wanted in zip(per_block, tetrahedra, strict=True) if wanted]
-        whole = np.concatenate(parts)
-        if whole.dtype != bool or whole.any():
-            kept[name] = whole
-    return kept
+        parts = [
+            np.asarray(p)
+            for p, is_selected in zip(per_block, tetrahedra, strict=True)
+            if is_selected
+        ]
+        values = np.concatenate(parts)
+        if values.dtype != bool or values.any():
+            selected[name] = values
+    return selected
 
 
 def _triangle_sets(data: Any, arrays: Mapping[str, Any]) -> Arrays:
-    """Corners of the triangles on which arrays given block by block are 1."""
+    """Return the corners of the triangles on which arrays given block by block are 1."""
     blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
-    found = {}
+    sets = {}
     for name, per_block in arrays.items():
         masks = [np.asarray(per_block[k]) for k in blocks]
         if masks and all(m.ndim == 1 and np.isin(m, (0, 1)).all() for m in masks):
             chosen = [data.cells[k].data[m == 1, :3] for k, m in zip(blocks, masks, strict=True)]
             if any(map(len, chosen)):
-                found[name] = np.concatenate(chosen)
-    return found
+                sets[name] = np.concatenate(chosen)
+    return sets
 
 
 def _cell_counts(data: Any) -> Counter[str]:
+    """Return the number of cells by their type."""
     counts: Counter[str] = Counter()
     for block in data.cells:
         counts[block.type] += len(block.data)
@@ -264,10 +293,12 @@ def _cell_counts(data: Any) -> Counter[str]:
 
 
 def _listed(counts: Mapping[str, int]) -> str:
+    """Return the numbers of cells as text."""
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 
 def _note_left_out(counts: Mapping[str, int]) -> tuple[str, ...]:
+    """Return a note on cells other than tetrahedra, which are omitted; empty if there are none."""
     others = {name: count for name, count in counts.items() if name not in _TETRAHEDRA and count}
     if not others:
         return ()

@@ -1,8 +1,8 @@
-"""Elastic moduli in whichever pair the user knows: (λ, μ), (E, ν), (κ, μ) or (μ, ν).
+"""Elastic moduli in any usual pair: (λ, μ), (E, ν), (κ, μ) or (μ, ν).
 
-A material that has a constant μ takes any of these pairs; one whose shear modulus follows from
-constants of its own (Mooney and Rivlin's, Yeoh's) takes κ, λ or ν beside them. A region's own
-name, ``core.mu_pa``, goes before the name without it, which all regions share.
+A material that has a constant μ accepts any of these pairs; one whose shear modulus follows from
+other constants (Mooney–Rivlin, Yeoh) accepts κ, λ or ν beside them. The name with a region's
+prefix, ``core.mu_pa``, takes precedence over the name without it, which all regions share.
 """
 
 from __future__ import annotations
@@ -26,81 +26,94 @@ _BESIDE_SHEAR = (("kappa_pa",), ("lambda_pa",), ("poisson",))
 
 @dataclass(frozen=True)
 class Source:
-    """Where the constants of a region come from.
+    """Names of the parameters that determine the constants of a region.
 
     Attributes
     ----------
     material : Material
-    names : mapping of a constant's bare name to the name that gives it
-        For the elastic constants, those of the pair that was given.
+    names : mapping
+        For each constant, by its name without region, the name of the parameter that gives it. For
+        the elastic constants, the names of the pair that was given.
     """
 
     material: Material
     names: Mapping[str, str]
 
     def constants(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Every constant by its bare name, from the values by the names that were given."""
-        given = {own: values[name] for own, name in self.names.items()}
-        missing = [c.name for c in self.material.constants if c.name not in given]
+        """Return every constant by its name without region.
+
+        Parameters
+        ----------
+        values : mapping
+            Numbers or expressions by the names of the parameters.
+        """
+        by_constant = {own: values[name] for own, name in self.names.items()}
+        missing = [c.name for c in self.material.constants if c.name not in by_constant]
         if not missing:
-            return given
-        if "mu_pa" in given:
-            mu = given["mu_pa"]
-        elif "young_pa" in given:
-            mu = given["young_pa"] / (2 * (1 + given["poisson"]))
+            return by_constant
+        if "mu_pa" in by_constant:
+            mu = by_constant["mu_pa"]
+        elif "young_pa" in by_constant:
+            mu = by_constant["young_pa"] / (2 * (1 + by_constant["poisson"]))
         else:
             # With κ = λ = 0 what is left of the shear modulus is the own constants'.
-            own = [given.get(c.name, 0.0) for c in self.material.constants]
+            own = [by_constant.get(c.name, 0.0) for c in self.material.constants]
             mu = self.material.lame(ca.vertcat(*own))[1]
-        if "lambda_pa" in given:
-            lame = given["lambda_pa"]
-        elif "kappa_pa" in given:
-            lame = given["kappa_pa"] - 2 / 3 * mu
+        if "lambda_pa" in by_constant:
+            lame = by_constant["lambda_pa"]
+        elif "kappa_pa" in by_constant:
+            lame = by_constant["kappa_pa"] - 2 / 3 * mu
         else:
-            nu = given["poisson"]
+            nu = by_constant["poisson"]
             lame = 2 * mu * nu / (1 - 2 * nu)
-        return {**given, "mu_pa": mu, "lambda_pa": lame, "kappa_pa": lame + 2 / 3 * mu}
+        return {**by_constant, "mu_pa": mu, "lambda_pa": lame, "kappa_pa": lame + 2 / 3 * mu}
 
 
 def source_of(
     region: str, material: Material, others: Iterable[Constant], known: Sequence[str]
 ) -> Source:
-    """Find the constants of a region among the names that are known.
+    """Find the constants of a region among the names of the given parameters.
 
     Parameters
     ----------
     region : str
-        Its name, "" for the body's own.
+        Name of the region; "" for the rest of the body.
     material : Material
     others : iterable of Constant
-        Of the region's other terms.
+        Constants of the region beside those of its material.
     known : sequence of str
+        Names of the given parameters.
 
     Raises
     ------
     InputError
-        If one is missing or given twice.
+        If a constant is missing or given twice.
     """
 
     def name_of(own: str) -> str | None:
+        """Return the parameter that gives a constant, that of the region first; None if there is
+        none.
+        """
         prefixed = f"{region}.{own}" if region else own
         return prefixed if prefixed in known else own if own in known else None
 
-    owns = [c.name for c in material.constants]
-    elastic = _elastic_choices(owns)
-    plain = [own for own in owns if not (elastic and own in ELASTIC)]
+    material_constants = [c.name for c in material.constants]
+    elastic = _elastic_choices(material_constants)
+    plain = [own for own in material_constants if not (elastic and own in ELASTIC)]
     plain += [c.name for c in others]
     names = {own: name for own in plain if (name := name_of(own)) is not None}
     where = f"region '{region}'" if region else "the body"
-    what = f"the material {material.name} of {where}"
+    subject = f"the material {material.name} of {where}"
     if elastic:
         specific = {own for own in ELASTIC if region and f"{region}.{own}" in known}
-        there = {own for own in ELASTIC if name_of(own) is not None}
-        fitting = [c for c in elastic if set(c) <= there and specific <= set(c)]
+        available = {own for own in ELASTIC if name_of(own) is not None}
+        fitting = [c for c in elastic if set(c) <= available and specific <= set(c)]
         if len(fitting) != 1:
-            found = ", ".join(str(name_of(own)) for own in ELASTIC if own in there) or "none"
+            given_names = (
+                ", ".join(str(name_of(own)) for own in ELASTIC if own in available) or "none"
+            )
             raise InputError(
-                f"the elastic parameters of {where} are {found}; {what} expects "
+                f"the elastic parameters of {where} are {given_names}; {subject} expects "
                 f"{_alternatives(elastic)}"
             )
         names |= {own: str(name_of(own)) for own in fitting[0]}
@@ -113,14 +126,14 @@ def source_of(
         names[DENSITY.name] = MASS.name
     if lacking := [own for own in plain if own not in names]:
         raise InputError(
-            f"{_listed(lacking)} missing: {what} with its damping expects "
+            f"{_listed(lacking)} missing: {subject} with its damping expects "
             f"{_expected(elastic, plain)}"
         )
     return Source(material, names)
 
 
 def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """The sets of elastic names that a material with these constants may be given by."""
+    """Return the sets of elastic names by which a material with these constants can be given."""
     volumetric = {"lambda_pa", "kappa_pa"} & set(owns)
     if not volumetric:
         return ()
@@ -128,26 +141,29 @@ def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
 
 
 def elastic_names(material: Material) -> tuple[str, ...]:
-    """Names that may stand for a material's constants."""
+    """Return the names of elastic parameters that can replace a material's constants."""
     owns = [c.name for c in material.constants]
     return tuple(dict.fromkeys(name for choice in _elastic_choices(owns) for name in choice))
 
 
 def _alternatives(elastic: Sequence[Sequence[str]]) -> str:
+    """Return sets of names as text, joined by "or"."""
     return ", or ".join(" and ".join(choice) for choice in elastic)
 
 
 def _expected(elastic: Sequence[Sequence[str]], plain: Sequence[str]) -> str:
+    """Return the expected names as text."""
     own = ", ".join(plain)
     return f"{own}, and {_alternatives(elastic)}" if elastic else own
 
 
 def _listed(names: Sequence[str]) -> str:
+    """Return names and the verb "is" or "are" as text."""
     return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def engineering(lambda_pa: Any, mu_pa: Any) -> tuple[Any, Any]:
-    """(E, ν) of (λ, μ)."""
+    """Return (E, ν) from (λ, μ), as numbers or expressions."""
     return (
         mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa),
         lambda_pa / (2 * (lambda_pa + mu_pa)),

@@ -1,1 +1,32 @@
-"""The equations of motion: inputs from parameters, forces from inputs, and how time is stepped."""
+"""Equations of motion of a deformable body, with derivatives with respect to all parameters.
+
+From parameters to inputs of the equations:
+
+- `parameters`: shared parameters of a problem, with bounds, priors and the solver's coordinates q.
+- `nuisance`: nuisance parameters φ of one recording.
+- `inputs`: the vector u(q, φ; t) by which both enter the equations of motion.
+
+Forces:
+
+- `forces`: sum of all forces on a body; start here.
+- `force_term`: interface of a force, and forces that have an energy.
+- `weight`: gravity, masses and loads.
+- `contact`: pressure and friction of rigid obstacles.
+- `point_forces`: custom forces and air drag.
+- `generated`: small expressions with generated derivatives.
+
+Internal (history) variables:
+
+- `viscoelasticity`: memory of the material.
+- `force_history`: internal variables of forces.
+- `histories`: both of them along one motion.
+- `recursion`: recursions h_k = R(h_{k−1}, …) of sensors and memories.
+
+Equations in discrete time:
+
+- `schemes`: tables of the time-stepping schemes.
+- `dynamics`: discrete equations of motion of an experiment.
+- `setting`: these equations at given parameters, with the chain rule.
+- `grasp_constraint`: prescribed displacements of grasped nodes, as a function of φ.
+- `numerical_damping`: damping and period error of a scheme.
+"""

@@ -1,11 +1,16 @@
-"""The discrete equations of motion of one experiment, row by row from a scheme's table.
+"""Discrete equations of motion of one experiment, row by row from the tables of a scheme.
+
+With the time step included in the coefficients, row t is
 
     c_t = Σ_j w_j F_{t−j} − M (Σ_i s_i x_{t−i} + r v_0),
     F_t = f(Σ_i p_i x_{t−i}, Σ_i q_i x_{t−i}; θ) + f_ext,
 
-with the time step put in, so that with G = ∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `schemes`)
+so that with G = ∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `schemes`)
 
     −∂c_t/∂x_t = s_0 M − w_0 (p_0 G + q_0 C).
+
+Use `Dynamics.of` to discretise an experiment, `Dynamics.residual` and `Dynamics.linearise` to
+evaluate all rows, and `StencilRow` for time-marching methods that need the coefficients of one row.
 """
 
 from __future__ import annotations
@@ -30,7 +35,15 @@ from .weight import Mass
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """Stencil coefficients of every row, padded to the scheme's reach: (N, reach + 1) each."""
+    """Stencil coefficients of every row, padded with zeros to the largest lag of the scheme.
+
+    Attributes
+    ----------
+    p, q, w, s : (N, reach + 1)
+        Coefficients of each row by lag, see `schemes.Stencil`.
+    r : (N,)
+        Coefficient of the start velocity.
+    """
 
     p: Array
     q: Array
@@ -40,7 +53,7 @@ class Tables:
 
     @classmethod
     def of(cls, scheme: Scheme, rows: int, first_row: int) -> Tables:
-        """Tables of rows 0…`rows` − 1; those before `first_row` stay zero."""
+        """Return the tables of rows 0 … `rows` − 1; rows before `first_row` are zero."""
         p, q, w, s = (np.zeros((rows, scheme.reach + 1)) for _ in range(4))
         r = np.zeros(rows)
         for row in range(first_row, rows):
@@ -53,30 +66,40 @@ class Tables:
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """c_t(x; u) for rows t = `first_row` … N − 1 of a uniform grid, all dofs included.
+    """Residuals c_t(x; u) of the equations of motion, t = `first_row` … N − 1, for all 3n dofs.
 
-    Row 0 exists when the experiment starts in equilibrium and is the static problem; so are all
-    rows of a static experiment, whose times need not be evenly spaced.
+    The grid of times is uniform. Row 0 is an equation only if the experiment starts in equilibrium;
+    it is then the equation of statics. All rows of a static experiment are equations of statics,
+    and its times need not be evenly spaced. Evaluation k is the state (ξ_k, ν_k) at which row k
+    evaluates the forces.
 
     Attributes
     ----------
     body : Body
     tables : Tables
-    t_s : (N,) grid times
+        Stencil coefficients of every row.
+    t_s : (N,)
+        Times of the grid.
     first_row : int
-    mass : Mass of every dof in each row: the mean over its evaluations
-    forces : Forces at each row's evaluation
-    goals_m : (N, 3n) where dofs are held, NaN while free
+        Index of the first equation: 0 or 1.
+    mass : Mass
+        Mass of every dof in each row: the mean over the evaluations of the row.
+    forces : Forces
+        Forces at the N evaluations.
+    goals_m : (N, 3n)
+        Prescribed positions; NaN where a dof is free.
     taken : (N, 3n) bool
-        Held dofs that are free at other times: while one is held, the grasp takes what force
-        there is on it. Nothing of it reaches later rows, so that a dof let go starts like the
-        first step, from the velocity it has.
-    evaluated_s : (N,) times of the evaluations
+        True where a grasp holds a dof that is free at other times. The forces at such a dof are
+        balanced by the reaction force and omitted from all rows, so that a released dof starts like
+        the first step, from its velocity.
+    evaluated_s : (N,)
+        Times of the evaluations.
     start_velocity_m_s : (3n,)
+        Start velocity v_0.
     loaded_since_s : float
-        How long the body has been in its start shape; infinite where its memory has relaxed.
+        Time for which the body has been in its start shape; infinite if its memory has relaxed.
     static : bool
-        Whether each row is an equilibrium of its own.
+        Whether each row is an equilibrium.
     """
 
     body: Body
@@ -94,7 +117,16 @@ class Dynamics:
 
     @classmethod
     def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
-        """Discretise an experiment with `substeps` steps between samples; a static one has none."""
+        """Discretise an experiment in time.
+
+        Parameters
+        ----------
+        experiment : Experiment
+        scheme : str or Scheme
+            Scheme or its name; ignored for a static experiment.
+        substeps : int
+            Number of time steps between samples; ignored for a static experiment.
+        """
         if experiment.static:
             t_s = experiment.t_s
             table = SLIDING if any(o.rubs for o in experiment.obstacles) else QUASI_STATIC
@@ -102,7 +134,8 @@ class Dynamics:
             rows = (len(experiment.t_s) - 1) * substeps + 1
             t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
             table = as_scheme(scheme, experiment.start_rule)
-        rows, first_row = len(t_s), 0 if experiment.start == "equilibrium" else 1
+        rows = len(t_s)
+        first_row = 0 if experiment.start == "equilibrium" else 1
         tables = Tables.of(table, rows, first_row)
         velocity = experiment.start_velocities_m_s
         dofs = experiment.body.pattern.size
@@ -131,30 +164,37 @@ class Dynamics:
         )
 
     def at(self, u: Array) -> Dynamics:
-        """The same at inputs (N, U), see `inputs`."""
+        """Return these equations at inputs u (N, U), see `inputs`."""
         return self._under(self.forces.at(u))
 
     def with_theta(self, theta: Sequence[float] | Array) -> Dynamics:
-        """The same with a body of these constants (k,)."""
+        """Return these equations for a body with constants θ (k,)."""
         return self._under(self.forces.with_theta(theta))
 
     def _under(self, forces: Forces) -> Dynamics:
+        """Return these equations with other forces, and with the masses of these forces."""
         if forces.mass is self.forces.mass:
             return replace(self, forces=forces)
         return replace(self, forces=forces, mass=_of_rows(self.tables, forces.mass))
 
     def to_evaluations(self, of_rows: Array) -> Array:
-        """The transpose of `of_rows`, of weights (N, …)."""
+        """Apply the transpose of `of_rows`: distribute row quantities (N, …) to the evaluations."""
         total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (of_rows.ndim - 1))
         shares = of_rows / np.where(total == 0, 1.0, total)
         return np.where(total == 0, of_rows, 0.0) + self.combine_transposed(self.tables.w, shares)
 
     def of_rows(self, at_evaluations: Array) -> Array:
-        """What a row has of mass (N, …) that is there at the evaluations."""
+        """Return the mean over the evaluations of each row (N, …), weighted like the forces."""
         return _mean(self.tables, at_evaluations)
 
     def first_rows(self, rows: int) -> Dynamics:
-        """The same on the first grid times only."""
+        """Return these equations on the first grid times only; self if there are no more.
+
+        Parameters
+        ----------
+        rows : int
+            Number of grid times to keep.
+        """
         if rows >= self.rows:
             return self
         t = self.tables
@@ -171,40 +211,52 @@ class Dynamics:
 
     @property
     def pattern(self) -> SymmetricPattern:
-        """Sparsity of the blocks."""
+        """Sparsity pattern of the blocks ∂c_t/∂x_{t−i}."""
         return self.forces.pattern
 
     @property
     def rows(self) -> int:
-        """N, the number of grid points."""
+        """Number N of grid times."""
         return len(self.t_s)
 
     @property
     def step_s(self) -> float:
-        """Δt of the grid; of a static experiment, where nothing depends on it, a second."""
+        """Time step Δt of the grid; 1 s for a static experiment, which does not depend on Δt."""
         return 1.0 if self.static else float(self.t_s[1] - self.t_s[0])
 
     @property
     def reach(self) -> int:
-        """Largest lag of the scheme."""
+        """Largest lag of the scheme, in time steps."""
         return self.tables.p.shape[1] - 1
 
     def evaluation_states(self, x: Array) -> tuple[Array, Array]:
-        """ξ_k and ν_k of rows `first_row`…, each (N − first_row, 3n), from x (N, 3n)."""
+        """Return ξ_k and ν_k, each (N − first_row, 3n), of the rows from `first_row` on.
+
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions at all grid times [m].
+        """
         xi = self.combine(self.tables.p, x)
         nu = self.combine(self.tables.q, x) / self.step_s
         return xi[self.first_row :], nu[self.first_row :]
 
     @property
     def state_weights(self) -> Array:
-        """(N, reach + 1) p, and that of a given start, where only a stress is evaluated."""
+        """Weights (N, reach + 1) of x_{t−i} in ξ_t, where a given start counts as an evaluation.
+
+        Rows before `first_row` have weight 1 at lag 0: internal variables begin with the start
+        state.
+        """
         weights = self.tables.p.copy()
         weights[: self.first_row, 0] = 1.0
         return weights
 
     @property
     def until_next_s(self) -> Array:
-        """(N,) time from each evaluation to the next."""
+        """Time from each evaluation to the next (N,); the last entry is one step, or 1 s if
+        static.
+        """
         if self.static:
             return np.append(np.diff(self.t_s), 1.0)
         lags = self.tables.p @ np.arange(self.reach + 1.0)
@@ -212,49 +264,87 @@ class Dynamics:
 
     @property
     def theta(self) -> Array:
-        """(k,) constants of the body."""
+        """Constants θ of the body (k,)."""
         return self.forces.theta
 
     def histories(
         self, x: Array, brought: Mapping[int, Array] | None = None
     ) -> tuple[AnyHistory, ...]:
-        """What the evaluations of x (N, 3n), or its first rows, went through; empty if nothing.
+        """Return the internal variables along a motion; an empty tuple if there are none.
 
-        What they bring from the past follows from x where it is not given, by number.
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions [m]; fewer rows for the beginning of the motion.
+        brought : mapping, optional
+            Given internal variables of the previous evaluation, by the index of the history.
+            Internal variables that are not given are computed from x.
         """
         if not (self.body.remembers or self.forces.carrying):
             return ()
-        here = slice(len(x))
+        first_rows = slice(len(x))
         states = self.evaluated_at(x)
-        known = self.until_next_s[here], self.loaded_since_s, brought or {}
-        return histories(self.forces.rows(here), states, *known)
+        return histories(
+            self.forces.rows(first_rows),
+            states,
+            until_next_s=self.until_next_s[first_rows],
+            loaded_s=self.loaded_since_s,
+            brought=brought or {},
+        )
 
     def pressed(self, x: Array, pressed: Mapping[int, Array]) -> tuple[AnyHistory, ...]:
-        """Contact at b (1, N, i) that is given, by the number of the force, as histories are."""
-        states, since_s = self.evaluated_at(x), np.zeros(len(x))
+        """Return contact forces at given pressures b, in the form of histories.
+
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions [m].
+        pressed : mapping
+            Scaled contact pressure b (1, N, points) by the index of the force in `Forces.further`.
+        """
+        states = self.evaluated_at(x)
+        since_s = np.zeros(len(x))
         return tuple(
             ForceHistory.of(self.forces, number, *states, since_s, b)
             for number, b in pressed.items()
         )
 
     def evaluated_at(self, x: Array) -> tuple[Array, Array]:
-        """ξ and ν at all evaluations of x (N, 3n), or its first rows, a given start included."""
+        """Return ξ and ν at all evaluations, including a given start.
+
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions [m]; fewer rows for the beginning of the motion.
+
+        Returns
+        -------
+        xi, nu : (N, 3n)
+            Positions [m] and velocities [m/s]; before `first_row`, ν is the start velocity.
+        """
         xi = self.combine(self.state_weights[: len(x)], x)
         nu = self.combine(self.tables.q[: len(x)], x) / self.step_s
         nu[: self.first_row] = self.start_velocity_m_s
         return xi, nu
 
     def forces_along(self, along: Sequence[AnyHistory], rows: slice | None = None) -> Forces:
-        """The forces of rows `first_row`…, or some, with what they bring."""
+        """Return the forces of some rows with the internal variables of the motion.
+
+        Parameters
+        ----------
+        along : sequence of histories
+        rows : slice, optional
+            Indices of the rows; by default all from `first_row` on.
+        """
         rows = slice(self.first_row, self.rows) if rows is None else rows
         return onto(self.forces.rows(rows), along, rows)
 
     def combine(self, table: Array, rows: Array) -> Array:
-        """Σ_i table[t, i] rows[t − i] for every t; `rows` is (N, …)."""
+        """Return Σ_i table[t, i] rows[t − i] for every t, for `rows` (N, …)."""
         return _combine(table, rows)
 
     def combine_transposed(self, table: Array, rows: Array) -> Array:
-        """Σ_i table[k + i, i] rows[k + i] for every k, the transpose of `combine`."""
+        """Return Σ_i table[k + i, i] rows[k + i] for every k: the transpose of `combine`."""
         result = np.zeros_like(rows)
         shape = (-1,) + (1,) * (rows.ndim - 1)
         for lag in range(min(table.shape[1], len(rows))):
@@ -264,35 +354,58 @@ class Dynamics:
         return result
 
     def residual(self, x: Array, along: Sequence[AnyHistory] = ()) -> Array:
-        """Residuals c (N, 3n) [N] at positions x (N, 3n); rows before `first_row` are zero.
+        """Return the residuals c (N, 3n) [N]; rows before `first_row` are zero.
 
-        Here and below what is carried is what follows from x, unless other histories are given.
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions [m].
+        along : sequence of histories
+            Internal variables of the motion; computed from x where the sequence is empty.
         """
         return self.assemble_residual(x, self.force(x, along))
 
     @property
     def evaluated(self) -> Forces:
-        """The forces of rows `first_row`…."""
+        """Forces of the rows from `first_row` on."""
         return self.forces.rows(slice(self.first_row, self.rows))
 
     def force(self, x: Array, along: Sequence[AnyHistory] = ()) -> Array:
-        """Forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n)."""
+        """Return the forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n).
+
+        `along` are the internal variables of the motion; computed from x where the sequence is
+        empty.
+        """
         return self.forces_along(along or self.histories(x)).total(*self.evaluation_states(x))
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
-        """The same from the forces (N − first_row, 3n) at the evaluation states."""
+        """Return the residuals c (N, 3n) [N] from forces that have been evaluated.
+
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions [m].
+        force : (N − first_row, 3n)
+            Forces at the evaluation states [N].
+        """
         total = np.zeros_like(x)
         total[self.first_row :] = force
         inertia = self.mass.kg * self.acceleration(x)
         return self.combine(self.tables.w, self.without_taken(total)) - inertia
 
     def without_taken(self, rows: Array) -> Array:
-        """Forces (N, 3n, …) with those that a passing grasp takes set to zero, in place."""
+        """Set the forces at dofs of `taken` to zero, in place, and return the array.
+
+        Parameters
+        ----------
+        rows : (N, 3n, …)
+            Forces at the evaluations, or their derivatives; modified.
+        """
         rows[self.taken] = 0
         return rows
 
     def acceleration(self, x: Array) -> Array:
-        """Acceleration of every row, (N, 3n) [m/s²]."""
+        """Return the acceleration in every row (N, 3n) [m/s²] of positions x (N, 3n)."""
         acceleration = self.combine(self.tables.s, x) / self.step_s**2
         acceleration += np.outer(self.tables.r / self.step_s, self.start_velocity_m_s)
         return acceleration
@@ -300,22 +413,37 @@ class Dynamics:
     def linearise(
         self, x: Array, out: Array | None = None, along: Sequence[AnyHistory] = ()
     ) -> Linearisation:
-        """Forces and derivatives, at what is brought, at the evaluation states of x (N, 3n)."""
+        """Return forces and derivatives at the evaluation states of x (N, 3n).
+
+        Parameters
+        ----------
+        x : (N, 3n)
+            Positions [m].
+        out : array, optional
+            Memory for the result, see `Forces.linearise`.
+        along : sequence of histories
+            Internal variables of the motion; computed from x where the sequence is empty. They are
+            held fixed in the derivatives.
+        """
         forces = self.forces_along(along or self.histories(x))
         return forces.linearise(*self.evaluation_states(x), out)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:
-        """The force part of ∂c_t/∂x_{t−lag} as Σ_j a_j[t] G_{t−j} + b_j[t] C_{t−j}.
+        """Yield the force part of ∂c_t/∂x_{t−lag} as terms of Σ_j a_j[t] G_{t−j} + b_j[t] C_{t−j}.
 
         G and C are `by_position` and `by_velocity` at evaluation t − j.
 
         Yields
         ------
-        j, a, b : int, (N,) and (N,) arrays, where any is not zero
+        j : int
+            Lag of the evaluation.
+        a, b : (N,)
+            Coefficients; terms without any nonzero coefficient are skipped.
         """
         t = self.tables
         for j in range(min(lag + 1, self.rows)):
-            a, b = np.zeros(self.rows), np.zeros(self.rows)
+            a = np.zeros(self.rows)
+            b = np.zeros(self.rows)
             weights = t.w[j:, j]
             a[j:] = weights * t.p[: self.rows - j, lag - j]
             b[j:] = weights * t.q[: self.rows - j, lag - j] / self.step_s
@@ -323,11 +451,12 @@ class Dynamics:
                 yield j, a, b
 
     def inertia_coefficient(self, lag: int) -> Array:
-        """(N,) factor of the mass in ∂c_t/∂x_{t−lag}: −s_lag / Δt²."""
+        """Return the factor (N,) of the mass in ∂c_t/∂x_{t−lag}: −s_lag / Δt²."""
         return -self.tables.s[:, lag] / self.step_s**2
 
 
 def _combine(table: Array, rows: Array) -> Array:
+    """Return Σ_i table[t, i] rows[t − i] for every t; terms before the start are omitted."""
     result = np.zeros_like(rows)
     shape = (-1,) + (1,) * (rows.ndim - 1)
     for lag in range(min(table.shape[1], len(rows))):
@@ -338,12 +467,17 @@ def _combine(table: Array, rows: Array) -> Array:
 
 
 def _of_rows(tables: Tables, at_evaluations: Mass) -> Mass:
-    """The mass of the rows from that at the evaluations."""
+    """Return the mass in each row, from the mass at the evaluations."""
     return replace(at_evaluations, tied_kg=_mean(tables, at_evaluations.tied_kg))
 
 
 def _mean(tables: Tables, at_evaluations: Array) -> Array:
-    # As a row weighs forces: then gravity alone accelerates all mass alike, also what just joins.
+    # Weighted like the forces, so that gravity alone accelerates all masses equally, also a load
+    # that is joining.
+    """Return the mean over the evaluations of each row (N, …), weighted like the forces.
+
+    A row without forces keeps the value at its evaluation.
+    """
     if (at_evaluations == at_evaluations[:1]).all():
         return at_evaluations
     total = tables.w.sum(axis=1).reshape((-1,) + (1,) * (at_evaluations.ndim - 1))
@@ -353,13 +487,16 @@ def _mean(tables: Tables, at_evaluations: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class StencilRow:
-    """Row t of an experiment's equations of motion: its coefficients, and its block.
+    """Coefficients of row t of the equations of motion, with the time step included.
 
     Attributes
     ----------
-    p, q, w, s : floats of the stencil, by lag
+    p, q, w, s : tuple of float
+        Coefficients by lag, q and s divided by Δt and Δt².
     r : float
-    mass_kg : (3n,) of every dof
+        Coefficient of the start velocity, divided by Δt.
+    mass_kg : (3n,)
+        Mass of every dof, including added mass of the air.
     """
 
     p: tuple[float, ...]
@@ -371,8 +508,9 @@ class StencilRow:
 
     @classmethod
     def of(cls, dynamics: Dynamics, t: int) -> StencilRow:
-        """Row t of the tables, with its mass."""
-        tables, step_s = dynamics.tables, dynamics.step_s
+        """Return the coefficients and masses of the row with index t."""
+        tables = dynamics.tables
+        step_s = dynamics.step_s
         return cls(
             tuple(tables.p[t].tolist()),
             tuple((tables.q[t] / step_s).tolist()),
@@ -384,28 +522,52 @@ class StencilRow:
 
     @cached_property
     def lags(self) -> list[int]:
-        """Lags from one on that the evaluation of the force depends on."""
+        """Lags from 1 on whose positions the evaluation of the force depends on."""
         return [i for i in range(1, len(self.p)) if self.p[i] or self.q[i]]
 
     def block(self, by_position: Array, by_velocity: Array, pattern: SymmetricPattern) -> Array:
-        """Lower triangle (m,) of −∂c_t/∂x_t from those of G and C."""
+        """Return the lower triangle (m,) of −∂c_t/∂x_t, symmetric part.
+
+        Parameters
+        ----------
+        by_position, by_velocity : (m,)
+            Lower triangles of the symmetric parts of G and C.
+        pattern : SymmetricPattern
+            Positions of the diagonal in these triangles.
+        """
         values = -self.w[0] * self.p[0] * by_position
         values -= self.w[0] * self.q[0] * by_velocity
         values[pattern.diagonal] += self.s[0] * self.mass_kg
         return values
 
     def skew_block(self, by_position_skew: Array, by_velocity_skew: Array) -> Array:
-        """Lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t from those of G and C."""
+        """Return the lower triangle, (m,) or (0,), of the skew part of −∂c_t/∂x_t.
+
+        Parameters
+        ----------
+        by_position_skew, by_velocity_skew : (m,) or (0,)
+            Lower triangles of the skew parts of G and C; empty where there is no such part.
+        """
         return -self.w[0] * self.skew(0, by_position_skew, by_velocity_skew)
 
     def skew(self, lag: int, by_position_skew: Array, by_velocity_skew: Array) -> Array:
-        """That of p G + q C of a lag."""
-        found = self.p[lag] * by_position_skew
-        return found + self.q[lag] * by_velocity_skew if by_velocity_skew.size else found
+        """Return the skew part of p G + q C at a lag, (m,) or (0,)."""
+        skew_part = self.p[lag] * by_position_skew
+        return skew_part + self.q[lag] * by_velocity_skew if by_velocity_skew.size else skew_part
 
 
 def weighted(coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]) -> Array:
-    """Σ_i coefficients[i] past[i] over the lags from one on; past holds the latest first."""
+    """Return Σ_i coefficients[i] past[i − 1] over the lags i from 1 on.
+
+    Parameters
+    ----------
+    coefficients : sequence of float
+        Coefficients by lag; that of lag 0 is not used.
+    past : iterable of arrays
+        Values at lags 1, 2, …, the latest first.
+    shape : tuple of int
+        Shape of the result where no coefficient is nonzero.
+    """
     terms = [c * item for c, item in zip(coefficients[1:], past, strict=False) if c]
     if not terms:
         return np.zeros(shape)

@@ -1,9 +1,11 @@
-"""What a force beside those of the elements is to the equations of motion: F(ξ, ν; u) at T times.
+"""Interface of a force in the equations of motion, beside the internal forces of the elements.
 
-A term has inputs of its own, see `inputs`, beside the constants θ of the body. What it adds goes
-into arrays that all terms share: on the pattern of all couplings, with columns for all inputs. The
-chain rule from inputs to parameters is no term's, see `setting`. A force with an energy c(u) S(x)
-is −c ∂S/∂x, such as those of tendons and pressures.
+Derive a force from `ForceTerm`, or from `point_forces.Pointwise` if it acts point by point; use
+`Potential` for a force with an energy c(u) S(x), i.e. −c ∂S/∂x, such as that of a tendon or of a
+pressure. A term is F(ξ, ν; u) at T times. Its inputs (see `inputs`) follow the constants θ of the
+body in u. Terms add their values and derivatives to shared arrays, on the sparsity pattern of all
+couplings and with one column for every input. The chain rule from inputs to parameters is applied
+in `setting`.
 """
 
 from __future__ import annotations
@@ -21,12 +23,16 @@ from ..fem.pattern import SymmetricPattern
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """Where forces are evaluated.
+    """States at which forces are evaluated.
 
     Attributes
     ----------
-    xi, nu : (T, 3n) positions [m] and velocities [m/s]
-    theta : (k,) constants of the body
+    xi : (T, 3n)
+        Positions ξ [m].
+    nu : (T, 3n)
+        Velocities ν [m/s]; in a static experiment the displacements since the previous sample [m].
+    theta : (k,)
+        Constants θ of the body.
     """
 
     xi: Array
@@ -36,12 +42,14 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Where what a term adds goes.
+    """Positions in the shared arrays to which a term adds its derivatives.
 
     Attributes
     ----------
-    inputs : slice of the columns of its own inputs
-    entries : (m,) places of its couplings in the pattern
+    inputs : slice
+        Columns of the term's inputs.
+    entries : (m,)
+        Positions of the term's couplings in the shared sparsity pattern.
     """
 
     inputs: slice
@@ -49,23 +57,23 @@ class Slots:
 
 
 class ForceTerm(ABC):
-    """A force at T times.
+    """Force at T times, with first and second derivatives.
 
     Attributes
     ----------
     size : int
-        Number of its own inputs.
+        Number of the term's inputs.
     couplings : SymmetricPattern or None
-        Which dofs it joins; None where no slope by the state is anything but zero.
+        Pairs of dofs coupled by the force; None if the force does not depend on the state.
     slides : bool
-        Whether its velocities are, in a static experiment, ways since the sample before; others'
-        are none.
+        Whether the force uses the displacement since the previous sample in place of the velocity
+        in a static experiment, as friction does. Other terms get zero velocities there.
     by_velocity : bool
-        Whether its slopes by velocities may change with these.
+        Whether derivatives by the velocity may themselves depend on the velocity.
     spins : bool
-        Whether these slopes are not symmetric, as of gyroscopic forces.
+        Whether the derivatives by the velocity may be non-symmetric, as for gyroscopic forces.
     carries : int
-        How many numbers each of its instances carries; only one that is `Pointwise` carries any.
+        Number of internal variables of each instance; nonzero only for a `Pointwise` term.
     """
 
     size: int
@@ -77,59 +85,96 @@ class ForceTerm(ABC):
 
     @abstractmethod
     def at(self, u: Array) -> Self:
-        """The same at own inputs (T, size)."""
+        """Return this force at inputs u (T, size)."""
 
     @abstractmethod
     def rows(self, rows: slice) -> Self:
-        """The same at some of the times."""
+        """Return this force at some of the times."""
 
     @abstractmethod
     def scaled(self, share: float) -> Self:
-        """A share of the force."""
+        """Return this force multiplied by a factor."""
 
     @abstractmethod
     def towards(self, other: Self, share: float) -> Self:
-        """The same with a share of the way to another time."""
+        """Return this force with its loads and times interpolated linearly to those of another
+        time.
+
+        Parameters
+        ----------
+        other : Self
+            The force at the other time.
+        share : float
+            Fraction of the way: 0 for this time, 1 for the other.
+        """
 
     @abstractmethod
     def force(self, states: States) -> Array:
-        """F (T, 3n) [N]."""
+        """Return the forces F (T, 3n) [N]."""
 
     @abstractmethod
     def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
-        """Add F and its slopes, in place."""
+        """Add the forces and their first derivatives to a linearisation, in place.
+
+        Parameters
+        ----------
+        at : Linearisation
+            Shared arrays; modified.
+        places : Slots
+            Columns and entries of this term in the arrays.
+        states : States
+        """
 
     @abstractmethod
     def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
-        """Add the derivatives of weightsᵀ F, for weights (T, 3n), in place."""
+        """Add the derivatives of weightsᵀ F to a curvature, in place.
+
+        Parameters
+        ----------
+        at : Curvature
+            Shared arrays; modified.
+        places : Slots
+            Columns and entries of this term in the arrays.
+        states : States
+        weights : (T, 3n)
+        """
 
 
 class Scalar(Protocol):
-    """A scalar S of the shape of a body, of positions (T, 3n)."""
+    """Scalar function S of the node positions, such as the length of a tendon or the volume of a
+    cavity.
+
+    Attributes
+    ----------
+    couplings : SymmetricPattern
+        Pairs of dofs with a nonzero second derivative of S.
+    """
 
     couplings: SymmetricPattern
 
     def gradient(self, states: Array) -> Array:
-        """∂S/∂x (T, 3n)."""
+        """Return ∂S/∂x (T, 3n) at positions (T, 3n)."""
         ...
 
     def hessian(self, states: Array) -> Array:
-        """∂²S/∂x² (T, m) on the couplings."""
+        """Return ∂²S/∂x² (T, m) on the couplings, at positions (T, 3n)."""
         ...
 
     def hessian_along(self, states: Array, ways: Array) -> Array:
-        """Its derivative (T, m) along ways (T, 3n)."""
+        """Return the derivative (T, m) of the Hessian in the directions `ways` (T, 3n)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Potential(ForceTerm):
-    """The force of an energy at T times.
+    """Force −c ∂S/∂x of an energy c S(x) at T times.
 
     Attributes
     ----------
-    scalar : S
-    amplitude : (T, 1) c, its own input
+    scalar : Scalar
+        Function S of the positions.
+    amplitude : (T, 1)
+        Factor c of the energy; the only input of the force.
     """
 
     scalar: Scalar
@@ -137,46 +182,47 @@ class Potential(ForceTerm):
 
     @property
     def size(self) -> int:  # type: ignore[override]
-        """One."""
+        """Number of inputs, which is 1."""
         return 1
 
     @property
     def couplings(self) -> SymmetricPattern:  # type: ignore[override]
-        """Those of S."""
+        """Pairs of dofs coupled by S."""
         return self.scalar.couplings
 
     def at(self, u: Array) -> Self:
-        """The same with another amplitude."""
+        """Return this force with another amplitude (T, 1)."""
         return replace(self, amplitude=u)
 
     def rows(self, rows: slice) -> Self:
-        """The same at some of the times."""
+        """Return this force at some of the times."""
         return self.at(self.amplitude[rows])
 
     def scaled(self, share: float) -> Self:
-        """A share of it."""
+        """Return this force multiplied by a factor."""
         return self.at(share * self.amplitude)
 
     def towards(self, other: Self, share: float) -> Self:
-        """With a share of the way to another time."""
+        """Return this force with its amplitude interpolated to that of another time."""
         return self.at(self.amplitude + share * (other.amplitude - self.amplitude))
 
     def force(self, states: States) -> Array:
-        """(T, 3n) [N]."""
+        """Return the forces −c ∂S/∂x (T, 3n) [N]."""
         return -self.amplitude * self.scalar.gradient(states.xi)
 
     def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
-        """Add F and its slopes."""
+        """Add the forces and their first derivatives to a linearisation, in place."""
         gradient = self.scalar.gradient(states.xi)
         np.subtract(at.force, self.amplitude * gradient, out=at.force)
         at.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(states.xi)
         at.by_theta[:, :, places.inputs.start] -= gradient
 
     def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
-        """Add the derivatives of weightsᵀ F."""
-        xi, own = states.xi, places.inputs.start
-        along = self.scalar.hessian_along(xi, weights)
-        at.position_position[:, places.entries] -= self.amplitude * along
-        turned = self.couplings.products(self.scalar.hessian(xi), weights)
-        at.position_theta[:, :, own] -= turned
-        at.theta[:, own] -= np.einsum("ti,ti->t", weights, self.scalar.gradient(xi))
+        """Add the derivatives of weightsᵀ F to a curvature, in place."""
+        xi = states.xi
+        column = places.inputs.start
+        third_derivatives = self.scalar.hessian_along(xi, weights)
+        at.position_position[:, places.entries] -= self.amplitude * third_derivatives
+        hessian_products = self.couplings.products(self.scalar.hessian(xi), weights)
+        at.position_theta[:, :, column] -= hessian_products
+        at.theta[:, column] -= np.einsum("ti,ti->t", weights, self.scalar.gradient(xi))

@@ -1,9 +1,10 @@
-"""What parameters do to the equations of motion: inputs u(p; t), derivatives generated.
+"""Inputs u(p; t) by which parameters enter the equations of motion, with generated derivatives.
 
-Of every evaluation u has, in this order, the constants θ of the body; gravity (3), where a φ turns
-it; the share of each load whose time is estimated; the amplitude of each tendon and pressure. p are
-the parameters that move the body: q, then the φ of `NuisanceMap.moving`. Forces know how they
-depend on u, see `forces`; ∂u/∂p and Σ w ∂²u/∂p² are generated.
+The entries of u at each evaluation are, in this order: the constants θ of the body; gravity (3),
+if a nuisance parameter rotates it; the share of each load whose time is estimated; the amplitude of
+each tendon and pressure. The parameters p are those that affect the motion: the shared coordinates
+q, then the nuisance parameters φ of `NuisanceMap.moving`. Every force provides its derivatives by u
+(see `forces`); this module generates ∂u/∂p and Σ w ∂²u/∂p².
 """
 
 from __future__ import annotations
@@ -30,16 +31,18 @@ Expression = Callable[[ca.SX, ca.SX], ca.SX]
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """Entries of u.
+    """Group of consecutive entries of u, with one expression.
 
     Attributes
     ----------
     size : int
+        Number of entries.
     expression : callable
         ``expression(p, data) -> (size,)`` in CasADi operations.
-    data : (d, N) at the evaluations, or (d, 1) where the entries are constant
+    data : (d, N) or (d, 1)
+        Data at the N evaluations; (d, 1) for entries that are constant in time.
     by_state : bool
-        Whether forces change with it and the state together.
+        Whether the mixed second derivative of the forces by these entries and the state is nonzero.
     """
 
     size: int
@@ -50,11 +53,12 @@ class Input:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """u of one experiment.
+    """Input vector u of one experiment as a function of its parameters p.
 
     Attributes
     ----------
     inputs : sequence of Input
+        Groups of entries, in the order of u.
     parameters : int
         Length m of p.
     times : int
@@ -66,74 +70,96 @@ class Inputs:
     times: int
 
     def at(self, p: Array) -> tuple[Array, Array]:
-        """U (N, U) and ∂u/∂p (N, U, m); in the memory of one time where nothing changes."""
-        values, slopes = [], []
+        """Return the inputs u (N, U) and their derivatives ∂u/∂p (N, U, m) at parameters p (m,).
+
+        If all entries are constant in time, both arrays are read-only views with stride 0 along the
+        time.
+        """
+        values = []
+        slopes = []
         rows = max((e.data.shape[1] for e in self.inputs), default=1)
         for each, generated in zip(self.inputs, self._generated, strict=True):
             value, slope = generated.slopes(p, each.data)
             values.append(np.broadcast_to(value.T, (rows, each.size)))
             shape = (rows, each.size, self.parameters)
             slopes.append(np.broadcast_to(np.moveaxis(slope, 2, 0), shape))
-        u, by_p = np.concatenate(values, axis=1), np.concatenate(slopes, axis=1)
+        u = np.concatenate(values, axis=1)
+        by_p = np.concatenate(slopes, axis=1)
         if rows == self.times:
             return u, by_p
-        # In the memory of one time.
-        whole = self.times, *by_p.shape[1:]
-        return np.broadcast_to(u, whole[:2]), np.broadcast_to(by_p, whole)
+        full_shape = self.times, *by_p.shape[1:]
+        return np.broadcast_to(u, full_shape[:2]), np.broadcast_to(by_p, full_shape)
 
     def curvature(self, p: Array, weights: Array) -> Array:
-        """Σ weights[t] · ∂²u_t/∂p² (m, m), for weights (N, U)."""
-        found, first = np.zeros((self.parameters,) * 2), 0
+        """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) for weights (N, U)."""
+        hessian = np.zeros((self.parameters,) * 2)
+        offset = 0
         for each, generated in zip(self.inputs, self._generated, strict=True):
-            own = weights[:, first : first + each.size].T
+            group_weights = weights[:, offset : offset + each.size].T
             if each.data.shape[1] == 1:
-                own = own.sum(axis=1, keepdims=True)
-            found += generated.curvature(p, each.data, own).sum(axis=2)
-            first += each.size
-        return found
+                group_weights = group_weights.sum(axis=1, keepdims=True)
+            hessian += generated.curvature(p, each.data, group_weights).sum(axis=2)
+            offset += each.size
+        return hessian
 
     @cached_property
     def _generated(self) -> list[Generated]:
+        """Expressions of the groups with derivatives, in the order of `inputs`."""
         return [Generated(e.expression, self.parameters, len(e.data)) for e in self.inputs]
 
     @cached_property
     def by_state(self) -> Array:
-        """(m,) which parameters change forces together with the state."""
-        found = np.zeros(self.parameters, dtype=bool)
+        """Mask (m,) of the parameters on which entries with `Input.by_state` depend."""
+        mask = np.zeros(self.parameters, dtype=bool)
         for each, generated in zip(self.inputs, self._generated, strict=True):
             if each.by_state:
-                found |= generated.depends
-        return found
+                mask |= generated.depends
+        return mask
 
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
-    """The equations of motion with room for the inputs that φ change."""
-    forces, loads = dynamics.forces, [timed.load for timed in nuisance.timed]
-    turns = len(nuisance.of_gravity) > 0
-    weight = forces.weight.with_inputs(turns, loads, dynamics.evaluated_s)
+    """Return equations of motion with the inputs that φ changes: gravity and load shares."""
+    forces = dynamics.forces
+    loads = [timed.load for timed in nuisance.timed]
+    has_gravity_input = len(nuisance.of_gravity) > 0
+    weight = forces.weight.with_inputs(has_gravity_input, loads, dynamics.evaluated_s)
     return replace(dynamics, forces=replace(forces, weight=weight))
 
 
 def inputs_of(
     experiment: Experiment, parameters: Parameters, nuisance: NuisanceMap, evaluated_s: Array
 ) -> Inputs:
-    """U of an experiment, at the times of the evaluations (N,)."""
-    constants, still = ThetaMap(parameters, experiment.body), np.zeros((0, 1))
+    """Return the inputs of an experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    parameters : Parameters
+    nuisance : NuisanceMap
+    evaluated_s : (N,)
+        Times at which forces are evaluated.
+    """
+    constants = ThetaMap(parameters, experiment.body)
+    no_data = np.zeros((0, 1))
     nq = len(parameters.free)
     place = {phi: nq + k for k, phi in enumerate(nuisance.moving.tolist())}
 
     def theta(p: ca.SX, _: ca.SX) -> ca.SX:
+        """Return the constants θ of the body, of q alone."""
         return constants.expression(p[:nq])
 
     def value(p: ca.SX, phi: int) -> ca.SX:
-        """Of a φ, with its unit; zero of none."""
+        """Return a nuisance parameter with its unit; zero for the index −1, which means none."""
         return ca.SX(0) if phi < 0 else float(nuisance.scales[phi]) * p[place[phi]]
 
     def gravity(p: ca.SX, _: ca.SX) -> ca.SX:
+        """Return gravity (3,) in the frame of the body."""
         return nuisance.gravity_expression(p[[place[k] for k in nuisance.of_gravity.tolist()]])
 
     def share(phi: int, timed: Timed) -> Input:
-        sign, interval_s = 1.0 if timed.change == "from_s" else -1.0, experiment.timestep_s
+        """Return the input of the share of a load: the change from its share at the stated time."""
+        sign = 1.0 if timed.change == "from_s" else -1.0
+        interval_s = experiment.timestep_s
 
         def change(p: ca.SX, since_s: ca.SX) -> ca.SX:
             late_s = value(p, phi)
@@ -142,18 +168,23 @@ def inputs_of(
         return Input(1, change, evaluated_s[None] - timed.stated_s)
 
     def amplitude(number: int, actuator: Actuator) -> Input:
-        stated, places = nuisance.stated_off[number].tolist(), nuisance.drive_places(number)
+        """Return the input of the amplitude of a tendon or pressure."""
+        stated_calibration = nuisance.stated_off[number].tolist()
+        places = nuisance.drive_places(number)
 
         def driven(p: ca.SX, course: ca.SX) -> ca.SX:
-            off = (at + value(p, phi) for at, phi in zip(stated, places, strict=True))
-            return actuator.driven(course, *off)
+            calibration = (
+                nominal + value(p, phi)
+                for nominal, phi in zip(stated_calibration, places, strict=True)
+            )
+            return actuator.driven(course, *calibration)
 
         return Input(1, driven, actuator.course.at(evaluated_s)[None])
 
-    found = [Input(len(experiment.body.constants), theta, still)]
+    groups = [Input(len(experiment.body.constants), theta, no_data)]
     if len(nuisance.of_gravity):
-        found.append(Input(3, gravity, still, by_state=False))
+        groups.append(Input(3, gravity, no_data, by_state=False))
     joining = zip(nuisance.places(JOINING).tolist(), nuisance.timed, strict=True)
-    found += [share(phi, timed) for phi, timed in joining]
-    found += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
-    return Inputs(found, nq + len(nuisance.moving), len(evaluated_s))
+    groups += [share(phi, timed) for phi, timed in joining]
+    groups += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
+    return Inputs(groups, nq + len(nuisance.moving), len(evaluated_s))

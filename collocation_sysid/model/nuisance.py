@@ -1,16 +1,16 @@
-"""Nuisance parameters φ of an experiment: places, clock, gravity, the body in its grasp, cameras.
+"""Nuisance parameters φ of one recording: marker places, clocks, gravity, grasp, loads and cameras.
 
-Every φ is a number of prior standard deviations, so that its prior is φ² in the loss. What there
-may be is the table of `recording.nuisance`; an entry of φ is one component of a row, on one axis.
+Every φ is a number of prior standard deviations, so its prior adds φ² to the loss. The table in
+`recording.nuisance` lists the possible rows; an entry of φ is one axis of one component of a row.
 
-Grasps and body are off by the rigid motion x' = R(a) (x − c) + c + d in the frame of the markers,
-c being the middle of the undeformed body in its first pose. In the body's frame that changes
-nothing but what the markers read, and the direction of gravity, which becomes R(a)ᵀ g.
+A rigid motion x' = R(a) (x − c) + c + d of grasps and body in the frame of the markers has the
+middle c of the body in its first pose as pivot. In the frame of the body it changes only what
+markers measure, and the direction of gravity, which becomes R(a)ᵀ g.
 
-In the grasp the undeformed body is off by H X = R(a_h) (X − c_h) + c_h + d_h, c_h being the middle
-of the grasped nodes: they are held at U_t H X.
+The pose of the undeformed body in its grasp is H X = R(a_h) (X − c_h) + c_h + d_h with the middle
+c_h of the grasped nodes; these are held at U_t H X.
 
-A tension T is max(0, f T − b) at the body, a pressure p is f p − b.
+A tension T acts on the body as max(0, f T − b), a pressure p as f p − b.
 """
 
 from __future__ import annotations
@@ -60,43 +60,53 @@ from .generated import Generated
 
 Load = TypeVar("Load", PointMass, Force)
 
-# Samples are read between neighbours, up to this many away from the chart's.
+# Largest deviation of a delay from the current whole number of samples: the range of interpolation.
 LARGEST_SHIFT_SAMPLES = 2.0
-# A time shift may be this share of the recording.
+# Largest delay as a fraction of the recording's duration; more would leave too few samples.
 LARGEST_SHIFT_SHARE = 0.25
-# A load joins within this many standard deviations of its prior, further than any that is right,
-# and within the recording: not quite at its ends, where it would join at once or never.
-LARGEST_DELAY, NARROWER = 4.0, 1 - 1e-9
+# Largest delay of a joining load, in prior standard deviations: more than any true value.
+LARGEST_DELAY = 4.0
+# Factor that keeps a joining load inside the recording: at its ends it would join at once or never.
+NARROWER = 1 - 1e-9
+# What a row must change (see `NuisanceRow.changes`) to affect the motion.
 MOVING = {"gravity", "grasps", "loads", "drives"}
 
 
 class Timed(NamedTuple):
-    """A load that joins or leaves at an estimated time."""
+    """Load that joins or leaves at an estimated time.
+
+    Attributes
+    ----------
+    load : PointMass or Force
+    change : {"from_s", "until_s"}
+        Which time of the load is estimated.
+    """
 
     load: PointMass | Force
     change: Change
 
     @property
     def stated_s(self) -> float:
-        """The time stated."""
+        """Time given by the user [s]."""
         return getattr(self.load, self.change)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One φ.
+    """One nuisance parameter.
 
     Attributes
     ----------
     row : NuisanceRow
+        Row of the table of nuisance parameters.
     number : int
-        Of the component: marker, grasp, actuator, load or sensor of the experiment.
+        Index of the component: marker, grasp, actuator, load, camera or sensor of the experiment.
     axis : int
-        Of the vector.
+        Index of the axis of a vector-valued row.
     label : str
-        With its unit.
+        Label with unit, such as "place of tip, x [m]".
     sigma : float
-        Prior standard deviation, in the unit.
+        Prior standard deviation, in the unit of the label.
     """
 
     row: NuisanceRow
@@ -107,28 +117,40 @@ class Entry:
 
     @property
     def unit(self) -> str:
-        """Of the label."""
+        """Unit of the parameter, taken from its label."""
         return self.label.rpartition("[")[2].rstrip("]")
 
 
 @dataclass(frozen=True, eq=False)
 class NuisanceMap:
-    """φ of one experiment: what each is, and the gravity and grasps it makes.
+    """Nuisance parameters φ of one experiment, and the quantities that depend on them.
 
     Attributes
     ----------
-    entries : (k,) what each is
-    names : (k,) with units, such as "swing: place of tip, x [m]"
-    scales : (k,) prior standard deviations, in the names' units
-    reach : (k,) φ that a step may move at a time: what enters linearly needs no trust region
-    interval_s : float, between samples
+    entries : (k,)
+        Definition of each parameter.
+    names : (k,)
+        Names with units, such as "swing: place of tip, x [m]".
+    scales : (k,)
+        Prior standard deviations, in the units of the names.
+    reach : (k,)
+        Largest change of φ in one step of the solver; infinite for parameters that enter linearly.
+    interval_s : float
+        Time between samples.
     duration_s : float
-    gravity_m_s2 : (3,) as stated
-    pivot_m : (3,) c
-    grasp_pivot_m : (3,) c_h
-    stated_off : (A, 2) f and b of tensions and pressures as stated
-    timed : what joins or leaves, in the order of their φ
-    recorded_s : first and last time of the recording
+        Duration of the recording.
+    gravity_m_s2 : (3,)
+        Gravity as stated.
+    pivot_m : (3,)
+        Pivot c of the rigid motion in the frame of the markers.
+    grasp_pivot_m : (3,)
+        Pivot c_h of the motion of the body in its grasp.
+    stated_off : (A, 2)
+        Factor f and loss b of each tension and pressure, as stated.
+    timed : tuple of Timed
+        Loads with an estimated time, in the order of their parameters.
+    recorded_s : (float, float)
+        First and last time of the recording.
     """
 
     entries: tuple[Entry, ...]
@@ -146,18 +168,31 @@ class NuisanceMap:
 
     @classmethod
     def of(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
-        """What the experiment wants estimated; the pivot is another recording's where one is given.
+        """Return the nuisance parameters of an experiment.
 
-        What recordings share has the same name in all of them.
+        A parameter that recordings share has the same name in all of them.
+
+        Parameters
+        ----------
+        experiment : Experiment
+        pivot_m : (3,), optional
+            Pivot c; by default the middle of the body in its first pose. Pass that of another
+            recording if the rigid motion is shared with it.
+
+        Raises
+        ------
+        InputError
+            If a custom expression fails, has the wrong shape, or is not finite at zero.
         """
-        entries, body = tuple(_entries(experiment)), experiment.body
+        entries = tuple(_entries(experiment))
+        body = experiment.body
         scope = experiment.nuisance.scope
         middle_m = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
         scales = np.array([entry.sigma for entry in entries], dtype=float)
         steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
-        held = held_nodes(experiment.gripping)
-        found = cls(
+        grasped_nodes = held_nodes(experiment.gripping)
+        nuisance_map = cls(
             entries,
             tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
             scales,
@@ -166,102 +201,147 @@ class NuisanceMap:
             experiment.duration_s,
             np.array(experiment.gravity_m_s2),
             middle_m if pivot_m is None else pivot_m,
-            body.nodes_m[held if len(held) else slice(None)].mean(axis=0),
+            body.nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0),
             np.array([a.off for a in experiment.actuators]).reshape(-1, 2),
             tuple(timed for _, timed in _timed(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
         for row in experiment.nuisance.own:
-            found._require_smooth(row)
-        return found
+            nuisance_map._require_smooth(row)
+        return nuisance_map
 
     def _require_smooth(self, row: NuisanceRow) -> None:
-        """Refuse an expression of a user's own that cannot be read with, or has no slopes."""
-        y, t_s = ca.SX.sym("y", 3), ca.SX.sym("t_s")
+        """Raise an `InputError` if a custom reading or clock cannot be evaluated and
+        differentiated.
+        """
+        y = ca.SX.sym("y", 3)
+        t_s = ca.SX.sym("t_s")
         values = ca.SX.sym("values", max(1, len(row.axes.split())))
         what = "reading" if row.reading else "clock"
         try:
-            made: Any = row.reading and row.reading(y, values, t_s, self)
-            made = ca.SX(row.clock(values, t_s, self) if row.clock else made)
+            expression: Any = row.reading and row.reading(y, values, t_s, self)
+            expression = ca.SX(row.clock(values, t_s, self) if row.clock else expression)
         except Exception as error:
             raise InputError(f"the {what} of {row.name} failed: {reason(error)}") from error
-        wanted = (3, 1) if row.reading else (1, 1)
-        if made.shape != wanted:
-            found = f"the {what} of {row.name} has the shape {made.shape}"
-            raise InputError(f"{found}; expected {wanted}")
-        slopes = ca.Function("slopes", [y, values, t_s], [made, ca.jacobian(made, values)])
-        at = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
-        if not all(np.isfinite(part.full()).all() for part in at):
+        expected = (3, 1) if row.reading else (1, 1)
+        if expression.shape != expected:
+            problem = f"the {what} of {row.name} has the shape {expression.shape}"
+            raise InputError(f"{problem}; expected {expected}")
+        slopes = ca.Function(
+            "slopes", [y, values, t_s], [expression, ca.jacobian(expression, values)]
+        )
+        evaluated = slopes([0.1, 0.2, 0.3], 0.0, self.interval_s)
+        if not all(np.isfinite(part.full()).all() for part in evaluated):
             raise InputError(f"the {what} of {row.name} or its slopes are not finite at zero")
 
     @property
     def size(self) -> int:
-        """Number k of φ."""
+        """Number k of nuisance parameters."""
         return len(self.names)
 
     def valued(self, phi: Array) -> Iterator[tuple[Entry, str, float]]:
-        """Each φ but the places of markers, which say nothing by themselves: name and value."""
+        """Yield entry, name and value with unit of each parameter, except for the places of
+        markers.
+        """
         for entry, name, value in zip(self.entries, self.names, phi * self.scales, strict=True):
             if entry.row != PLACE:
                 yield entry, name, float(value)
 
     def places(self, *rows: NuisanceRow, of: int | None = None) -> Index:
-        """Positions in φ of some rows, of all components or of one."""
+        """Return the indices in φ of some rows, of all components or of one.
+
+        Parameters
+        ----------
+        *rows : NuisanceRow
+        of : int, optional
+            Index of the component.
+        """
         return self._where(lambda e: e.row in rows and of in (None, e.number))
 
     def _where(self, chosen: Callable[[Entry], bool]) -> Index:
+        """Return the indices in φ of the entries for which a function is true."""
         return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
 
     @cached_property
     def moving(self) -> Index:
-        """Positions in φ of what changes the motion: gravity, grasps, loads and what drives it."""
+        """Indices in φ of the parameters that affect the motion: gravity, grasps, loads,
+        actuators.
+        """
         return self._where(lambda e: not MOVING.isdisjoint(e.row.changes))
 
     @cached_property
     def of_drives(self) -> Index:
-        """Positions in φ of what tensions and pressures may be off by."""
+        """Indices in φ of the calibration of tensions and pressures."""
         return self._where(lambda e: "drives" in e.row.changes)
 
     def drive_places(self, number: int) -> tuple[int, int]:
-        """Positions in φ of the factor and of what is lost of an actuator, −1 where it has none."""
-        found = [-1, -1]
+        """Return the indices in φ of factor and loss of an actuator; −1 where they are not
+        estimated.
+        """
+        indices = [-1, -1]
         for k in self.of_drives:
             if self.entries[k].number == number:
-                found[self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)] = int(k)
-        return found[0], found[1]
+                indices[self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)] = int(k)
+        return indices[0], indices[1]
 
     def drives(self, phi: Array) -> Array:
-        """F and b (A, 2) of tensions and pressures."""
-        found, values = self.stated_off.copy(), phi * self.scales
-        for number in range(len(found)):
+        """Return factor f and loss b (A, 2) of each tension and pressure at φ."""
+        calibration = self.stated_off.copy()
+        values = phi * self.scales
+        for number in range(len(calibration)):
             for column, place in enumerate(self.drive_places(number)):
-                found[number, column] += 0.0 if place < 0 else values[place]
-        return found
+                calibration[number, column] += 0.0 if place < 0 else values[place]
+        return calibration
 
     # What markers read --------------------------------------------------------------------------
 
     def of_markers(self, count: int) -> Index:
-        """(count, f) positions in φ of what the reading of each marker depends on."""
+        """Return the indices in φ (count, f) on which the measurement of each of `count` markers
+        depends.
+        """
         read = self._where(lambda e: e.row.reading is not None or e.row.clock is not None)
-        one = [k for k in read if self.entries[k].row.of == "marker"]
-        each = [[k for k in one if self.entries[k].number == m] for m in range(count)]
-        common = np.tile(np.setdiff1d(read, one), (count, 1))
+        single = [k for k in read if self.entries[k].row.of == "marker"]
+        of_marker = [[k for k in single if self.entries[k].number == m] for m in range(count)]
+        common = np.tile(np.setdiff1d(read, single), (count, 1))
         return np.hstack(
-            [np.array(each, dtype=np.int64).reshape(count, -1 if count else 0), common]
+            [np.array(of_marker, dtype=np.int64).reshape(count, -1 if count else 0), common]
         )
 
     @cached_property
     def of_clock(self) -> Index:
-        """Positions in φ of what shifts the times at which markers are seen."""
+        """Indices in φ of the parameters that shift the times at which markers were measured."""
         return self._where(lambda e: e.row.clock is not None)
 
     def late_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
-        """How much later than at t_s a marker was seen, at its φ."""
+        """Return the delay of a marker's measurement relative to the time t_s [s].
+
+        Parameters
+        ----------
+        phi : SX
+            Parameters at the indices `places`.
+        places : array of int
+            Indices in φ of the marker, a row of `of_markers`.
+        t_s : SX
+            Time of the sample.
+        """
         values = self.by_row(phi, places)
         return sum((row.clock(values[row], t_s, self) for row in values if row.clock), ca.SX(0))
 
     def read(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
-        """What is read of a marker at y (3,), at its φ: first as all are seen, then as it is."""
+        """Return the measured position (3,) of a marker whose true position is y (3,).
+
+        Effects common to all markers are applied before those of the single marker.
+
+        Parameters
+        ----------
+        y : (3,) SX
+        phi : SX
+            Parameters at the indices `places`.
+        places : array of int
+            Indices in φ of the marker, a row of `of_markers`.
+        t_s : SX
+            Time of the sample.
+        """
         values = self.by_row(phi, places)
         for row in sorted(values, key=lambda row: row.of == "marker"):
             y = y if row.reading is None else row.reading(y, values[row], t_s, self)
@@ -271,54 +351,83 @@ class NuisanceMap:
 
     @cached_property
     def moves_grasps(self) -> bool:
-        """Whether the body may be off in its grasps, or these in their zero."""
+        """Whether any φ that affects the motion is not of gravity, so that prescribed positions may
+        change.
+        """
         return len(np.setdiff1d(self.moving, self.of_gravity)) > 0
 
     def zero(self, number: int) -> Index:
-        """Positions in φ of the zeros of a grasp, along its axes in turn."""
+        """Return the indices in φ of the zeros of a grasp's displacement, axis by axis."""
         return self.places(ZERO, of=number)
 
     def of_obstacle(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
-        """Row, axis and position in φ of all that is not known of an obstacle."""
+        """Return row, axis and index in φ of every nuisance parameter of an obstacle.
+
+        Parameters
+        ----------
+        number : int
+            Index among the grasps, in which obstacles follow the grippers.
+        """
         own = (k for k in self.moving.tolist() if self.entries[k].row.of == "obstacle")
         here = ((self.entries[k], k) for k in own if self.entries[k].number == number)
         return [(entry.row, entry.axis, k) for entry, k in here]
 
     def with_grasps(self, grasps: Sequence[Grasp], phi: Array) -> tuple[Grasp, ...]:
-        """Grasps and obstacles where φ has them."""
+        """Return the grasps and obstacles at their poses at φ."""
         motion = self.in_grasp(phi)
         return tuple(self._with_grasp(k, grasp, motion, phi) for k, grasp in enumerate(grasps))
 
     def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
+        """Return one grasp or obstacle at its pose at φ.
+
+        Parameters
+        ----------
+        number : int
+            Index of the grasp.
+        grasp : Grasp
+        motion : (4, 4)
+            Motion H of the body in its grasp.
+        phi : (k,)
+        """
         if isinstance(grasp, Obstacle):
-            off: dict[NuisanceRow, Array] = {}
+            deviations: dict[NuisanceRow, Array] = {}
             for row, axis, place in self.of_obstacle(number):
-                off.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
-            nothing = np.zeros(2)
-            offset, late = (off.get(r, nothing)[0] for r in (OBSTACLE_OFFSET, OBSTACLE_TIME))
-            return grasp.off_by(offset, off.get(OBSTACLE_TILT, nothing), late)
+                deviations.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
+            zeros = np.zeros(2)
+            offset, delay_s = (
+                deviations.get(r, zeros)[0] for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
+            )
+            return grasp.off_by(offset, deviations.get(OBSTACLE_TILT, zeros), delay_s)
         zero_m = np.zeros(3)
         for place in self.zero(number):
             zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
         return replace(grasp, poses=grasp.poses.after(motion).shifted(zero_m))
 
     def limits(self, samples: int) -> tuple[Array, Array]:
-        """Lowest and highest φ (k,), where samples are read about this many whole ones away."""
+        """Return the lowest and the highest φ (k,) with valid measurements and loads.
+
+        Parameters
+        ----------
+        samples : int
+            Number of whole samples by which marker measurements are currently shifted; delays may
+            deviate from it by `LARGEST_SHIFT_SAMPLES`.
+        """
         low = np.array([entry.row.low for entry in self.entries])
         high = np.array([entry.row.high for entry in self.entries])
         for k in self.places(TIME):
-            about, unit = samples * self.interval_s, self.scales[k]
-            around = LARGEST_SHIFT_SAMPLES * self.interval_s
-            furthest = max(around, LARGEST_SHIFT_SHARE * self.duration_s)
-            low[k] = max(about - around, -furthest) / unit
-            high[k] = min(about + around, furthest) / unit
+            middle_s = samples * self.interval_s
+            unit = self.scales[k]
+            range_s = LARGEST_SHIFT_SAMPLES * self.interval_s
+            largest_s = max(range_s, LARGEST_SHIFT_SHARE * self.duration_s)
+            low[k] = max(middle_s - range_s, -largest_s) / unit
+            high[k] = min(middle_s + range_s, largest_s) / unit
         for k, timed in zip(self.places(JOINING), self.timed, strict=True):
-            way = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
-            low[k], high[k] = np.clip(NARROWER * way, -LARGEST_DELAY, LARGEST_DELAY)
+            margins = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
+            low[k], high[k] = np.clip(NARROWER * margins, -LARGEST_DELAY, LARGEST_DELAY)
         return low, high
 
     def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
-        """The experiment with its loads joining and leaving when φ says."""
+        """Return the experiment with its loads joining and leaving at the times estimated by φ."""
         if not self.timed:
             return experiment
         late_s = (phi * self.scales)[self.places(JOINING)]
@@ -331,20 +440,22 @@ class NuisanceMap:
             }
             return replace(load, **times) if times else load
 
-        masses, forces = map(moved, experiment.masses), map(moved, experiment.forces)
+        masses = map(moved, experiment.masses)
+        forces = map(moved, experiment.forces)
         return replace(experiment, masses=masses, forces=forces)
 
     @cached_property
     def of_grasps(self) -> Index:
-        """Positions in φ of what moves the body in its grasps."""
+        """Indices in φ of rotation and shift of the body in its grasp."""
         return self.places(GRASP_TURN, GRASP_SHIFT)
 
     @cached_property
     def in_grasps(self) -> Generated:
-        """H X of a point X, of the φ of `of_grasps`."""
+        """Expression of H X for a point X, of the φ of `of_grasps`."""
         return Generated(self._carried, len(self.of_grasps), 3)
 
     def _carried(self, phi: ca.SX, point: ca.SX) -> ca.SX:
+        """Return H X as an expression."""
         values = self.by_row(phi, self.of_grasps)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
@@ -354,7 +465,7 @@ class NuisanceMap:
         return point
 
     def in_grasp(self, phi: Array) -> Array:
-        """H as a 4×4 matrix [[R, p], [0, 1]]."""
+        """Return H at φ as a 4×4 matrix [[R, p], [0, 1]]."""
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
         images = self.in_grasps.value(phi[self.of_grasps], points)
         matrix = np.eye(4)
@@ -362,19 +473,22 @@ class NuisanceMap:
         return matrix
 
     def gravity(self, phi: Array) -> Array:
-        """Gravity (3,) in the body's frame."""
+        """Return gravity (3,) in the frame of the body at φ [m/s²]."""
         if not len(self.of_gravity):
             return self.gravity_m_s2
         return ca.evalf(self.gravity_expression(ca.SX(phi[self.of_gravity]))).full().ravel()
 
     @cached_property
     def of_gravity(self) -> Index:
-        """Positions in φ of what turns gravity, in the body's frame."""
+        """Indices in φ of the parameters that rotate gravity in the frame of the body."""
         return self.places(TILT, TURN)
 
     def gravity_expression(self, phi: ca.SX) -> ca.SX:
-        """Gravity (3,) in the body's frame, of the φ of `of_gravity`."""
-        values, gravity = self.by_row(phi, self.of_gravity), ca.DM(self.gravity_m_s2)
+        """Return gravity (3,) in the frame of the body as an expression of the φ of
+        `of_gravity`.
+        """
+        values = self.by_row(phi, self.of_gravity)
+        gravity = ca.DM(self.gravity_m_s2)
         if TILT in values:
             gravity = self._tilted(values[TILT])
         if TURN in values:
@@ -382,13 +496,25 @@ class NuisanceMap:
         return ca.SX(gravity)
 
     def by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
-        """By row, of φ at some places, with units."""
-        sized, found = phi * self.scales[places][:, None], {}
-        for at, k in enumerate(places):
-            found.setdefault(self.entries[k].row, []).append(sized[at])
-        return {row: ca.vertcat(*each) for row, each in found.items()}
+        """Return parameters with units by row, each a column vector.
+
+        Parameters
+        ----------
+        phi : SX
+            Parameters at the indices `places`.
+        places : array of int
+            Indices in φ.
+        """
+        values = phi * self.scales[places][:, None]
+        parts = {}
+        for position, k in enumerate(places):
+            parts.setdefault(self.entries[k].row, []).append(values[position])
+        return {row: ca.vertcat(*each) for row, each in parts.items()}
 
     def _tilted(self, angles: ca.SX) -> ca.SX:
+        """Return gravity of the stated magnitude, tilted by two angles [rad] about the axes across
+        it.
+        """
         size = float(np.linalg.norm(self.gravity_m_s2))
         if size == 0:
             return ca.SX(ca.DM(self.gravity_m_s2))
@@ -400,13 +526,15 @@ class NuisanceMap:
 
 
 def _entries(experiment: Experiment) -> Iterator[Entry]:
-    """Every φ of an experiment, in order."""
+    """Yield every nuisance parameter of an experiment, in the order of φ."""
     for _, rows in groupby(experiment.nuisance.rows, key=lambda row: row.of):
-        here = [row for row in rows if row.applies(experiment)]
-        for number, which in _components(experiment, here[0].of) if here else ():
-            for row in here:
+        applicable = [row for row in rows if row.applies(experiment)]
+        for number, component_name in (
+            _components(experiment, applicable[0].of) if applicable else ()
+        ):
+            for row in applicable:
                 for axis, name, unit, sigma in _axes(experiment, row, number):
-                    label = row.label.format(which=which, axis=name)
+                    label = row.label.format(which=component_name, axis=name)
                     yield Entry(row, number, axis, f"{label} [{unit}]", sigma)
     for number, gauge in enumerate(experiment.readings):
         for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
@@ -415,7 +543,7 @@ def _entries(experiment: Experiment) -> Iterator[Entry]:
 
 
 def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
-    """Numbers and names of all there are of a kind."""
+    """Return index and name of all components of one kind, such as all markers."""
     names = experiment.markers.names
     if of == "recording":
         return [(0, "")]
@@ -443,8 +571,12 @@ def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
 def _axes(
     experiment: Experiment, row: NuisanceRow, number: int
 ) -> list[tuple[int, str, str, float]]:
-    """Number, name, unit and deviation of each axis of a row's component; none if exact."""
-    sigma, names = experiment.nuisance.sigma(row), row.axes.split() or [""]
+    """Return index, name, unit and prior deviation of each estimated axis of a component.
+
+    The list is empty if the component is exact or the row does not apply to it.
+    """
+    sigma = experiment.nuisance.sigma(row)
+    names = row.axes.split() or [""]
     if row == PLACE:
         sigma = float(experiment.place_sigma_m[number])
         names = ["first", "second"] if experiment.markers.on_surface else names
@@ -452,8 +584,8 @@ def _axes(
         return []
     if row == TARE:
         wrench = _wrenches(experiment)[number]
-        own = np.flatnonzero(wrench.measured).tolist()
-        return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in own]
+        measured = np.flatnonzero(wrench.measured).tolist()
+        return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in measured]
     if row in (OBSTACLE_TILT, OBSTACLE_TIME):
         obstacle = experiment.grasps[number]
         assert isinstance(obstacle, Obstacle)
@@ -463,21 +595,22 @@ def _axes(
         return []
     if row == DEPTH_EDGE and not len(experiment.depths[number].images_m):
         return []
-    found = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
-    return [each for each in found if row != ZERO or each[1] in experiment.grasps[number].zero]
+    axes = [(axis, name, row.unit, sigma) for axis, name in enumerate(names)]
+    return [each for each in axes if row != ZERO or each[1] in experiment.grasps[number].zero]
 
 
 def _wrenches(experiment: Experiment) -> list[Wrench]:
+    """Return the wrench sensors of all grasps."""
     return [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
 
 
 def _timed(experiment: Experiment) -> list[tuple[str, Timed]]:
-    """What joins or leaves at a time that is to be estimated, and its label."""
+    """Return label and load for every time of a load that is to be estimated."""
     if not experiment.nuisance.joining_s:
         return []
-    said: dict[Change, str] = {"from_s": "joining", "until_s": "leaving"}
+    verbs: dict[Change, str] = {"from_s": "joining", "until_s": "leaving"}
     return [
-        (f"{said[change]} of {kind} {number}", Timed(load, change))
+        (f"{verbs[change]} of {kind} {number}", Timed(load, change))
         for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
         for number, load in enumerate(loads, start=1)
         for change in get_args(Change)

@@ -1,11 +1,12 @@
-"""What a scheme does to an oscillation: the damping it adds and by how much it slows it down.
+"""Numerical damping and period error of a time-stepping scheme for one vibration mode.
 
-On x″ = −ω² x − 2 ζ ω x′ with step Δt, a scheme's row (see `model.schemes`) is a linear recurrence
-whose solutions are powers zᵏ. With h = ωΔt and u = 1/z they are the roots of
+Use this module to choose the number of substeps. For x″ = −ω² x − 2 ζ ω x′ with step Δt, a row of a
+scheme (see `model.schemes`) is a linear recurrence whose solutions are powers zᵏ. With h = ωΔt and
+u = 1/z they are the roots of
 
-    Σ_j w_j uʲ · (h² Σ_i p_i uⁱ + 2 ζ h Σ_i q_i uⁱ) + Σ_i s_i uⁱ = 0,
+    Σ_j w_j uʲ · (h² Σ_i p_i uⁱ + 2 ζ h Σ_i q_i uⁱ) + Σ_i s_i uⁱ = 0.
 
-of which the largest, the principal one, stands for z = exp(h (−ζ + i √(1 − ζ²))) of the exact
+The largest root, the principal one, corresponds to z = exp(h (−ζ + i √(1 − ζ²))) of the exact
 solution (Hairer, Lubich & Wanner, Geometric Numerical Integration, 2006, ch. XV, do the same for
 multistep methods). Its damping ratio is −ln|z| / |ln z|, its angular frequency arg(z) / Δt.
 Without physical damping backward Euler damps by ωΔt / 2 to leading order, midpoint not at all.
@@ -20,22 +21,22 @@ import numpy as np
 from ..errors import InputError
 from .schemes import Scheme, Stencil
 
-# More substeps than this are no remedy.
+# Largest number of substeps tried by `substeps_needed`; more would be too slow to be useful.
 MAX_SUBSTEPS = 4096
-# Shift of the period that `substeps_needed` allows.
+# Default of the largest relative error of the period in `substeps_needed`.
 PERIOD_ERROR = 0.01
 
 
 @dataclass(frozen=True)
 class NumericalMode:
-    """An oscillation as a scheme computes it.
+    """Numerical damping and period error of one mode.
 
     Attributes
     ----------
     damping_ratio : float
-        What the scheme adds to the physical damping ratio.
+        Damping ratio of the computed oscillation minus the physical damping ratio.
     period_error : float
-        Relative lengthening of the period.
+        Relative lengthening of the period; infinite where the computed mode does not oscillate.
     """
 
     damping_ratio: float
@@ -45,37 +46,46 @@ class NumericalMode:
 def numerical_mode(
     scheme: Scheme, angular_frequency_rad_s: float, timestep_s: float, damping_ratio: float = 0.0
 ) -> NumericalMode:
-    """Damping and period error of a scheme's regular rows.
+    """Return damping and period error of the regular rows of a scheme.
 
     Parameters
     ----------
     scheme : Scheme
     angular_frequency_rad_s : float
-        ω of the undamped oscillation.
+        Angular frequency ω of the undamped oscillation.
     timestep_s : float
-        Δt of the grid, substeps counted.
+        Time step Δt of the grid, i.e. the time between samples divided by the number of substeps.
     damping_ratio : float
-        Physical ζ, below 1.
+        Physical damping ratio ζ, 0 ≤ ζ < 1.
 
     Raises
     ------
     InputError
-        For a damping ratio of 1 and above: nothing oscillates.
+        For a damping ratio outside [0, 1): a critically damped mode does not oscillate.
     """
     if not 0 <= damping_ratio < 1:
         raise InputError(f"damping_ratio = {damping_ratio:g}, expected 0 <= damping_ratio < 1")
     h = angular_frequency_rad_s * timestep_s
     z = principal_root(scheme.regular, h, damping_ratio)
-    rate, angle = -float(np.log(abs(z))), float(np.angle(z))
+    rate = -float(np.log(abs(z)))
+    angle = float(np.angle(z))
     exact = h * float(np.sqrt(1 - damping_ratio**2))
     period_error = float(exact / angle - 1) if angle > 0 else np.inf
     return NumericalMode(rate / float(np.hypot(rate, angle)) - float(damping_ratio), period_error)
 
 
 def principal_root(stencil: Stencil, h: float, damping_ratio: float = 0.0) -> complex:
-    """The root z of the characteristic polynomial that stands for the exact solution.
+    """Return the root z of the characteristic polynomial that corresponds to the exact solution.
 
-    Of all roots it decays least; the argument is not negative.
+    The principal root has the largest modulus of all roots with a non-negative imaginary part.
+
+    Parameters
+    ----------
+    stencil : Stencil
+    h : float
+        Dimensionless time step ωΔt.
+    damping_ratio : float
+        Physical damping ratio ζ.
     """
     force = _sum(h**2 * np.array(stencil.p), 2 * damping_ratio * h * np.array(stencil.q))
     in_u = _sum(np.convolve(stencil.w, force), np.array(stencil.s))
@@ -92,27 +102,30 @@ def substeps_needed(
     period_error: float = PERIOD_ERROR,
     damping_ratio: float = 0.0,
 ) -> int | None:
-    """The fewest substeps with which a mode is damped and slowed down little.
+    """Return the fewest substeps that keep numerical damping and period error within limits.
 
     Parameters
     ----------
     scheme : Scheme
     angular_frequency_rad_s : float
+        Angular frequency ω of the undamped mode.
     timestep_s : float
         Time between samples.
     limit : float
-        Largest |numerical damping ratio|.
+        Largest absolute numerical damping ratio.
     period_error : float
-        Largest |relative error| of the period without damping.
+        Largest absolute relative error of the period, evaluated without physical damping.
     damping_ratio : float
-        Physical ζ, below 1.
+        Physical damping ratio ζ, below 1.
 
     Returns
     -------
-    int, or None where `MAX_SUBSTEPS` do not suffice
+    int or None
+        None where `MAX_SUBSTEPS` substeps do not suffice.
     """
 
     def suffices(substeps: int) -> bool:
+        """Return whether damping and period error are within the limits with this many substeps."""
         mode, damped = (
             numerical_mode(scheme, angular_frequency_rad_s, timestep_s / substeps, ratio)
             for ratio in (0.0, damping_ratio)
@@ -132,7 +145,7 @@ def substeps_needed(
 
 
 def _sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Sum of two polynomials, lowest power first."""
+    """Return the sum of two polynomials, given by their coefficients from the lowest power on."""
     total = np.zeros(max(len(a), len(b)))
     total[: len(a)] += a
     total[: len(b)] += b

@@ -1,12 +1,13 @@
-"""Forces that act point by point: their derivatives are generated, those of users among them.
+"""Forces that act point by point, with generated derivatives: custom forces and air drag.
 
-A law may carry numbers h of each instance from one evaluation to the next, such as how far a
-dashpot has crept or where friction's anchor is:
+Derive a force from `Pointwise` if it is a sum over points of the body of a law L of few numbers. A
+law may have internal variables h of each instance (point), such as the creep of a dashpot or the
+anchor of friction:
 
-    (F, h)_k = L(y_k, ẏ_k, c_k, h_{k−1}; data_k).
+    (F, h)_k = L(y_k, ẏ_k, c_k, h_{k−1}; data_k),
 
-To the equations of motion h_{k−1} is as what a memory brings: at that, F and its slopes are those
-of any other force; what it does along a motion is in `force_history`, for all methods.
+with the vectors y of the instance, their velocities ẏ and constants c. With h_{k−1} given, F and
+its derivatives are those of any other force; `force_history` treats h along a motion.
 """
 
 from __future__ import annotations
@@ -30,10 +31,14 @@ from .generated import Generated
 
 
 class Brought(NamedTuple):
-    """What instances bring to T evaluations.
+    """Internal variables of the previous evaluation, given at T evaluations.
 
-    before : (n, T, I) h_{k−1}
-    since_s : (T,) time since the evaluation before, zero at the start, which brings nothing
+    Attributes
+    ----------
+    before : (n, T, I)
+        Variables h_{k−1} of I instances.
+    since_s : (T,)
+        Time since the previous evaluation; zero at the start, where there is none.
     """
 
     before: Array
@@ -41,20 +46,22 @@ class Brought(NamedTuple):
 
 
 class Pointwise(ForceTerm):
-    """A law of what is at points of a body: of their vectors y, of ẏ, and of constants c.
+    """Force given by a law at points of a body.
 
     Attributes
     ----------
     points : ForcePoints
+        Points, and their vectors y (d numbers each).
     law : Generated
-        Forces (d,) on y, of (y, ẏ, c), or of (y, c) where nothing depends on ẏ, and of data. One
-        that carries n numbers takes them behind c, and gives those for the next behind its forces.
+        Forces (d,) on y as a function of (y, ẏ, c), or of (y, c) if nothing depends on ẏ, and of
+        data. With n internal variables, h_{k−1} follows c in the inputs and h follows the forces in
+        the values.
     share : float
-        Of the force; what is carried is the same.
+        Factor of the force; internal variables do not depend on it.
     brought : Brought, optional
-        Of one that carries; as at the start by default.
+        Internal variables of the previous evaluations; zero by default, as at the start.
     weighed : (n, T, I), optional
-        What each h_k counts in second derivatives, beside the force.
+        Weights of h in second derivatives, beside those of the force; zero by default.
     """
 
     points: ForcePoints
@@ -64,161 +71,216 @@ class Pointwise(ForceTerm):
 
     @property
     def turns(self) -> bool:
-        """Whether its slopes by positions have a skew part."""
+        """Whether derivatives by positions may have a skew part."""
         return True
 
     @property
     @abstractmethod
     def law(self) -> Generated:
-        """F(y, ẏ, c), or (F, h)(y, ẏ, c, h_{k−1})."""
+        """Law F(y, ẏ, c), or (F, h)(y, ẏ, c, h_{k−1}), with derivatives."""
 
     @property
     def by_velocity(self) -> bool:  # type: ignore[override]
-        """Whether it depends on ẏ."""
+        """Whether the law depends on ẏ."""
         return True
 
     def acting(self, states: States) -> tuple[Index | None, Array]:
-        """The instances at which it may be more than nothing, None for all, and y of these.
+        """Return the indices of the instances that may have a force, None for all, and their y.
 
-        Others leave nothing either.
+        Instances that are left out have neither a force nor internal variables.
         """
         return None, self.points.vectors(states.xi)
 
     @abstractmethod
     def constants(self, states: States) -> Array:
-        """C (c, T) or (c, 1)."""
+        """Return the constants c of the law, (c, T) or (c, 1)."""
 
     @abstractmethod
     def columns(self, places: Slots) -> Index:
-        """(c,) places of the constants in u."""
+        """Return the columns (c,) of the constants among all inputs."""
 
     @abstractmethod
     def data(self, chosen: Index | None) -> Array:
-        """(D, T, i) of the law, or (D, 1, i)."""
+        """Return the data of the law, (D, T, i) or (D, 1, i).
+
+        Parameters
+        ----------
+        chosen : array of int or None
+            Indices of the instances; None for all.
+        """
 
     @property
     def couplings(self) -> SymmetricPattern:  # type: ignore[override]
-        """Of the nodes at each point."""
+        """Pairs of dofs of the nodes at each point."""
         return self.points.couplings
 
     def scaled(self, share: float) -> Self:
-        """A share of it."""
+        """Return this force multiplied by a factor."""
         return replace(self, share=share * self.share)  # type: ignore[type-var]
 
     def bringing(self, brought: Brought, weighed: Array | None = None) -> Self:
-        """The same at what instances bring."""
+        """Return this force with given internal variables, and with weights of h in second
+        derivatives.
+        """
         return replace(self, brought=brought, weighed=weighed)  # type: ignore[type-var]
 
     def began(self, times: int) -> tuple[Array, Array]:
-        """(T,) time since the evaluation before, and one where there is none, else zero."""
+        """Return the time since the previous evaluation (T,), and 1 at the start, else 0 (T,).
+
+        Parameters
+        ----------
+        times : int
+            Number T of evaluations.
+        """
         since_s = np.zeros(times) if self.brought is None else self.brought.since_s
         return since_s, (since_s == 0).astype(float)
 
     def _at(self, states: States) -> _At:
-        (chosen, y), constants = self.acting(states), self.constants(states)
-        moving = (self.points.vectors(states.nu, chosen),) if self.by_velocity else ()
+        """Return the inputs and data of the law at states."""
+        chosen, y = self.acting(states)
+        constants = self.constants(states)
+        velocities = (self.points.vectors(states.nu, chosen),) if self.by_velocity else ()
         steady = np.broadcast_to(constants[..., None], (len(constants), *y.shape[1:]))
         before = np.zeros((self.carries, *y.shape[1:]))
         if self.brought is not None:
             before = self.brought.before[..., slice(None) if chosen is None else chosen]
-        u = np.concatenate([y, *moving, steady, before])
-        ends = len(y), len(y) * (2 if self.by_velocity else 1), len(u) - len(before)
+        u = np.concatenate([y, *velocities, steady, before])
         data = self.data(chosen)
-        return _At(chosen, u, np.broadcast_to(data, (len(data), *y.shape[1:])), *ends)
+        return _At(
+            chosen,
+            u,
+            np.broadcast_to(data, (len(data), *y.shape[1:])),
+            moving=len(y),
+            steady=len(y) * (2 if self.by_velocity else 1),
+            brought=len(u) - len(before),
+        )
 
     def force(self, states: States) -> Array:
-        """(T, 3n) [N]."""
+        """Return the forces F (T, 3n) [N]."""
         at = self._at(states)
         value = self.law.value(at.u, at.data)[at.y]
         return self.share * self.points.summed(value, at.chosen)
 
     def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
-        """Add F and its slopes."""
-        here, points = self._at(states), self.points
-        value, slopes = self.law.slopes(here.u, here.data)
-        value, slopes = value[here.y], self.share * slopes[here.y]
-        at.force[:] += self.share * points.summed(value, here.chosen)
-        by_x, by_v, by_c = (slopes[:, part] for part in (here.y, here.v, here.c))
-        at_x, add = (places.entries, by_x, here.chosen), points.add_entries
-        depends_on_place = bool(self.law.depends[here.y].any())
+        """Add the forces and their first derivatives to a linearisation, in place."""
+        evaluated = self._at(states)
+        points = self.points
+        value, slopes = self.law.slopes(evaluated.u, evaluated.data)
+        value = value[evaluated.y]
+        slopes = self.share * slopes[evaluated.y]
+        at.force[:] += self.share * points.summed(value, evaluated.chosen)
+        by_x, by_v, by_c = (slopes[:, part] for part in (evaluated.y, evaluated.v, evaluated.c))
+        entries = places.entries
+        chosen = evaluated.chosen
+        add = points.add_entries
+        depends_on_place = bool(self.law.depends[evaluated.y].any())
         if depends_on_place:
-            add(at.by_position, *at_x)
+            add(at.by_position, entries, by_x, chosen)
         if depends_on_place and self.turns and at.by_position_skew.size:
-            add(at.by_position_skew, *at_x, skew=True)
-        at_v = places.entries, by_v, here.chosen
+            add(at.by_position_skew, entries, by_x, chosen, skew=True)
         if self.by_velocity:
-            add(at.by_velocity, *at_v)
+            add(at.by_velocity, entries, by_v, chosen)
         if self.spins:
-            add(at.by_velocity_skew, *at_v, skew=True)
+            add(at.by_velocity_skew, entries, by_v, chosen, skew=True)
         for k, column in enumerate(self.columns(places)):
-            at.by_theta[:, :, column] += points.summed(by_c[:, k], here.chosen)
+            at.by_theta[:, :, column] += points.summed(by_c[:, k], evaluated.chosen)
 
     def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
-        """Add the derivatives of weightsᵀ F + `weighed` · h."""
-        here, points, entries = self._at(states), self.points, places.entries
-        w, x, v = self._weights(here, weights), here.y, here.v
-        whole = self.law.curvature(here.u, here.data, w)
-        add, chosen = points.add_entries, here.chosen
+        """Add the derivatives of weightsᵀ F + Σ `weighed` · h to a curvature, in place."""
+        evaluated = self._at(states)
+        points = self.points
+        entries = places.entries
+        w = self._weights(evaluated, weights)
+        x = evaluated.y
+        v = evaluated.v
+        second = self.law.curvature(evaluated.u, evaluated.data, w)
+        add = points.add_entries
+        chosen = evaluated.chosen
         depends_on_place = bool(self.law.depends[x].any())
         if depends_on_place:
-            add(at.position_position, entries, whole[x, x], chosen)
+            add(at.position_position, entries, second[x, x], chosen)
         if self.by_velocity and depends_on_place:
-            add(at.position_velocity, entries, whole[x, v], chosen)
+            add(at.position_velocity, entries, second[x, v], chosen)
             if at.position_velocity_skew.size:
-                add(at.position_velocity_skew, entries, whole[x, v], chosen, skew=True)
+                add(at.position_velocity_skew, entries, second[x, v], chosen, skew=True)
         if self.by_velocity:
-            add(at.velocity_velocity, entries, whole[v, v], chosen)
-        _, slopes = self.law.slopes(here.u, here.data)
-        columns = list(enumerate(self.columns(places), here.c.start))
+            add(at.velocity_velocity, entries, second[v, v], chosen)
+        _, slopes = self.law.slopes(evaluated.u, evaluated.data)
+        columns = list(enumerate(self.columns(places), evaluated.c.start))
         for k, column in columns:
-            at.position_theta[:, :, column] += points.summed(whole[x, k], here.chosen)
+            at.position_theta[:, :, column] += points.summed(second[x, k], evaluated.chosen)
             if self.by_velocity:
-                at.velocity_theta[:, :, column] += points.summed(whole[v, k], here.chosen)
+                at.velocity_theta[:, :, column] += points.summed(second[v, k], evaluated.chosen)
             at.theta[:, column] += np.einsum("itk,itk->t", w, slopes[:, k])
             for other, place in columns:
-                at.theta_theta[:, column, place] += whole[k, other].sum(axis=1)
+                at.theta_theta[:, column, place] += second[k, other].sum(axis=1)
 
     def _weights(self, here: _At, weights: Array) -> Array:
-        """(d + n, T, i) what the force on the vectors, and what is left, count."""
-        own = self.share * self.points.vectors(weights, here.chosen)
+        """Return the weights (d + n, T, i) of the values of the law: of the forces on y, then of
+        h.
+        """
+        force_weights = self.share * self.points.vectors(weights, here.chosen)
         if not self.carries:
-            return own
-        shape = self.carries, *own.shape[1:]
+            return force_weights
+        shape = self.carries, *force_weights.shape[1:]
         some = slice(None) if here.chosen is None else here.chosen
-        left = np.zeros(shape) if self.weighed is None else self.weighed[..., some]
-        return np.concatenate([own, left])
+        variable_weights = np.zeros(shape) if self.weighed is None else self.weighed[..., some]
+        return np.concatenate([force_weights, variable_weights])
 
     # Of one that carries ----------------------------------------------------------------------
 
     def left(self, states: States) -> Array:
-        """H (n, T, I)."""
-        here = self._at(states)
-        return self._of_all(self.law.value(here.u, here.data)[here.y.stop :], here)
+        """Return the internal variables h (n, T, I) after the evaluations."""
+        evaluated = self._at(states)
+        return self._of_all(
+            self.law.value(evaluated.u, evaluated.data)[evaluated.y.stop :], evaluated
+        )
 
     def parts(self, states: States) -> Parts:
-        """Slopes of F and h, (d + n, …, T, I)."""
-        here = self._at(states)
-        _, slopes = self.law.slopes(here.u, here.data)
-        slopes[here.y] *= self.share
-        return here.split(self._of_all(slopes, here), 1)
+        """Return the first derivatives of F and h by y, ẏ, c and h_{k−1}, (d + n, …, T, I) each."""
+        evaluated = self._at(states)
+        _, slopes = self.law.slopes(evaluated.u, evaluated.data)
+        slopes[evaluated.y] *= self.share
+        return evaluated.split(self._of_all(slopes, evaluated), 1)
 
     def bent(self, states: States, weights: Array) -> Parts:
-        """Second derivatives by u and h_{k−1}, (…, n, T, I), of weights · F + `weighed` · h."""
-        here = self._at(states)
-        whole = self.law.curvature(here.u, here.data, self._weights(here, weights))
-        return here.split(self._of_all(whole[:, here.b], here), 0)
+        """Return second derivatives of weights · F + Σ `weighed` · h by u and h_{k−1}.
+
+        They are split along u = (y, ẏ, c, h_{k−1}), (…, n, T, I) each.
+
+        Parameters
+        ----------
+        states : States
+        weights : (T, 3n)
+            Weights of the forces.
+        """
+        evaluated = self._at(states)
+        second = self.law.curvature(evaluated.u, evaluated.data, self._weights(evaluated, weights))
+        return evaluated.split(self._of_all(second[:, evaluated.b], evaluated), 0)
 
     def _of_all(self, values: Array, here: _At) -> Array:
-        """(…, T, I) of all instances from those chosen."""
+        """Return values (…, T, I) of all instances, zero at those that are not chosen."""
         if here.chosen is None:
             return values
-        found = np.zeros((*values.shape[:-1], self.points.count))
-        found[..., here.chosen] = values
-        return found
+        expanded = np.zeros((*values.shape[:-1], self.points.count))
+        expanded[..., here.chosen] = values
+        return expanded
 
 
 class Parts(NamedTuple):
-    """What stands by y, ẏ, c and h_{k−1}."""
+    """Derivatives by y, ẏ, c and h_{k−1} of a law.
+
+    Attributes
+    ----------
+    y : array
+        By the vectors y of the instance.
+    v : array
+        By their velocities ẏ.
+    c : array
+        By the constants.
+    b : array
+        By the previous internal variables h_{k−1}.
+    """
 
     y: Array
     v: Array
@@ -228,14 +290,15 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """Inputs u = (y, ẏ, c, h_{k−1}) and data of a law at states.
+    """Inputs u = (y, ẏ, c, h_{k−1}) and data of a law at some states.
 
     Attributes
     ----------
-    chosen : (i,) of the instances, or None for all
+    chosen : (i,) or None
+        Indices of the instances; None for all.
     u, data : (…, T, i)
     moving, steady, brought : int
-        Where ẏ, c and h_{k−1} begin in u.
+        Offsets of ẏ, c and h_{k−1} in u.
     """
 
     chosen: Index | None
@@ -247,38 +310,45 @@ class _At:
 
     @property
     def y(self) -> slice:
-        """Of the vectors."""
+        """Slice of the vectors y in the inputs u."""
         return slice(self.moving)
 
     @property
     def v(self) -> slice:
-        """Of their velocities."""
+        """Slice of the velocities ẏ in u."""
         return slice(self.moving, self.steady)
 
     @property
     def c(self) -> slice:
-        """Of the constants."""
+        """Slice of the constants in u."""
         return slice(self.steady, self.brought)
 
     @property
     def b(self) -> slice:
-        """Of what is brought."""
+        """Slice of the previous internal variables h_{k−1} in u."""
         return slice(self.brought, len(self.u))
 
     def split(self, values: Array, axis: int) -> Parts:
-        """What stands by each along an axis."""
+        """Split values along one axis into the parts of u."""
         return Parts(*np.split(values, [self.moving, self.steady, self.brought], axis=axis))
 
 
 @dataclass(frozen=True, eq=False)
 class PointForces(Pointwise):
-    """A user's force, or the drag of the air, at T times.
+    """Custom force, or the drag of the air, at T times.
 
     Attributes
     ----------
     placed : PlacedForce
+        Law and the points on which it acts.
     t_s : (T,)
+        Times.
     share : float
+        Factor of the force.
+    brought : Brought, optional
+        Internal variables of the previous evaluations, see `Pointwise`.
+    weighed : (n, T, I), optional
+        Weights of the internal variables in second derivatives.
     """
 
     placed: PlacedForce
@@ -290,72 +360,90 @@ class PointForces(Pointwise):
 
     @property
     def spins(self) -> bool:  # type: ignore[override]
-        """Whether the user's law does."""
+        """Whether derivatives of the law by velocities may be non-symmetric."""
         return self.placed.force.spins
 
     @property
     def turns(self) -> bool:
-        """Whether the user's law does."""
+        """Whether derivatives of the law by positions may have a skew part."""
         return self.placed.force.turns
 
     @property
     def carries(self) -> int:  # type: ignore[override]
-        """How many numbers the user's law leaves."""
+        """Number of internal variables of the law."""
         return self.placed.force.carries
 
     @property
     def of_air(self) -> bool:
-        """Whether this is the drag of the air around the body, not a user's law."""
+        """Whether this is the drag of the air around the body, not a custom force."""
         return self.placed.force is unit_drag()
 
     @property
     def points(self) -> ForcePoints:  # type: ignore[override]
-        """Its nodes or faces."""
+        """Nodes or faces on which the law acts."""
         return self.placed.points
 
     @property
     def law(self) -> Generated:
-        """The user's."""
+        """Law of the force with derivatives."""
         return generated(self.placed.force, self.points.dofs)
 
     def at(self, u: Array) -> Self:
-        """It has no inputs but constants."""
+        """Return self: the force has no inputs beside the constants of the body."""
         return self
 
     def rows(self, rows: slice) -> Self:
-        """The same at some of the times."""
+        """Return this force at some of the times."""
         return replace(self, t_s=self.t_s[rows])
 
     def towards(self, other: Self, share: float) -> Self:
-        """With a share of the way to another time, at what that brings."""
+        """Return the force of `other`, at times interpolated linearly between both.
+
+        Internal variables are those of `other`.
+        """
         return replace(other, t_s=self.t_s + share * (other.t_s - self.t_s))
 
     def constants(self, states: States) -> Array:
-        """Those of the body."""
+        """Return the constants (c, 1) of the law."""
         return states.theta[self.placed.columns][:, None]
 
     def columns(self, places: Slots) -> Index:
-        """Their places in θ."""
+        """Return the indices in θ of the constants."""
         return self.placed.columns
 
     def data(self, chosen: Index | None) -> Array:
-        """Of an `AtNode`."""
+        """Return the data of the law at all instances, as an `AtNode` reads them."""
         data = np.empty((DATA, len(self.t_s), self.points.count))
-        data[0], data[1:-2] = self.t_s[:, None], self.placed.data[:, None]
+        data[0] = self.t_s[:, None]
+        data[1:-2] = self.placed.data[:, None]
         data[-2:] = np.array(self.began(len(self.t_s)))[..., None]
         return data
 
 
 @lru_cache(maxsize=32)
 def generated(force: NodeForce, dofs: int) -> Generated:
-    """Its law with derivatives at so many dofs; those of the last few are kept."""
+    """Return the law of a force with derivatives; the last 32 are cached.
+
+    Parameters
+    ----------
+    force : NodeForce
+    dofs : int
+        Number of dofs of one instance.
+    """
     return Generated(force.expression, force.inputs(dofs), DATA, compiled=force.compiled)
 
 
 def air_drag(experiment: Experiment, t_s: Array) -> tuple[PointForces, ...]:
-    """Return the drag of the air on an experiment's body at times (T,); none where nothing is.
+    """Return the drag of the air on the body of an experiment; empty if there is none.
 
-    Drag is linear in the density of the air, which is the share of that at a density of one.
+    Drag is linear in the density of the air, which is the factor of the drag at a density of 1
+    kg/m³.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    t_s : (T,)
+        Times.
     """
     if not experiment.has_air_drag:
         return ()
@@ -364,5 +452,5 @@ def air_drag(experiment: Experiment, t_s: Array) -> tuple[PointForces, ...]:
 
 
 def point_forces(body: Body, t_s: Array) -> tuple[PointForces, ...]:
-    """Those that a body's users declared, at times (T,)."""
+    """Return the custom forces declared for a body, at times (T,)."""
     return tuple(PointForces(placed, t_s) for placed in body.placed_forces)

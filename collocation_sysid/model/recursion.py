@@ -1,9 +1,12 @@
-"""What is carried from one evaluation to the next, h_k = R(h_{k−1}, s_k, s_{k−1}; c).
+"""Recursions h_k = R(h_{k−1}, s_k, s_{k−1}; c) along the time grid, with derivatives.
 
-R is one small expression of each instance, such as a channel of a sensor: s is what it looks at,
-c are constants that all instances share. Its data say where the start is: there R must depend on
-s_k and c alone. Instances and evaluations come last: states are (n, N, I), what is looked at
-(i, N, I), data (d, N, I).
+Use this module for a small state h that follows a signal s, such as the low-pass filter of a force
+sensor. R is an expression of one instance, for example of one component of a sensor; the constants
+c are shared by all instances. At the start (k = 0) h_{k−1} and s_{k−1} are unknown; the data mark
+the start, and there R must depend on s_k and c alone.
+
+Times and instances are the last axes of all arrays: states are (n, N, I), signals (i, N, I) and
+data (d, N, I) for N times and I instances.
 """
 
 from __future__ import annotations
@@ -23,15 +26,21 @@ Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 
 @dataclass(frozen=True, eq=False)
 class Recursion:
-    """R, with all its derivatives.
+    """Recursion function R of one instance, with generated derivatives.
 
     Attributes
     ----------
     expression : callable
-        ``expression(before, now, last, constants, data) -> state`` in CasADi operations, of
-        columns: h_{k−1}, s_k, s_{k−1} and c.
-    state, looked, constants, data : int
-        Their lengths.
+        ``expression(before, now, last, constants, data) -> state`` in CasADi operations on column
+        vectors: h_{k−1}, s_k, s_{k−1}, c and the data at k; returns h_k.
+    state : int
+        Length n of the state h.
+    looked : int
+        Length i of the signal s.
+    constants : int
+        Length C of the constants c.
+    data : int
+        Length d of the data at each time.
     """
 
     expression: Expression
@@ -42,13 +51,13 @@ class Recursion:
 
     @property
     def ends(self) -> list[int]:
-        """Where h_{k−1}, s_k, s_{k−1} and c end among the inputs of `step`."""
+        """End indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of `step`."""
         sizes = [self.state, self.looked, self.looked, self.constants]
         return np.cumsum(sizes).tolist()
 
     @cached_property
     def step(self) -> Generated:
-        """R of u = (h_{k−1}, s_k, s_{k−1}, c)."""
+        """Expression R of the stacked inputs u = (h_{k−1}, s_k, s_{k−1}, c), with derivatives."""
 
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
             before, now, last, constants = ca.vertsplit(u, [0, *self.ends])
@@ -57,7 +66,19 @@ class Recursion:
         return Generated(expression, self.ends[-1], self.data)
 
     def coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:
-        """∂R/∂(h_{k−1}, s_k, s_{k−1}) by columns, of a recursion that is linear in these."""
+        """Return ∂R/∂(h_{k−1}, s_k, s_{k−1}) of a recursion that is linear in these, column by
+        column.
+
+        Parameters
+        ----------
+        constants : (C,) SX
+        data : (d,) SX
+
+        Returns
+        -------
+        (n (n + 2 i),) SX
+            The Jacobian (n, n + 2 i), stacked column by column.
+        """
         u = ca.SX.sym("u", self.ends[2])
         before, now, last = ca.vertsplit(u, [0, *self.ends[:3]])
         return ca.vec(ca.jacobian(self.expression(before, now, last, constants, data), u))
@@ -65,15 +86,19 @@ class Recursion:
 
 @dataclass(frozen=True, eq=False)
 class Evolution:
-    """A recursion along what it looks at.
+    """States of a recursion along a given signal, with derivatives forward and backward in time.
 
     Attributes
     ----------
     recursion : Recursion
     constants : (C,)
+        Constants c.
     data : (d, N, I)
-    looked : (i, N, I) s
-    states : (n, N, I) h
+        Data at each time and instance.
+    looked : (i, N, I)
+        Signal s.
+    states : (n, N, I)
+        States h.
     """
 
     recursion: Recursion
@@ -84,17 +109,30 @@ class Evolution:
 
     @classmethod
     def of(cls, recursion: Recursion, constants: Array, data: Array, looked: Array) -> Evolution:
-        """From the start on; data need not be told for each instance."""
+        """Run the recursion from the start along a signal.
+
+        Parameters
+        ----------
+        recursion : Recursion
+        constants : (C,)
+        data : (d, N, I) or broadcastable to it
+            Data that are equal for all instances may have the shape (d, N, 1).
+        looked : (i, N, I)
+            Signal s.
+        """
         data = np.broadcast_to(data, (recursion.data, *looked.shape[1:]))
         states = np.zeros((recursion.state, *looked.shape[1:]))
-        found = cls(recursion, constants, data, looked, states)
+        trajectory = cls(recursion, constants, data, looked, states)
         for k in range(looked.shape[1]):
-            here = slice(k, k + 1)
-            states[:, here] = recursion.step.value(found._u(here), data[:, here])
-        return found
+            now = slice(k, k + 1)
+            states[:, now] = recursion.step.value(trajectory._u(now), data[:, now])
+        return trajectory
 
     def _u(self, here: slice) -> Array:
-        """(k, …) inputs of some evaluations, one after the other."""
+        """Return the stacked inputs (h_{k−1}, s_k, s_{k−1}, c) at consecutive times.
+
+        At the start, h_{k−1} is zero and s_{k−1} is s_0.
+        """
         before = np.arange(here.start, here.stop) - 1
         states = np.where((before < 0)[:, None], 0.0, self.states[:, before])
         last = self.looked[:, np.maximum(before, 0)]
@@ -103,26 +141,42 @@ class Evolution:
 
     @cached_property
     def _slopes(self) -> list[Array]:
-        """∂R by h_{k−1}, s_k, s_{k−1} and c, (n, …, N, I) each."""
-        step, every = self.recursion.step, slice(0, self.looked.shape[1])
-        by_u = step.slopes(self._u(every), self.data)[1]
+        """Derivatives of R by h_{k−1}, s_k, s_{k−1} and c, a list of arrays (n, …, N, I)."""
+        step = self.recursion.step
+        all_times = slice(0, self.looked.shape[1])
+        by_u = step.slopes(self._u(all_times), self.data)[1]
         return np.split(by_u, self.recursion.ends[:-1], axis=1)
 
     def forward(self, looked: Array, constants: Array) -> Array:
-        """Changes (n, N, I, c) of the states, from those of s (i, N, I, c) and of c (C, c)."""
+        """Return the changes of the states (n, N, I, c) for c directions at once.
+
+        Parameters
+        ----------
+        looked : (i, N, I, c)
+            Changes of the signal s.
+        constants : (C, c)
+            Changes of the constants.
+        """
         by_state, by_now, by_last, by_constants = self._slopes
-        found = np.einsum("abkp,bkpc->akpc", by_now, looked)
-        found += np.einsum("abkp,bc->akpc", by_constants, constants)
-        found[:, 1:] += np.einsum("abkp,bkpc->akpc", by_last[:, :, 1:], looked[:, :-1])
-        for k in range(1, found.shape[1]):
-            found[:, k] += np.einsum("abp,bpc->apc", by_state[:, :, k], found[:, k - 1])
-        return found
+        changes = np.einsum("abkp,bkpc->akpc", by_now, looked)
+        changes += np.einsum("abkp,bc->akpc", by_constants, constants)
+        changes[:, 1:] += np.einsum("abkp,bkpc->akpc", by_last[:, :, 1:], looked[:, :-1])
+        for k in range(1, changes.shape[1]):
+            changes[:, k] += np.einsum("abp,bpc->apc", by_state[:, :, k], changes[:, k - 1])
+        return changes
 
     def backward(self, weights: Array) -> tuple[Array, Array]:
-        """Slopes of Σ weights · h by s (i, N, I) and by c (C,), at weights (n, N, I)."""
-        (by_state, by_now, by_last, by_constants), total = self._slopes, weights.copy()
+        """Return the gradient of Σ weights · h by the signal (i, N, I) and by the constants (C,).
+
+        Parameters
+        ----------
+        weights : (n, N, I)
+            Weights of the states; not modified.
+        """
+        by_state, by_now, by_last, by_constants = self._slopes
+        total = weights.copy()
         for k in range(total.shape[1] - 1, 0, -1):
             total[:, k - 1] += np.einsum("abp,ap->bp", by_state[:, :, k], total[:, k])
-        by_looked = np.einsum("abkp,akp->bkp", by_now, total)
-        by_looked[:, :-1] += np.einsum("abkp,akp->bkp", by_last[:, :, 1:], total[:, 1:])
-        return by_looked, np.einsum("abkp,akp->b", by_constants, total)
+        by_signal = np.einsum("abkp,akp->bkp", by_now, total)
+        by_signal[:, :-1] += np.einsum("abkp,akp->bkp", by_last[:, :, 1:], total[:, 1:])
+        return by_signal, np.einsum("abkp,akp->b", by_constants, total)

@@ -1,6 +1,7 @@
 """Time-stepping schemes as tables of stencils.
 
-On a grid x_0, x_1, … with step Δt the force is evaluated once per step,
+Use `as_scheme` to get a scheme by name. On a grid x_0, x_1, … with step Δt the force is evaluated
+once per step,
 
     F_k = f(ξ_k, ν_k; θ) + f_ext,   ξ_k = Σ_i p_i x_{k−i},   ν_k = Σ_i q_i x_{k−i} / Δt,
 
@@ -8,8 +9,8 @@ and row t of the constraints reads
 
     c_t = Σ_j w_j F_{t−j} − M (Σ_i s_i x_{t−i} + r Δt v_0) / Δt² = 0.
 
-The first rows have stencils of their own, made from the start velocity v_0 and the terms that
-exist; r is not zero only there.
+The first rows have separate stencils, because x_{t−i} does not exist for t < i; these stencils use
+the start velocity v_0, so r is nonzero only there.
 """
 
 from __future__ import annotations
@@ -18,13 +19,27 @@ from dataclasses import dataclass, replace
 
 from ..errors import InputError
 
-# Steps from sample to sample; whoever asks for more has slipped.
+# Largest accepted number of steps from sample to sample; a larger one is a typing error.
 MOST_STEPS = 10_000
 
 
 @dataclass(frozen=True)
 class Stencil:
-    """One row: evaluation point (p, q), force weights w, inertia s and start velocity r."""
+    """Coefficients of one row of the equations of motion.
+
+    Attributes
+    ----------
+    p : tuple of float
+        Weights of x_{t−i} in the position ξ at which the force is evaluated.
+    q : tuple of float
+        Weights of x_{t−i} / Δt in the velocity ν at which the force is evaluated.
+    w : tuple of float
+        Weights of the forces F_{t−j}.
+    s : tuple of float
+        Weights of x_{t−i} / Δt² in the acceleration.
+    r : float
+        Weight of the start velocity v_0 / Δt in the acceleration.
+    """
 
     p: tuple[float, ...]
     q: tuple[float, ...]
@@ -35,7 +50,18 @@ class Stencil:
 
 @dataclass(frozen=True)
 class Scheme:
-    """A table entry: the stencil of regular rows and those of rows 1, 2, … of the start."""
+    """Time-stepping scheme: a regular stencil and separate stencils for the first rows.
+
+    Attributes
+    ----------
+    name : str
+    order : int
+        Order of accuracy in the time step.
+    regular : Stencil
+        Stencil of all rows after the start.
+    start : tuple of Stencil
+        Stencils of rows 1, 2, ….
+    """
 
     name: str
     order: int
@@ -43,7 +69,10 @@ class Scheme:
     start: tuple[Stencil, ...]
 
     def stencil(self, row: int) -> Stencil:
-        """The stencil of row t >= 1; row 0, where it exists, is the static problem."""
+        """Return the stencil of a row.
+
+        Row 0, which exists where an experiment starts in equilibrium, has the stencil of statics.
+        """
         if row == 0:
             return STATIC
         return self.start[row - 1] if row <= len(self.start) else self.regular
@@ -52,14 +81,14 @@ class Scheme:
     def is_midpoint(self) -> bool:
         """Whether forces are evaluated half way between the last two states, with their difference.
 
-        Then ξ ∓ Δt ν/2 are these states, and a force may be averaged over the step.
+        The last two states are then ξ ∓ Δt ν/2, and a force may be averaged over the step.
         """
         stencils = (self.regular, *self.start)
         return all((each.p, each.q) == ((0.5, 0.5), (1.0, -1.0)) for each in stencils)
 
     @property
     def reach(self) -> int:
-        """Largest lag l with ∂c_t/∂x_{t−l} ≠ 0."""
+        """Largest lag l with ∂c_t/∂x_{t−l} ≠ 0, in time steps."""
         lags = []
         for stencil in (self.regular, *self.start):
             points = max(len(stencil.p), len(stencil.q))
@@ -68,9 +97,9 @@ class Scheme:
 
 
 STATIC = Stencil(p=(1.0,), q=(0.0,), w=(1.0,), s=(0.0,))
-# Every sample is an equilibrium of its own: that of static experiments, whatever the others'.
+# Scheme of static experiments: every sample is an equilibrium, independent of the others.
 QUASI_STATIC = Scheme("quasi-static", 1, STATIC, ())
-# What rubs there feels how far it has come since the sample before.
+# Scheme of static experiments with friction: ν is the displacement since the previous sample.
 SLIDING = Scheme("sliding", 1, Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(0.0,)), ())
 
 BACKWARD_EULER = Stencil(p=(1.0,), q=(1.0, -1.0), w=(1.0,), s=(1.0, -2.0, 1.0))
@@ -79,7 +108,7 @@ MIDPOINT = Stencil(p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5, 0.5), s=(1.0, -2.0, 1.0)
 _BDF2_VELOCITY = (1.5, -2.0, 0.5)
 
 SCHEMES: dict[str, Scheme] = {
-    # The paper's. Damps a mode of angular frequency ω with the ratio ωΔt/2.
+    # The scheme of the paper. It damps a mode of angular frequency ω with the ratio ωΔt/2.
     "backward-euler": Scheme("backward-euler", 1, BACKWARD_EULER, (_FIRST_STEP,)),
     # Variational midpoint rule (Marsden & West 2001, sec. 2.6): no numerical damping.
     "midpoint": Scheme(
@@ -88,8 +117,8 @@ SCHEMES: dict[str, Scheme] = {
         MIDPOINT,
         (Stencil(p=(0.5, 0.5), q=(1.0, -1.0), w=(0.5,), s=(1.0, -1.0), r=-1.0),),
     ),
-    # BDF2 in velocity and acceleration; v_1 is backward Euler's, v_0 is given, and rows 2 and 3
-    # are a_t = (3 v_t − 4 v_{t−1} + v_{t−2}) / 2Δt with those velocities put in.
+    # BDF2 in velocity and acceleration; v_1 is that of backward Euler, v_0 is given, and rows 2
+    # and 3 are a_t = (3 v_t − 4 v_{t−1} + v_{t−2}) / 2Δt with these velocities inserted.
     "bdf2": Scheme(
         "bdf2",
         2,
@@ -104,18 +133,18 @@ SCHEMES: dict[str, Scheme] = {
 
 
 def as_scheme(given: str | Scheme, start_rule: str = "standard") -> Scheme:
-    """A scheme from a name in `SCHEMES` or itself, with the start rule of its first step.
+    """Return a scheme by its name in `SCHEMES`, or the given scheme, with the start rule applied.
 
     Parameters
     ----------
     given : str or Scheme
     start_rule : {"standard", "paper"}
-        "paper" drops the inertia of the first step (a = 0); only for backward Euler.
+        "paper" drops the inertia of the first step (a = 0); for backward Euler only.
 
     Raises
     ------
     InputError
-        For unknown names and combinations.
+        For an unknown scheme or start rule, or "paper" with another scheme than backward Euler.
     """
     if isinstance(given, str) and given not in SCHEMES:
         raise InputError(f"no scheme {given!r}; available: {', '.join(SCHEMES)}")

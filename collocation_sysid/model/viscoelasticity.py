@@ -1,21 +1,25 @@
-"""The memory of a body along a trajectory, with derivatives forward and backward in time.
+"""Memory of a viscoelastic body along a motion, with derivatives forward and backward in time.
 
-Of each branch (see `fem.memory`) what is carried from evaluation k to the next is
+Use this module for the Prony branches of a material (see `fem.memory`). The internal variables that
+evaluation k passes to the next one are, for each branch,
 
     m_k = d_k m_{k−1} + a_k S_k,   d_k = e_{k+1},   a_k = e_{k+1} c_k − c_{k+1},
 
-and evaluation k has H_k = Σ m_{k−1} and s_k = Σ c_k. It begins with S_0 and Q_0 = c_0 S_0 in the
-start shape, c_0 = g exp(−t/τ) of a load that came at once and has been there for a time t: none
-where the body has relaxed. Columns of derivatives follow by the chain rule,
+with the stress S of the long-term energy, and the overstress at evaluation k is H_k + s_k S_k with
+H_k = Σ m_{k−1} and s_k = Σ c_k. The start shape has S_0 and Q_0 = c_0 S_0, where c_0 = g exp(−t/τ)
+if a load was applied suddenly a time t ago; c_0 = 0 if the body has relaxed. Columns of derivatives
+follow by the chain rule,
 
     dF_k ∋ ∂f_H/∂H Σ dm_{k−1},   dm_k = d_k dm_{k−1} + a_k dS_k + dd_k m_{k−1} + da_k S_k,
 
-and backward, with weights λ_k of the forces and μ_k of m_k,
+and backward in time, with weights λ_k of the forces and μ_k of m_k,
 
     μ_{k−1} = d_k μ_k + (∂f_H/∂H)ᵀ λ_k,   ξ_k gets (∂S_k/∂ξ_k)ᵀ Σ a_k μ_k.
 
-The recursion is one of `recursion`; as it is linear in m and S, all points of a branch share its
-coefficients, which spares most of what generated rows of each point would cost.
+`History` holds all evaluations; `Slopes` propagates columns forward, `Weights` propagates weights
+backward; `Remembered` is the state at one time, for time marching. The recursion is one of
+`recursion`; since it is linear in m and S, all points of a branch share its coefficients, which
+avoids most of the cost of a generated recursion for each point.
 """
 
 from __future__ import annotations
@@ -33,30 +37,40 @@ from .forces import Forces
 from .generated import Generated
 from .recursion import Recursion
 
-# Stress slopes of so many evaluations are kept at a time.
+# Number of evaluations whose stress derivatives are kept at a time; limits memory.
 CHUNK = 16
-# Of what was held for so many relaxation times nothing is left.
+# Number of relaxation times after which a load counts as relaxed: exp(−1000) is 0 in doubles.
 LONG = 1e3
 
 
 def _even(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
-    """C of an interval in which S changes evenly."""
-    share, tau_s = u[0], u[1]
+    """Return c of an interval in which S changes linearly.
+
+    Parameters
+    ----------
+    u : (2,) SX
+        Share g and relaxation time τ.
+    spacing_s : SX
+        Length of the interval.
+    """
+    share = u[0]
+    tau_s = u[1]
     return -share * ca.expm1(-spacing_s / tau_s) * tau_s / spacing_s
 
 
 def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
-    """C of an evaluation."""
-    since_s, began = data[0], data[1]
+    """Return c of an evaluation; at the start c_0 of the load."""
+    since_s = data[0]
+    began = data[1]
     at_once = u[0] * ca.exp(-since_s / u[1])
     return began * at_once + (1 - began) * _even(u, since_s + began)
 
 
 def _overstress(before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX) -> ca.SX:
-    """M from the one before and from S, of u = (g, τ).
+    """Return m_k from m_{k−1} (`before`) and S_k (`now`), with u = (g, τ).
 
-    Data are the time from the evaluation before, or since the load of the start came, and whether
-    it is the start, and the time to the next.
+    Data are the time since the previous evaluation, or at the start since the load was applied; 1
+    at the start, else 0; and the time to the next evaluation.
     """
     e = ca.exp(-data[2] / u[1])
     return e * before + (e * _stiffening(u, data) - _even(u, data[2])) * now
@@ -66,23 +80,29 @@ OVERSTRESS = Recursion(_overstress, 1, 1, 2, 3)
 
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
-    """c, d and a."""
+    """Return the coefficients c, d and a of an evaluation."""
     return ca.vertcat(_stiffening(u, data), OVERSTRESS.coefficients(u, data)[:2])
 
 
-COEFFICIENTS, STIFFENING = Generated(_coefficients, 2, 3), Generated(_stiffening, 2, 3)
+COEFFICIENTS = Generated(_coefficients, 2, 3)
+STIFFENING = Generated(_stiffening, 2, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Fading:
-    """c, d and a of B branches at N evaluations, with their derivatives by g and τ.
+    """Coefficients c, d and a of B branches at N evaluations, with derivatives by g and τ.
 
     Attributes
     ----------
-    places : (2, B) of g and τ in θ
-    u, data : (2, B, N) and (3, B, N) of `COEFFICIENTS`
+    places : (2, B)
+        Indices of g and τ in θ.
+    u : (2, B, N)
+        Values of g and τ.
+    data : (3, B, N)
+        Times, see `_overstress`.
     c, d, a : (B, N)
-    by : (3, 2, B, N) their slopes
+    by : (3, 2, B, N)
+        Derivatives of c, d and a by g and τ.
     """
 
     places: Index
@@ -95,36 +115,55 @@ class Fading:
 
     @classmethod
     def of(cls, body: Body, theta: Array, until_next_s: Array, loaded_s: float) -> Fading:
-        """Of all branches, from the times (N,) from each evaluation to the next."""
+        """Return the coefficients of all branches of a body.
+
+        Parameters
+        ----------
+        body : Body
+        theta : (k,)
+            Constants of the body.
+        until_next_s : (N,)
+            Time from each evaluation to the next.
+        loaded_s : float
+            Time for which the body has been in its start shape; infinite if its memory has relaxed.
+        """
         places = np.array([(each.share, each.tau) for each in body.memory.branches]).T
-        shape = len(body.memory.branches), len(until_next_s)
+        branches = len(body.memory.branches)
+        shape = (branches, len(until_next_s))
         since_s = np.empty(shape)
         since_s[:, 0] = np.minimum(loaded_s, LONG * theta[places[1]])
         since_s[:, 1:] = until_next_s[:-1]
         began = np.broadcast_to(np.arange(shape[1]) == 0, shape)
         data = np.stack([since_s, began, np.broadcast_to(until_next_s, shape)])
-        u = np.broadcast_to(theta[places][..., None], (2, *shape))
+        u = np.broadcast_to(theta[places][..., None], (2, branches, len(until_next_s)))
         (c, d, a), by = COEFFICIENTS.slopes(u, data)
         return cls(places, u, data, c, d, a, by)
 
     def along(self, theta_q: Array) -> tuple[Array, Array]:
-        """Derivatives (q, B, N) of d and a by what θ changes with by theta_q (k, q)."""
+        """Return the derivatives (q, B, N) of d and of a in the directions `theta_q` (k, q) of
+        θ.
+        """
         d_q, a_q = np.einsum("cjbn,jbq->cqbn", self.by[1:], theta_q[self.places])
         return d_q, a_q
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What the evaluations of a trajectory have been through.
+    """Memory of the material at the evaluations of a motion.
 
     Attributes
     ----------
     body : Body
     theta : (k,)
-    xi : (N, 3n) evaluation states
-    stress : (N, width) S
+        Constants of the body.
+    xi : (N, 3n)
+        Positions at the evaluations [m].
+    stress : (N, width)
+        Long-term stress S at all points.
     fading : Fading
-    brought : (N, all branches) m_{k−1}
+        Coefficients of the recursion.
+    brought : (N, all branches)
+        Internal variables m_{k−1} at each evaluation.
     """
 
     body: Body
@@ -144,14 +183,27 @@ class History:
         loaded_s: float,
         brought: Array | None = None,
     ) -> History:
-        """Of the states xi (N, 3n), the first of which is the start.
+        """Return the memory along given states.
 
-        What they bring follows from that, where it is not given.
+        Parameters
+        ----------
+        body : Body
+        xi : (N, 3n)
+            Positions at the evaluations, the first of which is the start [m].
+        theta : (k,)
+            Constants of the body.
+        until_next_s : (N,)
+            Time from each evaluation to the next.
+        loaded_s : float
+            Time for which the body has been in its start shape; infinite if its memory has relaxed.
+        brought : (N, all branches), optional
+            Given internal variables m_{k−1}; computed from the states by default.
         """
         stress = body.stresses.stress(xi, theta)
         fades = Fading.of(body, theta, until_next_s, loaded_s)
         if brought is None:
-            borne, (d, a) = body.memory.borne(stress), map(body.memory.spread, (fades.d, fades.a))
+            borne = body.memory.borne(stress)
+            d, a = map(body.memory.spread, (fades.d, fades.a))
             brought = np.zeros(borne.shape)
             for k in range(len(brought) - 1):
                 brought[k + 1] = d[k] * brought[k] + a[k] * borne[k]
@@ -159,132 +211,180 @@ class History:
 
     @property
     def memory(self) -> PointLayout:
-        """What is where."""
+        """Layout of points and branches in the arrays."""
         return self.body.memory
 
     def carried(self, rows: slice) -> Past:
-        """What some of the evaluations bring from the past."""
-        found, fades = self.memory.nothing(len(self.xi[rows])), self.fading
-        found.overstress[:] = self.memory.summed(self.brought[rows])
+        """Return the memory's contribution to the forces at some evaluations."""
+        past = self.memory.nothing(len(self.xi[rows]))
+        fades = self.fading
+        past.overstress[:] = self.memory.summed(self.brought[rows])
         for branch, c in zip(self.memory.branches, fades.c, strict=True):
-            found.stiffening[:, branch.part] += c[rows]
-        bent = STIFFENING.curvature(fades.u, fades.data)
-        found.slopes[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
-        found.bends[:, fades.places[:, None], fades.places] = np.moveaxis(bent[..., rows], 3, 0)
-        return found
+            past.stiffening[:, branch.part] += c[rows]
+        second = STIFFENING.curvature(fades.u, fades.data)
+        past.slopes[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
+        past.bends[:, fades.places[:, None], fades.places] = np.moveaxis(second[..., rows], 3, 0)
+        return past
 
     def onto(self, forces: Forces, rows: slice) -> Forces:
-        """Forces of some evaluations with what these bring."""
+        """Return the forces of the evaluations `rows` with the memory inserted."""
         return replace(forces, past=self.carried(rows))
 
     def weighed(self, forces: Forces, mu: Array) -> Forces:
-        """The forces of all evaluations, where a_k S_k counts μ (N, all branches) besides."""
-        borne = replace(self.carried(slice(None)), stress_weights=self.stress_weights(mu))
-        return replace(forces, past=borne)
+        """Return the forces of all evaluations, with weights μ of a_k S_k in second derivatives.
+
+        Parameters
+        ----------
+        forces : Forces
+        mu : (N, all branches)
+        """
+        past = replace(self.carried(slice(None)), stress_weights=self.stress_weights(mu))
+        return replace(forces, past=past)
 
     def forward(
         self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
     ) -> Slopes:
-        """Columns of what is carried, see `Slopes`; of an evaluation, those (U, c) of inputs."""
+        """Return an iterator of the columns dm forward in time, see `Slopes`.
+
+        Parameters
+        ----------
+        by_p : callable
+            Derivatives (U, columns) of the inputs at the evaluation with a given index.
+        done : int
+            Number of evaluations that have been passed already.
+        known : (columns, all branches), optional
+            Columns after those evaluations; 0 by default.
+        """
         return Slopes(self, by_p(0)[: len(self.theta)], done, known)
 
     def backward(self) -> Weights:
-        """Its weights, see `Weights`."""
+        """Return an iterator of the weights μ backward in time, see `Weights`."""
         return Weights(self)
 
     @property
     def last(self) -> Remembered:
-        """After the last evaluation."""
+        """State of the memory after the last evaluation."""
         c = self.memory.spread(self.fading.c)[-1]
         overstress = self.brought[-1] + c * self.memory.borne(self.stress[-1])
         return Remembered(self.body, self.theta, self.stress[-1], overstress)
 
     @property
     def gaps(self) -> Array:
-        """(N − 1, …) m_k − d_k m_{k−1} − a_k S_k: zero where m follows."""
+        """Residuals m_k − d_k m_{k−1} − a_k S_k (N − 1, all branches); zero if m satisfies the
+        recursion.
+        """
         d, a = (self.memory.spread(each[:, :-1]) for each in (self.fading.d, self.fading.a))
-        m, borne = self.brought, self.memory.borne(self.stress[:-1])
+        m = self.brought
+        borne = self.memory.borne(self.stress[:-1])
         return m[1:] - d * m[:-1] - a * borne
 
     # Derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k), μ (N, all branches) --------------------------
 
     def stress_weights(self, mu: Array) -> Array:
-        """σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k."""
+        """Return σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k, for weights μ (N, all
+        branches).
+        """
         return self.memory.summed(self.memory.spread(self.fading.a) * mu)
 
     def _summed(self, mu: Array) -> Array:
-        """U (5, B, N) of `OVERSTRESS` whose value is Σ μ_k m_k of each branch.
+        """Return the inputs (5, B, N) of `OVERSTRESS` whose value is Σ μ_k m_k of each branch.
 
-        As that is linear in m and S, it goes on from Σ μ_k m_{k−1}, at Σ μ_k S_k.
+        The recursion is linear in m and S, so the inputs are Σ μ_k m_{k−1} and Σ μ_k S_k.
         """
         borne = self.memory.borne(self.stress)
         before, now = (self.memory.totals(mu * each) for each in (self.brought, borne))
         return np.stack([before, now, 0 * now, *self.fading.u])
 
     def stress_by(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
-        """∂S/∂θ θ_q (T, q, width), a few evaluations at a time."""
+        """Yield ∂S/∂θ θ_q (T, q, width) of `CHUNK` evaluations at a time, with their slice."""
         for start in range(0, len(self.xi), CHUNK):
             rows = slice(start, start + CHUNK)
             yield rows, self.body.stresses.stress_by(self.xi[rows], self.theta, theta_q)
 
     def pulled(self, force_weights: Array, by_p: Array) -> tuple[Array, Array, Array]:
-        """Derivatives of Σ λ_k f_H(H_k) through H, by ξ and ν (N, 3n) and by p.
+        """Return the derivatives of Σ λ_k f_H(H_k) through H by ξ and ν, (N, 3n) each, and by p
+        (m,).
+
+        Those by ν are zero.
 
         Parameters
         ----------
-        force_weights : (N, 3n) λ
-        by_p : (N, U, m) derivatives of the inputs
+        force_weights : (N, 3n)
+            Weights λ of the forces.
+        by_p : (N, U, m)
+            Derivatives of the inputs by the parameters.
         """
         theta_p = by_p[0, : len(self.theta)]
         used = np.flatnonzero(theta_p.any(axis=0))
-        theta_q, found = theta_p[:, used], np.zeros(theta_p.shape[1])
-        stresses, d = self.body.stresses, self.memory.spread(self.fading.d)
+        theta_q = theta_p[:, used]
+        by_parameters = np.zeros(theta_p.shape[1])
+        stresses = self.body.stresses
+        d = self.memory.spread(self.fading.d)
         pushes = self.memory.borne(stresses.against(self.xi, force_weights, self.theta))
         mu = np.zeros_like(pushes)
         for k in range(len(mu) - 1, 0, -1):
             mu[k - 1] = d[k] * mu[k] + pushes[k]
         _, by = OVERSTRESS.step.slopes(self._summed(mu), self.fading.data)
-        by_own = by[0, OVERSTRESS.ends[2] :]
-        by_q = np.einsum("jbn,jbq->q", by_own, theta_q[self.fading.places])
+        by_fading = by[0, OVERSTRESS.ends[2] :]
+        by_q = np.einsum("jbn,jbq->q", by_fading, theta_q[self.fading.places])
         sigma = self.stress_weights(mu)
         for rows, slopes in self.stress_by(theta_q):
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
-        found[used] = by_q
-        return stresses.pulled(self.xi, sigma, self.theta), np.zeros_like(self.xi), found
+        by_parameters[used] = by_q
+        return stresses.pulled(self.xi, sigma, self.theta), np.zeros_like(self.xi), by_parameters
 
     def add_curvature(self, curvature: Curvature, mu: Array) -> None:
-        """Add those by g and τ, and those by another.
+        """Add the second derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k) that involve (g, τ).
 
-        In place, to the N states of a `Curvature` that has those of Σ σ_k S_k. A branch's Σ μ_k m_k
-        bends by (g, τ), and by these with Σ μ_k S_k, which moves with ξ and with moduli.
+        The derivatives are added in place to the N states of a `Curvature` that already has those
+        of Σ σ_k S_k, see `weighed`. Mixed derivatives are those with ξ and with elastic constants,
+        through S.
+
+        Parameters
+        ----------
+        curvature : Curvature
+            Second derivatives of the forces; modified.
+        mu : (N, all branches)
+            Weights μ.
         """
-        memory, places, at = self.memory, self.fading.places, (self._summed(mu), self.fading.data)
-        elastic, own = self.body.elastic_places, slice(OVERSTRESS.ends[2], None)
-        slopes, bent = OVERSTRESS.step.slopes(*at)[1], OVERSTRESS.step.curvature(*at)
-        curvature.theta[:, places] += np.moveaxis(slopes[0, own], 2, 0)
-        curvature.theta_theta[:, places[:, None], places] += np.moveaxis(bent[own, own], 3, 0)
-        across = bent[own, 1]
-        for number, of_branch in enumerate(memory.spread(np.eye(len(memory.branches)))):
-            weights = memory.summed(of_branch * mu)
+        memory = self.memory
+        places = self.fading.places
+        inputs = self._summed(mu)
+        data = self.fading.data
+        elastic = self.body.elastic_places
+        fading_inputs = slice(OVERSTRESS.ends[2], None)
+        slopes = OVERSTRESS.step.slopes(inputs, data)[1]
+        second = OVERSTRESS.step.curvature(inputs, data)
+        curvature.theta[:, places] += np.moveaxis(slopes[0, fading_inputs], 2, 0)
+        curvature.theta_theta[:, places[:, None], places] += np.moveaxis(
+            second[fading_inputs, fading_inputs], 3, 0
+        )
+        mixed = second[fading_inputs, 1]
+        for number, branch_mask in enumerate(memory.spread(np.eye(len(memory.branches)))):
+            weights = memory.summed(branch_mask * mu)
             by_xi = self.body.stresses.pulled(self.xi, weights, self.theta)
-            for place, factor in zip(places[:, number], across[:, number], strict=True):
+            for place, factor in zip(places[:, number], mixed[:, number], strict=True):
                 curvature.position_theta[:, :, place] += factor[:, None] * by_xi
         for rows, by in self.stress_by(np.eye(len(self.theta))[:, elastic]):
             by_moduli = memory.totals(memory.borne(by) * mu[rows, None])
-            both = np.einsum("jbt,bte->tjbe", across[..., rows], by_moduli)
+            both = np.einsum("jbt,bte->tjbe", mixed[..., rows], by_moduli)
             curvature.theta_theta[rows, places[..., None], elastic] += both
             curvature.theta_theta[rows, elastic, places[..., None]] += both
 
 
 @dataclass(frozen=True, eq=False)
 class Remembered:
-    """The state of the memory at one time.
+    """State of the material's memory at one time, for time marching.
 
     Attributes
     ----------
-    body, theta
-    stress : (width,) S
-    overstress : (all branches,) Q
+    body : Body
+    theta : (k,)
+        Constants of the body.
+    stress : (width,)
+        Long-term stress S.
+    overstress : (all branches,)
+        Overstress Q of each branch.
     """
 
     body: Body
@@ -294,32 +394,36 @@ class Remembered:
 
     @classmethod
     def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> Remembered:
-        """In the start shape x (3n,)."""
+        """Return the memory in the start shape x (3n,), loaded for a time `loaded_s`."""
         return History.of(body, x[None], theta, np.ones(1), loaded_s).last
 
     def now(self, forces: Forces) -> Forces:
-        """Forces in this very state, which bears this beside S."""
-        found = self.body.memory.nothing(1)
-        found.overstress[0] = self.body.memory.summed(self.overstress)
-        return replace(forces, past=found)
+        """Return forces in the same state, with the overstress Q inserted."""
+        past = self.body.memory.nothing(1)
+        past.overstress[0] = self.body.memory.summed(self.overstress)
+        return replace(forces, past=past)
 
     def ahead(self, forces: Forces, interval_s: float) -> Forces:
-        """Forces in a state an interval later."""
-        found, (brought, c) = self.body.memory.nothing(1), self._brought(interval_s)
-        found.overstress[0] = self.body.memory.summed(brought)
+        """Return forces in a state one interval later, with the memory inserted."""
+        past = self.body.memory.nothing(1)
+        brought, c = self._brought(interval_s)
+        past.overstress[0] = self.body.memory.summed(brought)
         for branch, own in zip(self.body.memory.branches, c, strict=True):
-            found.stiffening[0, branch.part] += own
-        return replace(forces, past=found)
+            past.stiffening[0, branch.part] += own
+        return replace(forces, past=past)
 
     def following(self, forces: Forces, x: Array, v: Array, interval_s: float) -> Remembered:
-        """In the state x (3n,) an interval later."""
-        memory, (brought, c) = self.body.memory, self._brought(interval_s)
+        """Return the memory in the state x (3n,) one interval later; forces and velocity are not
+        used.
+        """
+        memory = self.body.memory
+        brought, c = self._brought(interval_s)
         stress = self.body.stresses.stress(x[None], self.theta)[0]
         overstress = brought + memory.spread(c) * memory.borne(stress)
         return Remembered(self.body, self.theta, stress, overstress)
 
     def _brought(self, interval_s: float) -> tuple[Array, Array]:
-        """E Q − c S of all branches, and c (B,)."""
+        """Return e Q − c S of all branches, and c (B,), for an interval."""
         memory = self.body.memory
         share, tau_s = self.theta[[(b.share, b.tau) for b in memory.branches]].T
         e, c = fading(share, tau_s, interval_s)
@@ -328,35 +432,42 @@ class Remembered:
 
 
 def at_start(forces: Forces, loaded_s: float) -> Forces:
-    """Forces on a start shape that bears more than S, where a load has not been there for long."""
+    """Return forces on the start shape, with the overstress of a load that was applied recently.
+
+    The forces are unchanged for a body without memory, or if `loaded_s` is infinite.
+    """
     body = forces.body
     if not body.remembers or np.isinf(loaded_s):
         return forces
-    found = body.memory.nothing(1)
+    past = body.memory.nothing(1)
     c = Fading.of(body, forces.theta, np.ones(1), loaded_s).c
     for branch, own in zip(body.memory.branches, c, strict=True):
-        found.stiffening[:, branch.part] += own
-    return replace(forces, past=found)
+        past.stiffening[:, branch.part] += own
+    return replace(forces, past=past)
 
 
 class Slopes:
-    """Columns dm of a history, evaluation after evaluation.
+    """Columns dm of the internal variables, propagated forward in time.
 
     Parameters
     ----------
     history : History
-    theta_q : (k, columns) derivatives of θ
+    theta_q : (k, columns)
+        Derivatives of θ.
     done : int
-        Evaluations that are known.
+        Number of evaluations that have been passed already.
     known : (columns, all branches), optional
-        `columns` after the last of them.
+        Columns after those evaluations; 0 by default.
     """
 
     def __init__(
         self, history: History, theta_q: Array, done: int = 0, known: Array | None = None
     ) -> None:
-        self.history, self.next, self.memory = history, done, history.memory
-        self.stresses, self.theta = history.body.stresses, history.theta
+        self.history = history
+        self.next = done
+        self.memory = history.memory
+        self.stresses = history.body.stresses
+        self.theta = history.theta
         shape = theta_q.shape[1], history.brought.shape[1]
         self.columns = np.zeros(shape) if known is None else known.copy()
         # Work space, kept: fresh pages would cost as much as the numbers in them.
@@ -364,23 +475,35 @@ class Slopes:
         self._state = np.zeros((len(self.columns), history.xi.shape[1]))
         self._direction = np.zeros_like(self._state)
         self._moduli = np.flatnonzero(theta_q[history.body.elastic_places].any(axis=0))
-        self._theta_q, self._by_moduli = theta_q[:, self._moduli], np.zeros((0, 0, 0))
+        self._theta_q = theta_q[:, self._moduli]
+        self._by_moduli = np.zeros((0, 0, 0))
         fades = history.fading
         self._own = np.flatnonzero(theta_q[fades.places].any(axis=(0, 1)))
         self._d, self._a = map(self.memory.spread, (fades.d, fades.a))
         self._d_own, self._a_own = fades.along(theta_q[:, self._own])
 
     def force(self) -> Array:
-        """What they add to dF at the next evaluation, (3n, columns)."""
+        """Return the contribution of the memory to dF at the next evaluation, (3n, columns)."""
         self._state[:] = self.history.xi[self.next]
         return self.stresses.force(self._state, self.memory.summed(self.columns), self.theta).T
 
     def advance(self, of_state: Callable[[], Array], _: Callable[[], Array]) -> None:
-        """Go past the next evaluation, whose ξ changes by (3n, columns)."""
-        k, history, stress, spread = self.next, self.history, self._stress, self.memory.spread
-        self._state[:], self._direction[:] = history.xi[k], of_state().T
+        """Pass the next evaluation and update the columns, in place.
+
+        Parameters
+        ----------
+        of_state : callable
+            Change (3n, columns) of ξ there; the second argument, that of ν, is not used.
+        """
+        k = self.next
+        history = self.history
+        stress = self._stress
+        spread = self.memory.spread
+        self._state[:] = history.xi[k]
+        self._direction[:] = of_state().T
         # Of a single branch the stress itself is not needed.
-        alone, a = len(self.memory.branches) == 1, self._a[k]
+        alone = len(self.memory.branches) == 1
+        a = self._a[k]
         self.columns *= self._d[k]
         if alone:
             stress = self.columns
@@ -392,14 +515,17 @@ class Slopes:
             stress[column] += a * slope if alone else slope
         if not alone:
             self.columns += a * self.memory.borne(stress)
-        m, borne = history.brought[k], self.memory.borne(history.stress[k])
+        m = history.brought[k]
+        borne = self.memory.borne(history.stress[k])
         for j, column in enumerate(self._own):
             self.columns[column] += spread(self._d_own[j, :, k]) * m
             self.columns[column] += spread(self._a_own[j, :, k]) * borne
         self.next += 1
 
     def _slopes(self, k: int) -> Array:
-        """(moduli, width) of S by what changes moduli."""
+        """Return the derivatives of S at evaluation k by the columns that change elastic
+        constants.
+        """
         if not len(self._moduli):
             return self._by_moduli
         if k % CHUNK == 0 or not len(self._by_moduli):
@@ -410,15 +536,22 @@ class Slopes:
 
 
 class Weights:
-    """μ of a history, evaluation before evaluation."""
+    """Weights μ of the internal variables, propagated backward in time.
+
+    Parameters
+    ----------
+    history : History
+    """
 
     def __init__(self, history: History) -> None:
-        self.history, self.next = history, len(history.xi) - 1
+        self.history = history
+        self.next = len(history.xi) - 1
         self.columns = np.zeros(history.brought.shape[1])
 
     def pulled(self) -> tuple[Array, Array]:
-        """What position and velocity of the evaluation get through S, (3n,) each."""
-        history, k = self.history, self.next
+        """Return the derivatives of μ · m by ξ and ν of the evaluation, (3n,) each; by ν zero."""
+        history = self.history
+        k = self.next
         weights = history.memory.summed(
             history.memory.spread(history.fading.a[:, k]) * self.columns
         )
@@ -427,9 +560,17 @@ class Weights:
         return by_x, np.zeros_like(by_x)
 
     def retreat(self, force_weight: Array) -> None:
-        """Go before the evaluation, whose force has weights (3n,)."""
-        history, k = self.history, self.next
-        state, weight = history.xi[k][None], force_weight[None]
+        """Pass the evaluation backward and update μ, in place.
+
+        Parameters
+        ----------
+        force_weight : (3n,)
+            Weights λ of its forces.
+        """
+        history = self.history
+        k = self.next
+        state = history.xi[k][None]
+        weight = force_weight[None]
         push = history.body.stresses.against(state, weight, history.theta)[0]
         d = history.memory.spread(history.fading.d[:, k])
         self.columns = d * self.columns + history.memory.borne(push)

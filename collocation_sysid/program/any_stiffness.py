@@ -1,8 +1,10 @@
-"""Where markers may be if the stiffness is unknown: the grasp's motion, and the body's sway.
+"""Rough predictions of markers while the stiffness is unknown: motion of the grasp and natural
+modes.
 
-In the frame that the grasp carries, a body of small strains sways under gravity and the grasp's
-acceleration in its modes φ_k, q̈ + 2ζω_k q̇ + ω_k² q = φ_kᵀM Rᵀ(g − ẍ). A stiffness that is not known
-scales all ω_k; so a few scales and dampings predict the markers of any body of this shape roughly.
+In the frame of the grasp, a body at small strain responds to gravity and the grasp's acceleration
+in its modes φ_k, q̈ + 2ζω_k q̇ + ω_k² q = φ_kᵀM Rᵀ(g − ẍ). An unknown stiffness scales all ω_k; a
+few scales and damping ratios therefore predict the markers of any body of this shape roughly. Use
+it to test statements of a problem (poses, places, units) before anything is fitted.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ from .modes import natural_modes
 
 MODES = 20
 # The softest body sags by half its size; first frequencies from there on, and a rigid body.
-SOFTEST_SAG, STIFFNESSES, STIFFEST = 0.5, 12, 30.0
+SOFTEST_SAG = 0.5
+STIFFNESSES = 12
+STIFFEST = 30.0
 DAMPING_RATIOS = (0.03, 0.25)
 STANDARD_GRAVITY_M_S2 = 9.81
 MOST_SAMPLES = 300
@@ -28,21 +32,27 @@ MOST_SAMPLES = 300
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """What an experiment says of poses, markers, mesh and gravity, all of which may be wrong.
+    """Statements of an experiment about poses, markers, mesh size and gravity, each of which may be
+    wrong.
 
     Attributes
     ----------
-    t_s : (T,)
-    rotations : (T, 3, 3) R of the grasp's poses
-    translations_m : (T, 3) p of them
-    tracks_m : (T, M, 3) measured, NaN where missing
-    gravity_m_s2 : (3,)
+    t_s : (T,) array
+        Times [s].
+    rotations : (T, 3, 3) array
+        Rotations R of the grasp's poses.
+    translations_m : (T, 3) array
+        Translations p of the poses [m].
+    tracks_m : (T, M, 3) array
+        Measured markers [m], NaN where missing.
+    gravity_m_s2 : (3,) array
+        Gravity [m/s²].
     mesh_scale : float
-        By which the mesh and the markers' places on it are too small.
+        Factor of the size of the mesh and of the markers' places on it.
     lag_s : float
-        By which the markers' clock is late.
+        Delay of the markers' clock [s].
     name : str
-        The experiment's, quoted.
+        Name of the experiment in quotation marks.
     """
 
     t_s: Array
@@ -56,35 +66,40 @@ class Described:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Described | None:
-        """Its first samples; None where no single motion carries the body throughout, or none."""
+        """Return the statements of an experiment for its first samples.
+
+        None if the experiment is static, or no single rigid motion carries the body at all times.
+        """
         grasp = carrying(experiment)
         if grasp is None or experiment.static:
             return None
         t_s = experiment.t_s[:MOST_SAMPLES]
         rotations, translations = grasp.poses.at(t_s)
         tracks = experiment.markers.positions_m[:MOST_SAMPLES]
-        name, gravity_m_s2 = f"'{experiment.name}'", experiment.gravity_m_s2
+        name = f"'{experiment.name}'"
+        gravity_m_s2 = experiment.gravity_m_s2
         return cls(t_s, rotations, translations, tracks, gravity_m_s2, name=name)
 
     def carry(self, points_m: Array) -> Array:
-        """Points (..., T, M, 3) in the grasp's frame where it carries them."""
+        """Return points (..., T, M, 3) of the grasp's frame in the world [m]."""
         turned = np.einsum("tij,...tmj->...tmi", self.rotations, points_m)
         return turned + self.translations_m[:, None]
 
     def pulled_back(self, points_m: Array) -> Array:
-        """Points (T, M, 3) of the cameras' frame in that of the grasp."""
+        """Return points (T, M, 3) of the world in the grasp's frame [m]."""
         return np.einsum("tji,tmj->tmi", self.rotations, points_m - self.translations_m[:, None])
 
     def after(self, rotation: Array, translation_m: Array) -> Described:
-        """The same with another rigid motion before the poses: x → U(Cx)."""
+        """Return the statements with another rigid motion C before the poses U: x → U(Cx)."""
         shifted = self.translations_m + self.rotations @ translation_m
         return replace(self, rotations=self.rotations @ rotation, translations_m=shifted)
 
 
 def carrying(experiment: Experiment) -> Grasp | None:
-    """The grasp that carries the body throughout, if all others that hold move with it.
+    """Return the grasp that carries the body at all times, or None.
 
-    One that holds some axes only carries none.
+    All other grasps must move with it. A grasp that prescribes some axes only does not carry the
+    body.
     """
     holding = [grasp for grasp in experiment.grasps if grasp.holds(experiment.t_s).any()]
     holding.sort(key=lambda grasp: grasp.axes != "xyz")
@@ -103,19 +118,24 @@ def carrying(experiment: Experiment) -> Grasp | None:
 
 @dataclass(frozen=True, eq=False)
 class Sway:
-    """The modes of a body in its grasp as its markers show them.
+    """Natural modes of a body in its grasp, evaluated at its markers.
 
     Attributes
     ----------
-    places_m : (M, 3) on the undeformed body
-    omega : (K,) angular frequencies over the first one
-    shapes : (K, M, 3) displacement of the markers
-    pushed : (K, 3) φᵀM for an acceleration common to all nodes
-    turned : (K, 3, 3) φᵀM xᵀ for one that is linear in the place
+    places_m : (M, 3) array
+        Markers on the undeformed body [m].
+    omega : (K,) array
+        Angular frequencies relative to the lowest.
+    shapes : (K, M, 3) array
+        Displacements of the markers.
+    pushed : (K, 3) array
+        Modal loads φᵀM of a uniform acceleration.
+    turned : (K, 3, 3) array
+        Modal loads φᵀM xᵀ of an acceleration that is linear in the place.
     size_m : float
-        Diagonal of the body.
+        Diagonal of the body [m].
     from_rest : bool
-        Whether it starts in its equilibrium, else undeformed.
+        Whether the body starts in equilibrium; otherwise undeformed.
     """
 
     places_m: Array
@@ -128,8 +148,9 @@ class Sway:
 
     @classmethod
     def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Sway:
-        """Of an experiment; of the constants only ratios count."""
-        body, markers = experiment.body, experiment.markers
+        """Compute the modes of an experiment; only ratios of the constants matter."""
+        body = experiment.body
+        markers = experiment.markers
         forces = Forces.of(experiment, experiment.t_s[:1], body.theta(constants)).undriven()
         modes = natural_modes(forces, body.nodes_m, experiment.free_dofs, MODES)
         weighed = modes.shapes * forces.mass.kg[0, ::3, None]
@@ -145,7 +166,9 @@ class Sway:
         )
 
     def predicted(self, described: Described) -> Array:
-        """(S, T, M, 3) markers of bodies of S stiffnesses and dampings, the last one rigid."""
+        """Return predictions (S, T, M, 3) of the markers for S combinations of stiffness
+        and damping, the last for a rigid body [m].
+        """
         scale = described.mesh_scale
         loads = self._loads(described)
         step_s = float(described.t_s[1] - described.t_s[0])
@@ -157,18 +180,24 @@ class Sway:
         swayed = np.tensordot(q, self.shapes, axes=1)
         limit = scale * self.size_m
         # Small strains are assumed: what sways farther than the body is long, stays there.
-        far = np.linalg.norm(swayed, axis=3, keepdims=True) / limit
-        seen = described.carry(scale * self.places_m + swayed / np.maximum(far, 1.0))
-        return later(seen, described.t_s, described.lag_s) if described.lag_s else seen
+        relative_size = np.linalg.norm(swayed, axis=3, keepdims=True) / limit
+        predictions = described.carry(
+            scale * self.places_m + swayed / np.maximum(relative_size, 1.0)
+        )
+        return (
+            later(predictions, described.t_s, described.lag_s) if described.lag_s else predictions
+        )
 
     def _omega(self, scale: float) -> Array:
-        """(S, K) angular frequencies."""
+        """Return the angular frequencies (S, K) [rad/s] of the assumed stiffnesses for a
+        mesh scale.
+        """
         softest = np.sqrt(STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m))
         stiffnesses = softest * np.geomspace(1.0, STIFFEST, STIFFNESSES)
         return np.asarray(np.outer(stiffnesses, self.omega), dtype=np.float64)
 
     def _loads(self, described: Described) -> Array:
-        """(T, K) of gravity and the grasp's acceleration."""
+        """Return the modal loads (T, K) of gravity and the grasp's acceleration."""
         inverse = described.rotations.transpose(0, 2, 1)
         step_s = float(described.t_s[1] - described.t_s[0])
         lift = described.gravity_m_s2 - _acceleration(described.translations_m, step_s)
@@ -178,17 +207,21 @@ class Sway:
 
 
 def later(seen: Array, t_s: Array, lag_s: float) -> Array:
-    """Predictions (S, T, M, 3) seen `lag_s` later, NaN where they end."""
+    """Return predictions (S, T, M, 3) delayed by `lag_s` (linear interpolation); NaN beyond
+    their range.
+    """
     at = np.arange(len(t_s)) - lag_s / (t_s[1] - t_s[0])
     low = np.clip(np.floor(at).astype(int), 0, len(t_s) - 2)
     share = (at - low)[:, None, None]
-    found = (1 - share) * seen[:, low] + share * seen[:, low + 1]
-    found[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
-    return found
+    shifted = (1 - share) * seen[:, low] + share * seen[:, low + 1]
+    shifted[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
+    return shifted
 
 
 def _acceleration(x: Array, step_s: float) -> Array:
-    """Second differences of (T, ...), which rests before the first sample."""
+    """Return second differences of (T, ...) over the step; the motion is at rest before the
+    first sample.
+    """
     padded = np.concatenate([x[1:2], x, x[-1:]])
     second = (padded[2:] - 2 * padded[1:-1] + padded[:-2]) / step_s**2
     second[-1] = second[-2]
@@ -196,17 +229,32 @@ def _acceleration(x: Array, step_s: float) -> Array:
 
 
 def _responses(omega: Array, ratio: float, loads: Array, step_s: float, from_rest: bool) -> Array:
-    """(S, T, K) coordinates of oscillators (S, K), exact for loads linear between samples.
+    """Return the coordinates (S, T, K) of oscillators (S, K), exact for loads that are linear
+    between samples.
 
     y = q̇ − λ̄q, the imaginary part of which is ω_d q, obeys ẏ = λy + load with λ = −ζω + iω_d.
+
+    Parameters
+    ----------
+    omega : (S, K) array
+        Angular frequencies [rad/s].
+    ratio : float
+        Damping ratio.
+    loads : (T, K) array
+        Modal loads.
+    step_s : float
+        Time between samples [s].
+    from_rest : bool
+        Whether to start in equilibrium with the first load; otherwise at zero.
     """
     damped = omega * np.sqrt(1 - ratio**2)
     root = -ratio * omega + 1j * damped
-    fading, of_constant = np.exp(root * step_s), np.expm1(root * step_s) / root
+    fading = np.exp(root * step_s)
+    of_constant = np.expm1(root * step_s) / root
     of_rise = (of_constant - step_s) / (root * step_s)
     pushes = of_constant * loads[:-1, None] + of_rise * np.diff(loads, axis=0)[:, None]
     at_rest = -root.conj() * loads[0] / omega**2
-    found = [at_rest if from_rest else np.zeros_like(root)]
+    coordinates = [at_rest if from_rest else np.zeros_like(root)]
     for push in pushes:
-        found.append(fading * found[-1] + push)
-    return np.imag(np.stack(found, axis=1)) / damped[:, None]
+        coordinates.append(fading * coordinates[-1] + push)
+    return np.imag(np.stack(coordinates, axis=1)) / damped[:, None]

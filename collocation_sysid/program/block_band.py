@@ -1,15 +1,15 @@
 """Sparse matrices made of mesh-graph blocks along the time axis, refilled at every iterate.
 
-Column block t holds the columns of x_t; row blocks are placed at fixed offsets from it. A block
-is a linear combination of lower triangles on the mesh graph,
+Column block t holds the columns of x_t; row blocks have fixed offsets from it. A block is a linear
+combination of lower triangles on the mesh graph,
 
     block(t, offset) = Σ_terms a[t] A[t + shift] + b[t] B[t + shift] + constant,
 
-so the positions and the coefficients are laid out once and `fill` only copies numbers. A and B
-are (K, m) arrays of lower-triangle values, see `fem.pattern`.
+so that positions and coefficients are computed once and `BlockBand.fill` only copies numbers. A and
+B are (K, m) arrays of lower-triangle values, see `fem.pattern`.
 
-Matrices on the mesh graph that are not symmetric have a symmetric part and a skew one, given by
-lower triangles, (m,) each; the skew part's is empty where there is none.
+An unsymmetric matrix on the mesh graph consists of a symmetric and a skew part, each given by its
+lower triangle (m,); the skew part is an empty array for a symmetric matrix.
 """
 
 from __future__ import annotations
@@ -28,7 +28,15 @@ from ..fem.pattern import SymmetricPattern
 
 @dataclass(frozen=True, eq=False)
 class BlockTerm:
-    """a[t] A[t + shift] + b[t] B[t + shift] with a, b of length N, by column time t."""
+    """Term a[t] A[t + shift] + b[t] B[t + shift] of a block.
+
+    Attributes
+    ----------
+    shift : int
+        Offset of the index into A and B.
+    a, b : (N,) arrays
+        Coefficients, by column time t.
+    """
 
     shift: int
     a: Array
@@ -37,16 +45,20 @@ class BlockTerm:
 
 @dataclass(frozen=True, eq=False)
 class BandBlock:
-    """The blocks at one row offset: their entries, and the terms that fill them.
+    """Blocks at one row offset: their entries, and the terms that fill them.
 
     Attributes
     ----------
     offset : int
         Row block minus column block.
-    rows, columns : (e,) entries within the block
-    source : (e,) position of each in the lower triangle; −1 where only constants go
-    terms : sequence of Term
-    whole : (e,) position of each in both triangles, see `pattern.full`
+    rows, columns : (e,) arrays
+        Entries within the block.
+    source : (e,) array
+        Position of each entry in the lower triangle; −1 where only constants are stored.
+    terms : sequence of BlockTerm
+        Terms whose sum is the block.
+    whole : (e,) array
+        Position of each entry in both triangles, see `pattern.full`.
     """
 
     offset: int
@@ -60,21 +72,27 @@ class BandBlock:
 class BlockBand:
     """Structure of the matrix in compressed columns, and the plan to fill it.
 
+    Attributes
+    ----------
+    indptr, indices : arrays
+        Compressed-column structure, rows ascending in each column.
+    nnz : int
+        Number of entries.
+    top_positions : (N · columns, top) array
+        Positions of the top rows' values.
+
     Parameters
     ----------
     columns : int
         Columns per block.
-    row_starts : (N,) first row of each row block, −1 where the block does not exist
-    blocks : sequence of Block
+    row_starts : (N,) array
+        First row of each row block, −1 where the block does not exist.
+    blocks : sequence of BandBlock
+        The blocks.
     top : int
-        Rows above all blocks that every column has an entry in (0 … top − 1).
+        Number of rows above all blocks, in which every column has an entry (0 … top − 1).
     adds : bool
-        Whether `fill` adds to the values instead.
-
-    Attributes
-    ----------
-    indptr, indices : compressed-column structure, rows ascending in each column
-    top_positions : (N · columns, top) positions of the top rows' values
+        If true, `fill` adds to the values instead of overwriting them.
     """
 
     def __init__(
@@ -114,11 +132,22 @@ class BlockBand:
         self._fill = make_combiner(_plan(kinds, starts[:-1], count, adds))
 
     def positions(self, times: Index, offset: int, rows: Index, columns: Index) -> Index:
-        """Positions in the values of entries of the blocks (t + offset, t), which must exist.
+        """Return the positions (len(times), len(rows)) in the values of entries of the blocks (t +
+        offset, t).
 
-        Returns
-        -------
-        (len(times), len(rows)) ndarray
+        Parameters
+        ----------
+        times : array
+            Column times t.
+        offset : int
+            Row block minus column block.
+        rows, columns : (e,) arrays
+            Entries within the block.
+
+        Raises
+        ------
+        IndexError
+            If an entry is not in the block.
         """
         result = np.empty((len(times), len(rows)), dtype=np.int64)
         for slab in self._slabs.values():
@@ -129,12 +158,16 @@ class BlockBand:
         return result
 
     def fill(self, values: Array, a: Array, b: Array, threads: int) -> None:
-        """Write all block entries into `values`; entries without terms become zero.
+        """Write all block entries into `values`, in place; entries without terms become zero.
 
         Parameters
         ----------
-        values : (nnz,) the top rows are left as they are
-        a, b : (K, m) rows contiguous, of the same row stride
+        values : (nnz,) array
+            Values; the top rows are left unchanged.
+        a, b : (K, m) arrays
+            Lower-triangle values A and B, rows contiguous, with the same row stride.
+        threads : int
+            Number of threads.
         """
         in_slices(
             lambda start, stop: self._fill(start, stop, a, b, values),
@@ -145,7 +178,29 @@ class BlockBand:
 
 @dataclass(frozen=True, eq=False)
 class _Slab:
-    """One column block's structure: entries sorted by column, then row."""
+    """Structure of one column block: entries sorted by column, then row.
+
+    Attributes
+    ----------
+    columns : int
+        Columns of the block.
+    top : int
+        Rows above all blocks.
+    blocks : sequence of BandBlock
+        Blocks that exist in it.
+    entries : int
+        Number of entries.
+    column_ends : (columns,) array
+        End of each column.
+    top_positions : (columns, top) array
+        Positions of the top rows' entries.
+    order : (entries,) array
+        Sorted position of each entry, blocks stacked after the top rows.
+    offsets : (entries,) array
+        Index of the block of each stacked entry, −1 for top rows.
+    rows : (entries,) array
+        Row of each stacked entry within its block.
+    """
 
     columns: int
     top: int
@@ -159,6 +214,7 @@ class _Slab:
 
     @classmethod
     def of(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _Slab:
+        """Build the structure of a column block of `columns` columns."""
         top_rows = np.tile(np.arange(top), columns)
         top_columns = np.repeat(np.arange(columns), top)
         rows = np.concatenate([top_rows, *(b.rows for b in blocks)])
@@ -183,43 +239,54 @@ class _Slab:
         )
 
     def row_indices(self, row_starts: Index, t: int) -> Index:
-        """Global row of every entry of this slab as column block t."""
+        """Return the row in the matrix of every entry, for column block t."""
         base = np.array([row_starts[t + b.offset] for b in self.blocks] + [0])
         result = np.empty(self.entries, dtype=np.int64)
         result[self.order] = base[self.offsets] + self.rows
         return result
 
     def places(self, block: int) -> Index:
-        """Place in the slab of each entry of its `block`-th block."""
+        """Return the position in the column block of each entry of block number `block` (an
+        index).
+        """
         first = self.top * self.columns + sum(len(b.rows) for b in self.blocks[:block])
         return self.order[first : first + len(self.blocks[block].rows)]
 
     def locate(self, offset: int, rows: Index, columns: Index) -> Index:
-        """Place in the slab of given entries of the block at `offset`."""
+        """Return the positions in the column block of given entries of the block at
+        `offset`; raise IndexError for others.
+        """
         k = [b.offset for b in self.blocks].index(offset)
         block = self.blocks[k]
         width = int(max(block.rows.max(), np.max(rows, initial=0))) + 1
         codes = block.columns * width + block.rows
         sorter = np.argsort(codes)
-        wanted = np.asarray(columns) * width + rows
-        found = sorter[np.minimum(np.searchsorted(codes, wanted, sorter=sorter), len(codes) - 1)]
-        if (codes[found] != wanted).any():
+        requested = np.asarray(columns) * width + rows
+        entries = sorter[
+            np.minimum(np.searchsorted(codes, requested, sorter=sorter), len(codes) - 1)
+        ]
+        if (codes[entries] != requested).any():
             raise IndexError("an entry lies outside the block")
-        return self.places(k)[found]
+        return self.places(k)[entries]
 
 
 @dataclass(frozen=True, eq=False)
 class CombinePlan:
-    """Tasks of all column blocks, in their order, for the combiner.
+    """Tasks of all column blocks, in their order, for the compiled combiner.
 
-    Task: value[out + target[i]] (+)= a A[row, source[i]] + b B[row, source[i]], i in the map.
+    A task is value[out + target[i]] (+)= a A[row, source[i]] + b B[row, source[i]] for all i of a
+    map.
 
     Attributes
     ----------
-    first_task : (N + 1,) tasks of column block t are first_task[t] … first_task[t + 1] − 1
-    tasks : (tasks, 5) out, map start, map length, row, 1 to add or 0 to overwrite
-    coefficients : (tasks, 2) a, b
-    targets, sources : concatenated maps
+    first_task : (N + 1,) array
+        Tasks of column block t are first_task[t] … first_task[t + 1] − 1.
+    tasks : (tasks, 5) array
+        out, start of the map, length of the map, row, and 1 to add or 0 to overwrite.
+    coefficients : (tasks, 2) array
+        a and b.
+    targets, sources : int32 arrays
+        Concatenated maps.
     """
 
     first_task: Index
@@ -230,9 +297,14 @@ class CombinePlan:
 
 
 def _plan(kinds: Sequence[_Slab], starts: Index, count: int, adds: bool) -> CombinePlan:
-    targets, sources, maps = [], [], {}
+    """Return the tasks that fill the column blocks."""
+    targets = []
+    sources = []
+    maps = {}
     used = 0
-    tasks, coefficients, first_task = [], [], [0]
+    tasks = []
+    coefficients = []
+    first_task = [0]
     for t, slab in enumerate(kinds):
         for k, block in enumerate(slab.blocks):
             if (id(slab), k) not in maps:
@@ -260,13 +332,17 @@ def _plan(kinds: Sequence[_Slab], starts: Index, count: int, adds: bool) -> Comb
 
 
 def signs_by_column(pattern: SymmetricPattern) -> Array:
-    """(nnz,) signs of a skew matrix's lower triangle in the entries of `pattern.full`."""
+    """Return the signs (nnz,) of a skew matrix's lower triangle in the entries of
+    `pattern.full`.
+    """
     rows, columns, _ = pattern.full
     return np.sign(rows - columns).astype(float)
 
 
 def skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
-    """Entries (…, nnz) of the whole skew matrix in the order of `pattern.full`; none of none."""
+    """Return the entries (…, nnz) of the complete skew matrix in the order of
+    `pattern.full`; empty input gives empty output.
+    """
     if not skew.size:
         return skew
     # Rows contiguous, which fancy indices would not leave so.
@@ -274,13 +350,16 @@ def skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
 
 
 class Submatrix:
-    """Some rows and columns of matrices that are given so.
+    """Some rows and columns of matrices given by lower triangles.
 
     Parameters
     ----------
     pattern : SymmetricPattern
-    rows : (k,) ascending dofs
-    columns : (c,) ascending dofs, by default all
+        Pattern of the complete matrix.
+    rows : (k,) array
+        Ascending dofs.
+    columns : (c,) array, optional
+        Ascending dofs; all by default.
     """
 
     def __init__(
@@ -300,7 +379,15 @@ class Submatrix:
         self._matrix = sp.csr_array(parts, shape=(len(rows), count))
 
     def of(self, lower: Array, skew: Array) -> sp.csr_array:
-        """The matrix (k, c); valid until the next call."""
+        """Return the submatrix (k, c); it is overwritten by the next call.
+
+        Parameters
+        ----------
+        lower : (m,) array
+            Lower triangle of the symmetric part.
+        skew : (m,) or (0,) array
+            Lower triangle of the skew part.
+        """
         if skew.size:
             both = np.concatenate([lower + skew, lower - skew])
             self._matrix.data = np.take(both, self._in_both)
@@ -310,7 +397,9 @@ class Submatrix:
 
 
 def whole(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
-    """The matrix (3n, 3n) of symmetric part `lower` (m,) and skew part `skew`, (m,) or (0,)."""
+    """Return the sparse matrix (3n, 3n) of the symmetric part `lower` (m,) and the skew
+    part `skew`, (m,) or (0,).
+    """
     matrix = pattern.matrix(lower)
     if skew.size:
         matrix.data += skew_values(pattern, skew)
@@ -324,9 +413,14 @@ def adding_skew(
     top: int = 0,
     by_velocity: bool = False,
 ) -> BlockBand:
-    """What adds skew parts, as `skew_values` has them, where these blocks have symmetric ones.
+    """Return the structure that adds skew parts to the entries of blocks of symmetric parts.
 
-    The slope by the velocity has none unless told.
+    Fill it with values in the order of `skew_values`. Other arguments as in `BlockBand`.
+
+    Parameters
+    ----------
+    by_velocity : bool
+        Whether the derivative by the velocity has a skew part too; if not, its terms are zero.
     """
     own = [
         replace(

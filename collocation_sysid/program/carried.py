@@ -1,7 +1,9 @@
-"""What a program has as variables, with an equation each, that follows from its other variables.
+"""Lifted variables: variables of the program that follow from the others, each with an equation.
 
-The equations come after all rows of the program given, the variables after all of its variables.
-Most are patterns, see `pattern_rows`: to be carried is to declare them.
+By default they are eliminated; `Collocation.explicit` adds them so that exact matrices stay sparse.
+Their equations come after all other constraints, and the variables after all other variables.
+Subclass `Carried` to lift another quantity; most subclasses only declare `patterns` of small
+expressions, see `pattern_rows`.
 """
 
 from __future__ import annotations
@@ -22,7 +24,15 @@ from .segment import RowWeights, Segment, Weighed
 
 @dataclass(frozen=True)
 class Places:
-    """Where in z and g the variables and the equations of what is carried begin."""
+    """Offsets of a group of lifted variables in the program.
+
+    Attributes
+    ----------
+    variable : int
+        Index in z of its first variable.
+    row : int
+        Index in g of its first equation.
+    """
 
     variable: int
     row: int
@@ -30,17 +40,20 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Carried(ABC):
-    """Variables of one experiment and as many equations.
+    """A group of lifted variables of one experiment, and as many equations.
 
     Attributes
     ----------
     segment : Segment
+        Transcription of the experiment.
     number : int
-        Of the segment.
+        Index of the segment.
     first_phi : int
-        Where in z the φ of all experiments begin.
+        Index in z where the nuisance parameters of all experiments begin.
     places : Places
-    called : what it belongs to: "memory", "force" or "wrench"
+        Offsets of the variables and equations.
+    called : {"memory", "force", "pressure", "wrench"}
+        Kind of quantity.
     """
 
     segment: Segment
@@ -52,31 +65,31 @@ class Carried(ABC):
     @property
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Of the variables, and of the equations."""
+        """Shape of the array of variables, and of that of the equations."""
 
     @property
     def count(self) -> int:
-        """Number of variables, and of equations."""
+        """Number of variables, which is that of the equations."""
         return int(np.prod(self.shape))
 
     @property
     def variables(self) -> slice:
-        """They in z."""
+        """Slice of the variables in z."""
         return slice(self.places.variable, self.places.variable + self.count)
 
     @property
     def rows(self) -> slice:
-        """Their equations in g."""
+        """Slice of the equations in g."""
         return slice(self.places.row, self.places.row + self.count)
 
     @property
     def after(self) -> Places:
-        """Where the next begins."""
+        """Offsets of the group that follows."""
         return Places(self.variables.stop, self.rows.stop)
 
     @property
     def phi_columns(self) -> Index:
-        """(k,) where in z the experiment's φ are."""
+        """Indices (k,) in z of the experiment's nuisance parameters."""
         return self.first_phi + self.segment.local.places - self.segment.nq
 
     @property
@@ -85,74 +98,104 @@ class Carried(ABC):
         return -np.inf
 
     def given(self, part: Part, z: Array) -> Part:
-        """The experiment with what it takes of these variables."""
+        """Return the part with those quantities replaced that these variables of z determine."""
         return part
 
     @abstractmethod
     def following(self, part: Part) -> Array:
-        """(count,) the variables as they follow from what the program given has."""
+        """Return the scaled variables (count,) that satisfy the equations at the part's
+        positions and parameters.
+        """
 
     @cached_property
     def patterns(self) -> tuple[Pattern, ...]:
-        """What adds up to the equations; rows count from the first of these."""
+        """Expressions whose sum is the equations; row indices count from the group's first
+        equation.
+        """
         return ()
 
     def values(self, part: Part, z: Array) -> Array:
-        """(count,) the equations."""
+        """Return the scaled equations (count,) at the part and z."""
         return np.sum([pattern.values(z, self.count) for pattern in self.patterns], axis=0)
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Rows and columns of the further entries of ∂g/∂z, in the order of their values."""
+        """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
+        values.
+        """
         rows, columns = together(pattern.jacobian_entries() for pattern in self.patterns)
         return self.places.row + rows, columns
 
     def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
-        """The equations, and the values of these entries."""
-        found = [pattern.jacobian_values(z, self.count) for pattern in self.patterns]
-        values, slopes = zip(*found, strict=True)
+        """Return the equations (count,), and the values of `jacobian_entries`."""
+        evaluated = [pattern.jacobian_values(z, self.count) for pattern in self.patterns]
+        values, slopes = zip(*evaluated, strict=True)
         return np.sum(values, axis=0), np.concatenate(slopes)
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """The same of the upper triangle of the Lagrangian's Hessian."""
+        """Return rows and columns of the additional entries of the Lagrangian's Hessian,
+        upper triangle.
+        """
         return together(pattern.hessian_entries() for pattern in self.patterns)
 
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
-        """The values of these entries; multipliers are those of all of g."""
+        """Return the values of `hessian_entries`.
+
+        Parameters
+        ----------
+        part : Part
+            The experiment at z.
+        z : array
+            All variables of the program.
+        loss_weight : float
+            Factor of the loss.
+        multipliers : array
+            Multipliers of all constraints g.
+        weights : RowWeights
+            Weights of the experiment's constraints and forces.
+        """
         own = multipliers[self.rows]
-        found = [pattern.hessian_values(z, own) for pattern in self.patterns]
-        return np.concatenate([np.zeros(0), *found])
+        blocks = [pattern.hessian_values(z, own) for pattern in self.patterns]
+        return np.concatenate([np.zeros(0), *blocks])
 
     # What the loss has of the variables ---------------------------------------------------------
 
     def gradient(self, part: Part) -> Array:
-        """∂loss by them (count,)."""
+        """Return the gradient of the loss by these variables (count,)."""
         return np.zeros(self.count)
 
     # What multipliers weigh ---------------------------------------------------------------------
 
     def row_weights(self, multipliers: Array) -> Array | float:
-        """(N, 3n) derivative of multipliers · its equations by what c has in newtons."""
+        """Return the derivative (N, 3n) of multipliers · equations by the residual c in
+        newtons [1/N]; 0 if there is none.
+        """
         return 0.0
 
     @property
     def history(self) -> int | None:
-        """Which of the histories of the motion it is, if any."""
+        """Index of the history among those of the motion, or None if the group is no history."""
         return None
 
     def weighed(self, part: Part, multipliers: Array) -> Weighed:
-        """That history, and what each h_k counts in multipliers · its equations."""
+        """Return the history, and the weights of each h_k in multipliers · equations.
+
+        Raises
+        ------
+        NotImplementedError
+            If the group is no history.
+        """
         raise NotImplementedError
 
     @property
     def nonzeros(self) -> tuple[int, int]:
-        """How many further entries Jacobian and Hessian have."""
+        """Numbers of additional entries of the Jacobian and of the Hessian."""
         return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
 
 
 def together(parts: Iterable[tuple[Index, Index]]) -> tuple[Index, Index]:
-    """Rows and columns of all."""
+    """Concatenate rows, and columns, of several groups of entries; no group gives empty arrays."""
     none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     rows, columns = zip(none, *parts, strict=True)
     return np.concatenate(rows), np.concatenate(columns)

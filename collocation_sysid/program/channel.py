@@ -1,9 +1,11 @@
-"""What can be looked at of a moving body, and how it follows positions and parameters.
+"""Observables of a moving body: quantities that measurements are functions of, with their
+derivatives.
 
-A channel has values c (n, e, 3) at the first n of its times: places on the body, here, or the force
-and torque that a grasp gives, see `wrench_channel`. Between them and a residual stand a few lines,
-see `reading`. What is `local` depends on few positions at each time, and tells its slopes and
-curvature by them; of others programs have the values among their variables.
+An observable has values c (n, e, 3) at n of the grid times: positions of e points of the body
+(`Points`, here), or force and torque of a grasp (`wrench_channel.GraspWrench`). `reading` turns
+them into residuals. An observable is `local` if it depends on few positions at each time; then it
+provides derivatives by these positions. Other observables can be lifted to variables of the
+program, see `carried`.
 """
 
 from __future__ import annotations
@@ -23,13 +25,16 @@ from .charts import Chart, ShapeFunctions
 
 @dataclass(frozen=True, eq=False)
 class Forced:
-    """The reactions on the sensed dofs of the first grid rows.
+    """Reaction forces on the sensed dofs at the first grid times.
 
     Attributes
     ----------
-    reaction : (N, g) R of each row [N]
-    position_m : (N, g) where the dofs are
-    reaction_by, position_by : (N, g, c) their changes, where these are wanted
+    reaction : (N, g) array
+        Reaction forces R [N].
+    position_m : (N, g) array
+        Positions of the dofs [m].
+    reaction_by, position_by : (N, g, c) arrays or None
+        Their changes with c columns; None where they are not needed.
     """
 
     reaction: Array
@@ -40,15 +45,16 @@ class Forced:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion as channels look at it.
+    """A motion as observables use it.
 
     Attributes
     ----------
-    x : (rows, 3n) positions, of the first rows of the grid
+    x : (rows, 3n) array
+        Positions of the first grid times [m].
     forces : callable
-        Tells the reactions there.
-    by : (R, p, c), optional
-        How what the channel's operator takes of x changes; by nothing, where it is left out.
+        Returns the reaction forces; called at most once.
+    by : (R, p, c) array or None
+        Changes with c columns of the observable's operator applied to x; None means no change.
     """
 
     x: Array
@@ -57,15 +63,25 @@ class Motion:
 
     @cached_property
     def forced(self) -> Forced:
-        """The reactions."""
+        """Reaction forces, computed on first use."""
         return self.forces()
 
 
 class Slopes(NamedTuple):
-    """How the values of a channel change.
+    """Derivatives of the values c (n, e, 3) of an observable.
 
-    by : (n, e, 3, c) by the parameters at `columns` (c,)
-    own : (n, E, 3, k) of some `entities` (E,) by the φ at `places` (E, k), which only they have
+    Attributes
+    ----------
+    columns : (c,) array
+        Indices of the common parameters.
+    by : (n, e, 3, c) array
+        Derivatives by the common parameters.
+    entities : (E,) array
+        Indices of points that have parameters of their own.
+    places : (E, k) array
+        Indices in φ of these parameters.
+    own : (n, E, 3, k) array
+        Derivatives of these points by them.
     """
 
     columns: Index
@@ -76,13 +92,23 @@ class Slopes(NamedTuple):
 
     @classmethod
     def along(cls, columns: Index, by: Array) -> Slopes:
-        """Those without φ of their own."""
+        """Build derivatives (n, e, 3, c) by the parameters at `columns` (c,) alone."""
         none = np.zeros(0, dtype=np.int64)
         return cls(columns, by, none, none.reshape(0, 0), by[:, :0, :, :0])
 
 
 class Pulled(NamedTuple):
-    """Slopes of a scalar by x (N, 3n), by the reactions (N, g) if any, and by φ (k,)."""
+    """Derivatives of a scalar by positions, reaction forces and nuisance parameters.
+
+    Attributes
+    ----------
+    by_x : (N, 3n) array
+        Derivatives by the positions [1/m].
+    by_reaction : (N, g) array or None
+        Derivatives by the reaction forces [1/N]; None if it does not depend on them.
+    by_phi : (k,) array
+        Derivatives by φ.
+    """
 
     by_x: Array
     by_reaction: Array | None
@@ -90,7 +116,7 @@ class Pulled(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """Entries of a sparse matrix; those at the same place are summed."""
+    """Entries of a sparse matrix; values with the same row and column are summed."""
 
     rows: Index
     columns: Index
@@ -99,14 +125,18 @@ class Entries(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Places X on the body, h(x_t) = Σ_a N_a(X) x_{t,a}.
+    """Positions of points X of the body, h(x_t) = Σ_a N_a(X) x_{t,a}, as an observable.
 
     Attributes
     ----------
-    rows : (T,) grid rows
+    rows : (T,) array
+        Grid times.
     chart : Chart
-        Where they are.
-    places : (e, k) positions in φ of those that are estimated; −1 of exact ones
+        Elements of the points.
+    places : (e, k) array
+        Indices in φ of the estimated coordinates of X; −1 for points that are exact.
+    late : int
+        Number of grid times after which a value is known; 0.
     """
 
     rows: Index
@@ -117,12 +147,14 @@ class Points:
 
     @property
     def local(self) -> Points:
-        """Itself."""
+        """The observable itself, because it depends on few positions (None for observables
+        that do not).
+        """
         return self
 
     @property
     def is_linear(self) -> bool:
-        """Whether its slopes are always the same."""
+        """Whether its derivatives are constant."""
         return not len(self.chart.estimated)
 
     @property
@@ -132,49 +164,68 @@ class Points:
 
     @property
     def each(self) -> int:
-        """Number of places."""
+        """Number of points."""
         return len(self.chart.given_m)
 
     @property
     def node_count(self) -> int:
-        """Of the body."""
+        """Number of nodes of the body."""
         return len(self.chart.body.nodes_m)
 
     def shape(self, phi: Array) -> tuple[Index, ShapeFunctions]:
-        """Nodes (e, npe), and with what weights they count, at φ."""
+        """Return the nodes (e, npe) of each point and their shape functions at φ (k,)."""
         return self.chart.reading(np.append(phi, 0.0)[self.places])
 
     def operator(self, phi: Array) -> sp.csr_array:
-        """H as a (3e, 3n) matrix at φ; row 3 m + axis, column 3 node + axis."""
+        """Return the matrix H (3e, 3n) from positions to points at φ (k,); row 3 m + axis,
+        column 3 node + axis.
+        """
         nodes, shape = self.shape(phi)
         return operator_of(nodes, shape.weights, self.node_count)
 
     def _combined(self, x: Array, nodes: Index, weights: Array) -> Array:
-        """Σ_a weights[m, a, …] x_a at the rows that are there, (R, m, 3, …)."""
+        """Return Σ_a weights[m, a, …] x_a for the known grid times, (R, m, 3, …)."""
         rows = self.rows[self.rows < len(x)]
         at = x[rows].reshape(len(rows), -1, 3)[:, nodes]
         return np.einsum("ma...,tmai->tmi...", weights, at)
 
     def _by_place(self, x: Array, shape: tuple[Index, ShapeFunctions]) -> Array:
-        """(R, estimated, 3, k) slopes by their own places."""
-        (nodes, functions), here = shape, self.chart.estimated
-        if not len(here):
+        """Return the derivatives (R, estimated, 3, k) of estimated points by their own
+        coordinates.
+        """
+        nodes, functions = shape
+        estimated = self.chart.estimated
+        if not len(estimated):
             return np.zeros((len(self.rows), 0, 3, self.places.shape[1]))
-        return self._combined(x, nodes[here], functions.slopes[here])
+        return self._combined(x, nodes[estimated], functions.slopes[estimated])
 
     def values(self, motion: Motion, phi: Array) -> Array:
-        """(R, e, 3) [m]."""
+        """Return the positions (R, e, 3) of the points in a motion [m], at those times that
+        the motion covers.
+        """
         return self.of(motion.x, phi)
 
     def of(self, x: Array, phi: Array) -> Array:
-        """The same of the first rows x (rows, 3n)."""
+        """Return the positions (R, e, 3) of the points [m] for the first rows x (rows, 3n)."""
         nodes, shape = self.shape(phi)
         return self._combined(x, nodes, shape.weights)
 
     def linearised(
         self, motion: Motion, phi: Array, columns: Index, size: int
     ) -> tuple[Array, Slopes]:
-        """The same with slopes."""
+        """Return the values (R, e, 3) and their derivatives.
+
+        Parameters
+        ----------
+        motion : Motion
+            The motion, with its changes `by` (R, 3e, c).
+        phi : (k,) array
+            Nuisance parameters.
+        columns : (c,) array
+            Indices of the parameters of the changes among all parameters.
+        size : int
+            Number of all parameters; not used here.
+        """
         values = self.values(motion, phi)
         by = np.zeros((len(values), 3 * self.each, 0)) if motion.by is None else motion.by
         return values, self.slopes_of(motion.x, self.shape(phi), columns, by)
@@ -182,13 +233,28 @@ class Points:
     def slopes_of(
         self, x: Array, shape: tuple[Index, ShapeFunctions], columns: Index, by: Array
     ) -> Slopes:
-        """Slopes of the values, H x changing by (R, 3e, c) with the parameters at `columns`."""
-        here, by = self.chart.estimated, by.reshape(len(by), self.each, 3, by.shape[2])
-        return Slopes(columns, by, here, self.places[here], self._by_place(x, shape))
+        """Return the derivatives of the values if H x changes by (R, 3e, c) with the
+        parameters at `columns`.
+        """
+        estimated = self.chart.estimated
+        by = by.reshape(len(by), self.each, 3, by.shape[2])
+        return Slopes(columns, by, estimated, self.places[estimated], self._by_place(x, shape))
 
     def pulled(self, motion: Motion, phi: Array, by_values: Array) -> Pulled:
-        """Slopes of a scalar from those by the values."""
-        by_x, by_phi, here = np.zeros_like(motion.x), np.zeros(len(phi)), self.chart.estimated
+        """Vector–Jacobian product: derivatives of a scalar from those by the values.
+
+        Parameters
+        ----------
+        motion : Motion
+            The motion, over all grid times.
+        phi : (k,) array
+            Nuisance parameters.
+        by_values : (R, e, 3) array
+            Derivatives of the scalar by the values.
+        """
+        by_x = np.zeros_like(motion.x)
+        by_phi = np.zeros(len(phi))
+        here = self.chart.estimated
         flat = by_values.reshape(len(by_values), -1)
         by_x[self.rows] = (self.operator(phi).T @ flat.T).T
         if len(here):
@@ -201,35 +267,46 @@ class Points:
     def carried(
         self, grasp: Grasp, motion: Motion, phi: Array, shifts: Array, turns: Array
     ) -> Array | float:
-        """Nothing: places are those of the body."""
+        """Return the changes of the values due to sensor frames moved by pose errors: 0 for points
+        of the body.
+
+        The signature is that of `GraspWrench.carried`.
+        """
         return 0.0
 
     # By (x, φ) --------------------------------------------------------------------------------
 
     @cached_property
     def _corners(self) -> tuple[Index, Index]:
-        """Places, and corners of their elements, that a value can depend on, both (w,)."""
+        """Point and corner of its element, both (w,), for each node that a value can depend on."""
         reads = self.chart.weights != 0
         reads[self.chart.estimated] = True
         marker, corner = np.nonzero(reads)
         return marker, corner
 
     def _slope_entries(self, variables: int, size: int) -> tuple[Index, Index]:
-        """Rows and columns of ∂(c, φ)/∂(x, φ), in the order of `slopes`; all x before all φ."""
+        """Return rows and columns of ∂(c, φ)/∂(x, φ) in the order of `slopes`; all x
+        precede all φ.
+        """
         nodes, _ = self.shape(np.zeros(size))
-        (marker, corner), axes, dofs = self._corners, np.arange(3), 3 * self.node_count
+        marker, corner = self._corners
+        axes = np.arange(3)
+        dofs = 3 * self.node_count
         first = 3 * self.each * np.arange(self.count)[:, None, None]
-        here = self.chart.estimated
+        estimated = self.chart.estimated
         row_place = np.broadcast_to(
-            first[..., None] + 3 * here[:, None, None] + axes[:, None],
-            (self.count, len(here), 3, self.places.shape[1]),
+            first[..., None] + 3 * estimated[:, None, None] + axes[:, None],
+            (self.count, len(estimated), 3, self.places.shape[1]),
         )
         pairs = (
             (
                 first + 3 * marker[:, None] + axes,
                 (self.rows * dofs)[:, None, None] + 3 * nodes[marker, corner][:, None] + axes,
             ),
-            (row_place, np.broadcast_to(variables + self.places[here][:, None], row_place.shape)),
+            (
+                row_place,
+                np.broadcast_to(variables + self.places[estimated][:, None], row_place.shape),
+            ),
             (3 * self.each * self.count + np.arange(size), variables + np.arange(size)),
         )
         rows, columns = zip(*pairs, strict=True)
@@ -238,40 +315,67 @@ class Points:
         )
 
     def slopes(self, x: Array | None, phi: Array, variables: int) -> sp.csr_array:
-        """∂(c, φ)/∂(x, φ), x (N, 3n) being so many variables; its structure without x."""
-        size, here = len(phi), self._slope_entries(variables, len(phi))
+        """Return the sparse matrix ∂(c, φ)/∂(x, φ).
+
+        Parameters
+        ----------
+        x : (N, 3n) array or None
+            Positions [m]; None gives the structure, with ones.
+        phi : (k,) array
+            Nuisance parameters.
+        variables : int
+            Number of positions N · 3n.
+        """
+        size = len(phi)
+        entries = self._slope_entries(variables, len(phi))
         if x is None:
-            values = np.ones(len(here[0]))
+            values = np.ones(len(entries[0]))
         else:
             nodes, shape = self.shape(phi)
             weights = shape.weights[self._corners][:, None]
             of_x = np.broadcast_to(weights, (self.count, len(weights), 3))
             own = self._by_place(x, (nodes, shape))
             values = np.concatenate([of_x.ravel(), own.ravel(), np.ones(size)])
-        whole = 3 * self.each * self.count + size
-        return sp.csr_array((values, here), shape=(whole, variables + size))
+        row_count = 3 * self.each * self.count + size
+        return sp.csr_array((values, entries), shape=(row_count, variables + size))
 
     def curvature(self, x: Array, phi: Array, by_values: Array, variables: int) -> Entries:
-        """Σ by_values · ∂²c/∂(x, φ)², upper triangle: it bends by places that are estimated."""
-        here, (nodes, shape) = self.chart.estimated, self.shape(phi)
-        weights, dofs = by_values[:, here], 3 * self.node_count
-        dof = 3 * nodes[here][:, :, None] + np.arange(3)  # (m, a, axis)
+        """Return Σ by_values · ∂²c/∂(x, φ)², upper triangle; non-zero for estimated points only.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        phi : (k,) array
+            Nuisance parameters.
+        by_values : (T, e, 3) array
+            Weights.
+        variables : int
+            Number of positions N · 3n.
+        """
+        estimated = self.chart.estimated
+        nodes, shape = self.shape(phi)
+        weights = by_values[:, estimated]
+        dofs = 3 * self.node_count
+        dof = 3 * nodes[estimated][:, :, None] + np.arange(3)  # (m, a, axis)
         row = self.rows[:, None, None, None, None] * dofs + dof[..., None]
-        column = variables + self.places[here]
-        value = np.einsum("tmi,mak->tmaik", weights, shape.slopes[here])
+        column = variables + self.places[estimated]
+        value = np.einsum("tmi,mak->tmaik", weights, shape.slopes[estimated])
         rows, columns = np.broadcast_arrays(row, column[:, None, None])
-        bent = self._combined(x, nodes[here], shape.curvatures[here])
-        bent = np.einsum("tmi,tmikl->mkl", weights, bent)
-        kept = np.nonzero(np.broadcast_to(np.triu(np.ones(bent.shape[1:])), bent.shape))
+        by_coordinates = self._combined(x, nodes[estimated], shape.curvatures[estimated])
+        by_coordinates = np.einsum("tmi,tmikl->mkl", weights, by_coordinates)
+        upper = np.nonzero(
+            np.broadcast_to(np.triu(np.ones(by_coordinates.shape[1:])), by_coordinates.shape)
+        )
         return Entries(
-            np.concatenate([rows.ravel(), column[kept[0], kept[1]]]),
-            np.concatenate([columns.ravel(), column[kept[0], kept[2]]]),
-            np.concatenate([value.ravel(), bent[kept]]),
+            np.concatenate([rows.ravel(), column[upper[0], upper[1]]]),
+            np.concatenate([columns.ravel(), column[upper[0], upper[2]]]),
+            np.concatenate([value.ravel(), by_coordinates[upper]]),
         )
 
 
 def operator_of(nodes: Index, weights: Array, node_count: int) -> sp.csr_array:
-    """Readings Σ_a weights[m, a] x_a as a (3M, 3n) matrix; row 3 m + axis, column 3 node + axis."""
+    """Return the matrix (3M, 3n) of Σ_a weights[m, a] x_a; row 3 m + axis, column 3 node + axis."""
     marker = np.repeat(np.arange(len(nodes)), nodes.shape[1])
     per_node = sp.csr_array(
         (weights.ravel(), (marker, nodes.ravel())), shape=(len(nodes), node_count)

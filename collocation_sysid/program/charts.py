@@ -1,8 +1,11 @@
-"""Where a recording is read: an element for each marker's place, and the clock's whole samples.
+"""Marker–element association: the element of each marker's place, and the whole samples of the
+clock.
 
-The place X of a marker on the undeformed body, and the time shift τ, are estimated. What a marker
-reads is smooth in them within one element and around one sample; a chart says which. As estimates
-move on, the chart follows, and the problem stays the same up to the tolerance below.
+The place X of a marker on the undeformed body and the shift τ of its clock are estimated.
+Predictions are smooth functions of them within one element and around one sample; a `Chart` states
+which. When estimates leave it, `Chart.following` returns another chart, and the problem stays the
+same up to the tolerances below. A chart also contains the surface correspondences of depth cameras,
+see `sighting`.
 """
 
 from __future__ import annotations
@@ -21,16 +24,25 @@ from .sighting import Sighting, sightings_of
 
 # A place leaves its element when another holds it better by this, in barycentric coordinates: so
 # it cannot swing between two. The clock leaves its sample when it is off by more than this.
-BETTER, SAMPLES_OFF = 0.01, 1.0
+BETTER = 0.01
+SAMPLES_OFF = 1.0
 # A place that leaves the surface across an edge where it did before, so many times more, keeps to
 # the plane it is in. What is nearer than this, over an edge of the mesh, is the same.
-AGAIN, SAME = 2, 1e-6
+AGAIN = 2
+SAME = 1e-6
 
 
 class ShapeFunctions(NamedTuple):
-    """Weights of the nodes in what each marker reads, and their derivatives by its φ.
+    """Weights of the nodes in the place of each marker, and their derivatives by its φ.
 
-    weights (M, npe), slopes (M, npe, k), curvatures (M, npe, k, k)
+    Attributes
+    ----------
+    weights : (M, npe) array
+        Shape functions, npe being the nodes per element.
+    slopes : (M, npe, k) array
+        First derivatives.
+    curvatures : (M, npe, k, k) array
+        Second derivatives.
     """
 
     weights: Array
@@ -40,26 +52,35 @@ class ShapeFunctions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """The element of each marker, the plane it may move in, and the clock's sample.
+    """Element of each marker, directions in which its place may move, and the clock's sample.
 
     Attributes
     ----------
     body : Body
-    sigma_m : (M,) deviation of each place, zero where it is exact
-    given_m : (M, 3) the places that the priors are about
+        The body.
+    sigma_m : (M,) array
+        Prior standard deviation of each place [m], zero where it is exact.
+    given_m : (M, 3) array
+        Places at the centres of the priors [m].
     on_surface : bool
-        Places move in the plane of the nearest face, k = 2; freely otherwise, k = 3.
-    nodes, weights : (M, npe) of the exact ones
-    cells : (M,) elements
-    points_m : (M, 3) places that the chart is about
-    axes : (M, 3, k) orthonormal directions that places may move in
+        Whether places move in the plane of the nearest face (k = 2) or freely (k = 3).
+    nodes, weights : (M, npe) arrays
+        Nodes and shape functions of exact places.
+    cells : (M,) array
+        Elements of estimated places.
+    points_m : (M, 3) array
+        Places at the centre of the chart [m].
+    axes : (M, 3, k) array
+        Orthonormal directions in which places may move.
+    crossed : (M, 2, 3) array
+        Point and direction of the edge across which each place last left the surface; NaN if it did
+        not.
+    again : (M,) array
+        How often in succession it left the surface across this edge before.
     samples : int
-        Whole samples of the time shift.
+        Whole samples of the clock's shift.
     sightings : tuple of Sighting
-        Where the points of depth cameras are on the surface.
-    crossed : (M, 2, 3) a point and the direction of the edge that each place last left the surface
-        across, NaN where it did not
-    again : (M,) how often it left there before
+        Surface correspondences of depth cameras.
     """
 
     body: Body
@@ -78,9 +99,14 @@ class Chart:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Chart:
-        """The chart about the places given, or where the first samples put the markers."""
-        body, markers = experiment.body, experiment.markers
-        placement, sigma_m = markers.placement, experiment.place_sigma_m
+        """Build the chart of the stated places of an experiment's markers and depth cameras.
+
+        Places that are not stated are NaN until `Segment.placed` initialises them.
+        """
+        body = experiment.body
+        markers = experiment.markers
+        placement = markers.placement
+        sigma_m = experiment.place_sigma_m
         points = markers.observe(body.nodes_m)
         k = 2 if markers.on_surface else 3
         chart = cls(
@@ -101,7 +127,7 @@ class Chart:
 
     @classmethod
     def exact(cls, body: Body, placement: Placement, points_m: Array) -> Chart:
-        """The chart of places that are not estimated."""
+        """Build the chart of places (M, 3) [m] that are not estimated."""
         count = len(points_m)
         none = np.zeros(count, dtype=np.int64)
         return cls(
@@ -119,7 +145,9 @@ class Chart:
         )
 
     def suits(self, experiment: Experiment) -> bool:
-        """Whether it is of this body, and of places known as well as the experiment's."""
+        """Whether the chart belongs to the experiment's body, and has the same priors and
+        cameras.
+        """
         return (
             self.body is experiment.body
             and self.on_surface == experiment.markers.on_surface
@@ -129,53 +157,63 @@ class Chart:
 
     @cached_property
     def estimated(self) -> Index:
-        """Markers whose places are not exact."""
+        """Indices of the markers whose places are estimated."""
         return np.flatnonzero(self.sigma_m > 0)
 
     @cached_property
     def centre(self) -> Array:
-        """(M, k) φ at the chart's points."""
+        """Coordinates φ (M, k) of the places at the centre of the chart."""
         return self._coordinates(self.points_m)
 
     def _coordinates(self, points_m: Array) -> Array:
+        """Return φ (M, k) of places (M, 3) [m]; zero for exact places."""
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
         return np.einsum("mik,mi->mk", self.axes, points_m - self.given_m) / sigma
 
     def places_m(self, phi: Array) -> Array:
-        """(M, 3) places on the undeformed body at φ (M, k)."""
+        """Return the places (M, 3) on the undeformed body at φ (M, k) [m]."""
         moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre)
         return self.points_m + self.sigma_m[:, None] * moved
 
     def reading(self, phi: Array) -> tuple[Index, ShapeFunctions]:
-        """Nodes (M, npe) that each marker reads, and with what weights, at φ (M, k)."""
-        element, k = self.body.element, self.axes.shape[2]
-        nodes, weights = self.nodes.copy(), self.weights.copy()
+        """Return the nodes (M, npe) of each marker's element and their shape functions at φ
+        (M, k).
+        """
+        element = self.body.element
+        k = self.axes.shape[2]
+        nodes = self.nodes.copy()
+        weights = self.weights.copy()
         slopes = np.zeros((*nodes.shape, k))
         curvatures = np.zeros((*nodes.shape, k, k))
-        here = self.estimated
-        if len(here):
-            cells = self.cells[here]
-            local = self._shape.barycentric(self.places_m(phi)[here], cells)
-            along = self._shape.gradients(cells) @ (
-                self.sigma_m[here, None, None] * self.axes[here]
+        estimated = self.estimated
+        if len(estimated):
+            cells = self.cells[estimated]
+            local = self._shape.barycentric(self.places_m(phi)[estimated], cells)
+            gradients = self._shape.gradients(cells) @ (
+                self.sigma_m[estimated, None, None] * self.axes[estimated]
             )
-            nodes[here] = self.body.cells[cells]
-            weights[here] = element.shape_functions(local)
-            slopes[here] = element.shape_gradients(local) @ along
-            curvatures[here] = np.einsum(
-                "mail,mik,mln->makn", _second_derivatives(element, local), along, along
+            nodes[estimated] = self.body.cells[cells]
+            weights[estimated] = element.shape_functions(local)
+            slopes[estimated] = element.shape_gradients(local) @ gradients
+            curvatures[estimated] = np.einsum(
+                "mail,mik,mln->makn", _second_derivatives(element, local), gradients, gradients
             )
         return nodes, ShapeFunctions(weights, slopes, curvatures)
 
     @cached_property
     def _shape(self) -> Shape:
+        """Geometry of the undeformed body."""
         return Shape(self.body.nodes_m, self.body)
 
     # Following the estimates ------------------------------------------------------------------
 
     def about(self, points_m: Array) -> Chart:
-        """The chart about places (M, 3); on a surface they move to its nearest point."""
-        points, cells, axes = points_m.copy(), self.cells.copy(), self.axes.copy()
+        """Return the chart with its centre at places (M, 3) [m]; with `on_surface` at the
+        nearest points of the surface.
+        """
+        points = points_m.copy()
+        cells = self.cells.copy()
+        axes = self.axes.copy()
         for m in self.estimated:
             if self.on_surface:
                 points[m], axes[m] = self._shape.on_surface(points[m])
@@ -185,35 +223,47 @@ class Chart:
         return replace(self, points_m=points, cells=cells, axes=axes)
 
     def following(self, phi: Array, shift_samples: float) -> tuple[Chart, Array]:
-        """A chart for estimates that have left this one, and φ (M, k) in it; itself where none has.
+        """Return a chart for estimates that have left this one, and φ in it.
 
         Parameters
         ----------
-        phi : (M, k) of the places
-        shift_samples : float, the time shift over the sample interval
+        phi : (M, k) array
+            Coordinates of the places.
+        shift_samples : float
+            Shift of the clock over the sample interval.
+
+        Returns
+        -------
+        (Chart, (M, k) array)
+            The new chart, which is self if nothing has left it, and φ in it.
         """
-        points, left = self.places_m(phi), False
+        points = self.places_m(phi)
+        has_left = False
         for m in self.estimated:
-            left = left or self._has_left(points[m], int(self.cells[m]))
+            has_left = has_left or self._has_left(points[m], int(self.cells[m]))
         samples = self.samples
         if abs(shift_samples - samples) > SAMPLES_OFF:
             samples = round(shift_samples)
-        if not left:
+        if not has_left:
             return (self if samples == self.samples else replace(self, samples=samples)), phi
         chart = replace(self._settled(points), samples=samples)
         return chart, chart.centre
 
     def _settled(self, points_m: Array) -> Chart:
-        """The chart about places (M, 3), of which none alternates between two faces for ever.
+        """Return the chart about places (M, 3) such that none alternates between two faces for
+        ever.
 
-        Beyond an edge, as of a marker that stands off it, the plane of each face may lead back to
-        the other. Such a place stays in one of the planes, also where that has left the surface.
+        Where a marker stands off an edge, the plane of each face may lead back to the other. Such a
+        place stays in one of the planes, even outside the surface.
         """
-        found = self.about(points_m)
+        centred = self.about(points_m)
         if not self.on_surface:
-            return found
-        points, axes, cells = found.points_m.copy(), found.axes.copy(), found.cells.copy()
-        crossed, again = self.crossed.copy(), self.again.copy()
+            return centred
+        points = centred.points_m.copy()
+        axes = centred.axes.copy()
+        cells = centred.cells.copy()
+        crossed = self.crossed.copy()
+        again = self.again.copy()
         same_m = SAME * self._shape.mean_edge_m
         for m in self.estimated:
             beyond = points_m[m] - points[m]
@@ -223,11 +273,17 @@ class Chart:
                 again[m] = again[m] + 1 if off_m < same_m else 0
                 crossed[m] = points[m], edge / np.linalg.norm(edge)
             if again[m] == AGAIN:
-                points[m], axes[m] = points_m[m], self.axes[m]
+                points[m] = points_m[m]
+                axes[m] = self.axes[m]
                 cells[m], _ = self._shape.cell_of(points_m[m])
-        return replace(found, points_m=points, axes=axes, cells=cells, crossed=crossed, again=again)
+        return replace(
+            centred, points_m=points, axes=axes, cells=cells, crossed=crossed, again=again
+        )
 
     def _has_left(self, point: Array, cell: int) -> bool:
+        """Whether another element contains a place better than element `cell`, by more than
+        `BETTER`; false for NaN.
+        """
         if not np.isfinite(point).all():
             return False
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
@@ -239,20 +295,34 @@ class Chart:
         return bool(depth[1] > depth[0] + BETTER)
 
     def at_markers(self, nodes_m: Array, points_m: Array) -> Array:
-        """(M, 3) places that lie at points (M, 3) of the body in some configuration (n, 3).
+        """Return the places (M, 3) on the undeformed body of points (M, 3) measured in another
+        configuration.
 
-        Where a point lies off that body, the nearest of its surface; NaN where it is not finite.
+        A point outside the body is projected onto its surface.
+
+        Parameters
+        ----------
+        nodes_m : (n, 3) array
+            Node positions of the configuration [m].
+        points_m : (M, 3) array
+            Points [m].
+
+        Returns
+        -------
+        (M, 3) array
+            Places [m]; NaN where a point is not finite.
         """
-        shape, found = Shape(nodes_m, self.body), np.full(points_m.shape, np.nan)
+        shape = Shape(nodes_m, self.body)
+        places_m = np.full(points_m.shape, np.nan)
         for m, point in enumerate(points_m):
             if np.isfinite(point).all():
                 nodes, weights = shape.nearest(point)
-                found[m] = weights @ self.body.nodes_m[nodes]
-        return found
+                places_m[m] = weights @ self.body.nodes_m[nodes]
+        return places_m
 
 
 def _second_derivatives(element, local: Array) -> Array:
-    """∂²N/∂L² (m, npe, 4, 4): gradients are linear in L."""
+    """Return ∂²N/∂L² (m, npe, 4, 4) of shape functions whose gradients are linear in L."""
     at = element.shape_gradients(local)
     steps = [element.shape_gradients(local + unit) - at for unit in np.eye(4)]
     return np.stack(steps, axis=3)

@@ -1,4 +1,4 @@
-"""The collocation NLP: all node positions at all timesteps beside the parameters.
+"""Collocation program: node positions at all grid times and the parameters as unknowns.
 
     minimise   L(q, x, φ) = Σ ρ(‖(ŷ − y(x, φ)) / σ‖) + priors(q) + Σ φ²
     subject to c_{e,t,i}(x, θ(q), φ) = 0 for free dofs, x_{e,t,i} = u_t x̄_i for grasped ones.
@@ -6,15 +6,17 @@
 Variables z, in this order:
 
 =================  =========================================================================
-q                  of each estimated parameter, in the order of `Parameters.free`
+q                  estimated parameters, in the order of `Parameters.free`
 x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axis, the last
                    index fastest; ℓ_e is the mean edge length
-φ_e                nuisance parameters of experiment e, see `model.nuisance`; experiment by
-                   experiment, what several share with the first of them, see `program.sharing`
+φ_e                nuisance parameters of experiment e, see `model.nuisance`, experiment by
+                   experiment; shared ones are those of the first experiment that has them,
+                   see `program.sharing`
 =================  =========================================================================
 
-What bodies carry and what grasps give follows from these, or stands behind them with equations
-behind all others, see `Collocation.explicit`.
+Lifted variables (history variables, reaction forces, wrenches, contact pressures) are eliminated by
+default; with `Collocation.explicit` they follow at the end of z, and their equations at the end of
+g.
 
 Constraints g, in this order:
 
@@ -22,8 +24,9 @@ Constraints g, in this order:
 c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start in
                    equilibrium) or 1, free dofs i ascending; f_e is the mean of
                    |∂c_t/∂x_t| ℓ_e at the guess
-(x − u x̄) / ℓ_e    for dofs grasped for a while only, in place of c at those times; and with
-                   explicit grasps for all grasped ones, so that every dof has a row
+(x − u x̄) / ℓ_e    prescribed displacements, in place of c: of dofs grasped for a part of the
+                   time; with `explicit_grasps` of all grasped dofs, so that every dof has a
+                   constraint
 =================  =========================================================================
 """
 
@@ -52,13 +55,43 @@ from .sharing import locals_of, shared_charts
 
 
 def carried_over(z: Array, of: Collocation, to: Collocation) -> Array:
-    """Variables of a program as the same one has them that is explicit, or is not."""
+    """Convert the variables z of a program to those of the same program with or without lifted
+    variables.
+
+    Parameters
+    ----------
+    z : (variables,) array
+        Variables of the program `of`.
+    of : Collocation
+        The program that z belongs to.
+    to : Collocation
+        The same program, with or without lifted variables.
+
+    Returns
+    -------
+    (to.variables,) array
+        Variables; lifted ones follow from positions and parameters.
+    """
     return z if len(z) == to.variables else to.pack(*of.unpack(z))
 
 
 @dataclass(frozen=True)
 class Violation:
-    """One unsatisfied equation of motion."""
+    """Residual of one equation of motion.
+
+    Attributes
+    ----------
+    experiment : str
+        Name of the experiment.
+    time_s : float
+        Grid time [s].
+    node : int
+        Index of the node.
+    axis : str
+        "x", "y" or "z".
+    newtons : float
+        Residual [N].
+    """
 
     experiment: str
     time_s: float
@@ -75,34 +108,37 @@ class Violation:
 
 @dataclass(frozen=True, eq=False)
 class Collocation:
-    """Values and derivatives of the collocation NLP of one or several experiments.
+    """Values and derivatives of the collocation program of one or several experiments.
 
     Attributes
     ----------
     experiments : sequence of Experiment
-        They share the parameters; those for validation are left out.
+        Experiments with common parameters q; those for validation are left out.
     parameters : Parameters
+        Shared parameters.
     scheme : str or Scheme, default "midpoint"
+        Time discretisation.
     substeps : int, default 1
-        Grid steps between samples.
+        Grid steps between samples; static experiments have one.
     explicit_grasps : bool, default False
-        Grasped nodes as constraint rows instead of bounds.
+        If true, prescribed displacements are constraints instead of bounds.
     huber : float, optional
-        Huber's loss beyond this many standard deviations, see `Instrument`.
+        Threshold of Huber's loss in standard deviations, see `Instrument`; None means a quadratic
+        loss.
     charts : mapping of experiment name to Chart
-        Where recordings are read, see `charts`; where their markers start by default, and where
-        one is not of the experiment's body and places.
+        Elements, clock samples and correspondences of the measurements. Experiments that are
+        missing, or whose chart belongs to another body or other priors, get the chart of the stated
+        places.
     explicit : bool, default False
-        Whether what follows row by row are variables with equations of their own, see `carried`:
-        the memory of bodies, without which ∂g/∂z would be filled below the diagonal, and measured
-        wrenches, without which the loss would be one of all that moves around grasps. Matrices are
-        sparse then, and exact; eliminating it all leads back, with the same optimum and the same
-        multipliers of the other rows.
+        If true, keep history variables, measured wrenches and contact pressures as variables with
+        constraints (lifted variables, see `carried`), so that the exact matrices are sparse. If
+        false, they are eliminated. The optimum and the multipliers of the other constraints are the
+        same.
 
     Raises
     ------
     InputError
-        If nothing is to be fitted.
+        If all experiments are for validation, or an option is not positive.
     """
 
     experiments: Sequence[Experiment]
@@ -127,9 +163,10 @@ class Collocation:
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        """One of each experiment that is fitted."""
+        """Transcriptions of the experiments that are fitted."""
         fitted = [each for each in self.experiments if not each.validation]
-        options, found = (self.explicit_grasps, self.huber), list[Segment]()
+        options = (self.explicit_grasps, self.huber)
+        found = list[Segment]()
         for experiment, local in zip(fitted, locals_of(fitted, self.nq), strict=True):
             chart = self.charts.get(experiment.name)
             if chart is None or not chart.suits(experiment):
@@ -142,17 +179,19 @@ class Collocation:
 
     @cached_property
     def carried(self) -> tuple[Carried, ...]:
-        """What is among the variables behind all others, experiment by experiment."""
+        """Lifted variables, experiment by experiment; empty unless `explicit`."""
         if not self.explicit:
             return ()
         last = self.segments[-1].after
         return carried_by(self.segments, self.of_phi.start, Places(self.of_phi.stop, last.row))
 
     def made_explicit(self) -> Collocation:
-        """The same program with `explicit`; itself where nothing is carried or measured so."""
-        feels = any(len(s.sensed_dofs) for s in self.segments)
-        presses = any(s.dynamics.forces.pressing for s in self.segments)
-        if self.explicit or not (self.remembers or feels or presses):
+        """Return the program with lifted variables, or self if it has them already or
+        nothing can be lifted.
+        """
+        has_sensors = any(len(s.sensed_dofs) for s in self.segments)
+        has_complementarity = any(s.dynamics.forces.pressing for s in self.segments)
+        if self.explicit or not (self.remembers or has_sensors or has_complementarity):
             return self
         other = replace(self, explicit=True)
         vars(other)["segments"] = self.segments
@@ -160,37 +199,43 @@ class Collocation:
 
     @property
     def nq(self) -> int:
-        """Number of the shared parameters q."""
+        """Number of shared parameters q."""
         return len(self.parameters.free)
 
     @property
     def nphi(self) -> int:
-        """Number of the nuisance parameters φ, all together."""
+        """Number of nuisance parameters φ of all experiments; shared ones count once."""
         return int(np.concatenate(self.places).max(initial=self.nq - 1)) + 1 - self.nq
 
     @property
     def variables(self) -> int:
-        """Length of z."""
+        """Number of variables z."""
         return self.of_phi.stop + self.added()
 
     @property
     def constraints(self) -> int:
-        """Length of g."""
+        """Number of constraints g."""
         return self.segments[-1].after.row + self.added()
 
     def added(self, called: str | None = None) -> int:
-        """Number of the variables of what is carried, or is called so, and of their equations."""
+        """Return the number of lifted variables, which is also that of their equations.
+
+        Parameters
+        ----------
+        called : {"memory", "force", "pressure", "wrench"}, optional
+            Kind of lifted variables; None means all.
+        """
         return sum(each.count for each in self.carried if called in (None, each.called))
 
     @property
     def carried_nonzeros(self) -> tuple[int, int]:
-        """Entries that Jacobian and Hessian have for what is carried."""
+        """Numbers of entries of lifted variables in the Jacobian and in the Hessian."""
         both = [each.nonzeros for each in self.carried]
         return sum(each for each, _ in both), sum(each for _, each in both)
 
     @property
     def measurements(self) -> int:
-        """Scalar measurements that are present."""
+        """Number of scalar measurements that are compared."""
         return sum(
             int(reading.components.sum())
             for segment in self.segments
@@ -199,40 +244,55 @@ class Collocation:
 
     @property
     def loss_scale(self) -> float:
-        """What the objective has the loss multiplied by."""
+        """Factor of the loss in the objective: one over the number of measurements."""
         return 1.0 / max(1, self.measurements)
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
-        """Variables z from p = (q, φ_1, φ_2, …) and each experiment's positions (N, 3n) [m]."""
+        """Return the variables z.
+
+        Parameters
+        ----------
+        p : (nq + nphi,) array
+            Parameters (q, φ_1, φ_2, …).
+        positions : sequence of (N, 3n) arrays
+            Positions of each fitted experiment [m].
+
+        Returns
+        -------
+        (variables,) array
+            Scaled variables; lifted ones follow from positions and parameters.
+        """
         parts = self.parts_at(p, positions) if self.carried else []
         following = [each.following(parts[each.number]) for each in self.carried]
         return np.concatenate([self._packed(p, positions), *following])
 
     def _packed(self, p: Array, positions: Sequence[Array]) -> Array:
-        """Without what is carried."""
+        """Return z without lifted variables."""
         pairs = zip(self.segments, positions, strict=True)
         scaled = [np.ravel(x) / segment.length_m for segment, x in pairs]
         return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Parameters p and positions, as `pack` takes them."""
+        """Return the parameters p (nq + nphi,) and the positions (N, 3n) of each experiment
+        [m] from z.
+        """
         return self.parameters_of(z), [
             z[segment.columns].reshape(segment.grid_rows, segment.dofs) * segment.length_m
             for segment in self.segments
         ]
 
     def parameters_of(self, z: Array) -> Array:
-        """All estimated parameters p = (q, φ_1, φ_2, …)."""
+        """Return all estimated parameters p = (q, φ_1, φ_2, …) from z."""
         return np.concatenate([z[: self.nq], z[self.of_phi]])
 
     @property
     def of_phi(self) -> slice:
-        """The nuisance parameters in z."""
+        """Slice of the nuisance parameters in z."""
         first = self.segments[-1].after.x
         return slice(first, first + self.nphi)
 
     def parts(self, z: Array) -> list[Part]:
-        """Every experiment at z."""
+        """Return every experiment at the variables z, with lifted variables taken from z."""
         parts = self.parts_at(*self.unpack(z))
         for each in self.carried:
             parts[each.number] = each.given(parts[each.number], z)
@@ -240,16 +300,19 @@ class Collocation:
 
     @cached_property
     def places(self) -> list[Index]:
-        """Where the (q, φ) of each experiment are in p."""
+        """Indices of (q, φ) of each experiment in p."""
         return [segment.places for segment in self.segments]
 
     @property
     def threads(self) -> int:
-        """How many its bodies may use."""
+        """Number of threads that all bodies may use."""
         return min(segment.body.threads for segment in self.segments)
 
     def parts_at(self, p: Array, positions: Sequence[Array]) -> list[Part]:
-        """Every experiment at p and positions, or their first rows."""
+        """Return every experiment at parameters p and positions (N, 3n) [m], or their first rows.
+
+        Lifted quantities follow from positions and parameters.
+        """
         return [
             Part(segment, p[: self.nq], p[segment.local.places], x)
             for segment, x in zip(self.segments, positions, strict=True)
@@ -257,7 +320,9 @@ class Collocation:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each entry of p is: the parameters' names, then the nuisance parameters."""
+        """Name of each entry of p: the parameters' names, then the labels of the nuisance
+        parameters.
+        """
         found = [item.name for item in self.parameters.free] + [""] * self.nphi
         for segment in self.segments:
             for place, name in zip(segment.local.places, segment.nuisance.names, strict=True):
@@ -265,7 +330,11 @@ class Collocation:
         return tuple(found)
 
     def prior(self, p: Array) -> tuple[Array, Array]:
-        """Residuals of the priors at p, and their slopes; φ counts in its deviations."""
+        """Return residuals (nq + nphi,) of the priors at p and their derivatives, both in standard
+        deviations.
+
+        A parameter without a prior has the residual 0.
+        """
         residuals, slopes = self.parameters.prior(p[: self.nq])
         return (
             np.concatenate([residuals, p[self.nq :]]),
@@ -278,37 +347,61 @@ class Collocation:
         lower, upper = self.parameters.bounds_q
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
         for segment in self.segments:
-            here = segment.local.places - self.nq
+            indices = segment.local.places - self.nq
             least, most = segment.nuisance.limits(segment.chart.samples)
-            low[here], high[here] = np.maximum(low[here], least), np.minimum(high[here], most)
+            low[indices] = np.maximum(low[indices], least)
+            high[indices] = np.minimum(high[indices], most)
         return np.concatenate([lower, low]), np.concatenate([upper, high])
 
     # Where recordings are read ----------------------------------------------------------------
 
     def following(self, p: Array, positions: Sequence[Array] = ()) -> tuple[Collocation, Array]:
-        """The problem read where the estimates p are, and p in it; itself if they left no chart.
+        """Update the charts where the estimates p have left them.
 
-        Positions are the first rows that depth cameras need, none where there are none.
+        Parameters
+        ----------
+        p : (nq + nphi,) array
+            Parameters.
+        positions : sequence of (rows, 3n) arrays
+            First rows of each experiment [m], which depth cameras need; empty without depth
+            cameras.
+
+        Returns
+        -------
+        (Collocation, array)
+            The program with the new charts, which is self if no chart has changed, and p in it.
         """
         rows = positions or [np.zeros((0, segment.dofs)) for segment in self.segments]
         pairs = zip(self.segments, rows, strict=True)
-        found = [s.following(p[s.local.places], x) for s, x in pairs]
-        if all(chart is s.chart for (chart, _), s in zip(found, self.segments, strict=True)):
+        updates = [s.following(p[s.local.places], x) for s, x in pairs]
+        if all(chart is s.chart for (chart, _), s in zip(updates, self.segments, strict=True)):
             return self, p
-        return self._read_in([chart for chart, _ in found], p, [phi for _, phi in found])
+        return self._read_in([chart for chart, _ in updates], p, [phi for _, phi in updates])
 
     def placed(self, p: Array, positions: Sequence[Array]) -> tuple[Collocation, Array]:
-        """The problem with unknown places where first samples lie on the first rows of positions.
+        """Initialise unknown marker places and depth cameras before a solve, see `Segment.placed`.
 
-        That is where a solve starts; p has these places.
+        Parameters
+        ----------
+        p : (nq + nphi,) array
+            Parameters.
+        positions : sequence of (rows, 3n) arrays
+            First rows of each experiment [m].
+
+        Returns
+        -------
+        (Collocation, array)
+            The program with the new charts, which is self if everything is stated, and p in it.
         """
         if not any(segment.rows_to_place for segment in self.segments):
             return self, p
-        found = [part.segment.placed(part.phi, part.x) for part in self.parts_at(p, positions)]
-        return self._read_in([chart for chart, _ in found], p, [phi for _, phi in found])
+        updates = [part.segment.placed(part.phi, part.x) for part in self.parts_at(p, positions)]
+        return self._read_in([chart for chart, _ in updates], p, [phi for _, phi in updates])
 
     def placed_at(self, places_m: Sequence[Array]) -> Collocation:
-        """The problem read about places (M, 3) of each experiment's markers."""
+        """Return the program with charts about given marker places, (M, 3) for each
+        experiment [m].
+        """
         charts = [s.chart.about(m) for s, m in zip(self.segments, places_m, strict=True)]
         segments = [s.with_chart(c) for s, c in zip(self.segments, charts, strict=True)]
         return self._read_in(charts, self.guess_p, [s.guess_phi for s in segments])[0]
@@ -316,21 +409,25 @@ class Collocation:
     def _read_in(
         self, charts: Sequence[Chart], p: Array, phis: Sequence[Array]
     ) -> tuple[Collocation, Array]:
-        other, moved = copy(self), self._put_together(p[: self.nq], phis)
+        """Return the program with other charts, and p with the φ of each experiment in them."""
+        other = copy(self)
+        updated = self._put_together(p[: self.nq], phis)
         segments = _read_alike(self.segments, charts)
         by_name = {s.experiment.name: s.chart for s in segments}
         vars(other).update(charts=by_name, segments=segments)
         for stale in ("_hessian", "hessian_diagonals", "carried"):
             vars(other).pop(stale, None)
-        return other, moved
+        return other, updated
 
     @property
     def guess_p(self) -> Array:
-        """The guess of p; φ is zero, or where the charts are."""
+        """Guess of p: that of q, and φ at the centres of the charts."""
         return self._put_together(self.parameters.guess_q, [s.guess_phi for s in self.segments])
 
     def _put_together(self, q: Array, phis: Sequence[Array]) -> Array:
-        """P of the φ of each experiment; shared ones as the first has them."""
+        """Return p from q and the φ of each experiment; shared entries are those of the
+        first experiment.
+        """
         p = np.concatenate([q, np.zeros(self.nphi)])
         for segment, phi in reversed([*zip(self.segments, phis, strict=True)]):
             p[segment.local.places] = phi
@@ -338,11 +435,11 @@ class Collocation:
 
     @property
     def reach_p(self) -> Array:
-        """What a trust region of one allows each entry of p."""
+        """Scale of p: the change of each entry that a trust region of radius one allows."""
         return self._put_together(np.ones(self.nq), [s.nuisance.reach for s in self.segments])
 
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of z; equal for what is given."""
+        """Return lower and upper bounds of z; equal where a value is prescribed."""
         lower, upper = self.bounds_p
         lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
         least = [np.full(each.count, each.least) for each in self.carried]
@@ -354,16 +451,17 @@ class Collocation:
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """L divided by the number of measurements."""
+        """Return the objective: loss and priors, divided by the number of measurements."""
         residuals, _ = self.prior(self.parameters_of(z))
         loss = sum(part.loss for part in self.parts(z))
         return self.loss_scale * float(residuals @ residuals + loss)
 
     def gradient(self, z: Array) -> Array:
-        """∂objective/∂z."""
+        """Return the gradient of the objective by z."""
         parts = self.parts(z)
         residuals, slopes = self.prior(self.parameters_of(z))
-        by_p, by_x = 2 * residuals * slopes, []
+        by_p = 2 * residuals * slopes
+        by_x = []
         for part in parts:
             of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.segment.length_m)
@@ -374,7 +472,7 @@ class Collocation:
     # Constraints ------------------------------------------------------------------------------
 
     def constraint_values(self, z: Array) -> Array:
-        """g, scaled."""
+        """Return the scaled constraints g."""
         parts = self.parts(z)
         rows = [part.segment.constraint_values(part.x, part.setting, part.along) for part in parts]
         further = [each.values(parts[each.number], z) for each in self.carried]
@@ -382,14 +480,15 @@ class Collocation:
 
     @property
     def jacobian_structure(self) -> tuple[Index, Index]:
-        """Column pointers and row indices of ∂g/∂z by compressed columns."""
+        """Column pointers and row indices of ∂g/∂z in compressed columns."""
         return self._jacobian.structure
 
     @cached_property
     def _jacobian(self) -> OffBand:
-        """The columns of q and x, of each experiment those of its φ, and what is carried."""
+        """Structure of ∂g/∂z: columns of q and x, then those of φ and of the lifted variables."""
         own = self.segments[-1].after.row
-        indptr, indices = [np.arange(self.nq + 1) * own], [np.tile(np.arange(own), self.nq)]
+        indptr = [np.arange(self.nq + 1) * own]
+        indices = [np.tile(np.arange(own), self.nq)]
         of_phi = []
         for segment in self.segments:
             indptr.append(indptr[-1][-1] + segment.jacobian.indptr[1:])
@@ -403,21 +502,41 @@ class Collocation:
         return OffBand.of(structure, (self.constraints, self.variables), of_phi + further)
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
-        """Values of ∂g/∂z in the order of `jacobian_structure`."""
+        """Return the values of ∂g/∂z in the order of `jacobian_structure`.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        out : array, optional
+            Overwritten with the result and returned.
+        """
         return self.constraints_and_jacobian(z, out)[1]
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
-        """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
-        parts, height = self.parts(z), self.segments[-1].after.row
+        """Return constraints g and the values of ∂g/∂z, from one evaluation of the elements.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        out : array, optional
+            Overwritten with the values of ∂g/∂z.
+        """
+        parts = self.parts(z)
+        height = self.segments[-1].after.row
         count = self.nq * height + sum(s.jacobian.nnz for s in self.segments)
         values, own = self._jacobian.values(out, count)
         columns = own[: self.nq * height].reshape(self.nq, height)
-        rows, further, used = np.empty(height), [], columns.size
+        rows = np.empty(height)
+        further = []
+        used = columns.size
         for part in parts:
             segment = part.segment
             here = own[used : used + segment.jacobian.nnz]
             found, by_p = segment.constraints_and_jacobian(part.x, part.setting, part.forces, here)
-            rows[segment.rows], columns[:, segment.rows] = found, by_p[:, : self.nq].T
+            rows[segment.rows] = found
+            columns[:, segment.rows] = by_p[:, : self.nq].T
             further.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
         added = [each.jacobian_values(parts[each.number], z) for each in self.carried]
@@ -425,18 +544,24 @@ class Collocation:
         return np.concatenate([rows, *(equations for equations, _ in added)]), values
 
     def jacobian(self, z: Array) -> sp.csc_array:
-        """∂g/∂z as a sparse matrix; of bodies with memory, at the memory as it is."""
+        """Return ∂g/∂z as a sparse matrix; history variables that are eliminated are
+        treated as constant.
+        """
         indptr, indices = self.jacobian_structure
         shape = (self.constraints, self.variables)
         return sp.csc_array((self.jacobian_values(z), indices, indptr), shape=shape)
 
     @property
     def remembers(self) -> bool:
-        """Whether something is carried that is not in z: ∂g/∂z has more than `jacobian` holds."""
+        """Whether history variables are eliminated, so that ∂g/∂z has more entries than
+        `jacobian`.
+        """
         return not self.explicit and any(segment.carries for segment in self.segments)
 
     def pulled_back(self, z: Array, multipliers: Array) -> Array:
-        """(∂g/∂z)ᵀ multipliers, through what is carried too."""
+        """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers, including eliminated
+        history variables.
+        """
         slope = self.jacobian(z).T @ multipliers
         for part in self.parts(z) if self.remembers else ():
             segment = part.segment
@@ -450,13 +575,18 @@ class Collocation:
 
     @property
     def hessian_structure(self) -> tuple[Index, Index]:
-        """The same of the upper triangle of ∇²_z (w L + yᵀ g)."""
+        """Column pointers and row indices of the upper triangle of ∇²_z (w L + yᵀ g), in
+        compressed columns.
+        """
         return self._hessian.structure
 
     @cached_property
     def _hessian(self) -> OffBand:
-        """The columns of q, those of x as the motion has them, and what else experiments have."""
-        counts, further = np.arange(self.nq + 1), []
+        """Structure of the Hessian: columns of q, those of x from the motion, then all
+        other entries.
+        """
+        counts = np.arange(self.nq + 1)
+        further = []
         indptr = [counts * (counts + 1) // 2]
         indices = [np.concatenate([np.arange(k) for k in counts])]
         for segment in self.segments:
@@ -471,7 +601,8 @@ class Collocation:
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
         """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
-        of_q, of_x = np.cumsum(np.arange(1, self.nq + 1)) - 1, []
+        of_q = np.cumsum(np.arange(1, self.nq + 1)) - 1
+        of_x = []
         used = self.nq * (self.nq + 1) // 2
         for segment in self.segments:
             of_x.append(used + segment.hessian_diagonal)
@@ -481,10 +612,20 @@ class Collocation:
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
-        """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
+        """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
 
-        Without multipliers Gauss–Newton's: readings and constraints count as linear. That is
-        convex, which the loss itself is not where residuals are large: places and motions multiply.
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        loss_weight : float
+            Factor of the objective.
+        multipliers : (constraints,) array or None
+            Multipliers of g. None gives the Gauss–Newton matrix, which neglects the curvature of
+            constraints and observations and is convex; the exact Hessian of the loss is not where
+            residuals are large, because marker places and positions multiply.
+        out : array, optional
+            Overwritten with the result and returned.
         """
         bent = multipliers is not None
         parts = [replace(part, bent=bent) for part in self.parts(z)]
@@ -492,7 +633,9 @@ class Collocation:
         used = self.nq * (self.nq + 1) // 2
         count = used + sum(segment.hessian.nnz for segment in self.segments)
         values, own = self._hessian.values(out, count)
-        by_q, further, weights = np.zeros((self.nq, self.nq)), list[Array](), list[RowWeights]()
+        by_q = np.zeros((self.nq, self.nq))
+        further = list[Array]()
+        weights = list[RowWeights]()
         weight = loss_weight * self.loss_scale
         for number, part in enumerate(parts):
             segment = part.segment
@@ -503,7 +646,9 @@ class Collocation:
             carried = [each.weighed(part, multipliers) for each in mine if each.history is not None]
             at = part.x, part.phi, part.setting, weights[number], weight
             found, more = segment.hessian_values(*at, here, carried, bent)
-            by_q, further, used = by_q + found, further + more, used + len(here)
+            by_q = by_q + found
+            further = further + more
+            used = used + len(here)
         for each in self.carried:
             at = parts[each.number], z, weight, multipliers, weights[each.number]
             further.append(each.hessian_values(*at))
@@ -516,10 +661,11 @@ class Collocation:
         return values
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
-        """Largest violation of the first-order conditions of the whole NLP, in its scaling.
+        """Return the largest violation of the first-order optimality conditions, in the scaling of
+        the program.
 
-        Stationarity of objective + multipliers · g in every variable that is not given; a
-        parameter at a bound may only push against it. And feasibility.
+        Stationarity of objective + multipliers · g in every variable that is not prescribed (at a
+        bound, the gradient may point outwards), and feasibility.
         """
         rows = self.constraint_values(z)
         slope = self.gradient(z) + self.pulled_back(z, multipliers)
@@ -527,13 +673,18 @@ class Collocation:
         slope[lower == upper] = 0
         near = 1e-6
         for part in (slice(self.nq), self.of_phi):
-            at_lower, at_upper = (z - lower)[part] < near, (upper - z)[part] < near
+            at_lower = (z - lower)[part] < near
+            at_upper = (upper - z)[part] < near
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
         return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))
 
     def hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> sp.csc_array:
-        """∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse matrix."""
+        """Return ∇²_z (loss_weight · objective + multipliers · g), both triangles, as a sparse
+        matrix.
+
+        `multipliers` is None for the Gauss–Newton matrix, see `hessian_values`.
+        """
         indptr, indices = self.hessian_structure
         values = self.hessian_values(z, loss_weight, multipliers)
         upper = sp.csc_array((values, indices, indptr), shape=(len(z), len(z)))
@@ -542,11 +693,11 @@ class Collocation:
     # Reading a point --------------------------------------------------------------------------
 
     def violations_n(self, z: Array) -> list[Array]:
-        """(N, free dofs) residual of the equations of motion of each experiment [N]."""
+        """Return the residuals of the equations of motion (N, free dofs) of each experiment [N]."""
         return [part.residual_n for part in self.parts(z)]
 
     def largest_force_n(self, z: Array) -> float:
-        """Largest internal or external force on a dof [N], the yardstick of violations."""
+        """Return the largest internal or external force on a dof [N], as a scale for violations."""
         largest = 0.0
         for part in self.parts(z):
             dynamics = part.setting.dynamics
@@ -558,14 +709,15 @@ class Collocation:
         return largest
 
     def largest_violations(self, z: Array, count: int = 5) -> list[Violation]:
-        """The worst equations of motion in newtons, largest first."""
-        found = []
+        """Return the `count` largest residuals of the equations of motion, in descending order."""
+        violations = []
         for part in self.parts(z):
-            segment, residual = part.segment, part.residual_n
-            flat = np.argsort(-np.abs(residual), axis=None)[:count]
-            for t, place in zip(*np.unravel_index(flat, residual.shape), strict=True):
+            segment = part.segment
+            residual = part.residual_n
+            worst = np.argsort(-np.abs(residual), axis=None)[:count]
+            for t, place in zip(*np.unravel_index(worst, residual.shape), strict=True):
                 node, axis = divmod(int(segment.free_dofs[place]), 3)
-                found.append(
+                violations.append(
                     Violation(
                         segment.experiment.name,
                         float(segment.dynamics.t_s[t]),
@@ -574,23 +726,28 @@ class Collocation:
                         float(residual[t, place]),
                     )
                 )
-        return sorted(found, key=lambda violation: -abs(violation.newtons))[:count]
+        return sorted(violations, key=lambda violation: -abs(violation.newtons))[:count]
 
     def rms_m(self, z: Array) -> float:
-        """Root mean square distance of markers from their measurements."""
+        """Return the root mean square distance of the markers from their measurements [m];
+        0 without markers.
+        """
         squares = samples = 0.0
         for part in self.parts(z):
-            found = part.segment.markers.squared_distances_m2(part.x, part.phi)
-            squares, samples = squares + float(found.sum()), samples + len(found)
+            squares_m2 = part.segment.markers.squared_distances_m2(part.x, part.phi)
+            squares = squares + float(squares_m2.sum())
+            samples = samples + len(squares_m2)
         return float(np.sqrt(squares / max(1.0, samples)))
 
     def values(self, z: Array) -> dict[str, float]:
-        """The parameters of z by the user's names."""
+        """Return the shared parameters of z by the user's names, in SI units."""
         return self.parameters.values(z[: self.nq])
 
 
 def _read_alike(segments: Sequence[Segment], charts: Sequence[Chart]) -> tuple[Segment, ...]:
-    """The segments read in charts, of which those of shared φ are the same."""
+    """Return the segments with the given charts, made equal where nuisance parameters are
+    shared.
+    """
     parts = zip(segments, charts, strict=True)
     same = shared_charts((s.local, s.nuisance, chart) for s, chart in parts)
     return tuple(s.with_chart(chart) for s, chart in zip(segments, same, strict=True))

@@ -1,10 +1,12 @@
-"""What depth cameras read: how far the points that they see are from the surface, along its normal.
+"""Points of depth cameras as a measurement: distances from the surface of the body along its
+normal.
 
     r = n · (Σ_i ℓ_i(τ) Σ_a N_a x_{a,i} − T (R(a) ((1 + s) p + b d − c) + c + e)) / σ,
 
-T being the pose of the camera as stated, a and e what it is turned and shifted by, s and b scale
-and bias of its depth along the ray d, and ℓ the weights of the times around a sample. Which point
-of the surface has N_a and n says a `Sighting`.
+with the measured point p, the stated pose T of the camera, its rotation error R(a) about the pivot
+c, its translation error e, scale s and bias b of the depth along the ray d, and the weights ℓ of
+the grid times around a sample shifted by τ. The shape functions N_a and the normal n of the
+corresponding surface point are those of a `Sighting`.
 """
 
 from __future__ import annotations
@@ -34,35 +36,55 @@ NEIGHBOURS = 4
 HUBER = 3.0
 # Patches of the surface that statistics take the points of together, at most, and by how much these
 # grow until they are as few.
-PATCHES, GROWING = 60, 1.2
+PATCHES = 60
+GROWING = 1.2
 
 
 @dataclass(frozen=True, eq=False)
 class DepthReading(Reading):
-    """The points that a depth camera sees, one number each.
+    """Measurement model of the points of a depth camera, with one number each.
 
     Attributes
     ----------
     channel : Points
-        The nodes of the surface in all rows.
+        Surface nodes at all grid times.
     sighting : Sighting
-    at_s : (n,) the times of the channel
+        Correspondences of the points with the surface.
+    at_s : (n,) array
+        Times of the observable [s].
     """
 
     channel: Points
     sighting: Sighting
     at_s: Array
 
-    group, has_offsets, stated = 1, True, "sigma_m of depth"
+    group = 1
+    has_offsets = True
+    stated = "sigma_m of depth"
 
     @classmethod
     def of(
         cls, sighting: Sighting, at_s: Array, nuisance: NuisanceMap, huber: float | None
     ) -> DepthReading:
-        """That of a sighting, where positions are known at some times."""
-        view, nodes = sighting.view, sighting.skin.nodes
+        """Build the measurement model of a camera.
+
+        Parameters
+        ----------
+        sighting : Sighting
+            Correspondences of the points with the surface.
+        at_s : (n,) array
+            Times at which positions are known [s].
+        nuisance : NuisanceMap
+            Nuisance parameters of the experiment.
+        huber : float or None
+            Threshold of Huber's loss; None means 3 standard deviations, because outliers are
+            normal.
+        """
+        view = sighting.view
+        nodes = sighting.skin.nodes
         points_m = sighting.body.nodes_m[nodes]
-        count, none = len(nodes), np.zeros(len(nodes))
+        count = len(nodes)
+        none = np.zeros(len(nodes))
         placement = Placement(nodes[:, None], np.ones((count, 1)), none, len(sighting.body.nodes_m))
         chart = Chart.exact(sighting.body, placement, points_m)
         samples, points = sighting.used.shape
@@ -82,86 +104,114 @@ class DepthReading(Reading):
 
     @property
     def _instruments(self) -> dict[tuple[int, int], Instrument]:
+        """Generated functions by the numbers of vectors and of data, stored with the
+        camera's model.
+        """
         return self.sighting.view.instruments
 
     @property
     def pairs(self) -> Sighting | Outline:
-        """Points of the surface, and the planes of the image that each is compared with."""
+        """Corresponding points of surface and image that are compared."""
         return self.sighting
 
     @cached_property
     def _times(self) -> NDArray[np.int64]:
-        """(S, k) times of the channel that each sample is read from: at it, or around."""
+        """Indices (S, k) of the observable's times that each image is computed from: its
+        own, or those around it.
+        """
         nearest = np.abs(self.at_s - self.t_s[:, None]).argmin(axis=1)
-        off = np.abs(self.at_s[nearest] - self.t_s).max(initial=0.0) > TIME_TOLERANCE_S
+        is_off_grid = np.abs(self.at_s[nearest] - self.t_s).max(initial=0.0) > TIME_TOLERANCE_S
         clock = self.nuisance.places(DEPTH_TIME, of=self.sighting.view.number)
-        if not (off or len(clock)) or len(self.at_s) < 2:
+        if not (is_off_grid or len(clock)) or len(self.at_s) < 2:
             return nearest[:, None]
         used = min(NEIGHBOURS, len(self.at_s))
         return times_around(self.at_s, self.t_s + TIME_TOLERANCE_S, used)
 
     @cached_property
     def _window(self) -> Window:
-        seen, times = self.pairs, self._times
-        samples, points = seen.used.shape
+        """Stencil of all images: indices of the surface nodes, and the data of the expression."""
+        pairs = self.pairs
+        times = self._times
+        samples, points = pairs.used.shape
         rotations, translations = self.sighting.view.motion
-        in_camera = np.einsum("sji,sej->sei", rotations, seen.normals)
-        beyond = np.einsum("sei,si->se", seen.normals, translations)[..., None]
-        around = np.broadcast_to(
+        in_camera = np.einsum("sji,sej->sei", rotations, pairs.normals)
+        along_normal = np.einsum("sei,si->se", pairs.normals, translations)[..., None]
+        offsets_s = np.broadcast_to(
             (self.at_s[times] - self.t_s[:, None])[:, None], (samples, points, times.shape[1])
         )
-        parts = [around, seen.weights, seen.normals, in_camera, beyond, seen.points, seen.rays]
-        places = times[:, None, :, None] * self.channel.each + seen.nodes[:, :, None]
+        parts = [
+            offsets_s,
+            pairs.weights,
+            pairs.normals,
+            in_camera,
+            along_normal,
+            pairs.points,
+            pairs.rays,
+        ]
+        places = times[:, None, :, None] * self.channel.each + pairs.nodes[:, :, None]
         return Window(
             places.reshape(samples, points, -1), np.moveaxis(np.concatenate(parts, axis=2), 2, 0)
         )
 
     def window(self, phi: Array, known: int) -> Window:
-        """Of the samples whose times are all known."""
+        """Return the stencil of those first images whose times are among the first `known` ones."""
         samples = int(np.count_nonzero(self._times[:, -1] < known))
         return Window(self._window.places[:samples], self._window.data[:, :samples])
 
     @property
     def first_row(self) -> int:
-        """The last time of the channel that its first sample is read from."""
+        """Index of the last time of the observable that the first image is computed from."""
         return int(self._times[0, -1])
 
     def aligned(self, x: Array, phi: Array) -> Sighting:
-        """What is seen with the pose aligned to the first rows x (rows, 3n), to the last of these
-        where they do not suffice.
+        """Align the camera with the first rows of a motion and find the correspondences.
+
+        Parameters
+        ----------
+        x : (rows, 3n) array
+            First rows [m]; if they do not reach the first image, the last row is used for it.
+        phi : (k,) array
+            Nuisance parameters.
         """
-        seen, shapes = self.sighting, self.shapes(x, phi)
+        correspondences = self.sighting
+        shapes = self.shapes(x, phi)
         if not len(shapes):
-            shapes = x[-1:].reshape(1, -1, 3)[:, seen.skin.nodes]
-        later = np.concatenate([shapes, seen.shapes_m[len(shapes) :]])
-        return Sighting.aligned(seen.view, seen.body, later, phi)
+            shapes = x[-1:].reshape(1, -1, 3)[:, correspondences.skin.nodes]
+        all_shapes = np.concatenate([shapes, correspondences.shapes_m[len(shapes) :]])
+        return Sighting.aligned(correspondences.view, correspondences.body, all_shapes, phi)
 
     @property
     def begins_s(self) -> float:
-        """The last time that the first sample is read from."""
+        """Last time [s] that the first compared image is computed from."""
         first = int(self.components.any(axis=(1, 2)).argmax())
         return float(self.at_s[self._times[first, -1]])
 
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """How far a point is behind the surface."""
-        view, nodes = self.sighting.view, self.pairs.nodes.shape[2]
+        """Return the distance of a point behind the surface along the normal [m]."""
+        view = self.sighting.view
+        nodes = self.pairs.nodes.shape[2]
         sizes = np.cumsum([0, self._times.shape[1], nodes, 3, 3, 1, 3, 3]).tolist()
-        around, weights, normal, in_camera, beyond, point, ray = ca.vertsplit(data, sizes)
+        offsets, weights, normal, in_camera, along_normal, point, ray = ca.vertsplit(data, sizes)
         values = self.nuisance.by_row(phi, self.own[0])
-        late, times = values.get(DEPTH_TIME, ca.SX(0)), ca.vertsplit(around)
-        in_time = ca.vertcat(*lagrange_weights(late, times))
+        clock_shift = values.get(DEPTH_TIME, ca.SX(0))
+        times = ca.vertsplit(offsets)
+        in_time = ca.vertcat(*lagrange_weights(clock_shift, times))
         surface = looked @ ca.kron(in_time, weights)
-        seen = view.corrected(point, ray, values)
-        return ca.dot(normal, surface) - ca.dot(in_camera, seen) - beyond
+        corrected = view.corrected(point, ray, values)
+        return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - along_normal
 
     def roughly(self, x: Array, phi: Array) -> Array:
-        """How far what the first image should see is from what it sees, in deviations."""
+        """Return the distances from visible parts of the surface to the points of the first
+        image, in standard deviations.
+        """
         shapes = self.shapes(x, phi)
         return self.sighting.missed_m(shapes[0], phi) / self.sighting.view.depth.sigma_m
 
     @property
     def loss_of_far_points(self) -> float:
-        """Loss of the points beyond the gate, each counted as if it were at the gate stated."""
+        """Loss of the points beyond the gate, each counted as if its distance were the
+        stated gate.
+        """
         depth = self.sighting.view.depth
         deviations = depth.gate_m / depth.sigma_m
         if self.huber is not None and deviations > self.huber:
@@ -172,23 +222,27 @@ class DepthReading(Reading):
 
     @cached_property
     def _patches(self) -> NDArray[np.int64]:
-        """(S, E) the patch of each point that counts, −1 of others.
+        """Patch (S, E) of each compared point, −1 for others.
 
-        Neighbouring points are not independent; means over patches nearly are.
+        Residuals of neighbouring points are correlated; their means over patches nearly are not.
         """
-        seen, patches = self.pairs, np.full(self.pairs.used.shape, -1)
-        places, edge_m = seen.places_m[seen.used], 2 * self.sighting.view.depth.spacing_m
+        pairs = self.pairs
+        patches = np.full(self.pairs.used.shape, -1)
+        places = pairs.places_m[pairs.used]
+        edge_m = 2 * self.sighting.view.depth.spacing_m
         while True:
             cubes, number = np.unique(np.floor(places / edge_m), axis=0, return_inverse=True)
             if len(cubes) <= PATCHES:
                 break
             edge_m *= GROWING
-        patches[seen.used] = number.ravel()
+        patches[pairs.used] = number.ravel()
         return patches
 
     @cached_property
     def _pooling(self) -> tuple[sp.csr_array, NDArray[np.int64]]:
-        """What patches have of the points, root of a share each, and (S, 3M) how many of these."""
+        """Sparse matrix from points to patches, with entries 1/√count, and the counts (S,
+        3M) of points.
+        """
         samples, points = self._patches.shape
         patches = GROUP * -(-(int(self._patches.max(initial=0)) + 1) // GROUP)
         sample, point = np.nonzero(self._patches >= 0)
@@ -202,9 +256,10 @@ class DepthReading(Reading):
 
     @cached_property
     def pool(self) -> Pooled:
-        """Patches, three together."""
+        """Patches of the surface, in groups of three."""
         means, counts = self._pooling
-        name, count = self.names[0], counts.shape[1] // GROUP
+        name = self.names[0]
+        count = counts.shape[1] // GROUP
         of_points = self.pairs.places_m.reshape(-1, 3)
         sums = (means @ of_points).reshape(*counts.shape, 3) * np.sqrt(counts)[..., None]
         places = sums.sum(axis=0) / np.maximum(counts.sum(axis=0), 1)[:, None]
@@ -216,7 +271,9 @@ class DepthReading(Reading):
         )
 
     def pooled(self, values: Array) -> Array:
-        """(S, M, 3, …): sums over patches whose variance is that of a point."""
+        """Return sums over patches (S, M, 3, …) of residuals (S, E, 1, …), divided by
+        √count so that white noise keeps its variance.
+        """
         means, counts = self._pooling
         columns = int(np.prod(values.shape[3:]))  # zero where nothing is estimated
         flat = means @ values.reshape(values.shape[0] * values.shape[1] * values.shape[2], columns)
@@ -225,17 +282,30 @@ class DepthReading(Reading):
     # In pictures ------------------------------------------------------------------------------
 
     def apart_m(self, values: Array, phi: Array) -> Array:
-        """(s, E) how far points are behind the surface, NaN where they do not count."""
-        apart = self.predicted(values, phi)[..., 0]
-        return np.where(self.pairs.used[: len(apart)], apart, np.nan)
+        """Return how far points (s, E) are behind the surface [m]; NaN where they are not compared.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Positions of the surface nodes [m].
+        phi : (k,) array
+            Nuisance parameters.
+        """
+        distances = self.predicted(values, phi)[..., 0]
+        return np.where(self.pairs.used[: len(distances)], distances, np.nan)
 
     def shapes(self, x: Array, phi: Array) -> Array:
-        """(s, n, 3) of the surface at the samples that the first rows x (rows, 3n) suffice for."""
-        late, known = self.sighting.view.late_s(phi), int((self._times[:, -1] < len(x)).sum())
+        """Return the surface nodes (s, n, 3) [m] at the images that the first rows x (rows,
+        3n) suffice for.
+        """
+        clock_shift = self.sighting.view.late_s(phi)
+        known = int((self._times[:, -1] < len(x)).sum())
         nodes = x.reshape(len(x), -1, 3)[:, self.sighting.skin.nodes]
         return np.array(
             [
-                np.tensordot(lagrange_weights(t + late, self.at_s[times].tolist()), nodes[times], 1)
+                np.tensordot(
+                    lagrange_weights(t + clock_shift, self.at_s[times].tolist()), nodes[times], 1
+                )
                 for t, times in zip(self.t_s[:known], self._times[:known], strict=True)
             ]
         ).reshape(known, *nodes.shape[1:])

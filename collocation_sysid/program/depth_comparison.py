@@ -30,15 +30,15 @@ class DepthError:
     Attributes
     ----------
     points : int
-        How many points are compared.
+        Number of points that are compared.
     seen : int
-        How many points there are in the images; those of other things count too.
+        Number of points in the images, including those of other things.
     rms_m : float or None
-        Root mean square distance of these points; None without any.
+        Root mean square distance of the compared points; None without any.
     reach_m : float
-        Farther from the surface, points are taken to belong to something else.
+        Points farther from the surface are taken to belong to something else.
     gate_m : float
-        What the problem states as `gate_m`. It is at most `reach_m`.
+        Gate stated in the problem, at most `reach_m`.
     share_beyond_gate : float
         Share of the compared points that are farther from the surface than `gate_m`.
     rms_within_gate_m : float or None
@@ -46,8 +46,8 @@ class DepthError:
     sigmas : float
         Root mean square distance over the stated σ.
     tame_sigmas : float
-        The same, where distances beyond Huber's threshold count by the threshold, as in a fit: a
-        few wild points do not make a prediction wrong.
+        Root mean square distance over the stated σ, with distances beyond Huber's threshold
+        shortened as in a fit, so that a few outliers do not make a prediction wrong.
     """
 
     points: int
@@ -63,18 +63,22 @@ class DepthError:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceComparison:
-    """The points of a depth camera on the surface of a motion.
+    """Points of a depth camera compared with the surface of a motion.
 
     A first association takes every point within a quarter of the body's size of the surface. The
-    reach is then six times the median distance, at least `gate_m` and at most that quarter, and the
-    points within it, associated again with what is not hidden, are compared.
+    reach is then six times the median distance, at least `gate_m` and at most that quarter; the
+    points within it are associated again, without hidden ones, and compared.
 
     Attributes
     ----------
     sighting : Sighting
-    shapes_m : (S, n, 3) nodes of the surface at the images
-    apart_m : (S, E) how far points are behind the surface, NaN where they do not count
-    phi : (k,) nuisance parameters
+        Correspondences of the points with the surface.
+    shapes_m : (S, n, 3) array
+        Surface nodes at the images [m].
+    apart_m : (S, E) array
+        Distances of points behind the surface [m]; NaN where they are not compared.
+    phi : (k,) array
+        Nuisance parameters.
     """
 
     sighting: Sighting
@@ -86,14 +90,18 @@ class SurfaceComparison:
     def from_fit(
         cls, reading: DepthReading, x: Array, looked: Array, phi: Array
     ) -> SurfaceComparison:
-        """Return the points as they are associated in a fit.
+        """Compare the points with the correspondences of a fit.
 
         Parameters
         ----------
         reading : DepthReading
-        x : (N, 3n) positions of the fit
-        looked : what the reading looks at, see `Part.sights`
-        phi : (k,)
+            Measurement model of the camera.
+        x : (N, 3n) array
+            Positions of the fit [m].
+        looked : (n, e, 3) array
+            Values of the observable, see `Part.sights`.
+        phi : (k,) array
+            Nuisance parameters.
         """
         return cls(reading.sighting, reading.shapes(x, phi), reading.apart_m(looked, phi), phi)
 
@@ -101,17 +109,22 @@ class SurfaceComparison:
     def from_motion(
         cls, reading: DepthReading, t_s: Array, positions_m: Array, phi: Array
     ) -> SurfaceComparison:
-        """Associate the points with a motion.
+        """Associate the points with a motion and compare them.
 
         Parameters
         ----------
         reading : DepthReading
-        t_s : (T,) times of the motion
-        positions_m : (T, n, 3) of all nodes
-        phi : (k,)
+            Measurement model of the camera.
+        t_s : (T,) array
+            Times of the motion [s].
+        positions_m : (T, n, 3) array
+            Positions of all nodes [m].
+        phi : (k,) array
+            Nuisance parameters.
         """
         shapes_m = reading.shapes(_at_rows(reading, t_s, positions_m), phi)
-        view, body = reading.sighting.view, reading.sighting.body
+        view = reading.sighting.view
+        body = reading.sighting.body
         widest_m = max(wide_m(body.nodes_m), view.depth.gate_m)
         first = Sighting.of(view, body, shapes_m, phi, widest_m)
         reach_m = first.next_gate_m(shapes_m, phi)
@@ -120,7 +133,7 @@ class SurfaceComparison:
 
     @cached_property
     def error(self) -> DepthError:
-        """The distances in numbers."""
+        """Summary of the distances."""
         depth = self.sighting.view.depth
         apart_m = np.abs(self.apart_m[np.isfinite(self.apart_m)])
         within_m = apart_m[apart_m <= depth.gate_m]
@@ -140,7 +153,9 @@ class SurfaceComparison:
 
 
 def _at_rows(reading: DepthReading, t_s: Array, positions_m: Array) -> Array:
-    """Return positions (N, 3n) of a motion at the times that a reading is interpolated from."""
+    """Return positions (N, 3n) of a motion at the times of a measurement's observable,
+    interpolated.
+    """
     flat = positions_m.reshape(len(t_s), -1)
     at_s = np.clip(reading.at_s, t_s[0], t_s[-1])
     if len(t_s) >= FEWEST_FOR_SPLINE:

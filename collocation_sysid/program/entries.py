@@ -1,4 +1,4 @@
-"""Where entries go that are added, group by group, to a sparse matrix in compressed columns."""
+"""Assembly of additional entries into a sparse matrix in compressed columns."""
 
 from __future__ import annotations
 
@@ -13,32 +13,47 @@ from ..arrays import Array, Index
 
 
 class Outer(NamedTuple):
-    """Entries whose rows and columns are sums of what broadcasts."""
+    """Entries whose rows and columns are sums of arrays that broadcast.
+
+    Attributes
+    ----------
+    rows : sequence of arrays or int
+        Summands of the row indices.
+    columns : sequence of arrays or int
+        Summands of the column indices.
+    """
 
     rows: Sequence[Index | int]
     columns: Sequence[Index | int]
 
     @property
     def count(self) -> int:
-        """How many these are."""
+        """Number of entries."""
         return int(np.prod(np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))))
 
     def laid_out(self) -> tuple[Index, Index]:
-        """Row and column of each."""
+        """Return row and column index of each entry, flat."""
         rows, columns = np.broadcast_arrays(sum(self.rows), sum(self.columns))
         return rows.ravel(), columns.ravel()
 
 
 @dataclass(frozen=True, eq=False)
 class OffBand:
-    """Structure in compressed columns, and where the values go.
+    """Structure of a sparse matrix, and positions of the values of its contributions.
 
     Attributes
     ----------
-    indptr, indices : column pointers and row indices
-    kept : place of each value of the smaller matrix; None where they all come first
-    places : of each group, the place of each of its entries
-    repeats : of each group, whether several of its entries are at the same place
+    indptr : array
+        Column pointers.
+    indices : array
+        Row indices.
+    kept : array or None
+        Position of each value of the initial structure; None if they all come first, in their
+        order.
+    places : tuple of arrays
+        Positions of the entries of each group.
+    repeats : tuple of bool
+        Whether several entries of a group have the same position.
     """
 
     indptr: Index
@@ -54,30 +69,37 @@ class OffBand:
         shape: tuple[int, int],
         groups: Iterable[tuple[Index, Index]],
     ) -> OffBand:
-        """Add groups of entries, some of which may be there already or in other groups.
+        """Add groups of entries to a structure; entries may exist already, or belong to several
+        groups.
 
         Parameters
         ----------
-        structure : column pointers and row indices, ascending, of the first columns
-        shape : rows and columns of the whole
-        groups : rows and columns of each group's entries
+        structure : (array, array)
+            Column pointers and ascending row indices of the first columns.
+        shape : (int, int)
+            Rows and columns of the complete matrix.
+        groups : iterable of (array, array)
+            Rows and columns of each group's entries.
         """
-        (indptr, indices), (height, width) = structure, shape
-        wanted = [columns * height + rows for rows, columns in groups]
-        codes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *wanted]))
+        indptr, indices = structure
+        height, width = shape
+        group_codes = [columns * height + rows for rows, columns in groups]
+        codes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *group_codes]))
         before, absent = _found(structure, height, codes)
         own = before + np.cumsum(absent) - absent
-        added, columns = own[absent], codes[absent] // height
+        added = own[absent]
+        columns = codes[absent] // height
         is_kept = np.ones(len(indices) + len(added), dtype=bool)
         is_kept[added] = False
-        whole = np.empty(len(is_kept), dtype=np.int64)
-        whole[is_kept], whole[added] = indices, codes[absent] - columns * height
+        all_indices = np.empty(len(is_kept), dtype=np.int64)
+        all_indices[is_kept] = indices
+        all_indices[added] = codes[absent] - columns * height
         counts = np.bincount(columns, minlength=width)
         counts[: len(indptr) - 1] += np.diff(indptr)
-        numbers = [np.searchsorted(codes, each) for each in wanted]
+        numbers = [np.searchsorted(codes, each) for each in group_codes]
         return cls(
             np.concatenate([[0], np.cumsum(counts)]),
-            whole,
+            all_indices,
             None if is_kept[: len(indices)].all() else np.flatnonzero(is_kept),
             tuple(own[each] for each in numbers),
             tuple(bool(np.bincount(each, minlength=1).max() > 1) for each in numbers),
@@ -89,16 +111,38 @@ class OffBand:
         return self.indptr, self.indices
 
     def places_of(self, positions: Index) -> Index:
-        """Places of values of the smaller matrix, by their positions there."""
+        """Return the positions of values of the initial structure, given by their positions
+        there.
+        """
         return positions if self.kept is None else self.kept[positions]
 
     def values(self, out: Array | None, count: int) -> tuple[Array, Array]:
-        """Room for all values, `out` where that is given, and for the `count` smaller ones."""
+        """Return arrays for all values, and for the `count` values of the initial structure.
+
+        The second array is a view of the first where possible. Neither is initialised.
+
+        Parameters
+        ----------
+        out : array or None
+            Used for all values if given.
+        count : int
+            Number of values of the initial structure.
+        """
         values = np.empty(len(self.indices)) if out is None else out
         return values, values[:count] if self.kept is None else np.empty(count)
 
     def fill(self, values: Array, smaller: Array, groups: Sequence[Array]) -> None:
-        """Complete the values from those of the smaller matrix and of the groups."""
+        """Compute all values in place.
+
+        Parameters
+        ----------
+        values : array
+            All values, overwritten; the initial values may be stored in them already, see `values`.
+        smaller : array
+            Values of the initial structure.
+        groups : sequence of arrays
+            Values of each group; duplicates are added up.
+        """
         if self.kept is None:
             values[len(smaller) :] = 0.0
         else:
@@ -114,7 +158,22 @@ class OffBand:
 def _found(
     structure: tuple[Index, Index], height: int, codes: Index
 ) -> tuple[Index, NDArray[np.bool_]]:
-    """How many entries are before column · height + row of others, and whether those are absent."""
+    """Find entries in a structure.
+
+    Parameters
+    ----------
+    structure : (array, array)
+        Column pointers and row indices.
+    height : int
+        Number of rows of the complete matrix.
+    codes : array
+        Column · height + row of the entries, ascending.
+
+    Returns
+    -------
+    (array, array of bool)
+        Number of entries of the structure before each, and whether it is absent.
+    """
     indptr, indices = structure
     if not len(codes) or codes[0] >= (len(indptr) - 1) * height:
         return np.full(len(codes), len(indices)), np.ones(len(codes), dtype=bool)

@@ -1,4 +1,4 @@
-"""What experiments carry as variables of a program, in their order."""
+"""Lifted variables of all experiments in the order of the program, see `carried`."""
 
 from __future__ import annotations
 
@@ -14,17 +14,25 @@ from .wrench_rows import WrenchRows
 
 
 def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> tuple[Carried, ...]:
-    """Of each experiment the reactions of grasps with a sensor, its memory, what forces carry, the
-    pressures of contact as complementarity, and its wrenches.
+    """Create the groups of lifted variables of all experiments.
+
+    For each experiment, in this order: reaction forces of instrumented grasps, memory of the
+    material, history variables of forces, contact pressures of complementarity problems, and
+    measured wrenches. Quantities that an experiment does not have are left out.
 
     Parameters
     ----------
-    first_phi : where in z the φ of all experiments begin
-    places : where what is carried begins
+    segments : sequence of Segment
+        Transcriptions of the experiments.
+    first_phi : int
+        Index in z where the nuisance parameters of all experiments begin.
+    places : Places
+        Offsets of the first group.
     """
-    found: list[Carried] = []
+    groups: list[Carried] = []
     for number, segment in enumerate(segments):
-        reactions, here = None, (segment, number, first_phi)
+        reactions = None
+        here = (segment, number, first_phi)
         wrenches = [
             (k, reading)
             for k, reading in enumerate(segment.readings)
@@ -32,21 +40,22 @@ def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> t
         ]
         if wrenches:
             reactions = Reactions(*here, places)
-            found.append(reactions)
+            groups.append(reactions)
             places = reactions.after
         histories = 0
         if segment.body.remembers:
-            found.append(Overstress(*here, places, reactions))
-            places, histories = found[-1].after, 1
+            groups.append(Overstress(*here, places, reactions))
+            places = groups[-1].after
+            histories = 1
         for history, force in enumerate(segment.dynamics.forces.carrying, histories):
-            found.append(ForceRows(*here, places, history, force, reactions))
-            places = found[-1].after
+            groups.append(ForceRows(*here, places, history, force, reactions))
+            places = groups[-1].after
             histories = history + 1
         for history, force in enumerate(segment.dynamics.forces.pressing, histories):
-            found.append(PressureRows(*here, places, history, force, reactions))
-            places = found[-1].after
+            groups.append(PressureRows(*here, places, history, force, reactions))
+            places = groups[-1].after
         for wrench in wrenches:
             assert reactions is not None
-            found.append(WrenchRows(*here, places, *wrench, reactions))
-            places = found[-1].after
-    return tuple(found)
+            groups.append(WrenchRows(*here, places, *wrench, reactions))
+            places = groups[-1].after
+    return tuple(groups)

@@ -1,12 +1,13 @@
-"""Factorise matrices on the mesh graph, again and again with one pattern.
+"""Factorisation of matrices on the mesh graph, repeated with one sparsity pattern.
 
-Reverse Cuthill–McKee makes the mesh graph a narrow band; a factorisation without exchanges of rows,
-within its skyline or, if it is wide, Cholesky's, then also tells whether the matrix is positive
-definite. Wide bands are those of LAPACK, or of a supernodal method where that is installed.
-Indefinite matrices go to SuperLU, and so do all where its fill-in is estimated to cost less than
-the band. What has a skew part besides, see `block_band`, needs no exchanges either where the
-symmetric part is positive definite and the skew one does not outweigh it: within a skyline it is
-factorised whole, else by its symmetric part and refined. What remains SuperLU takes.
+Reverse Cuthill–McKee ordering makes the mesh graph a narrow band. A factorisation without row
+exchanges, within the skyline or, for wide bands, Cholesky's, then also decides whether the matrix
+is positive definite. Wide bands use LAPACK, or a supernodal method where it is installed.
+Indefinite matrices use SuperLU, and so do all where its fill-in is estimated to cost less than the
+band. A matrix with a skew part (see `block_band`) needs no row exchanges either where the symmetric
+part is positive definite and the skew part is small compared with it: within a skyline it is
+factorised directly, otherwise by its symmetric part and iterative refinement. SuperLU takes the
+rest.
 """
 
 from __future__ import annotations
@@ -46,14 +47,16 @@ NARROW = 250
 GROWTH = 10.0
 # Corrections by the skew part end where the next would be so small, far below what a Newton or
 # Gauss–Newton step is accurate to; they must shrink so fast, else another factor pays.
-ACCURACY, CONTRACTION, TINY = 1e-10, 0.2, 1e-300
+ACCURACY = 1e-10
+CONTRACTION = 0.2
+TINY = 1e-300
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 NONE = np.zeros(0)
 
 
 class Factor(Protocol):
-    """A factorised matrix on the free degrees of freedom."""
+    """Factorised matrix on the free degrees of freedom."""
 
     @property
     def positive_definite(self) -> bool:
@@ -61,17 +64,33 @@ class Factor(Protocol):
         ...
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for (k,) or (k, m) right-hand sides in the order of the free dofs."""
+        """Solve for right-hand sides (k,) or (k, m) in the order of the free dofs.
+
+        If `transposed`, solve with the transposed matrix.
+        """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class _BandFactor:
+    """Cholesky factor of a symmetric band.
+
+    Attributes
+    ----------
+    band : (half-bandwidth + 1, k) array
+        Lower band of the factor.
+    order : (k,) array
+        Free dof of each row of the band.
+    positive_definite : bool
+        Always true.
+    """
+
     band: Array
     order: Index
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Solve for right-hand sides (k,) or (k, m)."""
         permuted = right[self.order]
         solved, _ = _pbtrs(self.band, permuted, lower=1)
         result = np.empty_like(right)
@@ -81,7 +100,21 @@ class _BandFactor:
 
 @dataclass(frozen=True, eq=False)
 class _SkylineFactor:
-    """L, D and U, see `fem.kernels.skyline`; of a symmetric matrix both sides are one."""
+    """Factors L, D and U within a skyline, see `fem.kernels.skyline`.
+
+    Attributes
+    ----------
+    skyline : Skyline
+        Structure and kernels.
+    sides : array
+        L and U; one of them for a symmetric matrix.
+    pivots : array
+        D.
+    order, rank : (k,) arrays
+        Permutation to the skyline and its inverse.
+    positive_definite : bool
+        Always true.
+    """
 
     skyline: Skyline
     sides: Array
@@ -91,7 +124,9 @@ class _SkylineFactor:
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        first, second = self.sides[-transposed], self.sides[transposed - 1]
+        """Solve for right-hand sides (k,) or (k, m)."""
+        first = self.sides[-transposed]
+        second = self.sides[transposed - 1]
         rows = np.atleast_2d(right.take(self.order, axis=0).T)
         solved = self.skyline.solve(first, self.pivots, second, rows)
         return solved.T.take(self.rank, axis=0).reshape(right.shape)
@@ -99,7 +134,21 @@ class _SkylineFactor:
 
 @dataclass(frozen=True, eq=False)
 class _RefinedFactor:
-    """Of S + K, K skew: Σ_k (−S⁻¹K)^k S⁻¹, or `whole` where that does not contract."""
+    """Inverse of S + K with symmetric S and skew K as the series Σ_k (−S⁻¹K)^k S⁻¹.
+
+    Attributes
+    ----------
+    symmetric : Factor
+        Factor of S.
+    skew : sparse array
+        K.
+    whole : callable
+        Returns the factor of S + K, which is used if the series does not converge.
+    positive_definite : bool
+        Always true.
+    diverged : list of bool
+        Not empty after the series has failed once.
+    """
 
     symmetric: Factor
     skew: sp.csc_array
@@ -108,63 +157,79 @@ class _RefinedFactor:
     diverged: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Solve for right-hand sides (k,) or (k, m)."""
         if self.diverged:
             return self.whole().solve(right, transposed)
-        found = correction = self.symmetric.solve(right)
-        size = last = np.abs(found).max(axis=0, initial=TINY)
+        solution = correction = self.symmetric.solve(right)
+        size = last = np.abs(solution).max(axis=0, initial=TINY)
         shrinks = 1.0
         # What the next correction would be is not worth another solution.
         while (shrinks * last > ACCURACY * size).any():
-            pushed = self.skew @ correction
-            correction = self.symmetric.solve(pushed if transposed else -pushed)
+            product = self.skew @ correction
+            correction = self.symmetric.solve(product if transposed else -product)
             length = np.abs(correction).max(axis=0, initial=TINY)
             shrinks = float((length / last).max(initial=0.0))
             if not shrinks <= CONTRACTION:
                 self.diverged.append(True)
                 return self.whole().solve(right, transposed)
-            found, last = found + correction, length
-        return found
+            solution = solution + correction
+            last = length
+        return solution
 
 
 @dataclass(frozen=True, eq=False)
 class _SparseFactor:
+    """Factor by SuperLU."""
+
     lu: SuperLU
     positive_definite: bool
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
+        """Solve for right-hand sides (k,) or (k, m)."""
         return self.lu.solve(right, "T" if transposed else "N")
 
 
 class Factoriser:
     """Symbolic analysis of a symmetric pattern restricted to free degrees of freedom.
 
+    Attributes
+    ----------
+    half_bandwidth : int
+        Number of subdiagonals of the reordered band.
+
     Parameters
     ----------
     pattern : SymmetricPattern
-    free : (k,) sorted degrees of freedom kept
+        Pattern of the complete matrix.
+    free : (k,) array
+        Sorted free degrees of freedom.
     choice : {"auto", "band", "sparse", "supernodal"}
-        Banded Cholesky, SuperLU, supernodal Cholesky, or whichever is estimated to cost least.
+        Banded Cholesky ("band"), SuperLU ("sparse"), supernodal Cholesky, or the one with the least
+        estimated cost.
 
     Raises
     ------
     InputError
-        Where a supernodal method is asked for and not installed.
+        If a supernodal method is asked for and not installed.
     """
 
     def __init__(self, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> None:
         self.choice: Choice = choice
         position = np.full(pattern.size, -1)
         position[free] = np.arange(len(free))
-        rows, columns = position[pattern.rows], position[pattern.columns]
+        rows = position[pattern.rows]
+        columns = position[pattern.columns]
         self._kept = np.flatnonzero((rows >= 0) & (columns >= 0))
-        rows, columns = rows[self._kept], columns[self._kept]
+        rows = rows[self._kept]
+        columns = columns[self._kept]
         self._size = len(free)
         ones = np.ones(len(rows))
         graph = sp.csr_array((ones, (rows, columns)), shape=(self._size, self._size))
         self._order = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True).astype(np.int64)
         self._rank = rank = np.empty(self._size, dtype=np.int64)
         rank[self._order] = np.arange(self._size)
-        low, high = np.minimum(rank[rows], rank[columns]), np.maximum(rank[rows], rank[columns])
+        low = np.minimum(rank[rows], rank[columns])
+        high = np.maximum(rank[rows], rank[columns])
         self.half_bandwidth = int((high - low).max(initial=0))
         self._band_places = low * (self.half_bandwidth + 1) + high - low
         self._ranks = rank[rows], rank[columns]
@@ -181,7 +246,7 @@ class Factoriser:
 
     @classmethod
     def of(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
-        """The analysis of a pattern; that of the last few is kept."""
+        """Return the analysis of a pattern; the last few are cached."""
         return _analysed(pattern, free.tobytes(), choice)
 
     @cached_property
@@ -203,11 +268,12 @@ class Factoriser:
 
     @property
     def _band_work(self) -> int:
+        """Operations of a banded factorisation, up to a factor."""
         return self._size * self.half_bandwidth**2
 
     @property
     def numbers(self) -> int:
-        """Numbers that one factor of a symmetric matrix holds."""
+        """Number of floating-point numbers in the factor of a symmetric matrix."""
         if self.banded:
             width = self.skyline.shape[1] if self.skyline else self.half_bandwidth + 1
             return self._size * width
@@ -217,32 +283,40 @@ class Factoriser:
 
     @property
     def unsymmetric_numbers(self) -> int:
-        """Numbers that one factor of another matrix holds."""
+        """Number of floating-point numbers in the factor of an unsymmetric matrix."""
         return (2 if self.skyline else 1) * self.numbers
 
     @cached_property
     def skyline(self) -> Skyline | None:
-        """What factorises narrow bands."""
+        """Skyline factorisation for narrow bands; None for others."""
         if not self.banded or self.half_bandwidth > NARROW:
             return None
         return make_skyline(self._size, *self._ranks, self._kept)
 
     @property
     def _sparse_work(self) -> float:
+        """Operations of a factorisation by SuperLU, up to a factor."""
         return float(np.sum(self._column_counts.astype(float) ** 2))
 
     @cached_property
     def _column_counts(self) -> Index:
-        """Entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
+        """Number of entries of each column of SuperLU's L, from a matrix that needs no pivoting."""
         values = np.full(self._entries, -1.0)
         degree = np.bincount(self._full_rows, minlength=self._size)
         values[self._full_source[self._full_rows == self._full_columns]] = degree
         return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
 
     def factorise(self, values: Array, skew: Array = NONE, room: Room | None = None) -> Factor:
-        """Factorise the matrix with (m,) lower-triangle values, and those of a skew part.
+        """Factorise a matrix.
 
-        Of a factor in a room that was given, nothing is left when another is put there.
+        Parameters
+        ----------
+        values : (m,) array
+            Lower triangle of the symmetric part.
+        skew : (m,) or (0,) array
+            Lower triangle of the skew part; empty if the matrix is symmetric.
+        room : Room, optional
+            Memory for the factor; the factor is valid until it is used again.
 
         Raises
         ------
@@ -250,9 +324,9 @@ class Factoriser:
             If the matrix is singular or not finite.
         """
         skew = skew if skew.any() else NONE
-        within = self._within(values, skew, room)
-        if within:
-            return within
+        skyline_factor = self._within(values, skew, room)
+        if skyline_factor:
+            return skyline_factor
         if not (np.isfinite(values).all() and np.isfinite(skew).all()):
             raise np.linalg.LinAlgError("the matrix has entries that are not finite")
         definite = (self._within(values, NONE, room) if skew.size else None) or self._definite(
@@ -274,7 +348,7 @@ class Factoriser:
         return _RefinedFactor(definite, self._matrix(entries), whole)
 
     def _definite(self, values: Array) -> Factor | None:
-        """The factor of a symmetric matrix that is positive definite."""
+        """Return the factor of a symmetric matrix, or None if it is not positive definite."""
         if self.supernodal:
             try:
                 pardiso = self._pool.pop()
@@ -292,29 +366,42 @@ class Factoriser:
         return _BandFactor(band, self._order) if cholesky_in_place(band) else None
 
     def _pardiso(self) -> Pardiso:
+        """Return a new PARDISO solver for the pattern."""
         return Pardiso(*self._upper[:2])
 
     @cached_property
     def _supernodal_numbers(self) -> int:
+        """Number of floating-point numbers in a supernodal factor."""
         if not self._pool:
             self._pool.append(self._pardiso())
         return self._pool[-1].numbers
 
     @cached_property
     def _upper(self) -> tuple[Index, Index, Index]:
-        """Starts of the upper triangle's rows, their columns, and where their values are."""
+        """Starts of the rows of the upper triangle, their columns, and the positions of
+        their values in the lower triangle.
+        """
         here = self._full_rows <= self._full_columns
-        rows, columns = self._full_rows[here], self._full_columns[here]
+        rows = self._full_rows[here]
+        columns = self._full_columns[here]
         order = np.lexsort((columns, rows))
         starts = np.searchsorted(rows[order], np.arange(self._size + 1))
         return starts, columns[order], self._full_source[here][order]
 
     def room(self, sides: int) -> Room | None:
-        """Room for a factor, of two sides where the matrix is not symmetric, if it can be given."""
+        """Return memory for a factor within the skyline, or None if other methods are used.
+
+        Parameters
+        ----------
+        sides : int
+            2 for unsymmetric matrices, else 1.
+        """
         return self.skyline.room(sides) if self.skyline else None
 
     def _within(self, values: Array, skew: Array, room: Room | None) -> Factor | None:
-        """The factor within the skyline, unless the matrix needs exchanges of rows."""
+        """Return the factor within the skyline, or None if there is no skyline or the
+        matrix needs row exchanges.
+        """
         skyline = self.skyline
         if skyline is None:
             return None
@@ -333,12 +420,23 @@ class Factoriser:
         threads: int,
         rooms: Sequence[Room | None] = (),
     ) -> list[Factor]:
-        """Factorise `count` matrices, side by side on threads; matrix(k) gives both parts' values.
+        """Factorise several matrices in parallel.
+
+        Parameters
+        ----------
+        matrix : callable
+            Returns lower triangles of both parts of matrix k, see `factorise`.
+        count : int
+            Number of matrices.
+        threads : int
+            Number of threads.
+        rooms : sequence of Room or None
+            Memory for each factor; empty to allocate.
 
         Raises
         ------
         numpy.linalg.LinAlgError
-            If one is singular or not finite.
+            If a matrix is singular or not finite.
         """
         factors: dict[int, Factor] = {}
 
@@ -350,10 +448,14 @@ class Factoriser:
         return [factors[k] for k in range(count)]
 
     def _matrix(self, entries: Array) -> sp.csc_array:
+        """Return the sparse matrix (k, k) of entries in the order of both triangles."""
         places = self._full_rows, self._full_columns
         return sp.csc_array((entries, places), shape=(self._size, self._size))
 
     def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
+        """Factorise by SuperLU with a threshold for pivoting; raise LinAlgError if the
+        matrix is singular.
+        """
         entries = values[self._full_source]
         if skew.size:
             entries += self._signs * skew[self._full_source]
@@ -369,10 +471,11 @@ class Factoriser:
 
 
 def _positive(lu: SuperLU) -> bool:
-    """Whether pivots were taken in their order, and are positive."""
+    """Whether SuperLU took the pivots in their order, and all are positive."""
     return bool((lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all())
 
 
 @lru_cache(maxsize=8)
 def _analysed(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
+    """Return the analysis of a pattern; `free` are the bytes of an array of int64."""
     return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice)

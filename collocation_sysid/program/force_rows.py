@@ -1,11 +1,12 @@
-"""What one force's instances carry as variables of a program, and its recursion as equations.
+"""History variables b of one force as variables of the program, with their recursion as equations.
 
-Of evaluations k = 1 … N − 1, in edge lengths ℓ as positions are,
+For evaluations k = 1 … N − 1, in mean edge lengths ℓ as positions are,
 
     (b_k − h(ξ_{k−1}, ν_{k−1}, c_{k−1}, b_{k−1})) / ℓ = 0,   variables b_k / ℓ,
 
-see `model.point_forces`; b_0 is zero. Of second derivatives, those by x and by parameters are with
-the other forces', at other weights; those with b are here.
+see `model.point_forces`; b_0 is zero. Of the Lagrangian's second derivatives, those by positions
+and parameters alone are computed together with the other forces (with other weights); those with b
+are computed here.
 """
 
 from __future__ import annotations
@@ -29,16 +30,19 @@ from .segment import RowWeights, Weighed
 
 @dataclass(frozen=True, eq=False)
 class ForceRows(Carried):
-    """B of one force of one experiment; arrays end with evaluations and instances, (…, T, I).
+    """Lifted history variables b of one force of one experiment.
+
+    Arrays end with the axes of evaluations and instances, (…, T, I).
 
     Attributes
     ----------
     along : int
-        Which of the histories of the motion it is.
+        Index of the history among those of the motion, `Part.along`.
     force_number : int
-        Of the force, see `ForceHistory`.
-    reactions : Reactions, optional
-        Further rows of motion, where the program has them.
+        Index of the force, see `ForceHistory`.
+    reactions : Reactions or None
+        Lifted reaction forces, whose equations also contain the force; None if the program has
+        none.
     """
 
     along: int
@@ -48,50 +52,60 @@ class ForceRows(Carried):
 
     @property
     def first(self) -> int:
-        """The evaluation that the first b is of."""
+        """Index of the evaluation that the first variables belong to."""
         return 1
 
     @property
     def unit_m(self) -> float:
-        """Of b and of the equations."""
+        """Unit of the variables and of the equations [m]."""
         return self.segment.length_m
 
     @property
     def history(self) -> int:
-        """Which of the histories of the motion it is."""
+        """Index of the history among those of the motion."""
         return self.along
 
     @property
     def _points(self) -> ForcePoints:
+        """Points of the body at which the force acts."""
         return self.segment.dynamics.forces.pointwise(self.force_number)[0].points
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(n, N − 1, I)."""
+        """Shape (n, N − 1, I): n numbers at N − 1 evaluations and I instances."""
         term = self.segment.dynamics.forces.pointwise(self.force_number)[0]
         return term.carries, self.segment.grid_rows - 1, self._points.count
 
     def following(self, part: Part) -> Array:
-        """The variables as they follow from positions and parameters."""
+        """Return the scaled variables that satisfy the equations at the part's positions
+        and parameters.
+        """
         return self._of(part).brought.before[:, 1:].ravel() / self.segment.length_m
 
     def given(self, part: Part, z: Array) -> Part:
-        """The experiment with b at z."""
+        """Return the part with b taken from z."""
         later = z[self.variables].reshape(self.shape) * self.segment.length_m
         before = np.concatenate([np.zeros_like(later[:, :1]), later], axis=1)
         return replace(part, brought={**part.brought, self.history: before})
 
     def values(self, part: Part, z: Array) -> Array:
-        """The equations."""
-        left = self._of(part).left(slice(self.shape[1])).ravel()
-        return z[self.variables] - left / self.segment.length_m
+        """Return the scaled equations (count,)."""
+        predicted = self._of(part).left(slice(self.shape[1])).ravel()
+        return z[self.variables] - predicted / self.segment.length_m
 
     def weighed(self, part: Part, multipliers: Array) -> Weighed:
-        """And μ (n, N, I) such that multipliers · r has Σ μ_k h_k."""
+        """Return the history and its weights in the Lagrangian.
+
+        Returns
+        -------
+        (ForceHistory, (n, N, I) array)
+            The history, and μ such that multipliers · equations contains Σ μ_k h_k.
+        """
         mu = -multipliers[self.rows].reshape(self.shape) / self.segment.length_m
         return self._of(part), np.concatenate([mu, np.zeros_like(mu[:, :1])], axis=1)
 
     def _of(self, part: Part) -> ForceHistory:
+        """Return the force history of a part."""
         history = part.along[self.history]
         assert isinstance(history, ForceHistory)
         return history
@@ -100,20 +114,22 @@ class ForceRows(Carried):
 
     @cached_property
     def _own(self) -> Index:
-        """(n, N − 1, I) b_1, b_2, … by their numbers."""
+        """Indices (n, N − 1, I) of the variables b_1, b_2, … within this block."""
         return np.arange(self.count).reshape(self.shape)
 
     @cached_property
     def _moving(self) -> Index:
-        """(m,) what moves the body, in z."""
+        """Columns (m,) in z of the parameters that change the motion."""
         return self.segment.moving_in(self.first_phi)
 
     def _lags(self, first: int) -> Iterator[tuple[slice, Index, Array, Array]]:
-        """Of N − 1 evaluations from `first` on those with a lag, and their x in z (T, P).
+        """Iterate over the lags of the stencil, for N − 1 evaluations from `first` on.
 
-        P are the `pairs` of the points; the coefficients p and q are (T, 1).
+        Yields the slice of the evaluations with this lag, the columns (T, P) in z of their
+        positions, P being the `pairs` of the points, and the coefficients p and q (T, 1).
         """
-        dynamics, times = self.segment.dynamics, np.arange(first, first + self.shape[1])
+        dynamics = self.segment.dynamics
+        times = np.arange(first, first + self.shape[1])
         q = dynamics.tables.q / dynamics.step_s
         for lag, (of_p, of_q) in enumerate(zip(dynamics.state_weights.T, q.T, strict=True)):
             used = (times >= lag) & ((of_p[times] != 0) | (of_q[times] != 0))
@@ -124,7 +140,9 @@ class ForceRows(Carried):
                 yield here, x, of_p[k], of_q[k]
 
     def _by_x(self, first: int, parts: Parts) -> Iterator[Array]:
-        """Slopes (a, T, P) by x at each lag, from those of N − 1 evaluations."""
+        """Yield derivatives (a, T, P) by x at each lag, from those of N − 1 evaluations by
+        state and velocity.
+        """
         instance, local, _, weight = self._points.pairs
         by_y = parts.y[:, local, :, instance].transpose(1, 2, 0) * weight
         by_v = parts.v[:, local, :, instance].transpose(1, 2, 0) * weight if parts.v.size else 0.0
@@ -132,11 +150,13 @@ class ForceRows(Carried):
             yield by_y[:, here] * p + (by_v[:, here] * q if isinstance(by_v, np.ndarray) else 0.0)
 
     def _motion(self) -> Iterator[tuple[Index, Index, Index, Array]]:
-        """Rows of motion with b: which K pairs of the points they are of, and evaluations (T,).
+        """Iterate over the entries of equations of motion that contain b.
 
-        And the rows (T, K), and what the force counts in them.
+        Yields indices (K,) of the pairs of points, evaluations (T,), rows (T, K) in g, and the
+        weights (T, K) of the force in them.
         """
-        dynamics, first_row = self.segment.dynamics, self.segment.dynamics.first_row
+        dynamics = self.segment.dynamics
+        first_row = self.segment.dynamics.first_row
         _, _, of_pairs, shares = self._points.pairs
         for rows in rows_of_motion(self.segment, self.reactions):
             pairs = np.flatnonzero(rows.number[of_pairs] >= 0)
@@ -152,8 +172,11 @@ class ForceRows(Carried):
                 yield pairs, k[:, 0], row, weight / self.segment.force_n
 
     def _jacobian(self) -> Iterator[Outer]:
-        """Of r by b, by x, and by what moves the body; of the motion by b."""
-        rows, columns = self.places.row + self._own, self.places.variable + self._own
+        """Yield the entries of the equations by b, by x and by the dynamic parameters, then
+        those of the motion by b.
+        """
+        rows = self.places.row + self._own
+        columns = self.places.variable + self._own
         instance = self._points.pairs[0]
         yield Outer([rows], [columns])
         yield Outer([rows[:, None, 1:]], [columns[:, :-1]])
@@ -164,35 +187,45 @@ class ForceRows(Carried):
             yield Outer([row], [columns[:, k[:, None] - self.first, instance[pairs]]])
 
     def _hessian(self) -> Iterator[Outer]:
-        """In the columns of b: by b, by x, and by what moves the body."""
-        columns, (i, j) = self.places.variable + self._own, np.triu_indices(self.shape[0])
+        """Yield the Hessian's entries in the columns of b: by b, by x and by the dynamic
+        parameters.
+        """
+        columns = self.places.variable + self._own
+        i, j = np.triu_indices(self.shape[0])
         yield Outer([columns[i]], [columns[j]])
         for here, x, *_ in self._lags(self.first):
             yield Outer([x], [columns[:, here][..., self._points.pairs[0]]])
         yield Outer([self._moving[:, None, None, None]], [columns])
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Rows and columns of the further entries of ∂g/∂z, in the order of their values."""
+        """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
+        values.
+        """
         return together(each.laid_out() for each in self._jacobian())
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """The same of the upper triangle of the Lagrangian's Hessian."""
+        """Return rows and columns of the additional entries of the Hessian, upper triangle."""
         return together(each.laid_out() for each in self._hessian())
 
     def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
-        """The equations, and the values of these entries."""
-        history, length_m, d = self._of(part), self.segment.length_m, self._points.dofs
-        slopes, places = history.parts(slice(None)), history.columns
+        """Return the equations, and the values of `jacobian_entries`."""
+        history = self._of(part)
+        length_m = self.segment.length_m
+        d = self._points.dofs
+        slopes = history.parts(slice(None))
+        places = history.columns
         by = Parts(*(-each[d:, :, :-1] / length_m for each in slopes))
-        found = [np.ones(self.count), length_m * by.b[:, :, 1:]]
-        found += [length_m * each for each in self._by_x(0, by)]
+        blocks = [np.ones(self.count), length_m * by.b[:, :, 1:]]
+        blocks += [length_m * each for each in self._by_x(0, by)]
         of_inputs = part.setting.by_p[:-1][:, places]
-        found.append(np.einsum("acti,tcm->amti", by.c, of_inputs))
-        found += self._motion_by_b(slopes)
-        return self.values(part, z), np.concatenate([each.ravel() for each in found])
+        blocks.append(np.einsum("acti,tcm->amti", by.c, of_inputs))
+        blocks += self._motion_by_b(slopes)
+        return self.values(part, z), np.concatenate([each.ravel() for each in blocks])
 
     def _motion_by_b(self, slopes: Parts) -> Iterator[Array]:
-        """Slopes of the rows of motion, from those at all evaluations."""
+        """Yield derivatives of the equations of motion by b, from the force's derivatives
+        at all evaluations.
+        """
         instance, local, *_ = self._points.pairs
         for pairs, k, _, weight in self._motion():
             by_b = slopes.b[local[pairs], :, :, instance[pairs]][:, :, k]
@@ -201,15 +234,17 @@ class ForceRows(Carried):
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
-        """The values of these entries; multipliers are those of all of g."""
+        """Return the values of `hessian_entries`; arguments as in `Carried.hessian_values`."""
         history, mu = self.weighed(part, multipliers)
         assert isinstance(history, ForceHistory)
-        length_m, places = self.segment.length_m, history.columns
-        bent, first = history.bent(mu, weights.forces), self.first
-        by = Parts(*(self.unit_m * each[:, :, first:] for each in bent))
-        found = [self.unit_m * by.b[np.triu_indices(self.shape[0])]]
-        across = Parts(*(each.swapaxes(0, 1) for each in by))
-        found += [length_m * each for each in self._by_x(first, across)]
+        length_m = self.segment.length_m
+        places = history.columns
+        second_derivatives = history.bent(mu, weights.forces)
+        first = self.first
+        by = Parts(*(self.unit_m * each[:, :, first:] for each in second_derivatives))
+        blocks = [self.unit_m * by.b[np.triu_indices(self.shape[0])]]
+        by_state = Parts(*(each.swapaxes(0, 1) for each in by))
+        blocks += [length_m * each for each in self._by_x(first, by_state)]
         of_inputs = part.setting.by_p[first:][:, places]
-        found.append(np.einsum("cati,tcm->mati", by.c, of_inputs))
-        return np.concatenate([each.ravel() for each in found])
+        blocks.append(np.einsum("cati,tcm->mati", by.c, of_inputs))
+        return np.concatenate([each.ravel() for each in blocks])

@@ -1,7 +1,8 @@
-"""Readings of one's own: of points of the body with their velocities and accelerations, or of what
-a grasp gives.
+"""Custom sensors: measurements defined by a user's expression.
 
-These are those of the polynomial through the five times around a sample.
+The expression is a function of positions, velocities and accelerations of points of the body, or of
+the force and torque of a grasp. Velocities and accelerations are those of the polynomial through
+the five grid times around a sample.
 """
 
 from __future__ import annotations
@@ -27,25 +28,31 @@ from .reading import GROUP, Channel, Reading, Window, lagrange_weights, times_ar
 from .wrench_channel import GraspWrench, Grid
 
 # Times around a sample; of equilibria, which have no velocities, the two beside it.
-NEIGHBOURS, STATIC_NEIGHBOURS = 5, 2
+NEIGHBOURS = 5
+STATIC_NEIGHBOURS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class GaugeReading(Reading):
-    """The samples of a gauge.
+    """Measurement model of one custom sensor.
 
     Attributes
     ----------
     gauge : Gauge
-    at_s : (n,) the times of the channel
+        The user's sensor with its samples.
+    at_s : (n,) array
+        Times of the observable [s].
     static : bool
+        Whether the experiment is static: there are no velocities, and two times around a sample are
+        used.
     """
 
     gauge: Gauge
     at_s: Array
     static: bool
 
-    stated, has_offsets = "sigma", True
+    stated = "sigma"
+    has_offsets = True
 
     @classmethod
     def of(
@@ -58,12 +65,30 @@ class GaugeReading(Reading):
         huber: float | None,
         static: bool,
     ) -> GaugeReading:
-        """That of a gauge of some number, which looks at a channel that is known at some times."""
+        """Build the measurement model of a custom sensor.
+
+        Parameters
+        ----------
+        gauge : Gauge
+            The user's sensor with its samples.
+        number : int
+            Index of the sensor in the experiment.
+        channel : Channel
+            Observable.
+        at_s : (n,) array
+            Times of the observable [s]; samples outside are not compared.
+        nuisance : NuisanceMap
+            Nuisance parameters of the experiment.
+        huber : float or None
+            Threshold of Huber's loss; None means a quadratic loss.
+        static : bool
+            Whether the experiment is static.
+        """
         count = gauge.measured.shape[1]
         groups = -(-count // GROUP)
         padded = np.full((len(gauge.times), 1, GROUP * groups), np.nan)
         padded[:, 0, :count] = gauge.measured
-        there = np.isfinite(padded) & _within(gauge.times, at_s)[:, None, None]
+        is_compared = np.isfinite(padded) & _within(gauge.times, at_s)[:, None, None]
         which = [f" {k + 1}" if groups > 1 else "" for k in range(groups)]
         return cls(
             channel=channel,
@@ -73,7 +98,7 @@ class GaugeReading(Reading):
             t_s=gauge.times,
             sigmas=np.full(groups, gauge.sigma),
             measured=padded,
-            components=there.reshape(len(padded), groups, GROUP),
+            components=is_compared.reshape(len(padded), groups, GROUP),
             own=nuisance.places(GAUGE, of=number)[None],
             gauge=gauge,
             at_s=at_s,
@@ -81,11 +106,14 @@ class GaugeReading(Reading):
         )
 
     def of_some(self, known_s: Array, t_s: Array, numbers: Array, **changes: Any) -> GaugeReading:
-        """That of other samples (S, m), of a channel that is known at some times."""
+        """Return the model of other samples, see `Reading.of_some`."""
         return super().of_some(known_s, t_s, numbers, at_s=known_s, **changes)
 
     @cached_property
     def _window(self) -> Window:
+        """Stencil of all samples: indices of the neighbouring times, and the data of the
+        expression.
+        """
         used = min(STATIC_NEIGHBOURS if self.static else NEIGHBOURS, len(self.at_s))
         times = times_around(self.at_s, self.t_s + TIME_TOLERANCE_S, used)
         each = np.arange(self.channel.each)
@@ -94,21 +122,24 @@ class GaugeReading(Reading):
         return Window(places, data.T[..., None])
 
     def window(self, phi: Array, known: int) -> Window:
-        """Of the samples whose times are all known."""
+        """Return the stencil of those first samples whose times are among the first `known`
+        ones.
+        """
         last = self._window.places[:, 0, -1] // self.channel.each
         samples = int(np.count_nonzero(last < known))
         return Window(self._window.places[:samples], self._window.data[:, :samples])
 
     @property
     def begins_s(self) -> float:
-        """The last time that the first sample is read from."""
+        """Last time [s] that the first compared sample is computed from."""
         first = int(self.components.any(axis=(1, 2)).argmax())
         return float(self.at_s[self._window.places[first, 0, -1] // self.channel.each])
 
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """The user's, with zeros up to a multiple of three numbers."""
+        """Return the user's expression, padded with zeros to a multiple of three numbers."""
         *places, t_s = ca.vertsplit(data)
-        late, each = ca.SX.sym("late"), self.channel.each
+        late = ca.SX.sym("late")
+        each = self.channel.each
         by_time = ca.reshape(looked, GROUP * each, -1)
         weights = ca.vertcat(*lagrange_weights(late, places))
         at = []
@@ -119,12 +150,14 @@ class GaugeReading(Reading):
         if self.gauge.grasp is not None:
             at = ca.horzsplit(at[0])
         unknowns = ca.vertsplit(phi * self.nuisance.scales[self.own[0]][:, None])
-        read = self.gauge.read(t_s, at, unknowns)
-        return ca.vertcat(read, ca.SX.zeros(self.measured.shape[2] - read.numel()))
+        predicted = self.gauge.read(t_s, at, unknowns)
+        return ca.vertcat(predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel()))
 
     @cached_property
     def looked_sigmas(self) -> Array:
-        """From the slopes where all is zero."""
+        """Standard deviations (3 e,) of the observable as one sample determines it, from
+        the derivatives at zero.
+        """
         nothing = np.zeros((self.channel.count, self.channel.each, GROUP))
         _, _, by_u = self._read(nothing, np.zeros(self.nuisance.size))
         by_looked = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own.shape[1]])
@@ -134,17 +167,21 @@ class GaugeReading(Reading):
             return 1 / np.sqrt(squares)
 
     def of_motion(self, motion: Motion, phi: Array) -> Array:
-        """What it reads (S, G, 3) of a motion at the channel's times, NaN beyond them."""
-        read = self.predicted(self.channel.values(motion, phi), phi)
-        return np.where(_within(self.t_s, self.at_s)[:, None, None], read, np.nan)
+        """Return predictions (S, G, 3) for a motion at the observable's times; NaN for
+        samples outside.
+        """
+        predicted = self.predicted(self.channel.values(motion, phi), phi)
+        return np.where(_within(self.t_s, self.at_s)[:, None, None], predicted, np.nan)
 
     def said(self, read: Array) -> Array:
-        """(S, m) numbers of these groups."""
+        """Return the m numbers (S, m) of the sensor from predictions (S, G, 3)."""
         return read.reshape(len(read), -1)[:, : self.gauge.measured.shape[1]]
 
 
 def _within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
-    """Which samples lie among some times."""
+    """Return the mask (S,) of samples within the range of ascending times; none if there
+    are no times.
+    """
     if not len(at_s):
         return np.zeros(len(t_s), dtype=bool)
     return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (t_s <= at_s[-1] + TIME_TOLERANCE_S)
@@ -157,30 +194,40 @@ def gauge_readings(
     nuisance: NuisanceMap,
     huber: float | None = None,
 ) -> tuple[GaugeReading, ...]:
-    """Those of an experiment.
+    """Build the measurement models of all custom sensors of an experiment.
 
     Parameters
     ----------
-    t_s : (N,) times of the rows of x
+    experiment : Experiment
+        The experiment.
+    t_s : (N,) array
+        Times of the rows of x [s].
     grid : Grid
-        Of those that tell reactions.
+        Times at which reaction forces are known.
+    nuisance : NuisanceMap
+        Nuisance parameters of the experiment.
+    huber : float or None
+        Threshold of Huber's loss; None means a quadratic loss.
     """
-    found = []
+    models = []
     for number, gauge in enumerate(experiment.readings):
         if gauge.grasp is None:
-            channel, at_s = points_of(experiment, gauge, len(t_s)), t_s
+            channel = points_of(experiment, gauge, len(t_s))
+            at_s = t_s
         else:
-            grasp, origin = experiment.grasps[gauge.grasp], np.zeros(3)
+            grasp = experiment.grasps[gauge.grasp]
+            origin = np.zeros(3)
             channel = GraspWrench.of(experiment, grasp, gauge.frame, origin, grid, nuisance)
             at_s = channel.t_s
         how = channel, at_s, nuisance, huber, experiment.static
-        found.append(GaugeReading.of(gauge, number, *how))
-    return tuple(found)
+        models.append(GaugeReading.of(gauge, number, *how))
+    return tuple(models)
 
 
 def points_of(experiment: Experiment, gauge: Gauge, rows: int) -> Points:
-    """The places that a gauge looks at in all rows."""
-    body, points = experiment.body, np.asarray(gauge.points_m)
+    """Return the points of a custom sensor as an observable at the first `rows` grid times."""
+    body = experiment.body
+    points = np.asarray(gauge.points_m)
     names = [f"{gauge.name} {k + 1}" for k in range(len(points))]
     placement = place_markers(points, body.nodes.points_m, body, names=names)
     chart = Chart.exact(body, placement, points)

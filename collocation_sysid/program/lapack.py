@@ -1,7 +1,7 @@
-"""LAPACK's banded Cholesky without the interpreter lock, so that threads share the work.
+"""Banded Cholesky factorisation of LAPACK without the interpreter lock, for use in threads.
 
-SciPy's own wrappers hold the lock while they factorise; its Cython interface gives the address
-of the same routine.
+SciPy's wrappers hold the lock while they factorise; its Cython interface provides the address of
+the same routine.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from threadpoolctl import ThreadpoolController
 
 
 def _routine(name: str, arguments: int) -> Any:
+    """Return a LAPACK routine of SciPy's Cython interface as a ctypes function with pointer
+    arguments.
+    """
     module = import_module("scipy.linalg.cython_lapack")
     capsule = LowLevelCallable.from_cython(module, name).function
     api = ctypes.pythonapi
@@ -36,27 +39,32 @@ _DPBTRF = _routine("dpbtrf", 6)
 
 @cache
 def _controller() -> ThreadpoolController:
+    """Return the controller of BLAS threads; cached because its creation is slow."""
     return ThreadpoolController()
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Keep BLAS to one thread: several gain nothing on narrow bands, and wait for each other."""
+    """Context manager that limits BLAS to one thread: on narrow bands several gain nothing
+    and wait for each other.
+    """
     with _controller().limit(limits=1, user_api="blas"):
         yield
 
 
 def cholesky_in_place(band: NDArray[np.float64]) -> bool:
-    """Factorise a symmetric matrix given by its lower band; tell whether it is positive definite.
+    """Factorise a symmetric band matrix in place and return whether it is positive definite.
 
     Parameters
     ----------
-    band : (half-bandwidth + 1, n) Fortran-ordered ndarray
-        Diagonal first; overwritten by the factor.
+    band : (half-bandwidth + 1, n) Fortran-ordered array
+        Lower band, diagonal first; overwritten by the factor.
     """
     rows, columns = band.shape
     lower = ctypes.c_char(b"L")
-    size, width, leading = ctypes.c_int(columns), ctypes.c_int(rows - 1), ctypes.c_int(rows)
+    size = ctypes.c_int(columns)
+    width = ctypes.c_int(rows - 1)
+    leading = ctypes.c_int(rows)
     failed_at = ctypes.c_int(0)
     _DPBTRF(
         ctypes.addressof(lower),

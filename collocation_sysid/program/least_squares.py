@@ -1,8 +1,8 @@
-"""What rows of residuals say about parameters, as one small triangle.
+"""Information of least-squares rows about parameters, in square-root form.
 
-Rows r + S (p − p₀) are kept as the triangle T of a QR factorisation of (S, r − S p₀), so that
-‖T (p, 1)‖² is the sum of their squares at any p. More rows update it by another QR: their normal
-equations are never formed, and what T says stays positive semidefinite to rounding (Bierman,
+Rows r + S (p − p₀) are stored as the triangle T of a QR factorisation of (S, r − S p₀), so that ‖T
+(p, 1)‖² is their sum of squares at any p. Further rows update it by another QR. The normal
+equations are never formed, and the information stays positive semidefinite to rounding (Bierman,
 "Factorization methods for discrete sequential estimation", 1977).
 """
 
@@ -23,20 +23,22 @@ _names = ("geqrf", "trtrs", "trtri", "trcon")
 _geqrf, _trtrs, _trtri, _trcon = get_lapack_funcs(_names, dtype=np.float64)
 # Eigenvalue of the information SᵀS, in units of its diagonal, that is zero up to rounding; and the
 # share of a parameter in such a direction that does not matter.
-SINGULAR, NEGLIGIBLE = 1e-12, 1e-3
+SINGULAR = 1e-12
+NEGLIGIBLE = 1e-3
 # Triangles of a smaller reciprocal condition are not solved by substitution.
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """The triangle of some rows.
+    """Triangle of a linear least-squares problem in P parameters.
 
     Attributes
     ----------
-    triangle : (at most P + 1, P + 1) slopes, and residuals where p is zero behind them
+    triangle : (at most P + 1, P + 1) array
+        Derivatives by p, and in the last column residuals at p = 0.
     rows : int
-        How many it stands for.
+        Number of rows that it represents.
     """
 
     triangle: Array
@@ -44,55 +46,73 @@ class LeastSquares:
 
     @classmethod
     def none(cls, size: int) -> LeastSquares:
-        """Of no rows on p (P,)."""
+        """Return the problem in P = `size` parameters without rows."""
         return cls(np.zeros((0, size + 1)))
 
     def add(self, residual: Array, slope: Array, at: Array | None = None) -> LeastSquares:
-        """With rows whose residual is r (k,) at p (P,), by default zero; slopes (k, P)."""
+        """Return the problem with further rows.
+
+        Parameters
+        ----------
+        residual : (k,) array
+            Residuals at `at`.
+        slope : (k, P) array
+            Derivatives by p.
+        at : (P,) array, optional
+            Parameters of the residuals; zero by default.
+        """
         right = residual if at is None else residual - slope @ at
         return self._with(np.column_stack([slope, right]), len(residual))
 
     def joined(self, other: LeastSquares, places: Index | slice = slice(None)) -> LeastSquares:
-        """With all the rows of another, whose parameters are at some places of these."""
+        """Return the problem with all rows of another, whose parameters are at `places`
+        among these.
+        """
         rows = np.zeros((len(other.triangle), self.triangle.shape[1]))
         rows[:, :-1][:, places] = other.slope
         rows[:, -1] = other.residual
         return self._with(rows, other.rows)
 
     def _with(self, rows: Array, count: int) -> LeastSquares:
+        """Return the problem with rows of derivatives and residuals at p = 0, which count
+        as `count` rows.
+        """
         if not count:
             return self
         return LeastSquares(_rotated(np.concatenate([self.triangle, rows])), self.rows + count)
 
     @property
     def slope(self) -> Array:
-        """S, as the triangle has it."""
+        """Derivatives S by p, as the triangle represents them."""
         return self.triangle[:, :-1]
 
     @property
     def residual(self) -> Array:
-        """The residuals where p is zero, as the triangle has them."""
+        """Residuals at p = 0, as the triangle represents them."""
         return self.triangle[:, -1]
 
     @property
     def information(self) -> Array:
-        """(P, P) SᵀS."""
+        """Information matrix (P, P), SᵀS."""
         return self.slope.T @ self.slope
 
     @property
     def score(self) -> Array:
-        """(P,) Sᵀ r, half the gradient of the loss where p is zero."""
+        """Score (P,), Sᵀ r: half the gradient of the sum of squares at p = 0."""
         return self.slope.T @ self.residual
 
     def loss(self, p: Array) -> float:
-        """Sum of the squares at p."""
-        left = self.triangle @ np.append(p, 1.0)
-        return float(left @ left)
+        """Return the sum of squares at p."""
+        residual = self.triangle @ np.append(p, 1.0)
+        return float(residual @ residual)
 
     def best(self, lower: Array, upper: Array) -> Array:
-        """The p between bounds with the least squares; of several the shortest."""
+        """Return the p with the least sum of squares between bounds (P,); without active
+        bounds, the shortest of several.
+        """
         size = len(lower)
-        square, right = self.slope[:size], -self.residual[:size]
+        square = self.slope[:size]
+        right = -self.residual[:size]
         regular = len(square) == size > 0 and _trcon(square)[0] > ROUNDING
         p = _trtrs(square, right)[0] if regular else np.linalg.lstsq(square, right)[0]
         if ((lower <= p) & (p <= upper)).all():
@@ -100,7 +120,9 @@ class LeastSquares:
         return np.clip(lsq_linear(square, right, (lower, upper), method="bvls").x, lower, upper)
 
     def marginal(self, first: int) -> LeastSquares:
-        """What the rows say about the first parameters, where the others are as is best then."""
+        """Return the problem in the first parameters alone, with the others eliminated at
+        their optimum.
+        """
         size = self.triangle.shape[1]
         others = np.arange(first, size - 1)
         order = np.concatenate([others, np.arange(first), [size - 1]])
@@ -109,51 +131,59 @@ class LeastSquares:
 
     @cached_property
     def root(self) -> Array:
-        """(P, r) L with SᵀS = (L Lᵀ)⁻¹ in the r directions that the rows determine."""
+        """Matrix L (P, r) with SᵀS = (L Lᵀ)⁻¹ in the r directions that the rows determine."""
         return self._split[0]
 
     @cached_property
     def undetermined(self) -> NDArray[np.bool_]:
-        """(P,) parameters in whose direction the loss is flat."""
+        """Mask (P,) of the parameters that a direction with zero information contains."""
         return self._split[1]
 
     @cached_property
     def _split(self) -> tuple[Array, NDArray[np.bool_]]:
+        """`root` and `undetermined`."""
         units = np.linalg.norm(self.slope, axis=0)
         units[units == 0] = 1.0
-        square, size = (self.slope / units)[: len(units)], len(units)
+        square = (self.slope / units)[: len(units)]
+        size = len(units)
         # So that no eigenvalue is zero up to rounding; much faster.
         if len(square) == size > 0 and _trcon(square)[0] > size * np.sqrt(SINGULAR):
             return _trtri(square)[0] / units[:, None], np.zeros(size, dtype=bool)
-        _, found, vectors = np.linalg.svd(square)
+        _, singular_values, vectors = np.linalg.svd(square)
         values = np.zeros(len(units))
-        values[: len(found)] = found
-        known = values**2 > SINGULAR
-        root = vectors[known].T / values[known] / units[:, None]
-        return root, np.asarray((np.abs(vectors[~known]) > NEGLIGIBLE).any(axis=0))
+        values[: len(singular_values)] = singular_values
+        is_determined = values**2 > SINGULAR
+        root = vectors[is_determined].T / values[is_determined] / units[:, None]
+        return root, np.asarray((np.abs(vectors[~is_determined]) > NEGLIGIBLE).any(axis=0))
 
     def covariance(self, of_score: Array | None = None) -> Array:
-        """(P, P) of p, infinite variance where that is undetermined.
+        """Return the covariance (P, P) of p.
+
+        Undetermined parameters have infinite variance, and NaN covariances.
 
         Parameters
         ----------
-        of_score : (r, r) Lᵀ B L, optional
-            Of errors whose score Sᵀe has the covariance B; by default those of errors that are
-            independent and of size one.
+        of_score : (r, r) array, optional
+            Lᵀ B L for errors e whose score Sᵀe has the covariance B; by default errors are
+            independent with unit variance.
         """
-        root, lost = self.root, self.undetermined
+        root = self.root
+        is_undetermined = self.undetermined
         found = root @ root.T if of_score is None else root @ of_score @ root.T
-        found[lost] = found[:, lost] = np.nan
-        found[lost, lost] = np.inf
+        found[is_undetermined] = found[:, is_undetermined] = np.nan
+        found[is_undetermined, is_undetermined] = np.inf
         return found
 
     @cached_property
     def errors(self) -> Array:
-        """(P,) standard deviations of p, for independent rows whose errors are of size one."""
+        """Standard deviations (P,) of p for independent errors of unit variance; infinite
+        where undetermined.
+        """
         return np.sqrt(np.diag(self.covariance()))
 
 
 def _rotated(rows: Array) -> Array:
+    """Return the triangle of a QR factorisation of rows (k, P + 1)."""
     size = rows.shape[1]
     factors, *_ = _geqrf(rows, lwork=64 * size)
     return np.triu(factors[:size])

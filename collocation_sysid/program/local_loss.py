@@ -1,4 +1,8 @@
-"""Second derivatives of the loss by positions and φ, of what follows from few positions."""
+"""Second derivatives of the loss by positions and nuisance parameters, for local observables.
+
+An observable is local if it depends on few positions at each time, such as the place of a marker.
+Wrenches are not; programs that need their second derivatives lift them, see `wrench_rows`.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +19,18 @@ from .reading import Reading
 
 @dataclass(frozen=True, eq=False)
 class LocalLoss:
-    """That of some readings of one experiment.
+    """Hessian of the loss of the local measurements of one experiment.
 
     Attributes
     ----------
-    readings : those whose channel is local, with that
+    readings : tuple of (Reading, Points)
+        Measurements with their local observables.
     variables : int
-        Number of x, all of which stand before φ.
+        Number of position variables, all of which precede φ.
     size : int
-        Number of φ.
+        Number of nuisance parameters φ.
     dofs : int
-        Of the body.
+        Number of dofs of the body.
     """
 
     readings: tuple[tuple[Reading, Points], ...]
@@ -35,37 +40,51 @@ class LocalLoss:
 
     @cached_property
     def structure(self) -> tuple[Index, Index]:
-        """Rows and columns of the entries, upper triangle, sorted by column."""
-        none, codes = np.zeros(self.size), [np.zeros(0, dtype=np.int64)]
+        """Rows and columns among (x, φ) of the entries, upper triangle, sorted by column."""
+        none = np.zeros(self.size)
+        codes = [np.zeros(0, dtype=np.int64)]
         for reading, points in self.readings:
             slopes = points.slopes(None, none, self.variables)
             codes.append(self._codes(*reading.hessian_structure(slopes)))
-        found = np.unique(np.concatenate(codes))
-        return found % self._height, found // self._height
+        unique_codes = np.unique(np.concatenate(codes))
+        return unique_codes % self._height, unique_codes // self._height
 
     @property
     def _height(self) -> int:
+        """Number of rows and columns."""
         return self.variables + self.size
 
     def _codes(self, rows: Index, columns: Index) -> Index:
-        """Numbers of entries that ascend as they are sorted."""
+        """Return one number for each entry, ascending in the order of `structure`."""
         return columns * self._height + rows
 
     def hessian(self, x: Array, phi: Array, bent: bool = True) -> Array:
-        """Values of the entries; of readings that are bent, or linear."""
+        """Return the values of the entries.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        phi : (k,) array
+            Nuisance parameters.
+        bent : bool
+            If false, neglect the curvature of the observations (Gauss–Newton).
+        """
         return self._constant if self._is_quadratic else self._at(x, phi, bent)
 
     @property
     def _is_quadratic(self) -> bool:
-        """Whether they are always the same."""
+        """Whether the values do not depend on x and φ."""
         return all(reading.is_quadratic and points.is_linear for reading, points in self.readings)
 
     @cached_property
     def _constant(self) -> Array:
+        """Values of the entries at zero positions."""
         rows = max((points.rows[-1] + 1 for _, points in self.readings), default=1)
         return self._at(np.zeros((rows, self.dofs)), np.zeros(self.size), True)
 
     def _at(self, x: Array, phi: Array, bent: bool) -> Array:
+        """Return the values of the entries at x and φ."""
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))
         for entries in self._entries(x, phi, bent):
@@ -73,6 +92,9 @@ class LocalLoss:
         return values
 
     def _entries(self, x: Array, phi: Array, bent: bool) -> Iterator[Entries]:
+        """Iterate over the contributions of the measurements, and of the curvature of
+        observables.
+        """
         for reading, points in self.readings:
             values = points.of(x, phi)
             yield reading.hessian(values, phi, points.slopes(x, phi, self.variables), bent)

@@ -40,21 +40,25 @@ SHIFT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class LostStability:
-    """The mode in which a body loses its stability, and the stretches where it moves most.
+    """Mode in which a body loses its stability, and the stretches where the mode is largest.
 
     Attributes
     ----------
-    positions_m : (n, 3) corner and mid nodes of the body at the end of the stable path
-    mode : (n, 3) displacements of the nodes, the longest of length one
-    faces : (F, 3) corners of the surface's triangles
-    place_m : (3,)
-        Undeformed place of the face that moves most.
+    positions_m : (n, 3) array
+        Nodes of the body at the end of the stable path [m].
+    mode : (n, 3) array
+        Displacements of the nodes; the longest has length one.
+    faces : (F, 3) array
+        Corners of the surface's triangles.
+    place_m : (3,) array
+        Undeformed place of the decisive face [m].
     stretch, across : float
         Principal stretches of the surface there, the smaller first.
     critical_stretch : float
-        At which a neo-Hookean surface is unstable, for the same relation of both stretches.
+        Smaller stretch at which a neo-Hookean surface is unstable, for the same relation of both
+        stretches.
     wavelength_m : float
-        Of the mode on the undeformed surface: 2π √(∫|φ|² / ∫|∇φ|²).
+        Wavelength of the mode on the undeformed surface, 2π √(∫|φ|² / ∫|∇φ|²) [m].
     """
 
     positions_m: Array
@@ -73,7 +77,7 @@ class LostStability:
 
     @property
     def sentence(self) -> str:
-        """What happens, where, and what to do about it."""
+        """Message for the user: the mode, where it is largest, and what to change."""
         x, y, z = (1e3 * self.place_m).tolist()
         where = (
             f"it moves most at ({x:.4g}, {y:.4g}, {z:.4g}) mm, where the stretches of the surface "
@@ -94,7 +98,9 @@ class LostStability:
 
 
 def explained(experiment: Experiment, theta: Array, error: SimulationError) -> SimulationError:
-    """Return the error with the mode if a static path ended by a loss of stability, or itself."""
+    """Return the error with the mode, if a static path ended by a loss of stability;
+    otherwise the same error.
+    """
     if error.state_m is None:
         return error
     try:
@@ -111,14 +117,25 @@ def explained(experiment: Experiment, theta: Array, error: SimulationError) -> S
 def lost_stability(
     experiment: Experiment, theta: Array, x: Array, time_s: float
 ) -> LostStability | None:
-    """Return the mode in which a body is about to lose its stability at positions x (3n,).
+    """Return the mode in which a body is about to lose its stability, or None.
 
-    None where its lowest eigenvalue is not small compared with that of the undeformed body, and
-    where nothing holds the body.
+    None where the lowest eigenvalue is not small compared with that of the undeformed body, and
+    where no grasp prevents rigid motions.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    x : (3n,) array
+        Positions at the end of the stable path [m].
+    time_s : float
+        Time of loads and poses [s].
     """
     forces = Forces.of(experiment, time_s, theta)
-    held = experiment.held([time_s])[0].ravel()
-    free = np.flatnonzero(~held)
+    is_prescribed = experiment.held([time_s])[0].ravel()
+    free = np.flatnonzero(~is_prescribed)
     reference, _ = _lowest(forces, experiment.rigid_positions([time_s])[0].ravel(), free, 0.0)
     if not reference > 0:
         return None

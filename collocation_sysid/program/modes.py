@@ -1,9 +1,9 @@
-"""Small oscillations of a body about a state: natural frequencies, shapes and their damping.
+"""Natural modes of a body about a state: frequencies, shapes and damping ratios.
 
 Free dofs obey M ẍ + C ẋ + K x = 0 with the stiffness K at that state, the lumped mass M and the
-damping C. A mode K φ = ω² M φ has the damping ratio ζ = φᵀC φ / 2ω φᵀM φ; where Rayleigh's
-C = γ_r K + γ_m M is the same throughout the body that is γ_r ω / 2 + γ_m / 2ω, and the mode
-oscillates for itself.
+damping C. A mode K φ = ω² M φ has the damping ratio ζ = φᵀC φ / 2ω φᵀM φ; where Rayleigh's C = γ_r
+K + γ_m M is the same throughout the body, ζ is γ_r ω / 2 + γ_m / 2ω, and modes are not coupled by
+damping.
 """
 
 from __future__ import annotations
@@ -31,16 +31,19 @@ RIGID_MOTIONS = 6
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """The lowest modes that oscillate, by frequency.
+    """Lowest oscillating modes, by ascending frequency.
 
     Attributes
     ----------
-    frequencies_hz : (k,) undamped natural frequencies ω / 2π
-    damping_ratios : (k,) ζ; 1 and above does not oscillate
-    shapes : (k, n, 3) displacements, φᵀ M φ = 1 kg (unit m); held nodes rest
+    frequencies_hz : (k,) array
+        Undamped natural frequencies ω / 2π.
+    damping_ratios : (k,) array
+        Damping ratios ζ; modes with 1 and above do not oscillate.
+    shapes : (k, n, 3) array
+        Displacements with φᵀ M φ = 1 kg (unit m); zero at prescribed dofs.
     not_oscillating : int
-        Modes left out because nothing drives them back: six rigid ones of a body nobody holds,
-        and those in which a state is unstable.
+        Number of modes left out because they have no restoring force: six rigid ones of a body
+        without grasp, and those in which a state is unstable.
     """
 
     frequencies_hz: Array
@@ -50,31 +53,30 @@ class Modes:
 
     @property
     def angular_frequencies_rad_s(self) -> Array:
-        """(k,) ω."""
+        """Angular frequencies ω (k,)."""
         return 2 * np.pi * self.frequencies_hz
 
 
 def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6) -> Modes:
-    """The lowest modes of a body about a state.
+    """Return the lowest modes of a body about a state.
 
     Parameters
     ----------
     forces : Forces
-        On the body at one time, see `Forces.on`.
+        Forces on the body at one time, see `Forces.of`.
     x : (n, 3) or (3n,) array
-        The state; it should be an equilibrium.
-    free_dofs : (k,) sorted dofs that are not held
+        The state [m], which should be an equilibrium.
+    free_dofs : (k,) array
+        Sorted dofs that are not prescribed.
     count : int
-        Modes wanted; there may be fewer.
-
-    Returns
-    -------
-    Modes
+        Number of modes; there may be fewer.
     """
-    mass, pattern = forces.mass.kg[0, free_dofs], forces.pattern
+    mass = forces.mass.kg[0, free_dofs]
+    pattern = forces.pattern
     state = np.asarray(x, dtype=float).reshape(1, -1)
     at = forces.linearise(state, np.zeros_like(state))
-    lower, damping = -at.by_position[0], -at.by_velocity[0]
+    lower = -at.by_position[0]
+    damping = -at.by_velocity[0]
     stiffness = sp.csc_array(pattern.matrix(lower)[:, free_dofs][free_dofs])
     largest = float((stiffness.diagonal() / mass).max(initial=0.0))
     wanted = count + RIGID_MOTIONS
@@ -87,7 +89,8 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     oscillating = squares > RIGID * largest
     shapes = np.zeros((int(oscillating.sum()), pattern.size))
     shapes[:, free_dofs] = vectors[:, oscillating].T
-    omega, shapes = np.sqrt(squares[oscillating])[:count], shapes[:count]
+    omega = np.sqrt(squares[oscillating])[:count]
+    shapes = shapes[:count]
     drag = np.einsum("ki,ki->k", shapes, (pattern.matrix(damping) @ shapes.T).T)
     return Modes(
         omega / (2 * np.pi),
@@ -98,6 +101,7 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
 
 
 def _dense(stiffness: sp.csc_array, mass: Array, wanted: int) -> tuple[Array, Array]:
+    """Return the lowest eigenvalues and eigenvectors by a dense solver."""
     root = np.sqrt(mass)
     scaled = stiffness.toarray() / np.outer(root, root)
     last = min(wanted, len(mass)) - 1
@@ -106,7 +110,7 @@ def _dense(stiffness: sp.csc_array, mass: Array, wanted: int) -> tuple[Array, Ar
 
 
 class _Inverse(LinearOperator):
-    """(K − shift · M)⁻¹ from its factor."""
+    """Operator (K − shift · M)⁻¹ of a factorised matrix."""
 
     def __init__(self, factor: Factor, size: int) -> None:
         super().__init__(np.dtype(float), (size, size))
@@ -119,7 +123,9 @@ class _Inverse(LinearOperator):
 def _lanczos(
     stiffness: sp.csc_array, mass: Array, factor: Factor, shift: float, wanted: int
 ) -> tuple[Array, Array]:
-    """Shift-invert Lanczos iterations: the modes nearest to `shift`, just below zero."""
+    """Return the eigenvalues and eigenvectors nearest to `shift`, just below zero, by
+    shift-invert Lanczos iterations.
+    """
     squares, vectors = eigsh(
         stiffness,
         wanted,

@@ -1,9 +1,10 @@
-"""Equations of motion of some dofs as rows of a Jacobian, in scaled quantities.
+"""Equations of motion of selected dofs as rows of a sparse Jacobian, in scaled quantities.
 
-Rows are c / `force_n` by x / `length_m`; where a dof is held instead, (x − u x̄) / `length_m`. A
-dof that is held for a while has a grasp row at those times instead of an equation of motion, and
-the force on it then counts in no later row, see `Dynamics.taken`: where a grasp ends or begins,
-entries differ from the scheme's.
+Rows are c / `force_n`, differentiated by x / `length_m`; a prescribed dof has the row (x − u x̄) /
+`length_m` instead. A dof that is prescribed for a part of the time has a grasp row at those times
+instead of an equation of motion, and the force on it at those times counts in no later row (see
+`Dynamics.taken`): where a grasp begins or ends, entries differ from those of the scheme, and
+`ReleasedGrasps` corrects them.
 """
 
 from __future__ import annotations
@@ -22,15 +23,20 @@ from .block_band import BandBlock, BlockBand, BlockTerm, adding_skew, skew_value
 
 @dataclass(frozen=True, eq=False)
 class MotionRows:
-    """∂c/∂x of the rows of one experiment; row numbers count from its first.
+    """Structure and values of ∂c/∂x of one experiment; row indices count from its first row.
 
     Attributes
     ----------
     dynamics : Dynamics
-        As stated.
-    row_dofs : (k,) the dof of each row of a grid time, ascending
-    moving_dofs : those of them with an equation of motion; others are held throughout
-    length_m, force_n : units
+        Equations of motion with inputs as stated; determines the structure.
+    row_dofs : (k,) array
+        Dof of each row of a grid time, ascending.
+    moving_dofs : array
+        Those of `row_dofs` with an equation of motion; the others are prescribed at all times.
+    length_m : float
+        Unit of positions [m].
+    force_n : float
+        Unit of forces [N].
     """
 
     dynamics: Dynamics
@@ -41,32 +47,36 @@ class MotionRows:
 
     @property
     def pattern(self) -> SymmetricPattern:
-        """Sparsity of the blocks."""
+        """Sparsity pattern of the blocks."""
         return self.dynamics.pattern
 
     @cached_property
     def band(self) -> BlockBand:
-        """The structure."""
+        """Sparsity structure of ∂c/∂x by columns."""
         return BlockBand(self.pattern.size, self._starts, self._blocks())
 
     @cached_property
     def _skew(self) -> BlockBand:
-        """The same, to add the skew parts of ∂F/∂x and ∂F/∂v to it."""
+        """Structure of `band` for adding the skew parts of ∂F/∂x and ∂F/∂v."""
         spins = self.dynamics.forces.spins
         return adding_skew(self.pattern.size, self._starts, self._blocks(), by_velocity=spins)
 
     @property
     def _starts(self) -> Index:
+        """Return the index of the first row of each grid time, −1 where there are no rows."""
         first_row = self.dynamics.first_row
         starts = (np.arange(self.dynamics.rows) - first_row) * len(self.row_dofs)
         return np.maximum(starts, -1) if first_row else starts
 
     def _blocks(self) -> list[BandBlock]:
+        """Return the blocks of ∂c_t/∂x_{t−lag}, with the terms that fill them."""
         rows, columns, source = self.pattern.full
-        place, moving = np.full(self.pattern.size, -1), np.zeros(self.pattern.size, dtype=bool)
+        place = np.full(self.pattern.size, -1)
+        moving = np.zeros(self.pattern.size, dtype=bool)
         place[self.row_dofs] = np.arange(len(self.row_dofs))
         moving[self.moving_dofs] = True
-        whole, held = moving[rows], ~moving[rows] & (place[rows] >= 0)
+        has_motion = moving[rows]
+        is_prescribed = ~moving[rows] & (place[rows] >= 0)
         scale = self.length_m / self.force_n
         blocks = []
         for lag in range(self.dynamics.reach + 1):
@@ -79,22 +89,24 @@ class MotionRows:
                 )
                 for j, a, b in self.dynamics.block_terms(lag)
             ]
-            kept = whole.copy() if terms else whole & (rows == columns)
+            kept = has_motion.copy() if terms else has_motion & (rows == columns)
             if lag == 0:
-                kept |= held & (rows == columns)
+                kept |= is_prescribed & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
             entries = place[rows[kept]], columns[kept], source[kept]
             blocks.append(BandBlock(lag, *entries, terms, np.flatnonzero(kept)))
         return blocks
 
     def _inertia_rows(self, lag: int) -> Index:
-        """Grid times whose rows have inertia at a lag."""
+        """Return the grid times whose equations of motion have inertia at a lag."""
         rows = np.arange(max(self.dynamics.first_row, lag), self.dynamics.rows)
         return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
 
     @cached_property
     def _constants(self) -> tuple[Index, Index]:
-        """Positions of the inertia, and of the unit grasp entries."""
+        """Positions of the inertia entries, and of the unit entries of grasp rows, in the
+        values.
+        """
         place = np.searchsorted(self.row_dofs, self.moving_dofs)
         positions = [np.zeros(0, dtype=np.int64)]
         for lag in range(self.dynamics.reach + 1):
@@ -106,21 +118,23 @@ class MotionRows:
         return np.concatenate(positions), grasps.ravel()
 
     def _inertia(self, dynamics: Dynamics) -> Array:
-        """∂c/∂x of the inertia, in the order of its positions."""
+        """Return the inertia entries of ∂c/∂x in the order of their positions."""
         mass = dynamics.mass.kg[:, self.moving_dofs] * self.length_m / self.force_n
         values = [np.zeros(0)]
         for lag in range(self.dynamics.reach + 1):
-            rows, coefficient = self._inertia_rows(lag), self.dynamics.inertia_coefficient(lag)
+            rows = self._inertia_rows(lag)
+            coefficient = self.dynamics.inertia_coefficient(lag)
             values.append((coefficient[rows, None] * mass[rows]).ravel())
         return np.concatenate(values)
 
     @cached_property
     def _known_inertia(self) -> Array:
-        """The same where it does not depend on (q, φ)."""
+        """Inertia entries of ∂c/∂x at the stated masses."""
         return self._inertia(self.dynamics)
 
     @cached_property
     def _passing(self) -> ReleasedGrasps:
+        """Corrections where grasps begin or end."""
         scale = self.length_m / self.force_n
         return ReleasedGrasps.of(
             self.dynamics, self.band, self._starts, self.pattern, self.row_dofs, scale
@@ -129,12 +143,18 @@ class MotionRows:
     def fill(
         self, values: Array, forces: Linearisation, dynamics: Dynamics, mass_moves: bool
     ) -> None:
-        """Write the values (band.nnz,), from the slopes of the forces at the evaluations.
+        """Write the values of ∂c/∂x.
 
         Parameters
         ----------
-        dynamics : at the parameters
-        mass_moves : whether the mass depends on them
+        values : (band.nnz,) array
+            Values, overwritten.
+        forces : Linearisation
+            Derivatives of the forces at the evaluations.
+        dynamics : Dynamics
+            Equations of motion at the parameters.
+        mass_moves : bool
+            Whether the mass depends on the parameters; if not, the stated mass is used.
         """
         threads = dynamics.body.threads
         self.band.fill(values, forces.by_position, forces.by_velocity, threads)
@@ -150,7 +170,7 @@ class MotionRows:
 
 
 def ahead(values: Array, steps: int) -> Array:
-    """values[t + steps] at t, zero beyond the end."""
+    """Return values[t + steps] at index t, zero beyond the end."""
     shifted = np.zeros_like(values)
     shifted[: len(values) - steps] = values[steps:]
     return shifted
@@ -158,7 +178,22 @@ def ahead(values: Array, steps: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Dropped:
-    """Entries a G + b C of one evaluation that are not there."""
+    """Entries a G + b C of one evaluation that the Jacobian does not have, because a grasp
+    prescribed the dof.
+
+    Attributes
+    ----------
+    positions : (e,) array
+        Positions in the values of the Jacobian.
+    evaluation : int
+        Index of the evaluation.
+    source : (e,) array
+        Entries in lower triangles.
+    whole : (e,) array
+        Entries in both triangles, in the order of `skew_values`.
+    a, b : float
+        Coefficients of G = ∂F/∂ξ and C = ∂F/∂ν.
+    """
 
     positions: Index
     evaluation: int
@@ -170,7 +205,17 @@ class _Dropped:
 
 @dataclass(frozen=True, eq=False)
 class ReleasedGrasps:
-    """What to correct in the values of ∂c/∂x."""
+    """Corrections of ∂c/∂x for grasps that hold for a part of the time.
+
+    Attributes
+    ----------
+    dropped : tuple of _Dropped
+        Forces to subtract.
+    zeros : array
+        Positions of entries to set to zero.
+    ones : array
+        Positions of entries to set to one.
+    """
 
     dropped: tuple[_Dropped, ...]
     zeros: Index
@@ -186,7 +231,23 @@ class ReleasedGrasps:
         row_dofs: Index,
         scale: float,
     ) -> ReleasedGrasps:
-        """The corrections of a segment's Jacobian, whose rows are scaled by `scale`."""
+        """Compute the corrections of an experiment's Jacobian.
+
+        Parameters
+        ----------
+        dynamics : Dynamics
+            Equations of motion.
+        band : BlockBand
+            Structure of the Jacobian.
+        row_starts : (N,) array
+            First row of each grid time, −1 where there are no rows.
+        pattern : SymmetricPattern
+            Sparsity pattern of the blocks.
+        row_dofs : (k,) array
+            Dof of each row of a grid time.
+        scale : float
+            Factor of the rows, `length_m` / `force_n`.
+        """
         taken = dynamics.taken
         nothing = np.zeros(0, dtype=np.int64)
         place = np.full(pattern.size, -1)
@@ -204,18 +265,24 @@ class ReleasedGrasps:
     def correct(
         self, values: Array, by_position: Array, by_velocity: Array, skew: Array, of_rates: Array
     ) -> None:
-        """Correct the values in place.
+        """Correct the values of ∂c/∂x in place.
 
-        G and C are (evaluations, m) lower triangles; the others are the entries of their skew
-        parts.
+        Parameters
+        ----------
+        values : (band.nnz,) array
+            Values without corrections, modified.
+        by_position, by_velocity : (evaluations, m) arrays
+            Lower triangles of the symmetric parts of G and C.
+        skew, of_rates : arrays
+            Entries of the skew parts of G and C, see `skew_values`; empty where there are none.
         """
-        for gone in self.dropped:
-            force = gone.a * by_position[gone.evaluation, gone.source]
-            values[gone.positions] -= force + gone.b * by_velocity[gone.evaluation, gone.source]
+        for entry in self.dropped:
+            force = entry.a * by_position[entry.evaluation, entry.source]
+            values[entry.positions] -= force + entry.b * by_velocity[entry.evaluation, entry.source]
             if skew.size:
-                values[gone.positions] -= gone.a * skew[gone.evaluation, gone.whole]
+                values[entry.positions] -= entry.a * skew[entry.evaluation, entry.whole]
             if of_rates.size:
-                values[gone.positions] -= gone.b * of_rates[gone.evaluation, gone.whole]
+                values[entry.positions] -= entry.b * of_rates[entry.evaluation, entry.whole]
         values[self.zeros] = 0.0
         values[self.ones] = 1.0
 
@@ -223,21 +290,27 @@ class ReleasedGrasps:
 def _dropped(
     dynamics: Dynamics, band: BlockBand, pattern: SymmetricPattern, place: Index, scale: float
 ) -> list[_Dropped]:
-    tables, step_s, found = dynamics.tables, dynamics.step_s, []
+    """Return the entries of forces that act while a dof is prescribed, in later rows where
+    it is free.
+    """
+    tables = dynamics.tables
+    step_s = dynamics.step_s
+    dropped = []
     rows, columns, source = pattern.full
     for k in range(dynamics.first_row, dynamics.rows):
         for j in range(1, min(dynamics.reach, dynamics.rows - 1 - k) + 1):
             weight = scale * tables.w[k + j, j]
-            let_go = dynamics.taken[k] & ~dynamics.taken[k + j]
-            if weight == 0 or not let_go.any():
+            released = dynamics.taken[k] & ~dynamics.taken[k + j]
+            if weight == 0 or not released.any():
                 continue
-            kept = np.flatnonzero(let_go[rows])
+            kept = np.flatnonzero(released[rows])
             for i in range(min(dynamics.reach - j, k) + 1):
-                a, b = weight * tables.p[k, i], weight * tables.q[k, i] / step_s
+                a = weight * tables.p[k, i]
+                b = weight * tables.q[k, i] / step_s
                 if a or b:
                     positions = band.positions(
                         np.array([k - i]), i + j, place[rows[kept]], columns[kept]
                     )
                     here = positions.ravel(), k - dynamics.first_row
-                    found.append(_Dropped(*here, source[kept], kept, a, b))
-    return found
+                    dropped.append(_Dropped(*here, source[kept], kept, a, b))
+    return dropped

@@ -1,8 +1,8 @@
-"""Contact within a timestep, at the points that may touch in it.
+"""Contact within one time step, restricted to the points that may touch.
 
-All other points of a surface add nothing, and obstacles stay where they are while the step is
-solved. So points are looked for once a step, with a margin, and of each force only what it does to
-the nodes of its own face is evaluated: that is what Newton's method asks for, with exact slopes.
+Other points of the surface contribute nothing, and obstacles do not move while the step is solved.
+Candidate points are therefore searched once a step, with a margin, and only the forces on the nodes
+of their faces are evaluated, with exact derivatives for Newton's method.
 """
 
 from __future__ import annotations
@@ -19,22 +19,30 @@ from ..fem.touching import VECTORS
 from ..model.contact import Contact, ContactLaw
 
 # Points so many edges away may come to touch, until a coordinate has changed by a third of that.
-MARGIN, CHANGE = 0.25, 1 / 3
+MARGIN = 0.25
+CHANGE = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
 class NearPoints:
-    """Points that an obstacle may touch.
+    """Contact points that an obstacle may touch in a time step.
 
     Attributes
     ----------
     law : ContactLaw
-    chosen : (i,) indices of the points
-    nodes : (i, k) of the face at each
-    weights : (i, k) of these
-    dofs : (i, 3k) of these
-    entries : (i, 3k, 3k) of these, in a pattern
-    symmetric, skew : (i, 3k, 3k) what they count in the two parts of a matrix
+        Contact law of the obstacle.
+    chosen : (i,) array
+        Indices of the points among all contact points.
+    nodes : (i, k) array
+        Nodes of the face of each point.
+    weights : (i, k) array
+        Shape functions of these nodes.
+    dofs : (i, 3k) array
+        Dofs of these nodes.
+    entries : (i, 3k, 3k) array
+        Positions of the pairs of dofs in the pattern.
+    symmetric, skew : (i, 3k, 3k) arrays
+        Factors of the entries in the symmetric and the skew part of a matrix.
     """
 
     law: ContactLaw
@@ -49,8 +57,20 @@ class NearPoints:
     @staticmethod
     @lru_cache(maxsize=64)
     def of(law: ContactLaw, pattern: SymmetricPattern, chosen: bytes) -> NearPoints:
-        """Some of an obstacle; those of the last few choices are kept, as steps are alike."""
-        some, points = np.frombuffer(chosen, dtype=np.int64), law.surface.points
+        """Build the candidates of an obstacle; the last few are cached, because successive steps
+        are similar.
+
+        Parameters
+        ----------
+        law : ContactLaw
+            Contact law of the obstacle.
+        pattern : SymmetricPattern
+            Pattern of the matrices.
+        chosen : bytes
+            Indices of the points, an array of int64 as bytes.
+        """
+        some = np.frombuffer(chosen, dtype=np.int64)
+        points = law.surface.points
         nodes = points.nodes[some, :-VECTORS]
         dofs = dofs_of(nodes)
         row, column = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
@@ -66,7 +86,17 @@ class NearPoints:
         )
 
     def inputs(self, contact: Contact, xi: Array, nu: Array, theta: Array) -> tuple[Array, Array]:
-        """Return the inputs of the push of a contact with this law, and its data, at ξ, ν (3n,)."""
+        """Return the inputs and the data of the contact law's generated force.
+
+        Parameters
+        ----------
+        contact : Contact
+            Contact force with this law.
+        xi, nu : (3n,) arrays
+            State [m] and velocity [m/s].
+        theta : (k,) array
+            Constants of the body.
+        """
         frame = self.law.obstacle.nodes
         moving = [each.reshape(-1, 3) for each in (xi, nu)[: 1 + self.law.by_velocity]]
         own = [np.einsum("ik,ikj->ji", self.weights, x[self.nodes] - x[frame[0]]) for x in moving]
@@ -76,27 +106,46 @@ class NearPoints:
         return np.concatenate(own), np.concatenate([data, contact.data_of(self.chosen)])
 
     def summed(self, push: Array, size: int) -> Array:
-        """(size,) on the dofs of a body, of forces (3, i) on the points."""
+        """Return forces (size,) on the dofs of a body from forces (3, i) on the points [N]."""
         on_nodes = self.weights[:, :, None] * push.T[:, None]
         summed = np.bincount(self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size)
         return np.asarray(summed, dtype=float)
 
 
 class NearContact:
-    """Contact in a timestep of a body with constants θ (k,), with slopes on a pattern."""
+    """Contact in one time step of a body with constants θ (k,).
+
+    Attributes
+    ----------
+    acts : bool
+        Whether there are contact forces at all.
+
+    Parameters
+    ----------
+    contacts : sequence of Contact
+        Contact forces; may be empty.
+    theta : (k,) array
+        Constants of the body.
+    pattern : SymmetricPattern
+        Pattern of the matrices.
+    """
 
     def __init__(
         self, contacts: Sequence[Contact], theta: Array, pattern: SymmetricPattern
     ) -> None:
-        self._contacts, self._theta, self._pattern = contacts, theta, pattern
-        self._from, self._near = np.full((2, 1), np.nan), list[tuple[Contact, NearPoints]]()
+        self._contacts = contacts
+        self._theta = theta
+        self._pattern = pattern
+        self._from = np.full((2, 1), np.nan)
+        self._near = list[tuple[Contact, NearPoints]]()
         edges_m = [each.contact.surface.edge_m for each in contacts]
-        self.acts, self._margin_m = bool(contacts), MARGIN * min(edges_m, default=0.0)
+        self.acts = bool(contacts)
+        self._margin_m = MARGIN * min(edges_m, default=0.0)
         # A pressure that is averaged over a step depends on the states at both ends.
         self._half_s = max((each.step_s for each in contacts), default=0.0) / 2
 
     def force(self, xi: Array, nu: Array) -> Array:
-        """(3n,) at ξ and ν, (1, 3n) each."""
+        """Return the contact forces (3n,) [N] at ξ and ν, each (1, 3n)."""
         force = np.zeros(xi.size)
         for near, u, data in self._at(xi[0], nu[0]):
             force += near.summed(near.law.push.value(u, data), xi.size)
@@ -105,10 +154,23 @@ class NearContact:
     def linearise(
         self, xi: Array, nu: Array, rates: tuple[float, float]
     ) -> tuple[Array, Array, Array]:
-        """The same, and lower triangles of the symmetric and the skew part of its slope.
+        """Return the contact forces and their derivative.
 
-        That is by what moves ξ and ν at these rates; there is a skew one (m,), not (0,), where
-        something rubs.
+        Parameters
+        ----------
+        xi, nu : (1, 3n) arrays
+            State [m] and velocity [m/s].
+        rates : (float, float)
+            Derivatives of ξ and of ν by the unknown positions.
+
+        Returns
+        -------
+        (3n,) array
+            Forces [N].
+        (m,) array
+            Lower triangle of the symmetric part of the derivative by the unknown positions.
+        (m,) or (0,) array
+            Lower triangle of its skew part; empty without friction or other velocity dependence.
         """
         force = np.zeros(xi.size)
         rubs = any(each.contact.by_velocity for each in self._contacts)
@@ -120,7 +182,8 @@ class NearContact:
             by_way = rates[0] * slopes[:, :3, touch]
             if near.law.by_velocity:
                 by_way += rates[1] * slopes[:, 3:, touch]
-            weights, here = near.weights[touch], near.entries[touch].ravel()
+            weights = near.weights[touch]
+            here = near.entries[touch].ravel()
             blocks = np.einsum("pa,ijp,pb->paibj", weights, by_way, weights)
             blocks = blocks.reshape(near.entries[touch].shape)
             counted = (near.symmetric, near.skew)[: 1 + near.law.by_velocity]
@@ -131,10 +194,13 @@ class NearContact:
         return force, *parts
 
     def _at(self, xi: Array, nu: Array) -> Iterator[tuple[NearPoints, Array, Array]]:
-        """What is near, with inputs and data of its law."""
+        """Iterate over the candidates of each contact, with inputs and data of its law; the
+        search is repeated if the state has changed by more than the margin allows.
+        """
         ends = np.array([xi - self._half_s * nu, xi + self._half_s * nu])
         if not np.abs(ends - self._from).max() <= CHANGE * self._margin_m:
-            self._from, self._near = ends, []
+            self._from = ends
+            self._near = []
             for each in self._contacts:
                 gaps = each.contact.gaps(each.points.vectors(ends)).min(axis=0)
                 (chosen,) = np.nonzero(gaps < each.contact.widths_m + self._margin_m)

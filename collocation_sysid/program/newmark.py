@@ -1,12 +1,12 @@
-"""Implicit Newmark (β = ¼, γ = ½), the reference integrator, with a step of its own.
+"""Implicit Newmark method (β = ¼, γ = ½, average acceleration): the reference integrator.
 
-All forces but contact are those at both ends of a step, as ever. Contact acts by its mean over the
-step, C(ξ, ν) at ξ = (x_0 + x_1)/2 and ν = (x_1 − x_0)/h, whose work is the loss of its energy, see
+All forces but contact are evaluated at both ends of a step. Contact acts by its mean over the step,
+C(ξ, ν) at ξ = (x_0 + x_1)/2 and ν = (x_1 − x_0)/h, whose work is the loss of its energy, see
 `model.contact`; forces at both ends would add energy at every impact:
 
     M (v_1 − v_0) = h/2 (F_0 + F_1) + h C,    x_1 − x_0 = h/2 (v_0 + v_1).
 
-So the accelerations a = M⁻¹ F of states are those without contact.
+The accelerations a = M⁻¹ F of states are therefore those without contact.
 """
 
 from __future__ import annotations
@@ -35,7 +35,19 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Positions, velocities and accelerations at one time, each (3n,)."""
+    """State of the integrator at one time.
+
+    Attributes
+    ----------
+    t_s : float
+        Time [s].
+    x, v, a : (3n,) arrays
+        Positions [m], velocities [m/s] and accelerations without contact [m/s²].
+    left : tuple
+        History variables after the step; empty if there are none.
+    contact_n : (3n,) array or None
+        Mean contact force over the step that led here [N]; None if there is no contact.
+    """
 
     t_s: float
     x: Array
@@ -54,61 +66,91 @@ def newmark(
     progress: Progress | None,
     sensed: Index,
 ) -> tuple[Array, Array, Forced]:
-    """Positions and velocities (T, 3n) at the samples, and the reactions on some dofs at all steps.
+    """Simulate an experiment by Newmark's method.
 
     Parameters
     ----------
-    sensed : (g,) those dofs
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    steps_per_sample : int
+        Time steps between samples.
+    options : NewtonOptions or None
+        Options of Newton's method; None means defaults.
+    progress : callable or None
+        Called with the share of the samples done.
+    sensed : (g,) array
+        Dofs whose reaction forces are wanted.
+
+    Returns
+    -------
+    (T, 3n) array
+        Positions at the samples [m].
+    (T, 3n) array
+        Velocities at the samples [m/s].
+    Forced
+        Reaction forces on the sensed dofs at all steps.
+
+    Raises
+    ------
+    SimulationError
+        If a step fails even after halvings.
     """
     stepper = _Stepper(experiment, theta, options)
     times = experiment.t_s
     x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
     state = stepper.start()
-    x[0], v[0] = state.x, state.v
+    x[0] = state.x
+    v[0] = state.v
     step = experiment.timestep_s / steps_per_sample
-    felt = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
-    felt[:, 0] = stepper.felt(state, sensed)
-    means_n = np.zeros_like(felt[0])
+    reactions_and_positions = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
+    reactions_and_positions[:, 0] = stepper.felt(state, sensed)
+    means_n = np.zeros_like(reactions_and_positions[0])
     if state.contact_n is not None:
         means_n[0] = state.contact_n[sensed]
     for k in range(1, len(times)):
         for j in range(1, steps_per_sample + 1):
             state = stepper.advance(state, float(times[k - 1] + j * step))
             row = (k - 1) * steps_per_sample + j
-            felt[:, row] = stepper.felt(state, sensed)
+            reactions_and_positions[:, row] = stepper.felt(state, sensed)
             if state.contact_n is not None:
                 means_n[row] = state.contact_n[sensed]
-        x[k], v[k] = state.x, state.v
+        x[k] = state.x
+        v[k] = state.v
         if progress:
             progress(k / (len(times) - 1))
     # Contact at a time is the mean over the steps before and after it.
-    felt[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
-    felt[0, [0, -1]] -= means_n[[0, -1]]
-    return x, v, Forced(*felt)
+    reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
+    reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
+    return x, v, Forced(*reactions_and_positions)
 
 
 class _Stepper:
     """Newmark steps of one experiment."""
 
     def __init__(self, experiment: Experiment, theta: Array, options: NewtonOptions | None) -> None:
-        self.experiment, self.theta = experiment, theta
+        self.experiment = experiment
+        self.theta = theta
         self.body = experiment.body
         self.options = options or NewtonOptions()
         self.solvers = Solvers(experiment, options)
 
     def start(self) -> _State:
-        """The experiment's start."""
+        """Return the initial state of the experiment."""
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
         x, v = start_state(self.experiment, self._forces(time_s), solver)
-        left = left_at_start(self._forces(time_s), x, v, self.experiment.loaded_since_s)
-        state = _State(time_s, x, v, np.zeros_like(x), left)
+        previous_histories = left_at_start(
+            self._forces(time_s), x, v, self.experiment.loaded_since_s
+        )
+        state = _State(time_s, x, v, np.zeros_like(x), previous_histories)
         if self.experiment.obstacles:
             state = replace(state, contact_n=self._contact_n(x, v, time_s))
         return self._balanced(state, time_s, solver.free)
 
     def advance(self, state: _State, goal_s: float) -> _State:
-        """Advance to `goal_s`, in halves where Newton fails."""
+        """Return the state at `goal_s`, in shorter steps where Newton's method fails."""
         step = goal_s - state.t_s
         smallest = step * 0.5**self.options.halvings
         state = self._after_a_change(state, goal_s)
@@ -126,24 +168,29 @@ class _Stepper:
         return state
 
     def felt(self, state: _State, dofs: Index) -> tuple[Array, Array]:
-        """The reactions on some dofs in a state, and where they are."""
+        """Return the reaction forces without contact on dofs [N], and their positions [m]."""
         if not len(dofs):
             return np.zeros(0), np.zeros(0)
         reaction = self._mass(state.t_s) * state.a - self._force(state, state.t_s)
         return reaction[dofs], state.x[dofs]
 
     def _force(self, state: _State, load_s: float) -> Array:
-        """Return all forces (3n,) but contact in a state, under the loads of a time."""
+        """Return all forces (3n,) but contact in a state, under the loads at a time [N]."""
         forces, _ = self._forces(load_s).without_contact()
         for each in state.left:
             forces = each.now(forces)
         return forces.total(state.x, state.v)[0]
 
     def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
+        """Return the forces under the loads at a time; contact is averaged over a step of
+        `step_s` if it is not zero.
+        """
         return Forces.of(self.experiment, load_s, self.theta, step_s=step_s)
 
     def _contact_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
-        """Return the contact forces (3n,) at a state, or their means over a step about it."""
+        """Return the contact forces (3n,) at a state [N], averaged over a step of `step_s`
+        about it if that is not zero.
+        """
         forces = self._forces(load_s, step_s)
         total_n = np.zeros_like(x)
         for term in forces.further:
@@ -152,26 +199,33 @@ class _Stepper:
         return total_n
 
     def _solver(self, time_s: float) -> Solver:
+        """Return the solver with the dofs that are prescribed at a time."""
         return self.solvers.holding(self.experiment.held(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
+        """Return the masses (3n,) at a time [kg]."""
         return Weight.of(self.experiment, time_s).with_theta(self.theta).mass.kg[0]
 
     def _after_a_change(self, state: _State, goal_s: float) -> _State:
-        """The state with the accelerations after nodes are let go."""
-        before, after = self._solver(state.t_s), self._solver(goal_s)
+        """Return the state with new accelerations at nodes that a grasp has released by
+        `goal_s`.
+        """
+        before = self._solver(state.t_s)
+        after = self._solver(goal_s)
         if before is after:
             return state
         return self._balanced(state, goal_s, np.setdiff1d(after.free, before.free))
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
-        """The state with accelerations of some dofs from the forces on them."""
+        """Return the state with the accelerations of some dofs computed from the forces on them."""
         acceleration = state.a.copy()
         acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
-        """One step of β = ¼, γ = ½ (average acceleration); held dofs follow the grasp."""
+        """Return the state after one step to `end_s`, with loads and grasps of the time
+        `load_s`.
+        """
         h = end_s - state.t_s
         forces, touching = ahead(self._forces(load_s, step_s=h), state.left, h).without_contact()
         contact = NearContact(touching, self.theta, forces.pattern)
@@ -182,9 +236,11 @@ class _Stepper:
         known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
 
         def kinematics(x: Array) -> tuple[Array, Array]:
-            v, a = slope * x + known_v, slope**2 * x + known_a
+            v = slope * x + known_v
+            a = slope**2 * x + known_a
             # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-            v[solver.held], a[solver.held] = v_held, a_held
+            v[solver.held] = v_held
+            a[solver.held] = a_held
             return v, a
 
         def middle(x: Array) -> tuple[Array, Array]:
@@ -192,8 +248,8 @@ class _Stepper:
 
         def residual(x: Array) -> Array:
             v, a = kinematics(x)
-            found = forces.total(x, v)[0] - mass * a
-            return found + 2 * contact.force(*middle(x)) if contact.acts else found
+            balance = forces.total(x, v)[0] - mass * a
+            return balance + 2 * contact.force(*middle(x)) if contact.acts else balance
 
         def linearise(x: Array) -> tuple[Array, Array, Array]:
             v, a = kinematics(x)
@@ -203,13 +259,13 @@ class _Stepper:
             skew = -at.by_position_skew[0]
             if at.by_velocity_skew.size:
                 skew = skew - slope * at.by_velocity_skew[0]
-            found = at.force[0] - mass * a
+            balance = at.force[0] - mass * a
             if contact.acts:
-                pushed, symmetric, askew = contact.linearise(*middle(x), (0.5, 1 / h))
-                found = found + 2 * pushed
+                contact_force, symmetric, askew = contact.linearise(*middle(x), (0.5, 1 / h))
+                balance = balance + 2 * contact_force
                 matrix -= 2 * symmetric
                 skew = skew - 2 * askew
-            return found, matrix, skew
+            return balance, matrix, skew
 
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         if state.contact_n is not None:
@@ -227,14 +283,17 @@ class _Stepper:
             # Held dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= 2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
-        left = following(forces, state.left, x, v, h)
-        return _State(end_s, x, v, a, left, contact_n)
+        previous_histories = following(forces, state.left, x, v, h)
+        return _State(end_s, x, v, a, previous_histories, contact_n)
 
     def _held_motion(
         self, solver: Solver, time_s: float, h: float, holding_s: float
     ) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration of the held dofs, by central differences."""
-        experiment, nodes_m = self.experiment, self.experiment.body.nodes_m
+        """Return position, velocity and acceleration of the prescribed dofs by central
+        differences over h.
+        """
+        experiment = self.experiment
+        nodes_m = self.experiment.body.nodes_m
         motion = np.zeros((3, *nodes_m.shape))
         for grasp in experiment.grasps:
             if not grasp.holds(holding_s):
@@ -245,8 +304,8 @@ class _Stepper:
             times = np.clip([time_s - h, time_s, time_s + h], first, last)
             before, now, after = grasp.carry(nodes_m, times)[..., grasp.columns]
             velocity = (after - before) / (times[2] - times[0])
-            whole = times[2] - times[1] > 0.5 * h
-            acceleration = (after - 2 * now + before) / h**2 if whole else np.zeros_like(now)
+            is_central = times[2] - times[1] > 0.5 * h
+            acceleration = (after - 2 * now + before) / h**2 if is_central else np.zeros_like(now)
             place = np.ix_(grasp.nodes, grasp.columns)
             motion[:, *place] = now, velocity, acceleration
         now, velocity, acceleration = motion.reshape(3, -1)[:, solver.held]

@@ -1,4 +1,4 @@
-"""Newton's method for the static problem and for one implicit timestep."""
+"""Newton's method for the static problem and for one implicit time step."""
 
 from __future__ import annotations
 
@@ -26,23 +26,26 @@ T = TypeVar("T")
 STALE = 0.01
 # Steps with the factor of the solution before are taken while each is this much shorter than the
 # last, so often at most, and until what is left is this share of a last step.
-FAST, OFTEN, LEFT = 0.1, 8, 1e-5
+FAST = 0.1
+OFTEN = 8
+LEFT = 1e-5
 
 
 @dataclass(frozen=True)
 class NewtonOptions:
-    """Newton's method for one implicit step or the rest state.
+    """Options of Newton's method for one implicit step or an equilibrium.
 
     Attributes
     ----------
     tolerance : float
         Length of the last Newton step over the body's size.
     iterations : int
-        Iterations before a step is given up.
+        Largest number of iterations.
     backtracks : int
-        Halvings of a Newton step before it is given up.
+        Largest number of halvings of a Newton step.
     halvings : int
-        How often a time step (Newmark) or the grasp's motion in it (schemes) is halved.
+        Largest number of halvings of a time step (Newmark) or of the increment of the grasps in it
+        (schemes).
     """
 
     tolerance: float = 1e-10
@@ -52,7 +55,15 @@ class NewtonOptions:
 
 
 class NewtonFailure(Exception):
-    """Newton did not converge; carries the worst state for the message."""
+    """Newton's method did not converge.
+
+    Parameters
+    ----------
+    x : (3n,) array
+        Last state [m], for the error message.
+    reason : str
+        Cause.
+    """
 
     def __init__(self, x: Array, reason: str) -> None:
         self.x = x
@@ -64,16 +75,23 @@ class NewtonFailure(Exception):
 
 
 class Solver:
-    """Newton with backtracking on the free dofs of a body with given held dofs.
+    """Newton's method with backtracking on the free dofs of a body, for one set of prescribed dofs.
+
+    Attributes
+    ----------
+    free, held : arrays
+        Indices of free and of prescribed dofs.
 
     Parameters
     ----------
     experiment : Experiment
-        Its body and grasps.
-    options : NewtonOptions
+        Its body, obstacles and grasps.
+    options : NewtonOptions, optional
+        Options; defaults otherwise.
     stopwatch : Stopwatch, optional
-    held : (n, 3) bool, optional
-        Which coordinates are held; those at the experiment's first time by default.
+        Accumulates the time spent.
+    held : (n, 3) array of bool, optional
+        Prescribed coordinates; by default those at the experiment's first time.
     """
 
     def __init__(
@@ -90,7 +108,8 @@ class Solver:
         self.options = options or NewtonOptions()
         at_start = experiment.held(experiment.t_s[:1])[0]
         holding = at_start if held is None else held
-        self.free, self.held = np.flatnonzero(~holding), np.flatnonzero(holding)
+        self.free = np.flatnonzero(~holding)
+        self.held = np.flatnonzero(holding)
         self.pattern = experiment.pattern
         self.factoriser = Factoriser.of(self.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
@@ -104,22 +123,38 @@ class Solver:
         keep_definite: bool = False,
         goal: Array | None = None,
     ) -> Array:
-        """Solve residual(x) = 0 for the free dofs, starting at x (3n,).
+        """Solve residual(x) = 0 for the free dofs.
 
-        A step is accepted when the next one, computed with the same factor, is shorter
-        (Deuflhard's natural monotonicity test), no element is inverted, and with
-        `keep_definite` only while −∂r/∂x stays positive definite. An equilibrium (`keep_definite`)
-        may be far from x: without obstacles its steps are rotations and strains, see `Retraction`.
-        Otherwise the factor of the solution before serves as long as steps shrink fast.
+        A step is accepted when the next one, computed with the same factor, is shorter (Deuflhard's
+        natural monotonicity test), and no element is inverted. Equilibria may be far from x:
+        without obstacles their steps are applied as rotations and strains, see `Retraction`. Time
+        steps first reuse the factor of the previous solution as long as steps shrink fast.
 
         Parameters
         ----------
-        residual : x -> (3n,)
-        linearise : x -> residual (3n,), and lower triangles of the symmetric part (m,) and the
-            skew part, (m,) or (0,), of −∂r/∂x
-        goal : (held,) ndarray, optional
-            Where the held dofs are to be, if not where they are. The body goes with them as its
-            stiffness at x has it: moved alone, they would crush the elements next to them.
+        x : (3n,) array
+            First guess [m]; not modified. Prescribed dofs keep their values unless `goal` is given.
+        residual : callable
+            Residual (3n,) of x.
+        linearise : callable
+            Residual (3n,), and lower triangles of the symmetric part (m,) and of the skew part,
+            (m,) or (0,), of −∂residual/∂x.
+        keep_definite : bool
+            If true, solve for a stable equilibrium: accept states only while −∂residual/∂x is
+            positive definite.
+        goal : (held,) array, optional
+            Positions of the prescribed dofs [m]. The free dofs first follow to first order, because
+            moving prescribed dofs alone would crush adjacent elements.
+
+        Returns
+        -------
+        (3n,) array
+            Solution [m].
+
+        Raises
+        ------
+        NewtonFailure
+            If the method does not converge.
         """
         x = x.copy() if goal is None else self._moved(x, goal, linearise)
         self._require_upright(x)
@@ -140,7 +175,13 @@ class Solver:
         raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
 
     def _chords(self, x: Array, residual: Residual, linearise: Linearise) -> tuple[Array, bool]:
-        """As near to the solution as steps lead with few factors, and whether that is there."""
+        """Iterate with few factorisations (simplified Newton method).
+
+        Returns
+        -------
+        ((3n,) array, bool)
+            Last state, and whether it is the solution.
+        """
         is_own = False
         for _ in range(self.options.iterations):
             if self._kept is not None:
@@ -152,14 +193,24 @@ class Solver:
                 x = nearer
             _, *matrix = self._timed(linearise, x)
             try:
-                self._kept, is_own = self._factorise(matrix, x, False), True
+                self._kept = self._factorise(matrix, x, False)
+                is_own = True
             except NewtonFailure:
                 break
         return x, False
 
     def _nearer(self, x: Array, residual: Residual, kept: Factor) -> tuple[Array, bool]:
-        """As near to the solution as the kept factor leads fast, and whether that is there."""
-        nearer, before, done = x.copy(), None, False
+        """Iterate with a given factor while steps shrink fast.
+
+        Returns
+        -------
+        ((3n,) array, bool)
+            Last state, which is x itself if steps grow or invert an element; and whether it is the
+            solution.
+        """
+        nearer = x.copy()
+        before = None
+        done = False
         for _ in range(OFTEN):
             step = self._step(kept, self._timed(residual, nearer))
             length = float(np.linalg.norm(step))
@@ -174,17 +225,20 @@ class Solver:
         return (nearer, done) if self.is_upright(nearer) else (x, False)
 
     def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
-        """The state with the held dofs at their goal, to first order in equilibrium."""
-        found, way = x.copy(), np.zeros_like(x)
+        """Return the state with the prescribed dofs at `goal`, and free dofs in equilibrium
+        to first order.
+        """
+        state = x.copy()
+        way = np.zeros_like(x)
         way[self.held] = goal - x[self.held]
-        found[self.held] = goal
+        state[self.held] = goal
         if not self._is_last(way):
             self._require_upright(x)
             value, *matrix = self._timed(linearise, x)
-            pulled = self.pattern.products(matrix[0][None], way[None])[0]
+            coupling = self.pattern.products(matrix[0][None], way[None])[0]
             factor = self._factorise(matrix, x, keep_definite=False)
-            found[self.free] += self._step(factor, value - pulled)
-        return found
+            state[self.free] += self._step(factor, value - coupling)
+        return state
 
     def _backtrack(
         self,
@@ -195,7 +249,9 @@ class Solver:
         linearise: Linearise,
         keep_definite: bool,
     ) -> tuple[Array, Factor, Array]:
-        """The next iterate, its factor and its step."""
+        """Return the next iterate, its factor and its Newton step; raise NewtonFailure if
+        none is acceptable.
+        """
         length = np.linalg.norm(step)
         share = 1.0
         update = self._retraction if keep_definite and self._is_free_of_contact else added
@@ -208,7 +264,8 @@ class Solver:
                 if share == 1:
                     value, *matrix = self._timed(linearise, trial)
                 else:
-                    value, matrix = self._timed(residual, trial), None
+                    value = self._timed(residual, trial)
+                    matrix = None
                 next_step = self._step(factor, value)
                 if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                     if self._is_last(next_step, STALE) and not keep_definite:
@@ -225,16 +282,20 @@ class Solver:
 
     @cached_property
     def _retraction(self) -> Retraction:
-        """How increments towards an equilibrium are applied."""
+        """Retraction that applies increments towards an equilibrium."""
         prescribed = np.zeros(self.pattern.size, dtype=bool)
         prescribed[self.held] = True
         return Retraction(self.body, prescribed.reshape(-1, 3))
 
     def _is_last(self, step: Array, share: float = 1.0) -> bool:
+        """Whether a step is shorter than `share` times the tolerance."""
         tolerance = share * self.options.tolerance * self._size_m
         return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
     def _factorise(self, matrix: Sequence[Array], x: Array, keep_definite: bool) -> Factor:
+        """Return the factor of a matrix; raise NewtonFailure if it is singular or, with
+        `keep_definite`, not positive definite.
+        """
         try:
             with self.stopwatch.solving():
                 factor = self.factoriser.factorise(matrix[0], matrix[1])
@@ -245,10 +306,12 @@ class Solver:
         return factor
 
     def _step(self, factor: Factor, residual: Array) -> Array:
+        """Return the Newton step of the free dofs."""
         with self.stopwatch.solving():
             return factor.solve(residual[self.free])
 
     def _timed(self, function: Callable[[Array], T], x: Array) -> T:
+        """Evaluate a function at x, and measure the time."""
         with self.stopwatch.evaluating():
             return function(x)
 
@@ -257,27 +320,36 @@ class Solver:
         return bool(self.body.volume_ratios(x).min() > 0)
 
     def _require_upright(self, x: Array) -> None:
+        """Raise NewtonFailure if an element is inverted at x (3n,)."""
         if not self.is_upright(x):
             raise NewtonFailure(x, "an element is inverted before the first iteration")
 
     def worst_element(self, x: Array) -> int:
-        """The element with the smallest det F."""
+        """Return the index of the element with the smallest det F at x (3n,)."""
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
 
 
 def followed(
     solve: Callable[[Array, float], Array], x: Array, halvings: int, guess: Array | None = None
 ) -> Array:
-    """Follow x(s), what `solve(near, s)` finds, from x(0) to x(1) in steps that shrink on failure.
+    """Follow the solution x(s) from x(0) to x(1) in increments that shrink on failure, and grow
+    after two successes.
 
-    They grow again after two that succeed.
-
-    A guess of x(1) is tried first; where that fails the way there is taken, if it may be halved.
+    Parameters
+    ----------
+    solve : callable
+        Returns x(s) from a first guess and s; raises NewtonFailure.
+    x : (3n,) array
+        x(0).
+    halvings : int
+        The smallest increment is 0.5 to this power.
+    guess : (3n,) array, optional
+        Guess of x(1), which is tried first; if it fails and `halvings` is 0, the failure is raised.
 
     Raises
     ------
     NewtonFailure
-        Where a step that has been halved so often fails.
+        If an increment of the smallest size fails.
     """
     if guess is not None:
         try:
@@ -285,25 +357,40 @@ def followed(
         except NewtonFailure:
             if not halvings:
                 raise
-    rate, reached, increment, easy = np.zeros_like(x), 0.0, 1.0, False
+    rate = np.zeros_like(x)
+    reached = 0.0
+    increment = 1.0
+    easy = False
     while reached < 1.0:
         step = min(increment, 1.0 - reached)
         try:
-            found = solve(x + step * rate, reached + step)
+            solution = solve(x + step * rate, reached + step)
         except NewtonFailure:
             # What fails costs many times what succeeds: better short steps that grow.
-            increment, easy = step / 4, False
+            increment = step / 4
+            easy = False
             if increment < 0.5**halvings:
                 raise
         else:
-            x, rate, reached = found, (found - x) / step, reached + step
+            x, rate, reached = solution, (solution - x) / step, reached + step
             # One step as long as that which failed would fail again.
-            increment, easy = (2 * step if easy else step), True
+            increment = 2 * step if easy else step
+            easy = True
     return x
 
 
 class Solvers:
-    """The solvers of an experiment, one for each set of dofs that is held at some time."""
+    """Solvers of an experiment, one for each set of prescribed dofs; created on demand.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    options : NewtonOptions, optional
+        Options of Newton's method.
+    stopwatch : Stopwatch, optional
+        Accumulates the time spent.
+    """
 
     def __init__(
         self,
@@ -315,7 +402,7 @@ class Solvers:
         self._known: dict[bytes, Solver] = {}
 
     def holding(self, held: NDArray[np.bool_]) -> Solver:
-        """The solver with these coordinates (n, 3) held."""
+        """Return the solver with the prescribed coordinates (n, 3) bool."""
         key = held.tobytes()
         if key not in self._known:
             self._known[key] = Solver(*self._arguments, held)
@@ -327,7 +414,19 @@ def simulation_error(
 ) -> SimulationError:
     """Return the error for the user: what failed, when, at which element, and what to change.
 
-    Of a static path it has the state where the path ended, see `lost_stability.explained`.
+    Parameters
+    ----------
+    solver : Solver
+        The solver that failed.
+    failure : NewtonFailure
+        The failure.
+    time_s : float
+        Time of the step [s].
+    what : str
+        Description of the step, as the subject of a sentence.
+    static : bool
+        If true, the error contains the state where the path of equilibria ended, see
+        `lost_stability.explained`.
     """
     element = solver.worst_element(failure.x)
     ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())

@@ -40,7 +40,9 @@ OUTSIDE_PX = 1.5
 # sensor sees its background, and missing depths are failures.
 SEEN_BACKGROUND = 0.1
 # What pixels show, compared with a point of the outline.
-BODY, UNKNOWN, EMPTY = 0, 1, 2
+BODY = 0
+UNKNOWN = 1
+EMPTY = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,22 +89,22 @@ class Outline:
             Pixels whose depth differs by less from that of the outline point may show the body [m].
         """
         corners = skin.faces.shape[1]
-        found = []
+        edges = []
         for sample, shape_m in enumerate(shapes_m):
             image_m = view.depth.images_m[sample] if len(view.depth.images_m) else None
             points = None
             if image_m is not None:
                 points = _outline_points(view, skin, shape_m, phi=phi, sample=sample)
             if image_m is None or points is None:
-                found.append(_no_edges(corners))
+                edges.append(_no_edges(corners))
                 continue
-            found.append(_edges(view, points, image_m, phi=phi, gate_m=gate_m, sample=sample))
-        most = max(1, *(len(each["used"]) for each in found))
+            edges.append(_edges(view, points, image_m, phi=phi, gate_m=gate_m, sample=sample))
+        most = max(1, *(len(each["used"]) for each in edges))
 
         def together(name: str) -> NDArray:
-            return np.stack([_padded(each[name], most) for each in found])
+            return np.stack([_padded(each[name], most) for each in edges])
 
-        of_points = {name: together(name) for name in found[0] if name not in ("faces",)}
+        of_points = {name: together(name) for name in edges[0] if name not in ("faces",)}
         faces = together("faces")
         nodes = skin.faces[faces]
         rest_m = body.nodes_m[skin.nodes][nodes]
@@ -135,11 +137,12 @@ class _OutlinePoints:
 
 
 def _padded(values: NDArray, count: int) -> NDArray:
+    """Return values (k, …) padded with zeros to a length of `count`."""
     return np.pad(values, [(0, count - len(values)), *[(0, 0)] * (values.ndim - 1)])
 
 
 def _no_edges(corners: int) -> dict[str, NDArray]:
-    """What `_edges` returns of no points."""
+    """Return the result of `_edges` for no points, with `corners` nodes per face."""
     return {
         "faces": np.zeros(0, dtype=np.int64),
         "weights": np.zeros((0, corners)),
@@ -186,15 +189,18 @@ def _outline_points(
         return None
     facing = skin.facing(shape_m, eye_m)
     ends, beside = skin.edges
-    front = facing[beside]
+    is_front = facing[beside]
     first, second = beside.T
-    seen = np.where(front[:, 0], first, second)
+    front_triangle = np.where(is_front[:, 0], first, second)
     parts = len(skin.flat) // len(skin.faces)
-    outer = np.flatnonzero((front[:, 0] != front[:, 1]) & skin.chosen[seen // parts])
+    outer = np.flatnonzero(
+        (is_front[:, 0] != is_front[:, 1]) & skin.chosen[front_triangle // parts]
+    )
     if not len(outer):
         return None
-    ends, seen = ends[outer], seen[outer]
-    corners = skin.flat[seen]
+    ends = ends[outer]
+    front_triangle = front_triangle[outer]
+    corners = skin.flat[front_triangle]
     lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
     counts = np.maximum(1, np.ceil(lengths_m / view.depth.spacing_m).astype(int))
     edge = np.repeat(np.arange(len(outer)), counts)
@@ -204,7 +210,7 @@ def _outline_points(
     at_first = corners[edge] == ends[edge, :1]
     at_second = corners[edge] == ends[edge, 1:]
     shares = at_first * (1 - share)[:, None] + at_second * share[:, None]
-    faces, places = skin.at(seen[edge], shares)
+    faces, places = skin.at(front_triangle[edge], shares)
     weights, points_m, _ = skin.points(shape_m, faces, places)
     pixels = camera.distorted_pixels(own_m)
     along = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
@@ -215,17 +221,17 @@ def _outline_points(
     places_px = camera.distorted_pixels(at_m)
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)
-    apart = _first_of_each_cube(points_m, view.depth.spacing_m)
+    separate = _first_of_each_cube(points_m, view.depth.spacing_m)
     alone = ~_covered(places_px + OUTSIDE_PX * outwards, pixels[skin.flat[facing]])
-    kept = apart[(alone & (length_px > 1e-6))[apart]]
-    if not len(kept):
+    selected = separate[(alone & (length_px > 1e-6))[separate]]
+    if not len(selected):
         return None
     return _OutlinePoints(
-        faces=faces[kept],
-        weights=weights[kept],
-        depth_m=at_m[kept, 2],
-        pixels=places_px[kept],
-        outwards=outwards[kept],
+        faces=faces[selected],
+        weights=weights[selected],
+        depth_m=at_m[selected, 2],
+        pixels=places_px[selected],
+        outwards=outwards[selected],
     )
 
 
@@ -247,7 +253,8 @@ def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
     a, b, c = triangles[np.concatenate([*near, []]).astype(int)].transpose(1, 0, 2)
 
     def side(start: Array, end: Array) -> Array:
-        way, to = end - start, points[point] - start
+        way = end - start
+        to = points[point] - start
         return way[:, 0] * to[:, 1] - way[:, 1] * to[:, 0]
 
     sides = np.stack([side(a, b), side(b, c), side(c, a)])
@@ -277,15 +284,17 @@ def _edges(
     outwards = points.outwards.copy()
     edges = points.pixels + middles[nearest, None] * outwards
     here = _shown(image_m, points.pixels, points.depth_m, gate_m=gate_m, empty=empty)
-    beyond = ~has_edge & (here == EMPTY)
-    if beyond.any():
-        nothing = (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
-        edges[beyond], outwards[beyond], found = _nearest_other(nothing, points.pixels[beyond])
-        beyond[beyond] = found
+    is_beyond = ~has_edge & (here == EMPTY)
+    if is_beyond.any():
+        is_nothing = (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
+        edges[is_beyond], outwards[is_beyond], has_nearest = _nearest_other(
+            is_nothing, points.pixels[is_beyond]
+        )
+        is_beyond[is_beyond] = has_nearest
     return {
         "faces": points.faces,
         "weights": points.weights,
-        "used": has_edge | beyond,
+        "used": has_edge | is_beyond,
         **_planes(view, camera, edges, outwards, points.depth_m, phi=phi, sample=sample),
     }
 
@@ -293,17 +302,18 @@ def _edges(
 def _shown(
     image_m: Array, pixels: Array, depth_m: Array, *, gate_m: float, empty: bool
 ) -> NDArray[np.int64]:
-    """Return what an image shows at pixels (…, 2) beside a body at depths: BODY, UNKNOWN or EMPTY.
+    """Classify pixels (…, 2) of an image beside a body at given depths as BODY, UNKNOWN or EMPTY.
 
-    Outside of the image nothing is known. `empty` says what a missing depth (NaN) shows.
+    Pixels outside the image are UNKNOWN. `empty` states whether a missing depth (NaN) means that
+    nothing is there.
     """
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
     inside = (column >= 0) & (column < image_m.shape[1]) & (row >= 0) & (row < image_m.shape[0])
-    found_m = image_m[np.where(inside, row, 0), np.where(inside, column, 0)]
-    behind_m = found_m - depth_m
-    shown = np.full(found_m.shape, UNKNOWN)
+    depths_m = image_m[np.where(inside, row, 0), np.where(inside, column, 0)]
+    behind_m = depths_m - depth_m
+    shown = np.full(depths_m.shape, UNKNOWN)
     shown[np.abs(behind_m) <= gate_m] = BODY
-    shown[(behind_m > gate_m) | (np.isnan(found_m) & empty)] = EMPTY
+    shown[(behind_m > gate_m) | (np.isnan(depths_m) & empty)] = EMPTY
     shown[~inside] = UNKNOWN
     return shown
 
@@ -311,10 +321,13 @@ def _shown(
 def _nearest_other(
     nothing: NDArray[np.bool_], pixels: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the edges nearest to pixels (P, 2) where nothing is, the ways there, and if any.
+    """Return the edges nearest to pixels (P, 2) that show nothing.
 
-    The edge lies half a pixel from the middle of the nearest other pixel; the way (P, 2) is a unit
-    vector from the edge to the pixel.
+    Returns
+    -------
+    ((P, 2) array, (P, 2) array, (P,) array of bool)
+        Edges, half a pixel from the middle of the nearest other pixel; unit vectors from the edge
+        to the pixel; and whether there is such an edge.
     """
     if nothing.all():
         return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
@@ -325,10 +338,10 @@ def _nearest_other(
     nearest = places[::-1, row, column].T.astype(float)
     way = pixels - nearest
     length = np.linalg.norm(way, axis=1)
-    found = length > 0
-    way[found] /= length[found, None]
-    way[~found] = [1.0, 0.0]
-    return nearest + 0.5 * way, way, found
+    has_edge = length > 0
+    way[has_edge] /= length[has_edge, None]
+    way[~has_edge] = [1.0, 0.0]
+    return nearest + 0.5 * way, way, has_edge
 
 
 def _planes(
@@ -363,5 +376,5 @@ def _planes(
 
 
 def _rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
-    """Rays of several sets of pixels (P, 2), found together."""
+    """Return the rays (P, 3) of several sets of pixels (P, 2), computed in one call."""
     return np.split(camera.rays(np.concatenate(pixels)), len(pixels))

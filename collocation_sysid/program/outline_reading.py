@@ -24,14 +24,18 @@ from .reading import Instrument, Window
 
 @dataclass(frozen=True, eq=False)
 class OutlineReading(DepthReading):
-    """Distances of the points of a body's outline from the edges in a camera's images [pixels]."""
+    """Measurement model of a body's outline: distances of outline points from edges in a
+    camera's images [pixels].
+    """
 
     stated = "outline_sigma_px of depth"
     noise_at_least_stated = True
 
     @classmethod
     def from_depth(cls, depth: DepthReading) -> OutlineReading:
-        """Return the reading of the outline that belongs to a reading of depth."""
+        """Build the measurement model of the outline for the camera of a depth measurement
+        model.
+        """
         used = depth.sighting.outline.used
         samples, points = used.shape
         view = depth.sighting.view
@@ -56,28 +60,35 @@ class OutlineReading(DepthReading):
 
     @property
     def _instruments(self) -> dict[tuple[int, int], Instrument]:
+        """Generated functions by the numbers of vectors and of data, stored with the
+        camera's model.
+        """
         return self.sighting.view.outline_instruments
 
     @cached_property
     def _window(self) -> Window:
+        """Stencil of all images as for depth, with the width of a pixel as last datum."""
         places, data = super()._window
         width_m = np.where(self.pairs.used, self.pairs.pixel_m, 1.0)
         return Window(places, np.concatenate([data, width_m[None]]))
 
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return how many pixels an outline point is outside of its edge."""
+        """Return how far an outline point is outside of its edge [pixels], with the
+        estimated edge offset subtracted.
+        """
         count = data.numel() - 1
         outside_m = super().expression(looked, phi, data[:count])
         inside_px = self.nuisance.by_row(phi, self.own[0]).get(DEPTH_EDGE, 0)
         return outside_m / data[count] - inside_px
 
     def apart_px(self, values: Array, phi: Array) -> Array:
-        """Return how many pixels (s, E) outline points are outside of their edges, NaN without one.
+        """Return how far outline points (s, E) are outside of their edges [pixels]; NaN where there
+        is no edge.
 
         Parameters
         ----------
         values : (n, e, 3) array
-            Positions of the surface's nodes at the times of the channel [m].
+            Positions of the surface nodes at the times of the observable [m].
         phi : (k,) array
             Nuisance parameters in units of their priors.
         """

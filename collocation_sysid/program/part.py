@@ -1,4 +1,9 @@
-"""One experiment at a point of the program: its parameters, its motion, and what is looked at."""
+"""One experiment at given variables of the nonlinear program: its parameters, motion and
+observables.
+
+Methods and statistics use a `Part` to evaluate the loss, its gradient and the forces at one
+iterate; derived quantities are computed once and cached.
+"""
 
 from __future__ import annotations
 
@@ -21,23 +26,29 @@ from .sensing import Sensing
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One experiment at a point of the NLP.
+    """One experiment at given variables of the nonlinear program.
 
     Attributes
     ----------
     segment : Segment
-    q : (nq,) shared parameters
-    phi : (k,) its nuisance parameters
-    x : (N, 3n) positions [m], or its first rows
-    brought : mapping
-        Of what is carried, by number, what evaluations bring, where that does not follow from x.
-    pressed : mapping
-        Of contact as complementarity, by the number of the force, b (1, N, i), see `model.contact`,
-        where that does not follow from x.
-    given : mapping
-        Of readings, by their numbers, what they look at where that does not follow from x.
+        Transcription of the experiment.
+    q : (nq,) array
+        Shared parameters.
+    phi : (k,) array
+        Nuisance parameters of the experiment in units of their priors.
+    x : (N, 3n) array
+        Positions [m], or their first rows.
+    brought : mapping of int to array
+        History variables by the index of the history, where they are variables of the program;
+        others follow from x.
+    pressed : mapping of int to array
+        Contact variables b (1, N, i) by the index of the force, where contact is a complementarity
+        problem (see `model.contact`); others follow from x.
+    given : mapping of int to array
+        Observables by the index of the measurement, where they are variables of the program; others
+        follow from x.
     bent : bool
-        Whether readings are, or taken as linear in second derivatives.
+        If false, neglect the curvature of the observations (Gauss–Newton).
     """
 
     segment: Segment
@@ -51,29 +62,31 @@ class Part:
 
     @cached_property
     def setting(self) -> Setting:
-        """The physical parameters."""
+        """Equations of motion at q and φ."""
         return self.segment.setting(self.q, self.phi)
 
     @cached_property
     def along(self) -> tuple[AnyHistory, ...]:
-        """What the evaluations went through, of all that is carried."""
+        """History variables of the body and of forces at all evaluations, followed by
+        lifted contact pressures.
+        """
         dynamics = self.setting.dynamics
         pressed = dynamics.pressed(self.x, self.pressed)
         return (*dynamics.histories(self.x, self.brought), *pressed)
 
     @cached_property
     def sensing(self) -> Sensing:
-        """What is looked at."""
+        """Evaluation of the observables of this experiment."""
         return Sensing(self.segment, self.setting, self.phi)
 
     @cached_property
     def motion(self) -> Motion:
-        """What channels look at."""
+        """Positions and reaction forces for the observables."""
         return self.sensing.motion(self.x, self.along)
 
     @cached_property
     def looked(self) -> list[Array]:
-        """Of each reading what it looks at (n, e, 3)."""
+        """Observables (n, e, 3) of each measurement."""
         return [
             self.given[k] if k in self.given else reading.channel.values(self.motion, self.phi)
             for k, reading in enumerate(self.segment.readings)
@@ -81,49 +94,62 @@ class Part:
 
     @property
     def sights(self) -> list[tuple[DepthReading, Array]]:
-        """What depth cameras see, and of each what it looks at."""
+        """Measurement models of the depth cameras, each with its observables."""
         return self.surface_sights[: len(self.segment.depths)]
 
     @property
     def surface_sights(self) -> list[tuple[DepthReading, Array]]:
-        """Readings of depth cameras, those of outlines behind, and of each what it looks at."""
+        """Measurement models of the depth cameras, then of the outlines, each with its
+        observables.
+        """
         readings = (*self.segment.depths, *self.segment.outlines)
         return [*zip(readings, self.looked[len(self.looked) - len(readings) :], strict=True)]
 
     @property
     def outline_distances_px(self) -> list[tuple[OutlineReading, Array]]:
-        """Readings of outlines, and distances (n,) of outline points from their edges [pixels]."""
-        found = []
+        """Measurement models of the outlines, each with the distances (n,) of outline
+        points from their edges [pixels].
+        """
+        distances = []
         for reading, looked in self.surface_sights[len(self.segment.depths) :]:
             assert isinstance(reading, OutlineReading)
             apart_px = reading.apart_px(looked, self.phi)
-            found.append((reading, apart_px[np.isfinite(apart_px)]))
-        return found
+            distances.append((reading, apart_px[np.isfinite(apart_px)]))
+        return distances
 
     @property
     def loss(self) -> float:
-        """Of all readings, without priors."""
+        """Loss of all measurements, without priors."""
         pairs = zip(self.segment.readings, self.looked, strict=True)
         return sum(reading.loss(looked, self.phi) for reading, looked in pairs)
 
     @cached_property
     def loss_slopes(self) -> list[tuple[Array, Array]]:
-        """Of each reading ∂loss by what it looks at (n, e, 3), and by its φ (k,)."""
+        """Gradient of the loss of each measurement by its observables (n, e, 3) and by φ (k,)."""
         pairs = zip(self.segment.readings, self.looked, strict=True)
         return [reading.loss_slopes(looked, self.phi) for reading, looked in pairs]
 
     def gradient(self) -> tuple[Array, Array]:
-        """∂loss/∂x (N, 3n) and ∂loss/∂(q, φ) (nq + k,), at what is given."""
-        nq, phi = self.segment.nq, self.phi
-        by_x, by_p, by_reaction = np.zeros_like(self.x), np.zeros(nq + len(phi)), None
+        """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,).
+
+        Observables that are variables of the program (`given`) are treated as constant.
+        """
+        nq = self.segment.nq
+        phi = self.phi
+        by_x = np.zeros_like(self.x)
+        by_p = np.zeros(nq + len(phi))
+        by_reaction = None
         pairs = zip(self.segment.readings, self.loss_slopes, strict=True)
         for k, (reading, (by_looked, by_phi)) in enumerate(pairs):
             by_p[nq:] += by_phi
             if k not in self.given:
-                pulled = reading.channel.pulled(self.motion, phi, by_looked)
-                by_x, by_p[nq:] = by_x + pulled.by_x, by_p[nq:] + pulled.by_phi
-                if pulled.by_reaction is not None:
-                    by_reaction = pulled.by_reaction + (0.0 if by_reaction is None else by_reaction)
+                products = reading.channel.pulled(self.motion, phi, by_looked)
+                by_x = by_x + products.by_x
+                by_p[nq:] = by_p[nq:] + products.by_phi
+                if products.by_reaction is not None:
+                    by_reaction = products.by_reaction + (
+                        0.0 if by_reaction is None else by_reaction
+                    )
         if by_reaction is not None:
             through_x, through_p = self.sensing.pulled(self.x, by_reaction)
             by_x += through_x
@@ -132,11 +158,13 @@ class Part:
 
     @cached_property
     def forces(self) -> Linearisation:
-        """Those of the evaluations with their slopes, valid until others are formed."""
+        """Forces at the evaluations with their derivatives; valid until the segment
+        linearises again.
+        """
         rows = self.segment.linearisation_rows
         return self.setting.dynamics.linearise(self.x, rows, self.along)
 
     @property
     def residual_n(self) -> Array:
-        """(N, free dofs) violation of the equations of motion in newtons."""
+        """Violation of the equations of motion (N, free dofs) [N]."""
         return self.segment.residual_n(self.x, self.setting, self.along)

@@ -1,7 +1,7 @@
-"""Rows of a program that are one small expression of a few of its variables, at many instances.
+"""Constraints that repeat one small expression at many instances, with generated derivatives.
 
-The rows y(u, data) of all instances are added up where they count; their derivatives are generated,
-and go where index tables say.
+The values y(u, data) of all instances are added to constraints; index arrays state which variables
+are the inputs u and which constraints the values belong to.
 """
 
 from __future__ import annotations
@@ -24,10 +24,15 @@ ONE = np.ones(1)
 
 
 class Numbers(NamedTuple):
-    """Variables, or rows, of instances.
+    """Variables or constraints of instances.
 
-    places : (k, …) which they are
-    unit : what one of them stands for, of the same shape or one that broadcasts
+    Attributes
+    ----------
+    places : (k, …) array
+        Their indices in z or g.
+    unit : array
+        Physical value of one unit of each; of the same shape as `places` or one that broadcasts to
+        it.
     """
 
     places: Index
@@ -36,15 +41,18 @@ class Numbers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """An expression of I instances.
+    """An expression at I instances.
 
     Attributes
     ----------
     expression : Generated
-        Its inputs u are `looked`, its values y count in `rows`.
-    data : (d, I)
-    looked : Numbers (k, I)
-    rows : Numbers (m, I)
+        Function y(u, data) with derivatives.
+    data : (d, I) array
+        Data of the instances.
+    looked : Numbers, (k, I)
+        Variables that are the inputs u.
+    rows : Numbers, (m, I)
+        Constraints that the values y are added to.
     """
 
     expression: Generated
@@ -56,13 +64,25 @@ class Pattern:
     def of(
         cls, expression: Generated, data: Array, looked: Sequence[Numbers], rows: Numbers
     ) -> Pattern:
-        """Of instances of any shape …, to which data (d, …) and all numbers (k, …) broadcast."""
+        """Build a pattern of instances of any shape.
+
+        Parameters
+        ----------
+        expression : Generated
+            Function y(u, data).
+        data : (d, …) array
+            Data; broadcast to the shape of the instances.
+        looked : sequence of Numbers, each (k, …)
+            Inputs, concatenated along the first axis after broadcasting.
+        rows : Numbers, (m, …)
+            Constraints.
+        """
         shapes = (data.shape, rows.places.shape, *(each.places.shape for each in looked))
         shape = np.broadcast_shapes(*(shape[1:] for shape in shapes))
 
         def flat(values: NDArray[T], length: int) -> NDArray[T]:
-            whole = np.broadcast_to(values, (length, *shape))
-            return whole.reshape(length, int(np.prod(shape)))
+            broadcast = np.broadcast_to(values, (length, *shape))
+            return broadcast.reshape(length, int(np.prod(shape)))
 
         def joined(parts: Sequence[Numbers]) -> Numbers:
             places = [flat(part.places, len(part.places)) for part in parts]
@@ -81,9 +101,25 @@ class Pattern:
         constants: Numbers,
         rows: Numbers,
     ) -> Pattern:
-        """h_k − R(h_{k−1}, s_k, s_{k−1}; c) of states (n, N, I) that look at (i, N, I).
+        """Build the pattern h_k − R(h_{k−1}, s_k, s_{k−1}; c) of a recursion R.
 
-        At the start the first stand for those before, which do not count there.
+        At the first evaluation, the first states and inputs stand for those before; the recursion
+        must ignore them.
+
+        Parameters
+        ----------
+        recursion : Recursion
+            The recursion R.
+        data : array
+            Data of the recursion.
+        states : Numbers, (n, N, I)
+            States h.
+        looked : Numbers, (i, N, I)
+            Inputs s.
+        constants : Numbers
+            Constants c.
+        rows : Numbers
+            Constraints.
         """
 
         def gap(u: ca.SX, data: ca.SX) -> ca.SX:
@@ -96,24 +132,28 @@ class Pattern:
         return cls.of(Generated(gap, size, recursion.data), data, parts, rows)
 
     def _u(self, z: Array) -> Array:
+        """Return the inputs (k, I) in physical units."""
         return self.looked.unit * z[self.looked.places]
 
     def values(self, z: Array, count: int) -> Array:
-        """(count,) rows."""
+        """Return the contributions to the constraints (count,)."""
         return self._summed(self.expression.value(self._u(z), self.data), count)
 
     def _summed(self, y: Array, count: int) -> Array:
-        found = np.zeros(count)
-        np.add.at(found, self.rows.places, y / self.rows.unit)
-        return found
+        """Add up values y (m, I) into constraints (count,)."""
+        assembled = np.zeros(count)
+        np.add.at(assembled, self.rows.places, y / self.rows.unit)
+        return assembled
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Row, and place in z, of each slope that there may be."""
+        """Return constraint, and index in z, of each derivative that may be non-zero."""
         y, u = np.nonzero(self.expression.slope_pattern)
         return self.rows.places[y].ravel(), self.looked.places[u].ravel()
 
     def jacobian_values(self, z: Array, count: int) -> tuple[Array, Array]:
-        """(count,) rows, and the slopes."""
+        """Return the contributions to the constraints (count,), and the values of
+        `jacobian_entries`.
+        """
         value, slopes = self.expression.slopes(self._u(z), self.data)
         y, u = np.nonzero(self.expression.slope_pattern)
         slopes = slopes[y, u] * self.looked.unit[u] / self.rows.unit[y]
@@ -121,23 +161,28 @@ class Pattern:
 
     @cached_property
     def _crossing(self) -> tuple[Index, Index, NDArray[np.bool_]]:
-        """Pairs of u that bend y together, and of which instances that is above the diagonal."""
+        """Pairs (i, j) of inputs with second derivatives, and a mask of the instances where
+        they are in the upper triangle.
+        """
         i, j = np.nonzero(self.expression.curvature_pattern)
         return i, j, self.looked.places[i] <= self.looked.places[j]
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """Places in z of second derivatives, upper triangle."""
+        """Return rows and columns in z of the second derivatives, upper triangle."""
         i, j, above = self._crossing
         return self.looked.places[i][above], self.looked.places[j][above]
 
     def hessian_values(self, z: Array, multipliers: Array) -> Array:
-        """Those of multipliers (count,) · rows."""
-        (i, j, above), unit = self._crossing, self.looked.unit
+        """Return the second derivatives of multipliers (count,) · constraints, in the order
+        of `hessian_entries`.
+        """
+        i, j, above = self._crossing
+        unit = self.looked.unit
         weights = multipliers[self.rows.places] / self.rows.unit
-        bent = self.expression.curvature(self._u(z), self.data, weights)
-        return (bent[i, j] * unit[i] * unit[j])[above]
+        curvature = self.expression.curvature(self._u(z), self.data, weights)
+        return (curvature[i, j] * unit[i] * unit[j])[above]
 
 
 def _at(numbers: Numbers, evaluations: Index) -> Numbers:
-    """Those of other evaluations; units are the same of all."""
+    """Return the indices of other evaluations; units must be the same at all evaluations."""
     return Numbers(numbers.places[:, evaluations], numbers.unit)

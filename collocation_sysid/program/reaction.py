@@ -1,16 +1,16 @@
-"""What the grasps give a body: what the equations of motion lack on the dofs that are held.
+"""Reaction forces of grasps: the residual of the equations of motion at the prescribed dofs.
 
 On the dofs g of grasps whose wrench is measured,
 
     R_t = M a_t − Σ_j w_j F_{t−j} = −c_{t,g},
 
-with the stencils of the rows, see `model.schemes`. Its changes along the equations of motion come
-from the same blocks as the others', rows g of G = ∂F/∂ξ and C = ∂F/∂ν:
+with the stencils of the scheme, see `model.schemes`. Changes along the equations of motion use the
+rows g of G = ∂F/∂ξ and C = ∂F/∂ν:
 
-    dF_k = G Σ_i p_i Y_{k−i} + C Σ_i q_i Y_{k−i} + ∂F/∂p + what the memory brings.
+    dF_k = G Σ_i p_i Y_{k−i} + C Σ_i q_i Y_{k−i} + ∂F/∂p + change due to history variables.
 
-A row belongs to the time in the middle of its stencil: of the midpoint rule row t is the balance
-of momentum about t − 1. Rows of the start know the acceleration to first order only, and are left
+A row belongs to the time in the middle of its stencil: with the midpoint rule row t is the balance
+of momentum about t − 1. Rows of the start know the acceleration to first order only and are left
 out.
 """
 
@@ -28,29 +28,38 @@ from ..model.histories import AnyHistory
 
 
 def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
-    """Rows (N,) whose acceleration is that of the middle of their stencil, and how late they are.
+    """Return the rows that determine a reaction force, and their delay.
 
-    Of a static problem all its rows, at their own times.
+    Those are the rows whose acceleration is second-order accurate in the middle of the stencil; in
+    a static problem all rows, at their own times.
+
+    Returns
+    -------
+    ((N,) array of bool, int)
+        Mask of the rows, and the number of grid times by which the reaction force precedes its row.
     """
-    t, lags = dynamics.tables, np.arange(dynamics.reach + 1.0)
+    t = dynamics.tables
+    lags = np.arange(dynamics.reach + 1.0)
     second = np.column_stack([t.s.sum(axis=1), t.s @ lags, t.s @ lags**2 - 2, t.r])
-    whole = np.isclose(t.w.sum(axis=1), 1.0)
-    moving = whole & np.isclose(second, 0.0).all(axis=1)
-    rows = moving if moving.any() else whole & ~t.s.any(axis=1)
+    is_complete = np.isclose(t.w.sum(axis=1), 1.0)
+    moving = is_complete & np.isclose(second, 0.0).all(axis=1)
+    rows = moving if moving.any() else is_complete & ~t.s.any(axis=1)
     evaluated = t.p @ lags
     last = int(np.flatnonzero(rows)[-1]) if rows.any() else 0
-    late = sum(t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1]))
-    return rows, round(float(late))
+    delay = sum(t.w[last, j] * (j + evaluated[last]) for j in range(t.w.shape[1]))
+    return rows, round(float(delay))
 
 
 @dataclass(frozen=True, eq=False)
 class HeldForces:
-    """F on the dofs g at every evaluation, and how it changes.
+    """Forces F on the sensed dofs at every evaluation, and their changes.
 
     Attributes
     ----------
-    force : (rows, g)
-    slopes : (rows, g, columns)
+    force : (rows, g) array
+        Forces [N].
+    slopes : (rows, g, columns) array
+        Changes dF of each column of a forward substitution.
     """
 
     force: Array
@@ -58,28 +67,55 @@ class HeldForces:
 
     @classmethod
     def nothing(cls, rows: int, dofs: int, columns: int) -> HeldForces:
-        """Room for them."""
+        """Allocate zeros for `rows` evaluations, `dofs` dofs and `columns` columns."""
         return cls(np.zeros((rows, dofs)), np.zeros((rows, dofs, columns)))
 
     def begin(self, known: HeldForces) -> None:
-        """Take over the first rows."""
+        """Copy the first rows from `known`, in place."""
         done = len(known.force)
-        self.force[:done], self.slopes[:done] = known.force, known.slopes
+        self.force[:done] = known.force
+        self.slopes[:done] = known.slopes
 
 
 def forces_on(dynamics: Dynamics, x: Array, dofs: Index, along: Sequence[AnyHistory] = ()) -> Array:
-    """F (N, g) on some dofs at the evaluations of x (N, 3n), also those that grasps take."""
+    """Return the forces F (N, g) on dofs at the evaluations of x (N, 3n) [N], including
+    forces on prescribed dofs; zero before the first equation of motion.
+    """
     force = np.zeros((len(x), len(dofs)))
     force[dynamics.first_row :] = dynamics.force(x, along)[:, dofs]
     return force
 
 
 def reactions(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array) -> Array:
-    """R (N, g) [N] of some dofs from their mass, the forces F on them and their acceleration."""
+    """Return the reaction forces R (N, g) [N] of dofs.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion.
+    mass_kg : (N, g) array
+        Masses of the dofs [kg].
+    force : (N, g) array
+        Forces F on the dofs [N].
+    acceleration : (N, g) array
+        Accelerations of the dofs [m/s²].
+    """
     return mass_kg * acceleration - dynamics.combine(dynamics.tables.w, force)
 
 
 def reaction_slopes(dynamics: Dynamics, mass_kg: Array, slopes: Array, moved: Array) -> Array:
-    """Changes dR (N, g, columns) from dF and from how the dofs move, both (N, g, columns)."""
+    """Return the changes dR (N, g, columns) of reaction forces.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations of motion.
+    mass_kg : (N, g) array
+        Masses of the dofs [kg].
+    slopes : (N, g, columns) array
+        Changes dF of the forces.
+    moved : (N, g, columns) array
+        Changes of the positions of the dofs.
+    """
     second = dynamics.combine(dynamics.tables.s, moved) / dynamics.step_s**2
     return mass_kg[..., None] * second - dynamics.combine(dynamics.tables.w, slopes)

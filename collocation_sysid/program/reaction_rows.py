@@ -1,9 +1,10 @@
-"""What grasps with a sensor give their dofs, as variables R of a program, and its equations.
+"""Reaction forces R of instrumented grasps as variables of the program, with their equations.
 
     (R_t + c_{t,g}) / f_e = 0,   variables R_t / f_e,
 
-the rows that held dofs lack, see `reaction`, of all grid times that have equations of motion. Their
-second derivatives are those of the other rows, at other weights.
+with the residual c of the equations of motion at the grasped dofs g, see `reaction`, and the force
+unit f_e of the experiment, at all grid times with equations of motion. Second derivatives are those
+of the equations of motion, with additional weights (`row_weights`).
 """
 
 from __future__ import annotations
@@ -23,60 +24,77 @@ from .segment import Segment
 
 
 class Reactions(Carried):
-    """R of one experiment."""
+    """Lifted reaction forces R of one experiment."""
 
     called = "wrench"
 
     @property
     def dofs(self) -> Index:
-        """(g,) which dofs."""
+        """Dofs (g,) whose reaction forces are lifted."""
         return self.segment.sensed_dofs
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Grid times from the first with a row on, and dofs."""
+        """Shape (times, g): grid times with equations of motion, and dofs."""
         return self.segment.constraint_times, len(self.dofs)
 
     def places_of(self, times: Index, dofs: Index) -> Index:
-        """Places (T, k) in z of some grid times and of dofs, by their numbers among `dofs`."""
+        """Return the columns (T, k) in z of reaction forces.
+
+        Parameters
+        ----------
+        times : (T,) array
+            Grid times.
+        dofs : (k,) array
+            Indices into `dofs`.
+        """
         first = self.segment.dynamics.first_row
         return self.places.variable + (times[:, None] - first) * self.shape[1] + dofs
 
     def newtons(self, z: Array) -> Array:
-        """R (N, g), zero before the first row."""
-        found = np.zeros((self.segment.grid_rows, self.shape[1]))
+        """Return the reaction forces R (N, g) [N] from z; zero before the first equation of
+        motion.
+        """
+        forces_n = np.zeros((self.segment.grid_rows, self.shape[1]))
         own = z[self.variables].reshape(self.shape)
-        found[self.segment.dynamics.first_row :] = own * self.segment.force_n
-        return found
+        forces_n[self.segment.dynamics.first_row :] = own * self.segment.force_n
+        return forces_n
 
     def row_weights(self, multipliers: Array) -> Array:
-        """(N, 3n) derivative of multipliers · g by what c has in newtons."""
-        found = np.zeros((self.segment.grid_rows, self.segment.dofs))
+        """Return the derivative (N, 3n) of multipliers · g by the residual c in newtons [1/N]."""
+        weights = np.zeros((self.segment.grid_rows, self.segment.dofs))
         by_row = multipliers[self.rows].reshape(self.shape) / self.segment.force_n
-        found[self.segment.dynamics.first_row :, self.dofs] = by_row
-        return found
+        weights[self.segment.dynamics.first_row :, self.dofs] = by_row
+        return weights
 
     @cached_property
     def _motion(self) -> MotionRows:
-        """Structure of ∂c/∂x; a force that a passing grasp takes is among what it gives."""
-        segment, dynamics = self.segment, self.segment.dynamics
+        """Structure of ∂c/∂x, including forces on dofs while a grasp prescribes them."""
+        segment = self.segment
+        dynamics = self.segment.dynamics
         untaken = replace(dynamics, taken=np.zeros_like(dynamics.taken))
         return MotionRows(untaken, self.dofs, self.dofs, segment.length_m, segment.force_n)
 
     def following(self, part: Part) -> Array:
-        """R as it follows from positions and parameters."""
+        """Return the scaled reaction forces (count,) that follow from positions and parameters."""
         return self._scaled(part.motion.forced.reaction)
 
     def _scaled(self, newtons: Array) -> Array:
+        """Return forces (N, …) [N] as scaled values, without the rows before the first
+        equation of motion.
+        """
         return newtons[self.segment.dynamics.first_row :].ravel() / self.segment.force_n
 
     def values(self, part: Part, z: Array) -> Array:
-        """The equations."""
+        """Return the scaled equations (count,)."""
         return z[self.variables] - self.following(part)
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Rows and columns: by x, by R, and by what moves the body."""
-        segment, band = self.segment, self._motion.band
+        """Return rows and columns of the entries by x, by R, and by the parameters that
+        change the motion.
+        """
+        segment = self.segment
+        band = self._motion.band
         equations = np.arange(self.rows.start, self.rows.stop)
         of_x = np.repeat(np.arange(segment.variables), np.diff(band.indptr))
         of_p = segment.moving_in(self.first_phi)
@@ -85,9 +103,11 @@ class Reactions(Carried):
         return np.concatenate(rows), np.concatenate([*columns, np.tile(of_p, self.count)])
 
     def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
-        """The equations, and the values of these entries."""
-        setting, motion = part.setting, self._motion
-        dynamics, first = setting.dynamics, setting.dynamics.first_row
+        """Return the equations, and the values of `jacobian_entries`."""
+        setting = part.setting
+        motion = self._motion
+        dynamics = setting.dynamics
+        first = setting.dynamics.first_row
         by_x = np.empty(motion.band.nnz)
         motion.fill(by_x, part.forces, dynamics, setting.mass_moves)
         by_p = np.zeros((len(part.x), self.shape[1], len(self.segment.moving)))
@@ -104,12 +124,18 @@ class Reactions(Carried):
 
 
 class RowsOfMotion(NamedTuple):
-    """Rows that forces count in.
+    """Constraints that contain forces: equations of motion, or those of reaction forces.
 
-    number : (3n,) of each dof among those of a grid time, −1 where it has none
-    first : where they begin
-    per_time : how many a grid time has
-    taken : whether those that grasps take do not count
+    Attributes
+    ----------
+    number : (3n,) array
+        Index of each dof's row within a grid time, −1 where it has none.
+    first : int
+        Index in g of the first row.
+    per_time : int
+        Number of rows of a grid time.
+    taken : bool
+        Whether forces on dofs that a grasp prescribes at that time are left out.
     """
 
     number: Index
@@ -119,13 +145,15 @@ class RowsOfMotion(NamedTuple):
 
 
 def rows_of_motion(segment: Segment, reactions: Reactions | None) -> list[RowsOfMotion]:
-    """The equations of motion, and those of what grasps give, where the program has them."""
+    """Return the equations of motion of a segment, and those of its lifted reaction forces
+    if there are any.
+    """
     kinds = [(segment.free_dofs, segment.row_dofs, segment.first.row, True)]
     if reactions is not None:
         kinds.append((reactions.dofs, reactions.dofs, reactions.places.row, False))
-    found = []
+    equations = []
     for moving, dofs, first, taken in kinds:
         number = np.full(segment.dofs, -1)
         number[moving] = np.searchsorted(dofs, moving)
-        found.append(RowsOfMotion(number, first, len(dofs), taken))
-    return found
+        equations.append(RowsOfMotion(number, first, len(dofs), taken))
+    return equations

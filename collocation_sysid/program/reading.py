@@ -1,8 +1,10 @@
-"""What is measured of a body: one expression of what is looked at and of φ, compared with data.
+"""Measurement models: residuals between data and an expression of an observable and nuisance
+parameters.
 
-A sample reads y(c, φ, data), c being a few vectors of its channel, such as a place on the body at
-neighbouring times, and φ its own nuisance parameters. The residual is r = (y − ŷ) / σ, in groups of
-three, the loss Σ ρ(‖r‖) over the groups. All derivatives are generated.
+A sample measures y(c, φ, data), where c are a few vectors of its observable (such as the place of a
+marker at neighbouring times) and φ its nuisance parameters. The residual is r = (y − ŷ) / σ with
+the measurement ŷ, in groups of usually three numbers, and the loss is Σ ρ(‖r‖) over the groups. All
+derivatives are generated from the expression. Subclass `Reading` for another kind of sensor.
 """
 
 from __future__ import annotations
@@ -36,20 +38,21 @@ Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
 @dataclass(frozen=True, eq=False)
 class Instrument:
-    """What one sample reads.
+    """Residual and loss of one sample as generated functions.
 
     Attributes
     ----------
     expression : callable
         ``expression(c, phi, data) -> y`` in CasADi operations; c is (3, vectors).
     vectors, own, data : int
-        Numbers of vectors, of φ and of data.
+        Numbers of vectors, of nuisance parameters and of data.
     measured : int
         Length of y, a multiple of the group.
     huber : float or None
-        Huber's loss: ρ(d) = d² up to this many standard deviations, linear beyond; d² without it.
+        Threshold of Huber's loss in standard deviations: ρ(d) = d² up to it, linear beyond; None
+        means ρ(d) = d².
     group : int
-        How many numbers of y the loss takes together.
+        How many numbers of y the loss takes as one vector.
     """
 
     expression: Expression
@@ -62,25 +65,34 @@ class Instrument:
 
     @cached_property
     def residual(self) -> Generated:
-        """R of u = (c, φ), at data, ŷ and 1/σ, which is zero where nothing is measured."""
+        """Residual r of u = (c, φ), given the data, ŷ and 1/σ; the latter is zero where
+        nothing is measured.
+        """
         return Generated(self._residual, self._inputs, self._data)
 
     @cached_property
     def loss(self) -> Generated:
-        """Σ ρ of the same."""
+        """Loss Σ ρ of the residual, of the same inputs."""
         return Generated(self._loss, self._inputs, self._data)
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether second derivatives of the loss are always the same."""
+        """Whether second derivatives of the loss are constant."""
         return self.huber is None and self.residual.is_linear
 
     def curvature(self, u: Array, data: Array, bent: bool = True) -> Array:
-        """Second derivatives (k, k, …) of the loss by u.
+        """Return second derivatives (k, k, …) of the loss by u.
 
-        Unless readings are bent, they count as linear: Gauss–Newton's, which is convex. Then wild
-        samples have the weights ρ'/2d of least squares, which curve no less than ρ does anywhere;
-        ρ'' is zero along their residuals, and steps by it would be too long.
+        Parameters
+        ----------
+        u : (k, …) array
+            Inputs (c, φ) of the samples.
+        data : array
+            Data, ŷ and 1/σ.
+        bent : bool
+            If false, neglect the curvature of the observations: the Gauss–Newton matrix, which is
+            convex. Outliers then have the weights ρ'/2d of reweighted least squares; this is an
+            upper bound of the curvature of ρ, and avoids the zero of ρ'' along their residuals.
         """
         if bent:
             return self.loss.curvature(u, data)
@@ -94,27 +106,33 @@ class Instrument:
 
     @property
     def _inputs(self) -> int:
+        """Number of inputs u."""
         return GROUP * self.vectors + self.own
 
     @property
     def _data(self) -> int:
+        """Number of data, including ŷ and 1/σ."""
         return self.data + 2 * self.measured
 
     def _residual(self, u: ca.SX, data: ca.SX) -> ca.SX:
+        """Expression of the residual."""
         ends = [0, self.data, self.data + self.measured, self._data]
         own, measured, weight = ca.vertsplit(data, ends)
-        looked, phi = ca.vertsplit(u, [0, GROUP * self.vectors, self._inputs])
-        read = self.expression(ca.reshape(looked, GROUP, self.vectors), phi, own)
-        return weight * (read - measured)
+        vectors, phi = ca.vertsplit(u, [0, GROUP * self.vectors, self._inputs])
+        predicted = self.expression(ca.reshape(vectors, GROUP, self.vectors), phi, own)
+        return weight * (predicted - measured)
 
     def _loss(self, u: ca.SX, data: ca.SX) -> ca.SX:
+        """Expression of the loss."""
         return self._rhos(self._residual(u, data), data)
 
     def _rhos(self, residual: ca.SX, _: ca.SX) -> ca.SX:
+        """Expression of Σ ρ over the groups of a residual."""
         groups = ca.vertsplit(residual, self.group)
         return sum((self._rho(ca.sumsqr(group)) for group in groups), start=ca.SX(0))
 
     def _rho(self, square: ca.SX) -> ca.SX:
+        """Expression of ρ from the squared length of a group."""
         if self.huber is None:
             return square
         limit = self.huber**2
@@ -123,11 +141,21 @@ class Instrument:
 
 
 def as_squares(residual: Array, slope: Array, huber: float | None) -> tuple[Array, Array]:
-    """Residuals (…, 3) and slopes (…, 3, p) whose squares sum to Huber's loss, with its gradient.
+    """Scale residuals and derivatives such that their squares reproduce Huber's loss and its
+    gradient.
 
-    With d the length of a group and δ the threshold, ρ = d² up to δ and 2δd − δ² beyond; residuals
-    are scaled by √ρ / d and slopes by δ / √ρ there, so that r'ᵀr' = Σρ and S'ᵀr' is half its
-    gradient (Huber 1964; reweighting after Triggs et al. 2000, sec. 4.3).
+    With d the length of a group and δ the threshold, ρ = d² up to δ and 2δd − δ² beyond. Beyond,
+    residuals are scaled by √ρ / d and derivatives by δ / √ρ, so that r'ᵀr' = Σρ and S'ᵀr' is half
+    the gradient (Huber 1964; reweighting after Triggs et al. 2000, sec. 4.3).
+
+    Parameters
+    ----------
+    residual : (…, 3) array
+        Residuals in standard deviations.
+    slope : (…, 3, p) array
+        Their derivatives by p parameters.
+    huber : float or None
+        Threshold δ; None returns both unchanged.
     """
     if huber is None:
         return residual, slope
@@ -139,10 +167,11 @@ def as_squares(residual: Array, slope: Array, huber: float | None) -> tuple[Arra
 
 
 def as_weights(residual: Array, slope: Array, huber: float | None) -> tuple[Array, Array]:
-    """The same as Huber's loss sees them at its optimum.
+    """Weight residuals and derivatives as Huber's loss does at its optimum, for statistics.
 
-    Slopes have the weight of the fit's normal equations; residuals end at the threshold, so that a
-    few wild samples tell nothing of the others' noise.
+    Derivatives get the square root of the weight in the normal equations. Residuals are shortened
+    to the threshold, so that a few outliers do not determine the noise of the others. Arguments as
+    in `as_squares`.
     """
     if huber is None:
         return residual, slope
@@ -152,10 +181,14 @@ def as_weights(residual: Array, slope: Array, huber: float | None) -> tuple[Arra
 
 
 class Window(NamedTuple):
-    """What samples are read from.
+    """Vectors and data that samples are computed from.
 
-    places : (S, E, v) of vectors among those of the channel, one time after the other
-    data : (d, S, E) of the instrument
+    Attributes
+    ----------
+    places : (S, E, v) array
+        Indices of v vectors among those of the observable, flattened over times and points.
+    data : (d, S, E) array
+        Data of the expression.
     """
 
     places: Index
@@ -164,13 +197,18 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Pooled:
-    """What of a reading statistics look at, in groups of three.
+    """Residuals as statistics use them, in M groups of three.
 
     Attributes
     ----------
-    names, sigmas : (M,)
-    components : (S, M, 3) numbers that are there
-    places_m : (3M, 3) of these on the undeformed body, where each has one
+    names : tuple of str
+        Name of each group.
+    sigmas : (M,) array
+        Standard deviations.
+    components : (S, M, 3) array of bool
+        Numbers that exist.
+    places_m : (3M, 3) array or None
+        Place of each number on the undeformed body [m]; None if they have none.
     """
 
     names: tuple[str, ...]
@@ -181,33 +219,41 @@ class Pooled:
 
 @dataclass(frozen=True, eq=False)
 class Reading(ABC):
-    """Samples (S, E) of an instrument in one experiment, E at a time, of m numbers each.
+    """Measurement model: S samples of E entities at a time, of m numbers each, in one experiment.
 
     Attributes
     ----------
     channel : Channel
-        What is looked at; its values c are (n, e, 3), at the first n of its times.
+        Observable; its values c are (n, e, 3), at the first n of its times.
     nuisance : NuisanceMap
+        Nuisance parameters of the experiment.
     huber : float or None
-        See `Instrument`.
-    names : (G,) what each group is, G = E m / g
-    t_s : (S,)
-    sigmas : (G,) standard deviations given
-    measured : (S, E, m), NaN where missing
-    components : (S, G, g) numbers that are compared
-    own : (E, f) positions in φ of what each reads by
+        Threshold of Huber's loss, see `Instrument`; None means a quadratic loss.
+    names : (G,) tuple of str
+        Name of each group, G = E m / g.
+    t_s : (S,) array
+        Times of the samples [s].
+    sigmas : (G,) array
+        Stated standard deviations, in the unit of the measurement.
+    measured : (S, E, m) array
+        Measurements ŷ, NaN where missing.
+    components : (S, G, g) array of bool
+        Numbers that are compared.
+    own : (E, f) array
+        Indices in φ of the nuisance parameters of each entity.
     stated : str
-        What states σ in a problem.
+        Key of σ in a problem file.
     has_offsets : bool
-        Whether it is off by what nothing else tells, such as its tare: where nothing is fitted yet
-        that is allowed for.
+        Whether measurements have an unknown offset, such as a tare, which must be allowed for
+        before anything is fitted.
     group : int
-        How many numbers the loss takes together, g; three, as those of a place.
+        How many numbers the loss takes as one vector, g; three for a position.
     has_fixed_windows : bool
-        Whether its windows do not depend on φ.
+        Whether the stencils do not depend on φ.
     noise_at_least_stated : bool
-        Whether error bars never take its noise for smaller than σ, and its residuals do not tell
-        the noise of others: for measurements with rounding errors, which may happen to be small.
+        Whether error bars never use a noise below σ, and the residuals are not used to estimate the
+        noise of other measurements. Set it for measurements with rounding errors, which may happen
+        to be small.
     """
 
     channel: Channel
@@ -228,69 +274,106 @@ class Reading(ABC):
 
     @property
     def begins_s(self) -> float:
-        """From when on what is looked at tells something that is compared, however φ is."""
+        """Time [s] that must be known before the first sample can be compared, for any φ."""
         return float(self.t_s[self.components.any(axis=(1, 2)).argmax()])
 
     @cached_property
     def pool(self) -> Pooled:
-        """What statistics look at: all there is, but where neighbours are taken together."""
+        """Groups that statistics use: those of the measurement, unless a subclass combines
+        neighbours.
+        """
         return Pooled(self.names, self.sigmas, self.components)
 
     def pooled(self, values: Array) -> Array:
-        """(S, M, 3, …) of it, from residuals (S, G, g, …) or their slopes."""
+        """Return residuals (S, G, g, …), or their derivatives, as values (S, M, 3, …) of
+        the groups of `pool`.
+        """
         return values
 
     @property
     def looked_sigmas(self) -> Array:
-        """(3 e,) how well what is looked at is known by a sample; infinite where it is not."""
+        """Standard deviations (3 e,) of the observable as one sample determines it;
+        infinite where it does not.
+        """
         return np.repeat(self.sigmas, GROUP)
 
     @abstractmethod
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """What a sample reads, of vectors (3, v), its φ and the data of its window."""
+        """Return the prediction y of one sample as a CasADi expression.
+
+        Parameters
+        ----------
+        looked : (3, v) SX
+            Vectors of the observable.
+        phi : SX
+            Nuisance parameters of the entity.
+        data : SX
+            Data of the stencil.
+        """
 
     @abstractmethod
     def window(self, phi: Array, known: int) -> Window:
-        """Of the samples that the first times of the channel may suffice for, the first ones."""
+        """Return the stencil of those first samples for which the first `known` times of
+        the observable may suffice.
+        """
 
     def windows(self) -> Index:
-        """(…, E, v) places that samples may be read from, whatever φ is."""
+        """Return the indices (…, E, v) of vectors that samples may be computed from, for any φ."""
         return self.window(np.zeros(self.nuisance.size), self.channel.count).places
 
     def there(self, known: int) -> NDArray[np.bool_]:
-        """(S, G, 3) what is compared where so many times of the channel are known."""
+        """Return the mask (S, G, 3) of the numbers that can be compared if the first
+        `known` times are known.
+        """
         return self.components & self.covered(known)[:, None, None]
 
     def covered(self, known: int) -> NDArray[np.bool_]:
-        """(S,) those of them that these suffice for, however φ is."""
+        """Return the mask (S,) of the samples for which the first `known` times suffice,
+        for any φ.
+        """
         return np.ones(len(self.t_s), dtype=bool)
 
     def roughly(self, x: Array, phi: Array) -> Array | None:
-        """Residuals of a first guess, where its own say little of bodies that are far off."""
+        """Return residuals for ranking first guesses, or None if the ordinary residuals are
+        suitable.
+        """
         return None
 
     # One sample -------------------------------------------------------------------------------
 
     @cached_property
     def _instruments(self) -> dict[tuple[int, int], Instrument]:
+        """Generated functions by the numbers of vectors and of data."""
         return {}
 
     def of_some(self, known_s: Array, t_s: Array, numbers: Array, **changes: Any) -> Self:
-        """That of other samples (S, m), of a channel that is known at some times (n,)."""
+        """Return the model of other samples, sharing the generated functions.
+
+        Parameters
+        ----------
+        known_s : (n,) array
+            Times at which the observable is known [s].
+        t_s : (S,) array
+            Times of the samples [s].
+        numbers : (S, m) array
+            Measurements, NaN where missing.
+        changes : Any
+            Other attributes to replace.
+        """
         measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
         measured[:, 0, : numbers.shape[1]] = numbers
-        there = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
-        changes |= {"t_s": t_s, "measured": measured, "components": there}
-        feels = isinstance(self.channel, GraspWrench)
-        when = {"on": Grid.at(known_s)} if feels else {"rows": np.arange(len(known_s))}
-        changes["channel"] = replace(self.channel, **when)
+        is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
+        changes |= {"t_s": t_s, "measured": measured, "components": is_compared}
+        is_wrench = isinstance(self.channel, GraspWrench)
+        times = {"on": Grid.at(known_s)} if is_wrench else {"rows": np.arange(len(known_s))}
+        changes["channel"] = replace(self.channel, **times)
         other = replace(self, **changes)
         # Derivatives of the same expression are generated once.
         vars(other)["_instruments"] = self._instruments
         return other
 
     def instrument(self, vectors: int, data: int) -> Instrument:
-        """That of windows of so many vectors and data."""
+        """Return the generated functions for stencils of `vectors` vectors and `data` data."""
         if (vectors, data) not in self._instruments:
             sizes = vectors, self.own.shape[1], data, self.measured.shape[2]
             self._instruments[vectors, data] = Instrument(
@@ -300,66 +383,96 @@ class Reading(ABC):
 
     @cached_property
     def _compared(self) -> tuple[Array, Array]:
-        """(m, S, E) ŷ, and 1/σ, zero where nothing is compared."""
+        """Measurements ŷ (m, S, E), and 1/σ, which is zero where nothing is compared."""
         weight = (self.components / self.sigmas[:, None]).reshape(self.measured.shape)
         return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(weight, 2, 0)
 
     def _at(self, values: Array, phi: Array) -> tuple[Instrument, Window, Array, Array]:
-        """The instrument, the window, u (k, s, E) and the data, of the samples that there are."""
+        """Return generated functions, stencil, inputs u (k, s, E) and data of the samples
+        that can be computed.
+        """
         window = self.window(phi, len(values))
         samples, each, vectors = window.places.shape
         around = values.reshape(-1, GROUP)[window.places].reshape(samples, each, GROUP * vectors)
         own = np.broadcast_to(phi[self.own.T][:, None], (self.own.shape[1], samples, each))
         measured, weight = (part[:, :samples] for part in self._compared)
-        there = self.covered(len(values))[:samples, None]
-        data = np.concatenate([window.data, measured, weight * there])
+        is_covered = self.covered(len(values))[:samples, None]
+        data = np.concatenate([window.data, measured, weight * is_covered])
         u = np.concatenate([around.transpose(2, 0, 1), own])
         return self.instrument(vectors, len(window.data)), window, u, data
 
     def _grouped(self, values: Array) -> Array:
-        """(s, G, 3) from (m, s, E)."""
+        """Return values (m, s, E) as groups (s, G, g)."""
         return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), self.group)
 
     # All samples ------------------------------------------------------------------------------
 
     def predicted(self, values: Array, phi: Array) -> Array:
-        """What should be read (s, G, 3), of the first samples as far as these go."""
+        """Return predictions y (s, G, g), for the first samples that the values suffice for.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable.
+        phi : (k,) array
+            Nuisance parameters.
+        """
         instrument, window, u, data = self._at(values, phi)
-        own, measured = len(window.data), self.measured.shape[2]
-        data[own : own + measured], data[own + measured :] = 0.0, 1.0
+        own = len(window.data)
+        measured = self.measured.shape[2]
+        data[own : own + measured] = 0.0
+        data[own + measured :] = 1.0
         return self._grouped(instrument.residual.value(u, data))
 
     def residuals(self, values: Array, phi: Array) -> Array:
-        """(s, G, 3) of (y − ŷ) / σ, zero where missing."""
+        """Return residuals (y − ŷ) / σ (s, G, g), zero where missing; arguments as in
+        `predicted`.
+        """
         instrument, _, u, data = self._at(values, phi)
         return self._grouped(instrument.residual.value(u, data))
 
     def linearised(
         self, values: Array, slopes: Slopes, phi: Array, size: int
     ) -> tuple[Array, Array]:
-        """The same, and their slopes (s, G, 3, size) by all parameters, of which φ are the last."""
+        """Return residuals (s, G, g) and their derivatives (s, G, g, size) by all parameters.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable.
+        slopes : Slopes
+            Their derivatives.
+        phi : (k,) array
+            Nuisance parameters; they are the last of all parameters.
+        size : int
+            Number of all parameters.
+        """
         if not len(values):
             samples = len(self.window(phi, 0).places), len(self.names), self.group
             return np.zeros(samples), np.zeros((*samples, size))
         window, residual, by_u = self._read(values, phi)
         samples, each, vectors = window.places.shape
-        by_looked, by_own = by_u[..., : GROUP * vectors], by_u[..., GROUP * vectors :]
-        found, first = np.zeros((*by_u.shape[:3], size)), size - len(phi)
-        found[..., slopes.columns] = by_looked @ _around(slopes.by, window.places)
+        by_looked = by_u[..., : GROUP * vectors]
+        by_own = by_u[..., GROUP * vectors :]
+        derivatives = np.zeros((*by_u.shape[:3], size))
+        first = size - len(phi)
+        derivatives[..., slopes.columns] = by_looked @ _around(slopes.by, window.places)
         if len(slopes.entities):
-            here = slopes.entities
-            times = window.places[:, here] // values.shape[1]
-            number = np.arange(len(here))[:, None]
-            shape = samples, len(here), GROUP * vectors, slopes.own.shape[3]
+            entities = slopes.entities
+            times = window.places[:, entities] // values.shape[1]
+            number = np.arange(len(entities))[:, None]
+            shape = samples, len(entities), GROUP * vectors, slopes.own.shape[3]
             around = slopes.own[times, number].reshape(shape)
-            _add(found, here, first + slopes.places, by_looked[:, here] @ around)
+            _add(derivatives, entities, first + slopes.places, by_looked[:, entities] @ around)
         if self.own.size:
-            _add(found, np.arange(each), first + self.own, by_own)
+            _add(derivatives, np.arange(each), first + self.own, by_own)
         shape = samples, len(self.names), self.group
-        return residual.reshape(shape), found.reshape(*shape, size)
+        return residual.reshape(shape), derivatives.reshape(*shape, size)
 
     def _read(self, values: Array, phi: Array) -> tuple[Window, Array, Array]:
-        """The window, residuals (s, E, m) and their slopes (s, E, m, u)."""
+        """Return the stencil, residuals (s, E, m) and their derivatives (s, E, m, u) by the
+        inputs.
+        """
         if self._linear is None or len(values) < self.channel.count:
             instrument, window, u, data = self._at(values, phi)
             residual, by_u = instrument.residual.slopes(u, data)
@@ -374,7 +487,9 @@ class Reading(ABC):
 
     @cached_property
     def _linear(self) -> tuple[Window, Array, Array] | None:
-        """The same where all is zero; None where slopes are not always the same."""
+        """Stencil, residuals and derivatives at zero inputs; None if derivatives are not
+        constant.
+        """
         if not self.has_fixed_windows or not self._first.residual.is_linear:
             return None
         nothing = np.zeros((self.channel.count, self.channel.each, GROUP))
@@ -384,28 +499,33 @@ class Reading(ABC):
         return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
 
     def changes(self, values: Array, by: Array, phi: Array) -> Array:
-        """Changes (s, M, 3, c) of the residuals where what is looked at changes (n, e, 3, c)."""
+        """Return the changes (s, M, 3, c) of the pooled residuals if the observable changes
+        by `by` (n, e, 3, c).
+        """
         size = by.shape[3] + len(phi)
         slopes = Slopes.along(np.arange(by.shape[3]), by)
         return self.pooled(self.linearised(values, slopes, phi, size)[1][..., : by.shape[3]])
 
     def loss(self, values: Array, phi: Array) -> float:
-        """Σ ρ."""
+        """Return the loss Σ ρ of values (n, e, 3) at φ (k,)."""
         if not len(values):
             return 0.0
         instrument, _, u, data = self._at(values, phi)
         return float(instrument.loss.value(u, data).sum())
 
     def loss_slopes(self, values: Array, phi: Array) -> tuple[Array, Array]:
-        """∂loss by what is looked at (n, e, 3), and by φ (k,)."""
-        by_values, by_phi = np.zeros_like(values), np.zeros(len(phi))
+        """Return the gradient of the loss by the observable (n, e, 3) and by φ (k,)."""
+        by_values = np.zeros_like(values)
+        by_phi = np.zeros(len(phi))
         if not len(values):
             return by_values, by_phi
         instrument, window, u, data = self._at(values, phi)
-        by_u, places = instrument.loss.slopes(u, data)[1][0], window.places
+        by_u = instrument.loss.slopes(u, data)[1][0]
+        places = window.places
         by_looked, by_own = np.split(by_u, [GROUP * places.shape[2]])
         by_looked = by_looked.reshape(places.shape[2], GROUP, *places.shape[:2])
-        where, count = np.moveaxis(places, 2, 0).ravel(), values.size // GROUP
+        where = np.moveaxis(places, 2, 0).ravel()
+        count = values.size // GROUP
         for axis in range(GROUP):
             by_values[..., axis] = np.bincount(
                 where, by_looked[:, axis].ravel(), minlength=count
@@ -416,7 +536,7 @@ class Reading(ABC):
     # Second derivatives -----------------------------------------------------------------------
 
     def _gathering(self, places: Index) -> sp.csr_array:
-        """∂u/∂(c, φ) of samples (s, E, v): rows by sample, and entry of u."""
+        """Return ∂u/∂(c, φ) of samples with stencils (s, E, v); rows by sample, then by input."""
         samples, each, vectors = places.shape
         of_looked = GROUP * places[..., None] + np.arange(GROUP)
         first = GROUP * self.channel.count * self.channel.each
@@ -428,38 +548,53 @@ class Reading(ABC):
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether second derivatives of the loss by what is looked at are always the same."""
+        """Whether second derivatives of the loss by the observable are constant."""
         return self._first.is_quadratic
 
     @cached_property
     def _first(self) -> Instrument:
+        """Generated functions for the stencil of all times."""
         window = self.window(np.zeros(self.nuisance.size), self.channel.count)
         return self.instrument(window.places.shape[2], len(window.data))
 
     @cached_property
     def _pattern(self) -> NDArray[np.bool_]:
-        """(u, u) which second derivatives a sample may have."""
+        """Mask (u, u) of the second derivatives that a sample may have."""
         return self._first.loss.curvature_pattern
 
     def hessian_structure(self, slopes: sp.csr_array) -> tuple[Index, Index]:
-        """Rows and columns of ∂²loss by some variables, upper triangle, sorted by column.
+        """Return rows and columns of ∂²loss by some variables, upper triangle, sorted by column.
 
         Parameters
         ----------
-        slopes : the structure of the slopes of (c, φ) by these variables, all ones
+        slopes : sparse array
+            Structure of the derivatives of (c, φ) by these variables, all ones.
         """
         places = self.windows()
         instances = int(np.prod(places.shape[:2]))
         ones = np.broadcast_to(self._pattern.astype(float), (instances, *self._pattern.shape))
         # Positive numbers cannot cancel, so that no entry is lost.
-        found = _product(self._gathering(places) @ slopes, ones)
-        order = np.lexsort(found[:2])
-        return found.rows[order], found.columns[order]
+        entries = _product(self._gathering(places) @ slopes, ones)
+        order = np.lexsort(entries[:2])
+        return entries.rows[order], entries.columns[order]
 
     def hessian(
         self, values: Array, phi: Array, slopes: sp.csr_array, bent: bool = True
     ) -> Entries:
-        """The values of these entries, where some are; of readings that are bent, or linear."""
+        """Return the entries of ∂²loss by some variables, upper triangle; entries may be missing or
+        repeated.
+
+        Parameters
+        ----------
+        values : (n, e, 3) array
+            Values of the observable.
+        phi : (k,) array
+            Nuisance parameters.
+        slopes : sparse array
+            Derivatives of (c, φ) by the variables.
+        bent : bool
+            If false, neglect the curvature of the observations, see `Instrument.curvature`.
+        """
         instrument, window, u, data = self._at(values, phi)
         by_u = np.moveaxis(instrument.curvature(u, data, bent), (0, 1), (2, 3))
         by_u = by_u.reshape(-1, *by_u.shape[2:])
@@ -467,35 +602,59 @@ class Reading(ABC):
 
 
 def _around(by: Array, places: Index) -> Array:
-    """(s, E, 3 v, c) from the vectors' (n, e, 3, c)."""
+    """Return changes (s, E, 3 v, c) of the stencils' vectors from changes (n, e, 3, c) of
+    the observable.
+    """
     times, each, _, count = by.shape
     flat = by.reshape(times * each, GROUP, count)[places]
     return flat.reshape(*places.shape[:2], GROUP * places.shape[2], count)
 
 
 def _add(slope: Array, entities: Index, columns: Index, values: Array) -> None:
-    """Add (s, e, m, k) to columns (e, k) of (s, E, m, size), in place."""
+    """Add values (s, e, m, k) to columns (e, k) of the derivatives (s, E, m, size) of
+    entities (e,), in place.
+    """
     slope[:, entities[:, None], :, columns] += values.transpose(1, 3, 0, 2)
 
 
 def _product(slopes: sp.csr_array, blocks: Array) -> Entries:
-    """Upper triangle of Sᵀ B S, B having the blocks (instances, u, u) on its diagonal."""
+    """Return the upper triangle of Sᵀ B S, B being block-diagonal with the blocks
+    (instances, u, u).
+    """
     count = np.arange(len(blocks) + 1)
     middle = sp.bsr_array((blocks, count[:-1], count))
-    found = sp.coo_array(sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo"))
-    rows, columns = (np.asarray(index, dtype=np.int64) for index in found.coords)
-    return Entries(rows, columns, np.asarray(found.data, dtype=np.float64))
+    upper = sp.coo_array(sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo"))
+    rows, columns = (np.asarray(index, dtype=np.int64) for index in upper.coords)
+    return Entries(rows, columns, np.asarray(upper.data, dtype=np.float64))
 
 
 def times_around(known_s: Array, at_s: Array, count: int) -> Index:
-    """(S, count) which of some times (n,) in turn are around others (S,), as evenly as they can."""
+    """Return the indices (S, count) of consecutive times around each sample, as evenly as possible.
+
+    Parameters
+    ----------
+    known_s : (n,) array
+        Ascending times.
+    at_s : (S,) array
+        Times of the samples.
+    count : int
+        Number of neighbours, at most n.
+    """
     beside = np.searchsorted(known_s, at_s, side="right") - 1
     first = np.clip(beside - (count - 1) // 2, 0, len(known_s) - count)
     return first[:, None] + np.arange(count)
 
 
 def lagrange_weights(at: T, places: Sequence[T]) -> list[Any]:
-    """Weights of samples at some places, numbers or expressions, for the value between them."""
+    """Return Lagrange's weights of values at some places, for the value at `at`.
+
+    Parameters
+    ----------
+    at : float or SX
+        Place of interpolation.
+    places : sequence of float or SX
+        Distinct places of the values.
+    """
     return [
         math.prod((at - other) / (own - other) for j, other in enumerate(places) if j != i)
         for i, own in enumerate(places)

@@ -1,4 +1,4 @@
-"""The state an experiment starts from: equilibrium under its loads, undeformed, or given."""
+"""Initial state of an experiment: equilibrium under its loads, undeformed, or stated."""
 
 from __future__ import annotations
 
@@ -24,12 +24,26 @@ def rest_state(
     start: Array | None = None,
     solver: Solver | None = None,
 ) -> Array:
-    """Static equilibrium (3n,) under gravity and external forces, grasped nodes held.
+    """Return the static equilibrium (3n,) [m] under gravity and external forces, with grasped dofs
+    prescribed.
 
-    Starts from the undeformed shape carried by the grasp, or from `start`; where Newton fails, the
-    load is applied and the other grasps are moved in steps, from the shape carried; obstacles come
-    from where they just do not touch it. A body with memory has relaxed, or has been loaded for as
-    long as the experiment says.
+    Newton's method starts from the undeformed body in its grasps, or from `start`. If it fails,
+    load and relative displacements of the grasps are applied in increments, and obstacles approach
+    from where they do not touch the body. A body with memory has relaxed, or has been loaded for as
+    long as the experiment states.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    time_s : float, optional
+        Time of loads and poses [s]; the first time by default.
+    start : (3n,) array, optional
+        First guess [m].
+    solver : Solver, optional
+        Newton's method with the prescribed dofs of that time; a new one by default.
 
     Raises
     ------
@@ -50,28 +64,34 @@ def _at_rest(
     start: Array | None,
     solver: Solver,
 ) -> Array:
-    still, shape = np.zeros((1, len(goals_m))), experiment.rigid_positions([at_s])[0]
+    """Return the equilibrium (3n,) under given forces with prescribed positions (3n,); see
+    `rest_state`.
+    """
+    zero_velocity = np.zeros((1, len(goals_m)))
+    shape = experiment.rigid_positions([at_s])[0]
     forces = at_start(forces, experiment.loaded_since_s)
-    away = _before_contact(forces, shape)
+    without_contact = _before_contact(forces, shape)
 
     def solve(x: Array, share: float) -> Array:
         loaded = forces.scaled(share)
 
         def residual(state: Array) -> Array:
-            return loaded.total(state, still)[0]
+            return loaded.total(state, zero_velocity)[0]
 
         def linearise(state: Array) -> tuple[Array, Array, Array]:
             # Nothing moves: there is no skew part.
-            at = loaded.linearise(state, still)
+            at = loaded.linearise(state, zero_velocity)
             return at.force[0], -at.by_position[0], NONE
 
         # Grasps that are off are there at the end: the way there may be any.
-        goal = goals_m if share == 1 else _on_the_way(experiment, away, at_s, share).ravel()
+        goal = (
+            goals_m if share == 1 else _on_the_way(experiment, without_contact, at_s, share).ravel()
+        )
         return solver.newton(x, residual, linearise, keep_definite=True, goal=goal[solver.held])
 
     guess = shape.ravel() if start is None and experiment.obstacles else start
     try:
-        return followed(solve, away.ravel(), solver.options.halvings, guess)
+        return followed(solve, without_contact.ravel(), solver.options.halvings, guess)
     except NewtonFailure as failure:
         raise simulation_error(
             solver, failure, at_s, "finding the rest state", static=True
@@ -79,30 +99,34 @@ def _at_rest(
 
 
 def _before_contact(forces: Forces, shape: Array) -> Array:
-    """A shape (n, 3) with each obstacle drawn back from the point that is deepest in it.
+    """Return a shape (n, 3) with each obstacle retracted by its deepest penetration [m].
 
-    What a curved obstacle does to points far inside is not stable: it has to be come upon.
+    Deep inside a curved obstacle, contact forces are not stable; the obstacle must approach from
+    outside.
     """
     places = shape.copy()
     for term in forces.further:
         if isinstance(term, Contact):
-            frame, (depth_m, normal) = term.contact.obstacle.nodes, term.deepest(shape.ravel())
+            frame = term.contact.obstacle.nodes
+            depth_m, normal = term.deepest(shape.ravel())
             places[frame] -= max(depth_m, 0.0) * normal
     return places
 
 
 def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: float) -> Array:
-    """Held nodes (n, 3) when their grasps have come a share of their way from the carried body.
+    """Return positions (n, 3) with the grasps moved by a share of their displacement from the
+    carried body [m].
 
-    Each grasp turns about the middle of its nodes, which goes straight: none is squeezed or
-    sheared on the way, however far it turns. Obstacles are turned already. Other nodes stay where
-    they are carried.
+    Each grasp rotates about the middle of its nodes, which moves along a line, so that no grasp is
+    squeezed or sheared at large rotations. Obstacles have their final rotation already. Other nodes
+    keep their positions.
     """
     positions = carried.copy()
     for grasp in experiment.grasps:
         if not grasp.holds(time_s):
             continue
-        start, nodes = carried[grasp.nodes], grasp.nodes
+        start = carried[grasp.nodes]
+        nodes = grasp.nodes
         place = np.ix_(nodes, grasp.columns)
         goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
         if isinstance(grasp, Obstacle):
@@ -110,9 +134,10 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
             continue
         turn = grasp.poses.at(time_s)[0][0] @ experiment.rigid_motion(time_s)[0][0].T
         part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec())
-        middle, way = start.mean(axis=0), (goal - start).mean(axis=0)
-        moved = middle + share * way + part.apply(start - middle)
-        positions[place] = moved[:, grasp.columns]
+        middle = start.mean(axis=0)
+        way = (goal - start).mean(axis=0)
+        partial_m = middle + share * way + part.apply(start - middle)
+        positions[place] = partial_m[:, grasp.columns]
     return positions
 
 
@@ -124,16 +149,26 @@ def start_state(
     near: Array | None = None,
     goals_m: Array | None = None,
 ) -> tuple[Array, Array]:
-    """x_0 and v_0, each (3n,), after the experiment's start rule.
+    """Return initial positions x_0 [m] and velocities v_0 [m/s], each (3n,), by the experiment's
+    start rule.
 
     Parameters
     ----------
     experiment : Experiment
+        The experiment.
     forces : Forces
-        At the start.
+        Forces at the start.
     solver : Solver
-    near : (3n,) another x_0, where an equilibrium is looked for first
-    goals_m : (3n,) where dofs are held, NaN while free; as the experiment states by default
+        Newton's method with the prescribed dofs of the start.
+    near : (3n,) array, optional
+        First guess of an equilibrium [m].
+    goals_m : (3n,) array, optional
+        Prescribed positions [m], NaN at free dofs; those of the experiment by default.
+
+    Raises
+    ------
+    SimulationError
+        If no stable equilibrium is found.
     """
     velocity = experiment.start_velocities_m_s
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()

@@ -33,14 +33,15 @@ ANCHOR = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """The least-squares problem of one coordinate of the positions.
+    """Least-squares problem of one coordinate of the positions.
 
     Attributes
     ----------
-    free, prescribed : (f,), (p,) nodes whose coordinate is free or prescribed
+    free, prescribed : (f,), (p,) arrays
+        Nodes whose coordinate is free or prescribed.
     factor : SuperLU
         Factor of the normal equations of the free nodes.
-    coupling : (f, p) sparse
+    coupling : (f, p) sparse array
         Normal equations of the free nodes by the prescribed ones.
     """
 
@@ -104,7 +105,11 @@ class Retraction:
 
 
 def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
-    free, fixed = np.flatnonzero(~prescribed), np.flatnonzero(prescribed)
+    """Return the least-squares problem of one coordinate, from the normal equations of all
+    nodes.
+    """
+    free = np.flatnonzero(~prescribed)
+    fixed = np.flatnonzero(prescribed)
     rows = normal[free]
     return _Axis(free, fixed, splu(sp.csc_matrix(rows[:, free])), sp.csc_array(rows[:, fixed]))
 

@@ -1,7 +1,13 @@
-"""One experiment's share of the collocation NLP: its rows, columns, and derivative values.
+"""Transcription of one experiment: its variables, constraints and their derivatives.
 
-In scaled quantities: variables x / `length_m`, dynamics rows c / `force_n`, grasp rows
-(x − u x̄) / `length_m`.
+The constraints are the discrete equations of motion of a collocation scheme. Values are scaled:
+variables x / `length_m`, equations of motion c / `force_n`, and constraints of grasped dofs (x − u
+x̄) / `length_m`, which prescribe the pose u of the grasp applied to the undeformed position x̄.
+`Collocation` concatenates the segments of all experiments; use a `Segment` where one experiment is
+treated alone.
+
+Symbols: N grid times, n nodes, q shared parameters, φ nuisance parameters of the experiment, z all
+variables and g all constraints of the nonlinear program.
 """
 
 from __future__ import annotations
@@ -51,7 +57,15 @@ CHARTED = ("markers", "depths", "outlines", "readings", "local_loss", "_loss_sca
 
 @dataclass(frozen=True)
 class First:
-    """Where a segment begins: its x in z, and its rows in g."""
+    """Offsets of a segment in the nonlinear program.
+
+    Attributes
+    ----------
+    x : int
+        Index in z of its first position.
+    row : int
+        Index in g of its first constraint.
+    """
 
     x: int
     row: int
@@ -59,13 +73,16 @@ class First:
 
 @dataclass(frozen=True, eq=False)
 class RowWeights:
-    """What each row counts in a Lagrangian.
+    """Weights of the constraints and forces of one segment in a Lagrangian.
 
     Attributes
     ----------
-    multipliers : (constraints,) of the scaled rows
-    rows : (N, 3n) of c in newtons
-    forces : (N, 3n) of the forces at the evaluations
+    multipliers : (constraints,) array
+        Weights of the scaled constraints.
+    rows : (N, 3n) array
+        The same for the residuals c in newtons [1/N].
+    forces : (N, 3n) array
+        Weights of the forces at the evaluations [1/N].
     """
 
     multipliers: Array
@@ -75,23 +92,30 @@ class RowWeights:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """The variables x_{t,i} and constraints of one experiment.
+    """Variables x_{t,i} and constraints of one experiment, at grid time t and dof i.
 
     Attributes
     ----------
     experiment : Experiment
+        The experiment; it is not modified.
     parameters : Parameters
-        At their guess the constraints are scaled.
-    scheme, substeps, huber
-        See `Collocation`.
+        Shared parameters; constraints are scaled at their guess.
+    scheme : str or Scheme
+        Time discretisation, see `Collocation`.
+    substeps : int
+        Grid steps between samples.
     explicit_grasps : bool
-        Grasped nodes get rows of their own instead of bounds. Those that are held only for a
-        while always do, and so do all where the body may be off in its grasps.
+        If true, every prescribed displacement is a constraint instead of a bound. Dofs that are
+        prescribed for a part of the time always have constraints, and so do all grasped dofs if the
+        pose of the body in its grasps is estimated.
+    huber : float or None
+        Threshold of Huber's loss in standard deviations; None means a quadratic loss.
     first : First
+        Offsets of its variables and constraints.
     local : Local
-        Where its φ are in p = (q, φ_1, φ_2, …).
+        Indices of its φ in p = (q, φ_1, φ_2, …).
     chart : Chart
-        Where the recording is read.
+        Elements, clock samples and correspondences at which the measurements are evaluated.
     """
 
     experiment: Experiment
@@ -110,32 +134,34 @@ class Segment:
 
     @property
     def body(self) -> Body:
-        """What moves."""
+        """Body of the experiment."""
         return self.experiment.body
 
     @property
     def pattern(self) -> SymmetricPattern:
-        """Sparsity of the blocks."""
+        """Sparsity pattern of the time-step matrices (3n, 3n)."""
         return self.experiment.pattern
 
     @cached_property
     def constants(self) -> ThetaMap:
-        """The body's constants as functions of q."""
+        """Map from the shared parameters q to the constants θ of the body."""
         return ThetaMap(self.parameters, self.body)
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """The equations of motion with inputs as stated."""
+        """Discrete equations of motion with the inputs as stated in the experiment, before
+        any estimate.
+        """
         return with_inputs(Dynamics.of(self.experiment, self.scheme, self.substeps), self.nuisance)
 
     @cached_property
     def nuisance(self) -> NuisanceMap:
-        """The experiment's φ."""
+        """Nuisance parameters φ of the experiment."""
         return NuisanceMap.of(self.experiment, self.local.pivot_m)
 
     @cached_property
     def markers(self) -> MarkerReading:
-        """What its markers read."""
+        """Measurement model of the markers."""
         return MarkerReading.of(
             self.experiment.markers,
             np.arange(len(self.experiment.t_s)) * self.substeps,
@@ -147,88 +173,126 @@ class Segment:
 
     @cached_property
     def sensors(self) -> tuple[WrenchReading, ...]:
-        """Of the grasps whose wrench is measured."""
+        """Measurement models of the grasps' force–torque sensors."""
         return wrench_readings(self.experiment, Grid.of(self.dynamics), self.nuisance, self.huber)
 
     @cached_property
     def gauges(self) -> tuple[GaugeReading, ...]:
-        """Those of one's own."""
+        """Measurement models of the custom sensors."""
         grid = Grid.of(self.dynamics)
         return gauge_readings(self.experiment, grid.t_s, grid, self.nuisance, self.huber)
 
     @cached_property
     def depths(self) -> tuple[DepthReading, ...]:
-        """Those of depth cameras."""
+        """Measurement models of the depth cameras, in their order."""
         how = self.dynamics.t_s, self.nuisance, self.huber
         seen = zip(self.chart.sightings, self.views, strict=True)
         return tuple(DepthReading.of(replace(each, view=view), *how) for each, view in seen)
 
     @cached_property
     def outlines(self) -> tuple[OutlineReading, ...]:
-        """Those of depth cameras with images, in the order of the cameras."""
-        seen = (depth for depth in self.depths if len(depth.sighting.view.depth.images_m))
-        return tuple(OutlineReading.from_depth(depth) for depth in seen)
+        """Measurement models of the outlines in depth images, in the order of the cameras
+        that have images.
+        """
+        with_images = (depth for depth in self.depths if len(depth.sighting.view.depth.images_m))
+        return tuple(OutlineReading.from_depth(depth) for depth in with_images)
 
     @cached_property
     def views(self) -> tuple[View, ...]:
-        """Of depth cameras."""
+        """Camera models of the depth cameras, in their order."""
         numbers = range(len(self.experiment.depths))
         return tuple(View.of(self.experiment, k, self.nuisance) for k in numbers)
 
     @cached_property
     def readings(self) -> tuple[Reading, ...]:
-        """All that is measured, the markers first."""
+        """All measurement models: markers, wrench sensors, custom sensors, depth cameras,
+        outlines.
+        """
         return self.markers, *self.sensors, *self.gauges, *self.depths, *self.outlines
 
     @cached_property
     def local_loss(self) -> LocalLoss:
-        """Second derivatives of the loss by x and φ, where it has few."""
+        """Second derivatives of the loss by x and φ, for the measurements that depend on
+        few positions.
+        """
         pairs = ((reading, reading.channel.local) for reading in self.readings)
         local = tuple((reading, points) for reading, points in pairs if points and points.each)
         return LocalLoss(local, self.variables, self.nuisance.size, self.dofs)
 
     @cached_property
     def sensed_dofs(self) -> Index:
-        """Dofs of the nodes of these grasps."""
+        """Dofs (g,) of the nodes of grasps whose reaction forces are measured, ascending."""
         return sensed_dofs(self.experiment)
 
     def with_chart(self, chart: Chart) -> Segment:
-        """The same, read elsewhere."""
+        """Return the segment with other elements, clock samples and correspondences for its
+        measurements.
+
+        Everything that does not depend on the chart is shared with the copy.
+        """
         other = replace(self, chart=chart)
         # Nothing but how the markers are read depends on the chart.
-        kept = {k: v for k, v in vars(self).items() if k not in CHARTED}
-        vars(other).update(kept | {"chart": chart})
+        independent = {k: v for k, v in vars(self).items() if k not in CHARTED}
+        vars(other).update(independent | {"chart": chart})
         return other
 
     def following(self, phi: Array, x: Array) -> tuple[Chart, Array]:
-        """A chart where the estimates are, and φ in it; those given where they have not left.
+        """Update the chart where estimates have left it.
 
-        Depth cameras look anew at the first rows x (rows, 3n).
+        Markers get the elements that contain their estimated places, clocks the nearest samples,
+        and depth cameras the correspondences in the current shapes.
+
+        Parameters
+        ----------
+        phi : (k,) array
+            Nuisance parameters in units of their priors.
+        x : (rows, 3n) array
+            First rows of the motion [m], at least `rows_to_follow`; no rows without depth cameras.
+
+        Returns
+        -------
+        (Chart, (k,) array)
+            The chart, which is the present one if nothing has left it, and φ in the new chart.
         """
-        nuisance, places = self.nuisance, self.markers.place_places
-        late = phi[nuisance.places(TIME)] * nuisance.scales[nuisance.places(TIME)]
-        shift = float(late.sum()) / self.experiment.timestep_s
-        chart, of_places = self.chart.following(np.append(phi, 0.0)[places], shift)
-        seen = [d.sighting.following(d.shapes(x, phi), phi) for d in self.depths]
-        if any(s is not d.sighting for s, d in zip(seen, self.depths, strict=True)):
-            chart = replace(chart, sightings=tuple(seen))
-        return chart, self._with_places(phi, of_places)
+        nuisance = self.nuisance
+        places = self.markers.place_places
+        shifts_s = phi[nuisance.places(TIME)] * nuisance.scales[nuisance.places(TIME)]
+        shift = float(shifts_s.sum()) / self.experiment.timestep_s
+        chart, place_coordinates = self.chart.following(np.append(phi, 0.0)[places], shift)
+        sightings = [d.sighting.following(d.shapes(x, phi), phi) for d in self.depths]
+        if any(s is not d.sighting for s, d in zip(sightings, self.depths, strict=True)):
+            chart = replace(chart, sightings=tuple(sightings))
+        return chart, self._with_places(phi, place_coordinates)
 
     def placed(self, phi: Array, x: Array) -> tuple[Chart, Array]:
-        """The chart, and φ in it, with unknown places on the body's first rows x (rows, 3n).
+        """Initialise unknown marker places and depth cameras from the first rows of a motion.
 
-        Depth cameras are aligned to the first shape that they see.
+        A marker without a stated place is put where its first sample lies on the body; depth
+        cameras are aligned with the first shape that they measure.
+
+        Parameters
+        ----------
+        phi : (k,) array
+            Nuisance parameters; they are not modified.
+        x : (rows, 3n) array
+            First rows of the motion [m], at least `rows_to_place`.
+
+        Returns
+        -------
+        (Chart, (k,) array)
+            The chart, and φ in it.
         """
         phi = phi.copy()
-        seen = tuple(depth.aligned(x, phi) for depth in self.depths)
-        for each in seen:
+        sightings = tuple(depth.aligned(x, phi) for depth in self.depths)
+        for each in sightings:
             phi[each.view.own] = each.view.phi(each.start)[each.view.own]
         chart, phi = self._marked(phi, x)
-        return (replace(chart, sightings=seen) if seen else chart), phi
+        return (replace(chart, sightings=sightings) if sightings else chart), phi
 
     def _marked(self, phi: Array, x: Array) -> tuple[Chart, Array]:
-        """The same of markers alone."""
-        markers, rows = self.experiment.markers, self.markers.grid_rows
+        """Return the chart and φ with unknown marker places initialised from rows x (rows, 3n)."""
+        markers = self.experiment.markers
+        rows = self.markers.grid_rows
         if markers.located.all():
             return self.chart, phi
         points_m, _ = markers.first_samples
@@ -236,8 +300,8 @@ class Segment:
         places_m = self.places_m(phi)
         unknown = ~markers.located & (first < len(x)) & markers.present.any(axis=0)
         for row in np.unique(first[unknown]):
-            here = np.flatnonzero(unknown & (first == row))
-            places_m[here] = self.chart.at_markers(x[row].reshape(-1, 3), points_m[here])
+            starting = np.flatnonzero(unknown & (first == row))
+            places_m[starting] = self.chart.at_markers(x[row].reshape(-1, 3), points_m[starting])
         if not unknown.any():
             return self.chart, phi
         chart = self.chart.about(places_m)
@@ -245,7 +309,9 @@ class Segment:
 
     @property
     def rows_to_place(self) -> int:
-        """First rows of x that `placed` reads; none where all places are known."""
+        """Number of rows of x that `placed` needs; 0 if all places are stated and there is
+        no depth camera.
+        """
         unknown = ~self.experiment.markers.located
         first = self.experiment.markers.present[:, unknown].argmax(axis=0)
         rows = [int(self.markers.grid_rows[first].max())] if len(first) else []
@@ -253,37 +319,44 @@ class Segment:
 
     @property
     def rows_to_follow(self) -> int:
-        """First rows of x that `following` reads."""
+        """Number of rows of x that `following` needs; 0 without depth cameras."""
         return self.grid_rows if self.depths else 0
 
     def places_m(self, phi: Array) -> Array:
-        """(M, 3) places of the markers on the undeformed body."""
+        """Return the places (M, 3) of the markers on the undeformed body at φ (k,) [m]."""
         return self.chart.places_m(np.append(phi, 0.0)[self.markers.place_places])
 
     @property
     def guess_phi(self) -> Array:
-        """(k,) φ in the middle of the chart."""
-        phi, late = np.zeros(self.nuisance.size), self.nuisance.places(TIME)
-        phi[late] = self.chart.samples * self.experiment.timestep_s / self.nuisance.scales[late]
+        """Nuisance parameters φ (k,) at the centre of the chart."""
+        phi = np.zeros(self.nuisance.size)
+        time_shifts = self.nuisance.places(TIME)
+        phi[time_shifts] = (
+            self.chart.samples * self.experiment.timestep_s / self.nuisance.scales[time_shifts]
+        )
         for depth in self.depths:
             phi += depth.sighting.view.phi(depth.sighting.start)
         return self._with_places(phi, self.chart.centre)
 
     def _with_places(self, phi: Array, of_places: Array) -> Array:
-        moved, here = phi.copy(), self.chart.estimated
-        moved[self.markers.place_places[here]] = of_places[here]
-        return moved
+        """Return φ (k,) with the coordinates `of_places` (M, k') of the estimated marker
+        places replaced.
+        """
+        updated = phi.copy()
+        estimated = self.chart.estimated
+        updated[self.markers.place_places[estimated]] = of_places[estimated]
+        return updated
 
     # Sizes and places -------------------------------------------------------------------------
 
     @property
     def nq(self) -> int:
-        """Number of q."""
+        """Number of shared parameters q."""
         return len(self.parameters.free)
 
     @property
     def dofs(self) -> int:
-        """3n."""
+        """Number of dofs, 3n."""
         return self.pattern.size
 
     @cached_property
@@ -293,88 +366,94 @@ class Segment:
 
     @cached_property
     def held_dofs(self) -> Index:
-        """Dofs that are held throughout."""
+        """Dofs that are prescribed at all times."""
         return self.experiment.held_dofs
 
     @cached_property
     def row_dofs(self) -> Index:
-        """(rows_per_time,) the dof of each row of a grid time."""
+        """Dof of each constraint of one grid time, (rows_per_time,)."""
         return np.arange(self.dofs) if self.grasps_have_rows else self.free_dofs
 
     @property
     def grasps_have_rows(self) -> bool:
-        """Whether held dofs have rows of their own."""
+        """Whether prescribed displacements are constraints instead of bounds."""
         return self.explicit_grasps or self.nuisance.moves_grasps
 
     @property
     def rows_per_time(self) -> int:
-        """Constraint rows of a grid time: free dofs, or all dofs with explicit grasps."""
+        """Number of constraints of one grid time: free dofs, or all dofs if prescribed
+        displacements are constraints.
+        """
         return len(self.row_dofs)
 
     @property
     def grid_rows(self) -> int:
-        """N, grid times."""
+        """Number N of grid times."""
         return self.dynamics.rows
 
     @property
     def variables(self) -> int:
-        """N · 3n."""
+        """Number of position variables, N · 3n."""
         return self.grid_rows * self.dofs
 
     @property
     def constraint_times(self) -> int:
-        """Grid times that have rows."""
+        """Number of grid times with constraints."""
         return self.grid_rows - self.dynamics.first_row
 
     @property
     def constraints(self) -> int:
-        """Number of rows."""
+        """Number of constraints."""
         return self.constraint_times * self.rows_per_time
 
     @property
     def columns(self) -> slice:
-        """Its x in z."""
+        """Slice of its positions in z."""
         return slice(self.first.x, self.first.x + self.variables)
 
     @property
     def rows(self) -> slice:
-        """Its constraints in g."""
+        """Slice of its constraints in g."""
         return slice(self.first.row, self.first.row + self.constraints)
 
     @property
     def places(self) -> Index:
-        """Its (q, φ) in p."""
+        """Indices of its (q, φ) in p."""
         return np.concatenate([np.arange(self.nq), self.local.places])
 
     @property
     def after(self) -> First:
-        """Where the next segment begins."""
+        """Offsets of the segment that follows."""
         return First(self.columns.stop, self.rows.stop)
 
     # Grasps and scales ------------------------------------------------------------------------
 
     @cached_property
     def grasping(self) -> Grasping:
-        """Where the grasps are."""
+        """Prescribed displacements of the grasps as a function of φ."""
         return Grasping(self.experiment, self.nuisance, self.dynamics.t_s)
 
     def _goals(self, held: Held) -> Array:
-        """(N, 3n) goals of the grasped dofs, NaN elsewhere."""
+        """Return the prescribed positions (N, 3n) of the grasped dofs [m], NaN elsewhere."""
         goals = np.full((self.grid_rows, self.dofs), np.nan)
         goals[:, held.dofs] = held.positions_m
         return goals
 
     @cached_property
     def length_m(self) -> float:
-        """ℓ, the mean edge."""
+        """Mean edge length ℓ of the mesh [m], the unit of positions."""
         edges = np.diff(self.body.nodes_m[self.body.mesh.edges], axis=1)
         return float(np.linalg.norm(edges, axis=2).mean())
 
     @cached_property
     def force_n(self) -> float:
-        """The mean of |∂c_t/∂x_t| ℓ on the diagonal, at the undeformed shape."""
-        theta, at_rest = self.constants.theta(self.parameters.guess_q), self.body.nodes_m
-        dynamics, pattern = self.dynamics.with_theta(theta), self.pattern
+        """Mean of |∂c_t/∂x_t| ℓ over the diagonal at the undeformed shape and the guess
+        [N], the unit of equations of motion.
+        """
+        theta = self.constants.theta(self.parameters.guess_q)
+        at_rest = self.body.nodes_m
+        dynamics = self.dynamics.with_theta(theta)
+        pattern = self.pattern
         at_last = dynamics.forces.rows(slice(dynamics.rows - 1, None))
         forces = at_last.linearise(at_rest, np.zeros_like(at_rest))
         last = StencilRow.of(dynamics, dynamics.rows - 1)
@@ -383,7 +462,9 @@ class Segment:
         return self.length_m * float(stiffness)
 
     def start_positions(self) -> Array | None:
-        """(3n,) the given x_0, or None when it is found as an equilibrium."""
+        """Return the stated initial positions (3n,) [m], or None if they follow as an
+        equilibrium.
+        """
         experiment = self.experiment
         if experiment.start == "equilibrium":
             return None
@@ -392,7 +473,9 @@ class Segment:
         return experiment.rigid_positions(self.dynamics.t_s[:1]).ravel()
 
     def bounds(self) -> tuple[Array, Array]:
-        """(N, 3n) lower and upper bounds in metres; equal where a value is given."""
+        """Return lower and upper bounds (N, 3n) of the positions [m], equal where a value
+        is prescribed.
+        """
         lower = np.full((self.grid_rows, self.dofs), -np.inf)
         upper = np.full((self.grid_rows, self.dofs), np.inf)
         if not self.grasps_have_rows:
@@ -407,43 +490,56 @@ class Segment:
 
     @cached_property
     def moving(self) -> Index:
-        """Positions in (q, φ) of the parameters that change the motion."""
+        """Indices in (q, φ) of the parameters that change the motion, not only the measurements."""
         return np.concatenate([np.arange(self.nq), self.nq + self.nuisance.moving])
 
     def moving_in(self, first_phi: int) -> Index:
-        """The same in z, where the φ of all experiments begin at `first_phi`."""
+        """Return the indices in z of the parameters that change the motion.
+
+        Parameters
+        ----------
+        first_phi : int
+            Index in z where the nuisance parameters of all experiments begin.
+        """
         phi = first_phi - self.nq + self.local.places[self.nuisance.moving]
         return np.concatenate([np.arange(self.nq), phi])
 
     @property
     def carries(self) -> bool:
-        """Whether its body or a force on it carries something."""
+        """Whether its body or a force on it has history variables."""
         return self.body.remembers or bool(self.dynamics.forces.carrying)
 
     def setting(self, q: Array, phi: Array) -> Setting:
-        """The equations of motion at (q, φ)."""
+        """Return the equations of motion at shared parameters q (nq,) and nuisance
+        parameters φ (k,).
+        """
         p = np.concatenate([q, phi[self.nuisance.moving]])
         u, by_p = self.inputs.at(p)
-        dynamics, held = self.dynamics.at(u), self.grasping.at(phi)
+        dynamics = self.dynamics.at(u)
+        held = self.grasping.at(phi)
         if held.moves:
             dynamics = replace(dynamics, goals_m=self._goals(held))
         return Setting(self.inputs, p, self.nq, by_p, dynamics, held)
 
     @cached_property
     def inputs(self) -> Inputs:
-        """What parameters do to the equations of motion."""
+        """Map from the parameters (q, φ) to the inputs of the equations of motion at all
+        evaluations.
+        """
         return inputs_of(self.experiment, self.parameters, self.nuisance, self.dynamics.evaluated_s)
 
     def corrected(self, phi: Array) -> Experiment:
-        """The experiment in the body's frame, as φ has gravity, grasps, loads and drives."""
+        """Return the experiment with gravity, grasps, loads and actuators as estimated by φ
+        (k,), in the body's frame.
+        """
         if not len(self.nuisance.moving):
             return self.experiment
         grasps = self.experiment.grasps
         if self.nuisance.moves_grasps:
             grasps = self.nuisance.with_grasps(grasps, phi)
-        off = iter(self.nuisance.drives(phi))
+        drive_errors = iter(self.nuisance.drives(phi))
         tendons, pressures = (
-            tuple(actuator.off_by(*next(off)) for actuator in actuators)
+            tuple(actuator.off_by(*next(drive_errors)) for actuator in actuators)
             for actuators in (self.experiment.tendons, self.experiment.pressures)
         )
         changed = replace(
@@ -456,7 +552,9 @@ class Segment:
         return self.nuisance.with_times(changed, phi)
 
     def grasped(self, x: Array, phi: Array) -> Array:
-        """Positions (N, 3n) with the held nodes where their grasps are."""
+        """Return positions x (N, 3n) with the prescribed dofs where φ (k,) puts their
+        grasps [m].
+        """
         goals = self._goals(self.grasping.at(phi))
         return np.where(np.isnan(goals), x, goals)
 
@@ -465,10 +563,24 @@ class Segment:
     def constraint_values(
         self, x: Array, setting: Setting, along: Sequence[AnyHistory] = ()
     ) -> Array:
-        """(constraints,) scaled rows at x (N, 3n) in metres."""
+        """Return the scaled constraints (constraints,).
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        setting : Setting
+            Equations of motion at the parameters.
+        along : sequence of histories
+            History variables at x, of the body and of forces; empty if there are none, or if they
+            are to be computed from x.
+        """
         return self._rows(x, setting.dynamics.residual(x, along), setting)
 
     def _rows(self, x: Array, residual: Array, setting: Setting) -> Array:
+        """Return the scaled constraints at positions x (N, 3n) [m] with the residual (N,
+        3n) of the motion [N].
+        """
         rows = residual / self.force_n
         goals = setting.dynamics.goals_m
         grasped = ~np.isnan(goals)
@@ -476,47 +588,54 @@ class Segment:
         return self.of_rows(rows)
 
     def of_rows(self, values: NDArray[T]) -> NDArray[T]:
-        """(constraints,) what the rows have of (N, 3n)."""
+        """Select from values (N, 3n) those that belong to constraints, (constraints,)."""
         return values[self.dynamics.first_row :, self.row_dofs].ravel()
 
     @cached_property
     def grasp_rows(self) -> NDArray[np.bool_]:
-        """(constraints,) rows that hold a node instead of moving it."""
+        """Mask (constraints,) of the constraints that prescribe a displacement."""
         grasped = self.dynamics.taken.copy()
         grasped[:, self.held_dofs] = True
         return self.of_rows(grasped)
 
     def residual_n(self, x: Array, setting: Setting, along: Sequence[AnyHistory] = ()) -> Array:
-        """(N, free dofs) violation of the equations of motion in newtons."""
+        """Return the violation of the equations of motion (N, free dofs) [N]; arguments as
+        in `constraint_values`.
+        """
         residual = setting.dynamics.residual(x, along)
         return self.dynamics.without_taken(residual)[:, self.free_dofs]
 
     @cached_property
     def motion_rows(self) -> MotionRows:
-        """The structure of ∂c/∂x."""
+        """Sparsity structure and entries of ∂c/∂x."""
         return MotionRows(self.dynamics, self.row_dofs, self.free_dofs, self.length_m, self.force_n)
 
     @property
     def jacobian(self) -> BlockBand:
-        """Its entries; row numbers count within the segment."""
+        """Sparsity structure of ∂c/∂x by columns; row indices count within the segment."""
         return self.motion_rows.band
 
     def constraints_and_jacobian(
         self, x: Array, setting: Setting, forces: Linearisation, values: Array
     ) -> tuple[Array, Array]:
-        """Write ∂c/∂x into `values` (jacobian.nnz,), at the memory as it is.
+        """Evaluate the constraints and their derivatives; history variables are treated as
+        constant.
 
         Parameters
         ----------
-        x : (N, 3n) metres
+        x : (N, 3n) array
+            Positions [m].
         setting : Setting
+            Equations of motion at the parameters.
         forces : Linearisation
-            Of the evaluations of x.
+            Forces and their derivatives at the evaluations of x.
+        values : (jacobian.nnz,) array
+            Entries of ∂c/∂x, overwritten.
 
         Returns
         -------
-        rows : (constraints,) c
-        by_p : (constraints, len(moving)) ∂c/∂(q, φ), where it is not zero
+        ((constraints,) array, (constraints, len(moving)) array)
+            Scaled constraints c, and ∂c/∂(q, φ) by the parameters of `moving`.
         """
         dynamics = setting.dynamics
         self.motion_rows.fill(values, forces, dynamics, setting.mass_moves)
@@ -537,8 +656,18 @@ class Segment:
         return rows, by_p.reshape(self.constraints, len(self.moving))
 
     def weights(self, multipliers: Array, of_reactions: Array | float = 0.0) -> RowWeights:
-        """Those of multipliers · c, and of rows (N, 3n) where no force counts as taken."""
-        dynamics, t = self.dynamics, self.dynamics.tables
+        """Return the weights of constraints and forces in Σ multipliers · c.
+
+        Parameters
+        ----------
+        multipliers : (constraints,) array
+            Weights of the scaled constraints of this segment.
+        of_reactions : (N, 3n) array or 0
+            Additional weights of the residuals c [1/N], applied to the complete force balance
+            including dofs that are prescribed at that time.
+        """
+        dynamics = self.dynamics
+        t = self.dynamics.tables
         rows = np.zeros((self.grid_rows, self.dofs))
         by_time = multipliers.reshape(self.constraint_times, self.rows_per_time)
         rows[dynamics.first_row :, self.row_dofs] = by_time / self.force_n
@@ -551,11 +680,26 @@ class Segment:
         return RowWeights(multipliers, rows, forces)
 
     def pulled_through(self, x: Array, setting: Setting, weights: Array) -> tuple[Array, Array]:
-        """Slopes of Σ weights · F through what is carried, by x and by what moves the body.
+        """Vector–Jacobian product of the forces through the history variables.
 
-        Weights are (N, 3n).
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        setting : Setting
+            Equations of motion at the parameters.
+        weights : (N, 3n) array
+            Weights of the forces F at the evaluations.
+
+        Returns
+        -------
+        ((N, 3n) array, (len(moving),) array)
+            Derivatives of Σ weights · F through history variables alone, by x and by the parameters
+            of `moving`.
         """
-        dynamics, by_x, by_p = setting.dynamics, np.zeros_like(x), np.zeros(len(self.moving))
+        dynamics = setting.dynamics
+        by_x = np.zeros_like(x)
+        by_p = np.zeros(len(self.moving))
         for history in dynamics.histories(x):
             by_xi, by_nu, own = history.pulled(weights, setting.by_p)
             by_x += dynamics.combine_transposed(dynamics.state_weights, by_xi)
@@ -565,7 +709,7 @@ class Segment:
 
     @cached_property
     def linearisation_rows(self) -> Array:
-        """Work space of linearisations."""
+        """Work space (constraint_times, width) for linearisations; overwritten by each of them."""
         # Kept between calls: fresh pages would cost as much as the numbers in them.
         return np.zeros((self.constraint_times, self.dynamics.forces.linearisation_width))
 
@@ -573,7 +717,7 @@ class Segment:
 
     @cached_property
     def hessian(self) -> BlockBand:
-        """Structure of the upper triangle of the Lagrangian's Hessian in the columns of x.
+        """Sparsity structure of the upper triangle of the Lagrangian's Hessian in the columns of x.
 
         The nq rows of q stand above the rows of x.
         """
@@ -582,13 +726,13 @@ class Segment:
 
     @cached_property
     def _skew_hessian(self) -> BlockBand:
-        """The same, to add what the skew part of ∂²φ/∂x∂v gives."""
+        """Structure of `hessian` for adding the contribution of the skew part of ∂²φ/∂x∂v."""
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (pp * q - qq * p, 0 * q))
         return adding_skew(self.dofs, self._hessian_starts, blocks, top=self.nq)
 
     @cached_property
     def _rate_hessian(self) -> BlockBand:
-        """The same, to add what ∂²φ/∂v² gives."""
+        """Structure of `hessian` for adding the contribution of ∂²φ/∂v²."""
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (q * qq, 0 * q))
         return BlockBand(self.dofs, self._hessian_starts, blocks, self.nq, adds=True)
 
@@ -597,22 +741,39 @@ class Segment:
         return self.nq + np.arange(self.grid_rows) * self.dofs
 
     def _hessian_blocks(self, factors: Factors) -> list[BandBlock]:
-        """Blocks ∂²φ/∂x_{t−distance}∂x_t where those of ∂²φ/∂x² and ∂²φ/∂x∂v are."""
+        """Return the blocks ∂²φ/∂x_{t−distance}∂x_t of the Hessian of a potential φ of the
+        evaluation states.
+
+        Parameters
+        ----------
+        factors : callable
+            Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v from the stencils (p, q) of two positions in one
+            evaluation.
+        """
         rows, columns, source = self.pattern.full
         blocks = []
         for distance in range(self.dynamics.reach + 1):
             if distance > 0 and not self._curvature_terms(distance, _of_states):
                 continue
-            kept = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
-            entries, terms = np.flatnonzero(kept), self._curvature_terms(distance, factors)
+            is_stored = rows <= columns if distance == 0 else np.ones(len(rows), dtype=bool)
+            entries = np.flatnonzero(is_stored)
+            terms = self._curvature_terms(distance, factors)
             blocks.append(
-                BandBlock(-distance, rows[kept], columns[kept], source[kept], terms, entries)
+                BandBlock(
+                    -distance,
+                    rows[is_stored],
+                    columns[is_stored],
+                    source[is_stored],
+                    terms,
+                    entries,
+                )
             )
         return blocks
 
     def _curvature_terms(self, distance: int, factors: Factors) -> list[BlockTerm]:
-        """Terms of such a block, from evaluations k = t + i."""
-        p, q = self.dynamics.state_weights, self.dynamics.tables.q / self.dynamics.step_s
+        """Return the terms of the block at a distance in time, from the evaluations k = t + i."""
+        p = self.dynamics.state_weights
+        q = self.dynamics.tables.q / self.dynamics.step_s
         terms = []
         for i in range(self.dynamics.reach + 1 - distance):
             pair = factors(p[:, i], q[:, i], p[:, i + distance], q[:, i + distance])
@@ -631,20 +792,36 @@ class Segment:
         carried: Sequence[Weighed] = (),
         bent: bool = True,
     ) -> tuple[Array, list[Array]]:
-        """Second derivatives of loss_weight · L + weights · c.
+        """Second derivatives of loss_weight · loss + multipliers · c of this segment.
 
         Parameters
         ----------
-        values : (hessian.nnz,) out, of the dynamics in the columns of x
-        bent : whether readings are, see `LocalLoss.hessian`
-        carried : histories that are given, with what h_k of each counts besides, Σ μ_k h_k
+        x : (N, 3n) array
+            Positions [m].
+        phi : (k,) array
+            Nuisance parameters in units of their priors.
+        setting : Setting
+            Equations of motion at the parameters.
+        weights : RowWeights
+            Weights of the constraints, see `weights`.
+        loss_weight : float
+            Factor of the loss.
+        values : (hessian.nnz,) array
+            Derivatives of the constraints in the columns of x, overwritten.
+        carried : sequence of (history, array)
+            History variables that are lifted, each with the weights μ_k of its values h_k in the
+            Lagrangian, Σ μ_k h_k.
+        bent : bool
+            If false, neglect the curvature of the observations (Gauss–Newton), see
+            `LocalLoss.hessian`.
 
         Returns
         -------
-        by_q : (nq, nq) second derivatives by q
-        further : list of the values of `further_entries`
+        ((nq, nq) array, list of arrays)
+            Second derivatives by q, and the values of `further_entries`.
         """
-        dynamics, band = setting.dynamics, self.hessian
+        dynamics = setting.dynamics
+        band = self.hessian
         curvature = self._curvature(x, setting, weights.forces, carried)
         band.fill(
             values, curvature.position_position, curvature.position_velocity, self.body.threads
@@ -677,9 +854,12 @@ class Segment:
     def _curvature(
         self, x: Array, setting: Setting, weights: Array, carried: Sequence[Weighed]
     ) -> Curvature:
-        """That of the forces and what is left at all N evaluations, a given start included."""
+        """Return the weighted second derivatives of the forces at all N evaluations,
+        including a stated initial state.
+        """
         dynamics = setting.dynamics
-        forces, (xi, nu) = dynamics.forces, dynamics.evaluated_at(x)
+        forces = dynamics.forces
+        xi, nu = dynamics.evaluated_at(x)
         for history, mu in carried:
             forces = history.weighed(forces, mu)
         curvature = forces.curvature(xi, nu, weights, self._curvature_rows)
@@ -689,50 +869,64 @@ class Segment:
 
     @cached_property
     def by_state(self) -> Index:
-        """Which of (q, φ that move the body) are φ that change forces together with the state."""
+        """Indices in (q, φ of the motion) of the nuisance parameters with a mixed second
+        derivative with the state.
+        """
         return self.nq + np.flatnonzero(self.inputs.by_state[self.nq :])
 
     @cached_property
     def _curvature_rows(self) -> Array:
+        """Work space (N, width) for second derivatives; overwritten by each evaluation."""
         return np.zeros((self.grid_rows, self.dynamics.forces.curvature_width))
 
     @property
     def hessian_diagonal(self) -> Index:
-        """Positions of the diagonal of x in the values of `hessian`."""
+        """Positions of the diagonal entries of x in the values of `hessian`."""
         dofs = np.arange(self.dofs)
         return self.hessian.positions(np.arange(self.grid_rows), 0, dofs, dofs).ravel()
 
     def further_entries(self, first_phi: int) -> list[tuple[Index, Index]]:
-        """Rows and columns in z of what its Hessian has besides `hessian`, upper triangle.
+        """Return rows and columns in z of the Hessian's entries besides `hessian`, upper triangle.
 
-        Those of the loss by x and φ; of the motion by q and φ, and by x and φ; of φ by φ.
+        In order: the loss by x and φ; the motion by q and φ; the motion by x and φ; φ by φ.
 
         Parameters
         ----------
-        first_phi : where in z the φ of all experiments begin
+        first_phi : int
+            Index in z where the nuisance parameters of all experiments begin.
         """
         of_x = self.first.x + np.arange(self.variables)
         of_phi = first_phi - self.nq + self.local.places
-        in_z, moving = np.concatenate([of_x, of_phi]), of_phi[self.nuisance.moving]
-        states, pairs = moving[self.by_state - self.nq], np.triu_indices(len(of_phi))
+        in_z = np.concatenate([of_x, of_phi])
+        moving = of_phi[self.nuisance.moving]
+        states = moving[self.by_state - self.nq]
+        pairs = np.triu_indices(len(of_phi))
         rows, columns = self.local_loss.structure
-        found = [
+        entries = [
             (in_z[rows], in_z[columns]),
             (np.repeat(np.arange(self.nq), len(moving)), np.tile(moving, self.nq)),
             (np.repeat(of_x, len(states)), np.tile(states, len(of_x))),
             (of_phi[pairs[0]], of_phi[pairs[1]]),
         ]
         # Experiments that share a φ need not have them in the same order.
-        return [(np.minimum(*each), np.maximum(*each)) for each in found]
+        return [(np.minimum(*each), np.maximum(*each)) for each in entries]
 
     @cached_property
     def _loss_scale(self) -> Array:
-        """Of each entry of the loss, its factor in scaled variables."""
+        """Factor from SI units to scaled variables of each entry of the loss's Hessian."""
         rows, columns = self.local_loss.structure
         powers = (rows < self.variables).astype(float) + (columns < self.variables)
         return self.length_m**powers
 
 
 def _of_states(p: Array, q: Array, pp: Array, qq: Array) -> tuple[Array, Array]:
-    """Factors of ∂²φ/∂x² and ∂²φ/∂x∂v."""
+    """Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions.
+
+    Parameters
+    ----------
+    p, q : (N,) arrays
+        Stencil coefficients of state and velocity of the first position.
+    pp, qq : (N,) arrays
+        Stencil coefficients of the second position.
+    """
     return p * pp, p * qq + q * pp

@@ -1,6 +1,9 @@
-"""What is looked at of one experiment at a point, and how residuals follow the parameters.
+"""Observables of one experiment at given parameters, and their derivatives along the equations of
+motion.
 
-Reactions follow from positions x by the equations of motion, see `reaction`; readings from both.
+Reaction forces follow from positions x by the equations of motion, see `reaction`; the observables
+of measurements follow from both. Use `Sensing.motion` for values, `Sensing.linearised` for
+residuals with derivatives, and `Sensing.pulled` for gradients.
 """
 
 from __future__ import annotations
@@ -21,13 +24,16 @@ from .segment import Segment
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """How what is looked at follows the m parameters that move the body, or c poses.
+    """Changes of the observables with the m parameters that change the motion, or with c other
+    columns.
 
     Attributes
     ----------
-    looked : of each reading (R, p, m), what its channel's operator takes of the rows of x
+    looked : tuple of (R, p, m) arrays
+        For each measurement, the operator of its observable applied to the changes of the R rows of
+        x that it needs.
     held : HeldForces
-        On the sensed dofs; its first column may be that of a step.
+        Forces on the sensed dofs with their changes; column 0 may be a feasibility step.
     """
 
     looked: tuple[Array, ...]
@@ -36,13 +42,16 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Sensing:
-    """A segment at a point.
+    """Observables of a segment at given parameters.
 
     Attributes
     ----------
     segment : Segment
+        Transcription of the experiment.
     setting : Setting
-    phi : (k,)
+        Equations of motion at the parameters.
+    phi : (k,) array
+        Nuisance parameters.
     """
 
     segment: Segment
@@ -50,11 +59,21 @@ class Sensing:
     phi: Array
 
     def motion(self, x: Array, along: Sequence[AnyHistory] = ()) -> Motion:
-        """Positions x (N, 3n), or the first rows, with the reactions that follow from them."""
+        """Return a motion with the reaction forces that follow from it, computed on demand.
+
+        Parameters
+        ----------
+        x : (rows, 3n) array
+            Positions [m], or their first rows.
+        along : sequence of histories
+            History variables at x; by default they are computed from x if there are any.
+        """
         return Motion(x, lambda: self._forced(x, along))
 
     def _forced(self, x: Array, along: Sequence[AnyHistory] = ()) -> Forced:
-        dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
+        """Return the reaction forces on the sensed dofs at positions x (rows, 3n)."""
+        dynamics = self.setting.dynamics.first_rows(len(x))
+        dofs = self.segment.sensed_dofs
         force = forces_on(dynamics, x, dofs, along)
         mass_kg = self._mass_kg[: len(x)]
         reaction = reactions(dynamics, mass_kg, force, dynamics.acceleration(x)[:, dofs])
@@ -62,44 +81,65 @@ class Sensing:
 
     @property
     def _mass_kg(self) -> Array:
-        """(N, g) of the sensed dofs."""
+        """Masses (N, g) of the sensed dofs [kg]."""
         return self.setting.dynamics.mass.kg[:, self.segment.sensed_dofs]
 
     # Along the equations of motion ------------------------------------------------------------
 
     def read_along(self, rows: Iterable[Array], held: HeldForces) -> Response:
-        """What changes (3n, m) of row after row of x change of what is looked at."""
+        """Compute the changes of the observables from changes of x, row by row.
+
+        Parameters
+        ----------
+        rows : iterable of (3n, m) arrays
+            Changes of each row of x [m]; consumed.
+        held : HeldForces
+            Forces on the sensed dofs with their changes.
+        """
         channels = [reading.channel for reading in self.segment.readings]
         operators = [channel.operator(self.phi) for channel in channels]
-        wanted = [frozenset(channel.rows.tolist()) for channel in channels]
-        looked: list[list[Array]] = [[] for _ in channels]
+        needed_rows = [frozenset(channel.rows.tolist()) for channel in channels]
+        observed: list[list[Array]] = [[] for _ in channels]
         for t, row in enumerate(rows):
-            for found, operator, times in zip(looked, operators, wanted, strict=True):
+            for changes, operator, times in zip(observed, operators, needed_rows, strict=True):
                 if t in times:
-                    found.append(operator @ row)
-        return Response(tuple(map(np.stack, looked)), held)
+                    changes.append(operator @ row)
+        return Response(tuple(map(np.stack, observed)), held)
 
     def looked_along(self, by: Array, held: HeldForces) -> Response:
-        """The same of the first rows (rows, 3n, m) at once."""
-        found, (_, dofs, count) = [], by.shape
+        """Compute the changes of the observables from changes of the first rows of x,
+        (rows, 3n, m), at once.
+        """
+        changes = []
+        _, dofs, count = by.shape
         for channel in (reading.channel for reading in self.segment.readings):
             rows = channel.rows[channel.rows < len(by)]
             columns = by[rows].transpose(1, 0, 2).reshape(dofs, len(rows) * count)
             at = channel.operator(self.phi) @ columns
-            found.append(at.reshape(len(at), len(rows), count).transpose(1, 0, 2))
-        return Response(tuple(found), held)
+            changes.append(at.reshape(len(at), len(rows), count).transpose(1, 0, 2))
+        return Response(tuple(changes), held)
 
     def moving(
         self, x: Array, response: Response, step: Array | None = None, by_p: bool = True
     ) -> list[Motion]:
-        """The motion as each reading looks at it, and how it changes.
+        """Return the motion as each measurement observes it, with its changes.
 
         Parameters
         ----------
-        x : (rows, 3n), at which the forces of the response are
-        step : (rows, 3n), optional
-            After it everything is looked at, to first order; its forces are their first column.
-        by_p : whether the columns are those of what moves the body
+        x : (rows, 3n) array
+            Positions [m] at which the forces of the response were computed.
+        response : Response
+            Changes of the observables.
+        step : (rows, 3n) array, optional
+            Step [m]. If given, values are those after the step, to first order, and column 0 of the
+            forces of the response must belong to it.
+        by_p : bool
+            Whether the columns are derivatives by the parameters that change the motion.
+
+        Returns
+        -------
+        list of Motion
+            One entry per measurement.
         """
 
         def forced(moved: Array) -> Forced:
@@ -113,11 +153,17 @@ class Sensing:
     def _along(
         self, x: Array, held: HeldForces, moved: Array, step: Array | None, by_p: bool
     ) -> Forced:
-        dynamics, dofs = self.setting.dynamics.first_rows(len(x)), self.segment.sensed_dofs
+        """Return reaction forces with their changes, see `moving`; `moved` (rows, g, c) are
+        the changes of the positions of the sensed dofs [m].
+        """
+        dynamics = self.setting.dynamics.first_rows(len(x))
+        dofs = self.segment.sensed_dofs
         if step is not None:
             moved = np.concatenate([step[:, dofs, None], moved], axis=2)
-        acceleration, mass_kg = dynamics.acceleration(x)[:, dofs], self._mass_kg[: len(x)]
-        reaction, at = reactions(dynamics, mass_kg, held.force, acceleration), x[:, dofs]
+        acceleration = dynamics.acceleration(x)[:, dofs]
+        mass_kg = self._mass_kg[: len(x)]
+        reaction = reactions(dynamics, mass_kg, held.force, acceleration)
+        at = x[:, dofs]
         by = reaction_slopes(dynamics, mass_kg, held.slopes, moved)
         if by_p:
             first = 0 if step is None else 1
@@ -129,47 +175,99 @@ class Sensing:
     def linearised(
         self, x: Array, response: Response, step: Array | None = None
     ) -> list[tuple[Array, Array]]:
-        """Residuals (s, G, 3) of each reading, and slopes (s, G, 3, size), see `moving`."""
-        segment, size, found = self.segment, self.segment.nq + len(self.phi), []
+        """Linearise the residuals of all measurements by (q, φ).
+
+        Parameters
+        ----------
+        x : (rows, 3n) array
+            Positions [m].
+        response : Response
+            Changes of the observables with the parameters.
+        step : (rows, 3n) array, optional
+            Step after which residuals are computed, to first order; see `moving`.
+
+        Returns
+        -------
+        list of (array, array)
+            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, size) by all size =
+            nq + k parameters.
+        """
+        segment = self.segment
+        size = self.segment.nq + len(self.phi)
+        found = []
         motions = self.moving(x, response, step)
         for reading, motion in zip(segment.readings, motions, strict=True):
-            looked = reading.channel.linearised(motion, self.phi, segment.moving, size)
-            found.append(reading.linearised(*looked, self.phi, size))
+            values_and_slopes = reading.channel.linearised(motion, self.phi, segment.moving, size)
+            found.append(reading.linearised(*values_and_slopes, self.phi, size))
         return found
 
     def still(self, x: Array) -> list[tuple[Array, Array]]:
-        """The same, and slopes (s, G, 3, k) by φ, at the first rows x, none of which move."""
-        forced, none = self._forced(x), np.zeros(0, dtype=np.int64)
-        nothing, found = np.zeros((*forced.reaction.shape, 0)), []
+        """Linearise the residuals of all measurements by φ, at a motion that does not change.
+
+        Parameters
+        ----------
+        x : (rows, 3n) array
+            First rows of the motion [m].
+
+        Returns
+        -------
+        list of (array, array)
+            For each measurement, residuals (s, G, 3) and derivatives (s, G, 3, k).
+        """
+        forced = self._forced(x)
+        none = np.zeros(0, dtype=np.int64)
+        nothing = np.zeros((*forced.reaction.shape, 0))
+        linearised = []
         forced = replace(forced, reaction_by=nothing, position_by=nothing)
         for reading in self.segment.readings:
-            motion, count = Motion(x, lambda: forced), len(self.phi)
-            looked = reading.channel.linearised(motion, self.phi, none, count)
-            found.append(reading.linearised(*looked, self.phi, count))
-        return found
+            motion = Motion(x, lambda: forced)
+            count = len(self.phi)
+            values_and_slopes = reading.channel.linearised(motion, self.phi, none, count)
+            linearised.append(reading.linearised(*values_and_slopes, self.phi, count))
+        return linearised
 
     def wrenches(self, x: Array) -> list[Array]:
-        """What each sensor should read (S, 6), NaN where that is not known."""
+        """Return the prediction (S, 6) for each wrench sensor [N, N m], NaN at samples
+        outside the known times.
+        """
         return [s.of_forced(self.motion(x).forced, self.phi) for s in self.segment.sensors]
 
     # Backward ---------------------------------------------------------------------------------
 
     def pulled(self, x: Array, weights: Array) -> tuple[Array, Array]:
-        """Slopes of Σ weights · R by x (N, 3n) and by what moves the body, at weights (N, g)."""
-        setting, segment, dofs = self.setting, self.segment, self.segment.sensed_dofs
-        dynamics, t = setting.dynamics, setting.dynamics.tables
-        first, whole = dynamics.first_row, np.zeros_like(x)
-        whole[:, dofs] = -dynamics.combine_transposed(t.w, weights)
+        """Vector–Jacobian product of the reaction forces.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        weights : (N, g) array
+            Weights of the reaction forces R.
+
+        Returns
+        -------
+        ((N, 3n) array, (m,) array)
+            Derivatives of Σ weights · R by x and by the parameters that change the motion.
+        """
+        setting = self.setting
+        segment = self.segment
+        dofs = self.segment.sensed_dofs
+        dynamics = setting.dynamics
+        t = setting.dynamics.tables
+        first = dynamics.first_row
+        force_weights = np.zeros_like(x)
+        force_weights[:, dofs] = -dynamics.combine_transposed(t.w, weights)
         at = dynamics.linearise(x, segment.linearisation_rows)
         slopes = setting.force_slopes(slice(first, None), at.by_theta)
-        by_p = np.einsum("tg,tgp->p", whole[first:, dofs], slopes[:, dofs])
+        by_p = np.einsum("tg,tgp->p", force_weights[first:, dofs], slopes[:, dofs])
         if setting.mass_moves:
             acceleration = dynamics.acceleration(x)[:, dofs]
             own = setting.inertia_slopes(slice(None), acceleration, dofs)
             by_p += np.einsum("tg,tgp->p", weights, own)
         rows = Submatrix(dynamics.pattern, dofs)
-        state, rate = np.zeros_like(x), np.zeros_like(x)
-        for k, weight in enumerate(whole[first:, dofs]):
+        state = np.zeros_like(x)
+        rate = np.zeros_like(x)
+        for k, weight in enumerate(force_weights[first:, dofs]):
             if weight.any():
                 skew = at.by_position_skew[k]
                 state[first + k] = rows.of(at.by_position[k], skew).T @ weight
@@ -178,5 +276,5 @@ class Sensing:
         by_x += dynamics.combine_transposed(t.q, rate) / dynamics.step_s
         inertia = dynamics.combine_transposed(t.s, self._mass_kg * weights)
         by_x[:, dofs] += inertia / dynamics.step_s**2
-        of_carried, own = segment.pulled_through(x, setting, whole)
-        return by_x + of_carried, by_p + own
+        through_histories, own = segment.pulled_through(x, setting, force_weights)
+        return by_x + through_histories, by_p + own

@@ -1,7 +1,7 @@
-"""Nuisance parameters that several recordings share: one place in p, one prior, one chart.
+"""Nuisance parameters shared by several experiments: one entry of p, one prior, one chart.
 
-Recordings share those of a row of the table whose `scope` is the same word in both, and whose
-label is: the place of a marker by its name, the pose of the cameras or the clamp by its axis.
+Experiments share those nuisance parameters whose `scope` is the same word in both, and whose label
+is the same: the place of a marker by its name, the pose of the cameras or of the clamp by its axis.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ OF_MARKERS = ("given_m", "cells", "points_m", "axes", "crossed", "again")
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Where the φ of an experiment are.
+    """Indices of an experiment's nuisance parameters φ in p.
 
     Attributes
     ----------
-    places : (k,) in p = (q, φ_1, φ_2, …), each where the first experiment has it that shares it
-    counted : (k,) bool
-        Not those of an experiment before.
-    pivot_m : (3,) or None
-        About what the pose turns, where that is shared.
+    places : (k,) array
+        Index in p = (q, φ_1, φ_2, …) of each, that of the first experiment that shares it.
+    counted : (k,) array of bool
+        False for those that an earlier experiment has already.
+    pivot_m : (3,) array or None
+        Point about which the shared camera pose rotates [m]; None means the experiment's own.
     """
 
     places: Index
@@ -43,21 +44,32 @@ class Local:
 
 
 def locals_of(experiments: Sequence[Experiment], first: int) -> list[Local]:
-    """Where the φ of each experiment are in p, in which they begin at `first`.
+    """Assign the nuisance parameters of each experiment to entries of p.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        The experiments in their order.
+    first : int
+        Index in p of the first nuisance parameter.
 
     Raises
     ------
     InputError
-        Where recordings share what is not the same in them.
+        If experiments share a parameter of things that differ, or with different priors.
     """
-    found, known, leaders = [], dict[Any, tuple[int, Entry, Experiment]](), dict[Any, Experiment]()
+    indices = []
+    known = dict[Any, tuple[int, Entry, Experiment]]()
+    leaders = dict[Any, Experiment]()
     for experiment in experiments:
-        nuisance, scopes = NuisanceMap.of(experiment), experiment.nuisance.scope
-        places, before = np.zeros(nuisance.size, dtype=np.int64), first
+        nuisance = NuisanceMap.of(experiment)
+        scopes = experiment.nuisance.scope
+        places = np.zeros(nuisance.size, dtype=np.int64)
+        before = first
         for k, entry in enumerate(nuisance.entries):
             scope = scopes.get(entry.row.name)
             # What is not shared is nobody else's.
-            which = (len(found), k) if scope is None else (scope, entry.label)
+            which = (len(indices), k) if scope is None else (scope, entry.label)
             places[k], other, of = known.setdefault(which, (first, entry, experiment))
             first += places[k] == first
             leader = leaders.setdefault((scope, entry.row), experiment)
@@ -66,13 +78,14 @@ def locals_of(experiments: Sequence[Experiment], first: int) -> list[Local]:
                 _require_alike((of, other), (experiment, entry))
         leader = leaders.get((scopes.get(TURN.name), TURN), experiment)
         pivot_m = None if leader is experiment else NuisanceMap.of(leader).pivot_m
-        found.append(Local(places, places >= before, pivot_m))
-    return found
+        indices.append(Local(places, places >= before, pivot_m))
+    return indices
 
 
 def _require_same(leader: Experiment, experiment: Experiment, row: NuisanceRow) -> None:
-    """Refuse to share what belongs to things that differ."""
-    theirs, ours = row.same(leader), row.same(experiment)
+    """Raise InputError if a nuisance parameter is shared by experiments whose objects differ."""
+    theirs = row.same(leader)
+    ours = row.same(experiment)
     for thing in ours:
         if theirs[thing] != ours[thing]:
             raise _refusal(
@@ -81,9 +94,11 @@ def _require_same(leader: Experiment, experiment: Experiment, row: NuisanceRow) 
 
 
 def _require_alike(one: tuple[Experiment, Entry], other: tuple[Experiment, Entry]) -> None:
-    """Refuse one φ with two priors, or a marker's place with two places given."""
-    (leader, first), (experiment, second) = one, other
-    row, label = second.row, second.label
+    """Raise InputError if a shared φ has two priors, or a shared marker two stated places."""
+    leader, first = one
+    experiment, second = other
+    row = second.row
+    label = second.label
     if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
         found = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
         raise _refusal(experiment, row, found, f"the one here, {second.sigma:g}")
@@ -95,36 +110,41 @@ def _require_alike(one: tuple[Experiment, Entry], other: tuple[Experiment, Entry
 
 
 def _given(experiment: Experiment, entry: Entry) -> Array:
-    """The place given of a marker, NaN where there is none."""
+    """Return the stated place (3,) of a marker, NaN if there is none."""
     markers = experiment.markers
     at = markers.observe(experiment.body.nodes_m)[entry.number]
     return at if markers.located[entry.number] else np.full(3, np.nan)
 
 
 def _refusal(experiment: Experiment, row: NuisanceRow, found: str, expected: str) -> InputError:
+    """Return the error message for a parameter that cannot be shared."""
     key = row.key or row.name
     message = f"{key} is shared with {found}; expected {expected}, or a scope of its own"
     return InputError(message, None, f"experiment '{experiment.name}'")
 
 
 def shared_charts(locals_: Iterable[tuple[Local, NuisanceMap, Chart]]) -> list[Chart]:
-    """The charts, those of shared places and clocks as the first that shares them has them."""
-    leaders, samples, found = dict[int, tuple[Chart, int]](), dict[int, int](), []
+    """Return the charts, with shared places and clocks equal to those of the first
+    experiment that shares them.
+    """
+    leaders = dict[int, tuple[Chart, int]]()
+    samples = dict[int, int]()
+    charts = []
     for local, nuisance, chart in locals_:
-        taken = []
+        replaced = []
         for k in nuisance.places(PLACE):
             number = nuisance.entries[k].number
             leader = leaders.setdefault(int(local.places[k]), (chart, number))
             if leader[0] is not chart:
-                taken.append((number, *leader))
+                replaced.append((number, *leader))
         for k in nuisance.of_clock:
             shared = samples.setdefault(int(local.places[k]), chart.samples)
             chart = chart if shared == chart.samples else replace(chart, samples=shared)
-        if taken:
+        if replaced:
             own = {name: getattr(chart, name).copy() for name in OF_MARKERS}
             for name, values in own.items():
-                for number, leader, theirs in taken:
+                for number, leader, theirs in replaced:
                     values[number] = getattr(leader, name)[theirs]
             chart = replace(chart, **own)
-        found.append(chart)
-    return found
+        charts.append(chart)
+    return charts

@@ -1,8 +1,9 @@
-"""Where the points that a depth camera sees lie on the surface of the body.
+"""Correspondences between the points of a depth camera and the surface of the body.
 
-Nothing is labelled. A point belongs to the nearest of the surface, in the shape and with the pose
-of the camera that are known so far; a `Sighting` says which for every sample. As estimates move on
-it follows, as charts of markers' places do. Between, residuals along the normals there are smooth.
+Points are not labelled: each belongs to the nearest point of the surface, for the current shape and
+camera pose (iterative closest points). A `Sighting` states these correspondences for every image;
+it is renewed as estimates change, as charts of marker places are. In between, residuals along the
+surface normals are smooth.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from .view import View
 BESIDE = 0.5
 # Share of the body's size that points may be off by before anything is fitted; later so many
 # times the median, where that narrows the gate by a share.
-WIDE, SPREAD, NARROWER = 0.25, 6.0, 0.8
+WIDE = 0.25
+SPREAD = 6.0
+NARROWER = 0.8
 # What moved by less than this share of sigma is where it was.
 SAME = 0.2
 # An alignment farther than this many deviations of its prior is of something else.
@@ -40,34 +43,48 @@ FRONT = 0.5
 
 
 def wide_m(shape_m: Array) -> float:
-    """How far points of a body of this shape (n, 3) may be off before anything is fitted."""
+    """Return the largest distance of points from a surface with nodes (n, 3) before
+    anything is fitted [m].
+    """
     return WIDE * float(np.linalg.norm(np.ptp(shape_m, axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Which points of the surface a camera sees, in samples (S) of as many points (E) at most.
+    """Points of a camera and corresponding points of the surface, in S images of at most E points.
 
     Attributes
     ----------
     view : View
+        Model of the camera.
     body : Body
+        The body.
     skin : Skin
-    nodes, weights : (S, E, v) of the surface's nodes, in each point
-    normals : (S, E, 3) of the surface, in the world
-    points, rays : (S, E, 3) in the camera's frame
-    places_m : (S, E, 3) on the undeformed body
-    used : (S, E) points that count
+        Surface of the body.
+    nodes, weights : (S, E, v) arrays
+        Nodes of the surface, and shape functions of the corresponding points.
+    normals : (S, E, 3) array
+        Normals of the surface in the world.
+    points, rays : (S, E, 3) arrays
+        Measured points, and directions of their depths, in the camera's frame.
+    places_m : (S, E, 3) array
+        Corresponding points on the undeformed body [m].
+    used : (S, E) array of bool
+        Points that are compared.
     gate_m : float
-        Farther from the surface points are of something else, for now.
-    left_out : mapping of the reason to the number of points
-    shapes_m : (S, n, 3) of the surface, and `seen_m` (S, E, 3) in the world, as they were then
-    start : mapping of the label of what is not known of the camera to its value then
+        Points farther from the surface are taken to belong to something else [m].
+    left_out : mapping of str to int
+        Number of points that are not compared, by reason.
+    shapes_m : (S, n, 3) array
+        Surface nodes for which the correspondences were found [m].
+    start : mapping of str to float
+        The camera's nuisance parameters for which they were found, by label.
     settled : bool
-        Whether shapes had hardly moved before: what these hide from the camera does not count. From
-        shapes that are still sought too much would seem hidden, and all of the rest fit.
+        Whether shapes had hardly changed since the correspondences before. Only then are points
+        left out that the body hides from the camera: with wrong shapes, too many would seem hidden.
     outline : Outline
-        Of the body in these shapes, and the edges in the images; no point of it without images.
+        Outline of the body in these shapes and the edges in the images; without points if there are
+        no images.
     """
 
     view: View
@@ -97,22 +114,38 @@ class Sighting:
         gate_m: float,
         settled: bool = False,
     ) -> Sighting:
-        """That in shapes (S, n, 3) of the surface."""
+        """Find the correspondences for given shapes.
+
+        Parameters
+        ----------
+        view : View
+            Model of the camera.
+        body : Body
+            The body.
+        shapes_m : (S, n, 3) array
+            Surface nodes at the images [m].
+        phi : (k,) array
+            Nuisance parameters, with the pose of the camera.
+        gate_m : float
+            Largest distance of points from the surface [m].
+        settled : bool
+            Whether to leave out points that the body hides.
+        """
         skin = Skin.of(body, view.depth)
         how = phi, gate_m, settled
-        seen = [_seen(view, skin, body, k, x, *how) for k, x in enumerate(shapes_m)]
-        most = max(1, *(len(each["used"]) for each in seen))
+        images = [_seen(view, skin, body, k, x, *how) for k, x in enumerate(shapes_m)]
+        most = max(1, *(len(each["used"]) for each in images))
         arrays: dict[str, Any] = {
             name: np.stack(
                 [
                     np.pad(s[name], [(0, most - len(s[name])), *[(0, 0)] * (s[name].ndim - 1)])
-                    for s in seen
+                    for s in images
                 ]
             )
-            for name in seen[0]
+            for name in images[0]
             if name != "reasons"
         }
-        total = np.sum([each["reasons"] for each in seen], axis=0).tolist()
+        total = np.sum([each["reasons"] for each in images], axis=0).tolist()
         own: dict[str, Any] = {"left_out": dict(zip(LEFT_OUT, total, strict=True))}
         own |= {"start": view.told(phi), "gate_m": gate_m, "shapes_m": shapes_m, "settled": settled}
         own["outline"] = Outline.from_shapes(
@@ -122,61 +155,100 @@ class Sighting:
 
     @classmethod
     def aligned(cls, view: View, body: Body, shapes_m: Array, phi: Array) -> Sighting:
-        """The same, with the pose of the camera aligned to these shapes first."""
+        """Align the camera with the first shape, then find the correspondences.
+
+        The alignment is rejected if it differs from the stated pose by more than four prior
+        standard deviations.
+
+        Parameters
+        ----------
+        view : View
+            Model of the camera.
+        body : Body
+            The body.
+        shapes_m : (S, n, 3) array
+            Surface nodes at the images [m].
+        phi : (k,) array
+            Nuisance parameters, for those that the alignment does not estimate.
+        """
         first = view.depth.first
         skin = Skin.of(body, view.depth)
         turn, shift_m = alignment(view, skin, shapes_m[first], first)
         moved = view.with_pose(phi, turn, shift_m)
-        far = np.abs(moved[view.own]).max(initial=0.0) > FARTHEST
+        is_implausible = np.abs(moved[view.own]).max(initial=0.0) > FARTHEST
         gate_m = max(wide_m(body.nodes_m), view.depth.gate_m)
-        phi = phi if far else moved
-        some = tuple(map(thinned, view.depth.clouds))
-        rough = replace(view, depth=replace(view.depth, clouds=some, images_m=()))
-        gate_m = cls.of(rough, body, shapes_m, phi, gate_m).next_gate_m(shapes_m, phi)
+        phi = phi if is_implausible else moved
+        clouds = tuple(map(thinned, view.depth.clouds))
+        thinned_view = replace(view, depth=replace(view.depth, clouds=clouds, images_m=()))
+        gate_m = cls.of(thinned_view, body, shapes_m, phi, gate_m).next_gate_m(shapes_m, phi)
         return cls.of(view, body, shapes_m, phi, gate_m)
 
     def following(self, shapes_m: Array, phi: Array) -> Sighting:
-        """That in the first shapes (s, n, 3), which are known; itself where nothing has moved."""
+        """Update the correspondences.
+
+        Parameters
+        ----------
+        shapes_m : (s, n, 3) array
+            Surface nodes at the first s images [m]; later images keep their shapes.
+        phi : (k,) array
+            Nuisance parameters.
+
+        Returns
+        -------
+        Sighting
+            The new correspondences; self if neither shapes, camera nor gate have changed.
+        """
         known = len(shapes_m)
-        whole = np.concatenate([shapes_m, self.shapes_m[known:]])
-        depth, before = self.view.depth, self.view.phi(self.start)
+        all_shapes_m = np.concatenate([shapes_m, self.shapes_m[known:]])
+        depth = self.view.depth
+        before = self.view.phi(self.start)
         moved_m = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0)
         for k in range(known if moved_m < FRONT * depth.spacing_m else 0):
             way = self.view.world(phi, k) - self.view.world(before, k)
             moved_m = max(moved_m, np.abs(way).max(initial=0.0))
-        gate_m, settled = self.next_gate_m(whole, phi), moved_m < FRONT * depth.spacing_m
+        gate_m = self.next_gate_m(all_shapes_m, phi)
+        settled = moved_m < FRONT * depth.spacing_m
         if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.settled:
             return self
-        return Sighting.of(self.view, self.body, whole, phi, gate_m, settled)
+        return Sighting.of(self.view, self.body, all_shapes_m, phi, gate_m, settled)
 
     def missed_m(self, x: Array, phi: Array) -> Array:
-        """How far (P,) parts of a first shape x (n, 3) that face the camera are from its points."""
-        view, turned = self.view, self.skin.facing(x, self.view.eye_m(phi, 0), GRAZING)
-        middles = x[self.skin.flat[turned]].mean(axis=1)
-        apart_m, _ = KDTree(view.world(phi, 0)).query(middles)
-        return np.minimum(apart_m, wide_m(self.body.nodes_m))
+        """Return the distances (P,) from visible parts of a shape x (n, 3) to the points of the
+        first image [m].
+
+        Distances are limited to `wide_m` of the body.
+        """
+        view = self.view
+        is_facing = self.skin.facing(x, self.view.eye_m(phi, 0), GRAZING)
+        middles = x[self.skin.flat[is_facing]].mean(axis=1)
+        distances_m, _ = KDTree(view.world(phi, 0)).query(middles)
+        return np.minimum(distances_m, wide_m(self.body.nodes_m))
 
     def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
-        """A narrower gate, where points are near enough to the surface for one; else its own."""
+        """Return a narrower gate if the points are near enough to the surface [m], else the
+        present gate.
+        """
         gate_m = max(self._scatter_m(shapes_m, phi), self.view.depth.gate_m)
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
 
     def _scatter_m(self, shapes_m: Array, phi: Array) -> float:
-        """How far points of the body may be from the surface, by how far half of them are."""
+        """Return six times the median distance of the compared points from the surface [m];
+        infinite without any.
+        """
         apart_m = self.apart_m(shapes_m, phi)
         all_of_them = np.abs(apart_m[np.isfinite(apart_m)])
         return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
 
     def apart_m(self, shapes_m: Array, phi: Array) -> Array:
-        """Return how far points (S, E) are behind shapes (S, n, 3), along the normals.
+        """Return how far points (S, E) are behind shapes (S, n, 3), along the normals [m].
 
-        NaN where a point does not count.
+        NaN where a point is not compared.
         """
         apart_m = np.full(self.used.shape, np.nan)
         for k, x in enumerate(shapes_m):
             surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
-            seen = self.view.corrected_at(phi, self.points[k], self.rays[k], k)
-            behind_m = np.sum(self.normals[k] * (surface - seen), axis=1)
+            measured = self.view.corrected_at(phi, self.points[k], self.rays[k], k)
+            behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
             apart_m[k] = np.where(self.used[k], behind_m, np.nan)
         return apart_m
 
@@ -191,28 +263,40 @@ def _seen(
     gate_m: float,
     settled: bool,
 ) -> dict[str, NDArray]:
-    """What one sample sees: of points within the gate, and the reasons for leaving others out."""
-    depth, cloud = view.depth, view.depth.clouds[sample]
-    world, eye_m = view.world(phi, sample), view.eye_m(phi, sample)
+    """Find the correspondences of one image.
+
+    Returns
+    -------
+    dict of arrays
+        Arrays of the points within the gate, by attribute name of `Sighting`; and "reasons", the
+        numbers of points left out in the order of `LEFT_OUT`.
+    """
+    depth = view.depth
+    cloud = view.depth.clouds[sample]
+    world = view.world(phi, sample)
+    eye_m = view.eye_m(phi, sample)
     near, faces, places = _near(world, skin, x, eye_m, gate_m)
     weights, feet, normals = skin.points(x, faces, places)
     ways = normals if eye_m is None else eye_m - feet
-    seen = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
+    is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
     away = world[near] - feet
     distance = np.linalg.norm(away, axis=1)
-    across = np.linalg.norm(away - np.sum(away * normals, axis=1)[:, None] * normals, axis=1)
+    lateral = np.linalg.norm(away - np.sum(away * normals, axis=1)[:, None] * normals, axis=1)
     # A point beyond an edge of what the camera sees pulls that along the way to it.
-    beyond = across > BESIDE * distance + depth.sigma_m
-    normals[beyond] = away[beyond] / distance[beyond, None]
-    alike = open_to = everywhere = np.ones(len(near), dtype=bool)
+    is_beyond_edge = lateral > BESIDE * distance + depth.sigma_m
+    normals[is_beyond_edge] = away[is_beyond_edge] / distance[is_beyond_edge, None]
+    has_similar_normal = is_visible = is_any = np.ones(len(near), dtype=bool)
     if cloud.shape[1] == 6:
         measured = cloud[near, 3:] @ view.motion[0][sample].T
-        alike = np.sum(normals * measured, axis=1) >= GRAZING
+        has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
-        open_to = ~skin.hidden(x, eye_m, feet, FRONT * depth.spacing_m)
-    kept = distance <= gate_m
-    left = np.cumprod([everywhere, kept, seen, alike, skin.chosen[faces], open_to], axis=0)
-    reasons = -np.diff(left.sum(axis=1))
+        is_visible = ~skin.hidden(x, eye_m, feet, FRONT * depth.spacing_m)
+    is_within_gate = distance <= gate_m
+    remaining = np.cumprod(
+        [is_any, is_within_gate, is_frontal, has_similar_normal, skin.chosen[faces], is_visible],
+        axis=0,
+    )
+    reasons = -np.diff(remaining.sum(axis=1))
     reasons[0] += len(cloud) - len(near)
     rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[skin.nodes][skin.faces[faces]])
     of_points = {
@@ -222,16 +306,32 @@ def _seen(
         "points": cloud[near, :3],
         "rays": view.rays[sample][near],
         "places_m": rest_m,
-        "used": left[-1].astype(bool),
+        "used": remaining[-1].astype(bool),
     }
-    return {name: each[kept] for name, each in of_points.items()} | {"reasons": reasons}
+    return {name: each[is_within_gate] for name, each in of_points.items()} | {"reasons": reasons}
 
 
 def _near(
     world: Array, skin: Skin, x: Array, eye_m: Array | None, gate_m: float
 ) -> tuple[Index, Index, Array]:
-    """Points about a shape, and the nearest of what faces the camera: faces and places on them."""
-    low, high = x.min(axis=0) - gate_m, x.max(axis=0) + gate_m
+    """Return indices of points near a shape, and the nearest points of faces towards the camera:
+    faces and barycentric coordinates.
+
+    Parameters
+    ----------
+    world : (P, 3) array
+        Points in the world [m].
+    skin : Skin
+        Surface of the body.
+    x : (n, 3) array
+        Surface nodes [m].
+    eye_m : (3,) array or None
+        Position of the camera; None for a point cloud.
+    gate_m : float
+        Points outside the bounding box of the shape by more are left out [m].
+    """
+    low = x.min(axis=0) - gate_m
+    high = x.max(axis=0) + gate_m
     near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
     turned = np.flatnonzero(skin.facing(x, eye_m))
     if not len(turned) or not len(near):
@@ -240,10 +340,13 @@ def _near(
 
 
 def sightings_of(experiment: Experiment) -> tuple[Sighting, ...]:
-    """Those of an experiment's depth cameras, on the undeformed body as its grasp carries it."""
+    """Return the correspondences of an experiment's depth cameras with the undeformed body
+    in its grasps.
+    """
     if not experiment.depths:
         return ()
-    nuisance, sightings = NuisanceMap.of(experiment), []
+    nuisance = NuisanceMap.of(experiment)
+    sightings = []
     for number, depth in enumerate(experiment.depths):
         view = View.of(experiment, number, nuisance)
         nodes = Skin.of(experiment.body, depth).nodes

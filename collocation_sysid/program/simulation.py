@@ -1,10 +1,10 @@
-"""Forward simulation of an experiment: Newmark, or any collocation scheme.
+"""Forward simulation of an experiment by Newmark's method or any collocation scheme.
 
 By default the steps are refined until the motion at the samples no longer depends on them. A run
 with automatic substeps solves with fine steps too, so that it recovers the parameters of data
-simulated by default. Data simulated with one step a sample belong to other parameters: the midpoint
-rule lowers the frequencies of fast modes, and a run that resolves these finds moduli that are too
-small.
+simulated by default. Data simulated with one step a sample correspond to other parameters: the
+midpoint rule lowers the frequencies of fast modes, and a run that resolves these modes finds moduli
+that are too small.
 """
 
 from __future__ import annotations
@@ -53,26 +53,30 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Node positions over time, and the markers they carry.
+    """Simulated motion of an experiment, with the predictions of its measurements.
 
     Attributes
     ----------
-    t_s : (T,)
-    positions_m : (T, n, 3)
-    velocities_m_s : (T, n, 3)
-    markers_m : (T, M, 3)
+    t_s : (T,) array
+        Times of the samples [s].
+    positions_m : (T, n, 3) array
+        Node positions [m].
+    velocities_m_s : (T, n, 3) array
+        Node velocities [m/s]; zero in a static experiment.
+    markers_m : (T, M, 3) array
+        Markers [m].
     reactions : (Grid, Forced)
-        Those on the dofs of grasps with a sensor.
-    wrenches : tuple of (S, 6)
-        What the sensors of the grasps read at their times, [N] and [N m], NaN where that is not
-        known.
-    readings : tuple of (S, m)
-        What the experiment's readings of one's own read, of the positions at its samples.
+        Reaction forces on the dofs of instrumented grasps, and their times.
+    wrenches : tuple of (S, 6) arrays
+        Predictions of the force–torque sensors at their times [N] and [N m], NaN outside the known
+        times.
+    readings : tuple of (S, m) arrays
+        Predictions of the custom sensors, from the positions at the samples.
     steps_per_sample : int
-        Time steps between samples; one in a static experiment.
+        Time steps between samples; 1 in a static experiment.
     step_error_m : float or None
         Largest error of node positions at the samples due to the time step [m], estimated by
-        halving the step; None where the step was given, or the experiment is static.
+        halving the step; None where the step was stated, or the experiment is static.
     """
 
     t_s: Array
@@ -87,12 +91,7 @@ class Trajectory:
 
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
-    """Refuse a step that is far too short for an experiment's samples.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise InputError if a time step needs too many steps per sample of an experiment."""
     if not experiment.static and experiment.timestep_s > MOST_STEPS * step_s:
         raise InputError(
             f"found steps of {step_s:g} s; expected at most {MOST_STEPS} from sample to sample"
@@ -113,22 +112,26 @@ def simulate(
     Parameters
     ----------
     experiment : Experiment
-    parameters : Parameters (their guesses), values by name, or θ in the order of the body
+        The experiment; measurements are not used.
+    parameters : Parameters, mapping or sequence of float
+        Parameters (their guesses are used), values by name, or θ in the order of the body.
     integrator : str or Scheme
-        "newmark", or a scheme, by its name in `schemes.SCHEMES`, on the collocation grid.
+        "newmark", or a scheme on the collocation grid, by its name in `schemes.SCHEMES`.
     timestep_s : float, optional
-        Newmark's step, rounded to divide the sample interval.
+        Newmark's step, rounded to divide the sample interval; ignored for schemes.
     substeps : int or "auto"
         Time steps between samples; ignored where `timestep_s` is given for Newmark. "auto" doubles
-        them until the node positions at the samples are accurate to 0.01 % of the farthest way,
-        at most 32 (`Trajectory.steps_per_sample`, `Trajectory.step_error_m`).
+        them until the node positions at the samples are accurate to 0.01 % of the largest
+        displacement, at most 32 (`Trajectory.steps_per_sample`, `Trajectory.step_error_m`).
     options : NewtonOptions, optional
+        Options of Newton's method.
     progress : callable, optional
         Called with the share done, between 0 and 1, of each pass.
 
     Returns
     -------
-    Trajectory at the experiment's samples
+    Trajectory
+        The motion at the experiment's samples.
 
     Raises
     ------
@@ -247,8 +250,8 @@ def _with_steps(
         dynamics = Dynamics.of(experiment, integrator, steps).with_theta(theta)
         grid = march(experiment, dynamics, options, progress)
         x = grid[::steps]
-        still = np.zeros_like(grid)
-        v = still if experiment.static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
+        zeros = np.zeros_like(grid)
+        v = zeros if experiment.static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         at = Grid.of(dynamics)
         force = forces_on(dynamics, grid, sensed)
         mass_kg = dynamics.mass.kg[:, sensed]
@@ -278,7 +281,9 @@ def _with_steps(
 def _gauged(
     experiment: Experiment, positions_m: Array, reactions: tuple[Grid, Forced], ideal: NuisanceMap
 ) -> tuple[Array, ...]:
-    """What its gauges read of the body's motion, nothing of them unknown."""
+    """Return the predictions (S, m) of the custom sensors for a motion, without nuisance
+    parameters.
+    """
     readings = gauge_readings(experiment, experiment.t_s, reactions[0], ideal)
     motion = Motion(positions_m.reshape(len(positions_m), -1), lambda: reactions[1])
     return tuple(
@@ -287,8 +292,11 @@ def _gauged(
 
 
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
-    """The same experiment with other values (S, 6) at the grasps that have a sensor."""
-    found, grasps = iter(wrenches), []
+    """Return the experiment with other samples (S, 6) of the force–torque sensors, in the
+    order of the grasps that have one.
+    """
+    found = iter(wrenches)
+    grasps = []
     for grasp in experiment.grasps:
         sensor = grasp.wrench and replace(grasp.wrench, values=next(found))
         grasps.append(replace(grasp, wrench=sensor))
@@ -296,13 +304,15 @@ def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experime
 
 
 def with_readings(experiment: Experiment, readings: Sequence[ArrayLike]) -> Experiment:
-    """The same experiment with other values (S, m) of its readings of one's own."""
+    """Return the experiment with other samples (S, m) of its custom sensors."""
     pairs = zip(experiment.readings, readings, strict=True)
     return replace(experiment, readings=[replace(g, values=v) for g, v in pairs])
 
 
 def with_markers(experiment: Experiment, positions_m: ArrayLike) -> Experiment:
-    """The same experiment with other marker tracks (T, M, 3)."""
+    """Return the experiment with other marker tracks (T, M, 3) [m]; raise InputError for
+    another shape.
+    """
     tracks = np.asarray(positions_m, dtype=float)
     if tracks.shape != experiment.markers.positions_m.shape:
         raise InputError(

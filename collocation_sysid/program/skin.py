@@ -1,4 +1,4 @@
-"""A body's surface as depth cameras see it: what faces them, is hidden, or nearest to points."""
+"""Surface of a body as seen by a depth camera: facing and hidden parts, and nearest points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from ..recording.placement import nearest_on
 # Triangles, by their middles, of which the nearest point is taken.
 NEARBY = 10
 # Steps to it on a curved face, and shorter ones that end them.
-SETTLING, STILL = 3, 1e-6
+SETTLING = 3
+STILL = 1e-6
 # Below this cosine between normal and view a point is seen at a grazing angle; measured normals
 # may be off by as much.
 GRAZING = 0.3
@@ -31,13 +32,16 @@ FLAT = {3: np.array([[0, 1, 2]]), 6: np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """The faces of a body, each of them some flat triangles.
+    """Faces of a body's surface, each divided into flat triangles.
 
     Attributes
     ----------
-    nodes : (n,) of the body
-    faces : (F, 3) or (F, 6) which of these each has
-    chosen : (F,) those that may be seen
+    nodes : (n,) array
+        Nodes of the body on the surface.
+    faces : (F, 3) or (F, 6) array
+        Indices into `nodes` of each face.
+    chosen : (F,) array of bool
+        Faces that the camera may see according to the problem.
     """
 
     nodes: Index
@@ -46,7 +50,9 @@ class Skin:
 
     @classmethod
     def of(cls, body: Body, depth: Depth) -> Skin:
-        """That of a body, and what of it a camera may see."""
+        """Build the surface of a body, with the faces that a depth camera may see according
+        to the problem.
+        """
         triangles = body.mesh.surface
         chosen = np.ones(len(triangles), dtype=bool)
         if depth.faces is not None:
@@ -56,17 +62,21 @@ class Skin:
         return cls(nodes, faces.reshape(len(triangles), -1), chosen)
 
     def first_m(self, experiment: Experiment, depth: Depth) -> Array:
-        """(n, 3) as grasps carry it, undeformed, when a camera first sees anything."""
+        """Return the node positions (n, 3) of the undeformed body in its grasps at the
+        camera's first image with points [m].
+        """
         return experiment.rigid_positions(depth.times[[depth.first]])[0, self.nodes]
 
     @property
     def flat(self) -> Index:
-        """(F·k, 3) flat triangles, those of a face after each other."""
+        """Flat triangles (F·k, 3) as indices into `nodes`; those of a face are consecutive."""
         return self.faces[:, FLAT[self.faces.shape[1]]].reshape(-1, 3)
 
     @cached_property
     def edges(self) -> tuple[Index, Index]:
-        """Edges (K, 2) between two flat triangles, by their nodes, and (K, 2) these triangles."""
+        """Edges (K, 2) between two flat triangles, as indices into `nodes`, and these
+        triangles (K, 2).
+        """
         flat = self.flat
         ends = np.sort(flat[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         unique, number, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
@@ -77,29 +87,58 @@ class Skin:
         return unique[paired], beside
 
     def at(self, triangles: Index, shares: Array) -> tuple[Index, Array]:
-        """Faces (P,), and places (P, 3) on them, of places on flat triangles (P,)."""
+        """Return faces (P,), and barycentric coordinates (P, 3) on them, of points on flat
+        triangles.
+
+        Parameters
+        ----------
+        triangles : (P,) array
+            Indices of flat triangles.
+        shares : (P, 3) array
+            Barycentric coordinates in the triangles.
+        """
         parts = FLAT[self.faces.shape[1]]
         corners = CORNERS[parts[triangles % len(parts)]]
         return triangles // len(parts), np.einsum("pc,pci->pi", shares, corners)
 
     def points(self, x: Array, faces: Index, places: Array) -> tuple[Array, Array, Array]:
-        """Weights (P, v) of the nodes, points (P, 3) and outward normals of a shape x (n, 3)."""
+        """Evaluate points on faces of a deformed surface.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        faces : (P,) array
+            Faces.
+        places : (P, 3) array
+            Barycentric coordinates on them.
+
+        Returns
+        -------
+        ((P, v) array, (P, 3) array, (P, 3) array)
+            Shape functions of the nodes, points [m], and outward unit normals.
+        """
         weights, points, along = self._along(x, faces, places)
         normals = np.cross(along[:, 0], along[:, 1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
         return weights, points, normals
 
     def _along(self, x: Array, faces: Index, places: Array) -> tuple[Array, Array, Array]:
-        """Weights, points, and slopes (P, 2, 3) of these along the faces."""
+        """Return shape functions, points, and tangents (P, 2, 3) along the faces; arguments
+        as in `points`.
+        """
         weights, slopes = on_faces(places, self.faces.shape[1])
         corners = x[self.faces[faces]]
         along = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
         return weights, np.einsum("pa,pai->pi", weights, corners), along
 
     def triangles(self, x: Array, parts: int = 4) -> Array:
-        """(F·parts², 3, 3) of a shape x (n, 3), faces divided along each side into so many."""
+        """Return corners (F·parts², 3, 3) of triangles on a deformed surface, each side of
+        a face divided into `parts` [m].
+        """
         i, j = np.indices((parts, parts)).reshape(2, -1)
-        up, down = i + j < parts, i + j < parts - 1
+        up = i + j < parts
+        down = i + j < parts - 1
         upward = np.stack([[i, j], [i + 1, j], [i, j + 1]])[..., up]
         downward = np.stack([[i + 1, j], [i + 1, j + 1], [i, j + 1]])[..., down]
         of_b, of_c = np.concatenate([upward, downward], axis=2).transpose(1, 2, 0) / parts
@@ -109,39 +148,66 @@ class Skin:
         return points.reshape(-1, 3, 3)
 
     def facing(self, x: Array, eye_m: Array | None, least: float = 0.0) -> NDArray[np.bool_]:
-        """(F·k,) flat triangles whose cosine to the way to a camera is larger; all of a cloud."""
+        """Return the mask (F·k,) of flat triangles that face a camera.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        eye_m : (3,) array or None
+            Position of the camera [m]; None, for a point cloud without camera, gives all.
+        least : float
+            Smallest cosine between the normal and the direction to the camera.
+        """
         if eye_m is None:
             return np.ones(len(self.flat), dtype=bool)
         a, b, c = x[self.flat].transpose(1, 0, 2)
-        normal, way = np.cross(b - a, c - a), eye_m - (a + b + c) / 3
+        normal = np.cross(b - a, c - a)
+        way = eye_m - (a + b + c) / 3
         sizes = np.linalg.norm(normal, axis=1) * np.linalg.norm(way, axis=1)
         return np.sum(normal * way, axis=1) > least * sizes
 
     def hidden(
         self, x: Array, eye_m: Array | None, points_m: Array, front_m: float
     ) -> NDArray[np.bool_]:
-        """(P,) whether another part is in front of points (P, 3), seen by a camera, by so much."""
+        """Return the mask (P,) of points that another part of the surface hides from a camera.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        eye_m : (3,) array or None
+            Position of the camera [m]; None gives none.
+        points_m : (P, 3) array
+            Points [m].
+        front_m : float
+            A part hides a point if it is at least so much nearer to the camera [m].
+        """
         behind = np.zeros(len(points_m), dtype=bool)
         if eye_m is None or not len(points_m):
             return behind
         # Seen from there in the plane at distance one.
-        ahead, *across = np.linalg.svd((x.mean(axis=0) - eye_m)[None])[2]
-        ahead *= np.sign(ahead @ (x.mean(axis=0) - eye_m))
-        depths, away = (x - eye_m) @ ahead, (points_m - eye_m) @ ahead
+        optical_axis, *across = np.linalg.svd((x.mean(axis=0) - eye_m)[None])[2]
+        optical_axis *= np.sign(optical_axis @ (x.mean(axis=0) - eye_m))
+        depths = (x - eye_m) @ optical_axis
+        away = (points_m - eye_m) @ optical_axis
         corners = self.flat[self.facing(x, eye_m, 0.0)]
         corners = corners[(depths[corners] > 0).all(axis=1)]
         places = ((x - eye_m) @ np.transpose(across) / depths[:, None])[corners]
-        seen = (points_m - eye_m) @ np.transpose(across) / away[:, None]
+        projected = (points_m - eye_m) @ np.transpose(across) / away[:, None]
         middles = places.mean(axis=1)
         reach = np.linalg.norm(places - middles[:, None], axis=2).max(initial=0.0)
-        near = KDTree(middles).query_ball_point(seen, reach)
-        point = np.repeat(np.arange(len(seen)), [len(each) for each in near])
-        triangle = np.concatenate([*near, []]).astype(int)
+        candidates = KDTree(middles).query_ball_point(projected, reach)
+        point = np.repeat(np.arange(len(projected)), [len(each) for each in candidates])
+        triangle = np.concatenate([*candidates, []]).astype(int)
         first = depths[corners[triangle]].min(axis=1) < away[point] - front_m
-        point, triangle = point[first], triangle[first]
+        point = point[first]
+        triangle = triangle[first]
         a, b, c = places[triangle].transpose(1, 0, 2)
-        way, whole = seen[point] - a, _cross(b - a, c - a)
-        of_b, of_c = _cross(way, c - a) / whole, _cross(b - a, way) / whole
+        way = projected[point] - a
+        double_area = _cross(b - a, c - a)
+        of_b = _cross(way, c - a) / double_area
+        of_c = _cross(b - a, way) / double_area
         shares = np.column_stack([1 - of_b - of_c, of_b, of_c])
         # What is linear on a triangle is one over the depth in the plane.
         hit = 1 / np.sum(shares / depths[corners[triangle]], axis=1) < away[point] - front_m
@@ -149,22 +215,42 @@ class Skin:
         return behind
 
     def nearest(self, x: Array, points: Array, among: Index) -> tuple[Index, Array]:
-        """Faces (P,), and places (P, 3) on them, nearest to points (P, 3), of some triangles."""
+        """Return the nearest points of some flat triangles, and of the curved faces they belong to.
+
+        Parameters
+        ----------
+        x : (n, 3) array
+            Node positions [m].
+        points : (P, 3) array
+            Points [m].
+        among : array
+            Indices of the flat triangles, at least one.
+
+        Returns
+        -------
+        ((P,) array, (P, 3) array)
+            Faces, and barycentric coordinates on them.
+        """
         corners = x[self.flat[among]]
         middles = corners.mean(axis=1)
         sizes = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
-        found = KDTree(middles).query(points, min(NEARBY, len(corners)))
-        away, near = (np.reshape(each, (len(points), -1)) for each in found)
+        neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
+        away, near = (np.reshape(each, (len(points), -1)) for each in neighbours)
         # Triangles whose middles are farther than this by their own size cannot be nearer.
-        triangles, least = near[:, 0].copy(), np.full(len(points), np.inf)
+        triangles = near[:, 0].copy()
+        least = np.full(len(points), np.inf)
         feet = np.zeros_like(points)
         for rank, own in enumerate(near.T):
             here = np.flatnonzero(away[:, rank] - sizes[own] < least)
             on = nearest_on(points[here], corners[own[here]])
             apart = np.linalg.norm(on - points[here], axis=1)
             nearer = apart < least[here]
-            here, on, apart = here[nearer], on[nearer], apart[nearer]
-            triangles[here], feet[here], least[here] = own[here], on, apart
+            here = here[nearer]
+            on = on[nearer]
+            apart = apart[nearer]
+            triangles[here] = own[here]
+            feet[here] = on
+            least[here] = apart
         a, b, c = corners[triangles].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         squares = np.sum(normal**2, axis=1)
@@ -191,4 +277,5 @@ class Skin:
 
 
 def _cross(a: Array, b: Array) -> Array:
+    """Return the cross product of plane vectors (…, 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,9 +1,8 @@
-"""Whether small disturbances of a state grow: eigenvalues s of M s² + D s + K with Re(s) > 0.
+"""Stability of small disturbances of a state: eigenvalues s of M s² + D s + K with Re(s) > 0.
 
-K and D are −∂F/∂x and −∂F/∂v of the free dofs at a state, frozen and without velocity. Where both
-are positive definite nothing grows; to see that takes a factorisation each. A body that is
-compressed beyond buckling has a K that is not, and a damping law a D that is not where it feeds
-energy in.
+K and D are −∂F/∂x and −∂F/∂v of the free dofs at a state, constant and without velocity. Where both
+are positive definite, no disturbance grows; that is checked by a factorisation of each. K is not
+positive definite beyond buckling, nor D where a damping law feeds energy in.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from .factorisation import Factoriser
 # States of a motion that are looked at.
 STATES = 8
 # Fewer dofs are solved densely; of more, so many of the most negative directions are tried.
-DENSE, DIRECTIONS = 150, 8
+DENSE = 150
+DIRECTIONS = 8
 # Singular matrices, of rigid motions, are not indefinite: a share of their largest entry per mass.
 SHIFT = 1e-9
 # Lanczos' iterations need no more to tell a sign.
@@ -33,18 +33,19 @@ TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Instability:
-    """An experiment with states in which disturbances grow.
+    """Experiment with states in which disturbances grow.
 
     Attributes
     ----------
     experiment : str
+        Name of the experiment.
     time_s : float
-        Of the state in which they grow fastest.
+        Time of the state in which they grow fastest [s].
     growth_1_s : float
-        The largest Re(s) there.
+        Largest Re(s) there [1/s].
     e_foldings : float
-        What Re(s) > 0 adds up to over the recording: a disturbance may grow by e to this power.
-        Infinite for equilibria, which nothing that is disturbed returns to.
+        Integral of Re(s) > 0 over the recording: a disturbance may grow by e to this power.
+        Infinite for equilibria, to which a disturbed state does not return.
     """
 
     experiment: str
@@ -54,17 +55,22 @@ class Instability:
 
 
 def instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
-    """Those of the motions at z, one for each experiment that has unstable states."""
+    """Return the instabilities of the motions at z, at most one for each experiment."""
     found = (_instability(part) for part in collocation.parts(z))
     return tuple(each for each in found if each is not None)
 
 
 def _instability(part: Part) -> Instability | None:
+    """Return the instability of one experiment's motion, or None if all examined states are
+    stable.
+    """
     experiment = part.segment.experiment
     last = len(experiment.t_s) - 1
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
-    t_s, rows = experiment.t_s[samples], part.segment.markers.grid_rows[samples]
-    held, theta = experiment.held(t_s).reshape(len(t_s), -1), part.setting.theta
+    t_s = experiment.t_s[samples]
+    rows = part.segment.markers.grid_rows[samples]
+    held = experiment.held(t_s).reshape(len(t_s), -1)
+    theta = part.setting.theta
     growths = np.array(
         [
             growth_rate_1_s(Forces.of(experiment, time, theta), x, np.flatnonzero(~there))
@@ -79,19 +85,23 @@ def _instability(part: Part) -> Instability | None:
 
 
 def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
-    """The largest Re(s) of M s² + D s + K at a state; 0 where none is positive.
+    """Return the largest Re(s) of M s² + D s + K at a state [1/s]; 0 where none is positive.
 
     Parameters
     ----------
-    forces : Forces at one time
-    x : (3n,) the state
-    free_dofs : (k,) sorted dofs that are not held
+    forces : Forces
+        Forces at one time.
+    x : (3n,) array
+        State [m].
+    free_dofs : (k,) array
+        Sorted dofs that are not prescribed.
     """
     if not len(free_dofs):
         return 0.0
     state = x.reshape(1, -1)
     at = forces.linearise(state, np.zeros_like(state))
-    mass, pattern = forces.mass.kg[0, free_dofs], forces.pattern
+    mass = forces.mass.kg[0, free_dofs]
+    pattern = forces.pattern
     lowers = -at.by_position[0], -at.by_velocity[0]
     if all(_definite(lower, pattern, free_dofs, mass) for lower in lowers):
         return 0.0
@@ -106,7 +116,7 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
 
 
 def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
-    """Whether a matrix is positive definite, or as good as: none is."""
+    """Whether a matrix is positive semidefinite up to rounding; true for zero."""
     own = pattern.diagonal[free_dofs]
     largest = float((lower[own] / mass).max())
     if largest <= 0:
@@ -117,7 +127,7 @@ def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: A
 
 
 def _fastest(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
-    """The largest Re(s) of s² + D s + K."""
+    """Return the largest Re(s) of s² + D s + K."""
     size = len(stiffness.diagonal())
     if size <= DENSE:
         return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
@@ -130,7 +140,9 @@ def _fastest(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
 
 
 def _lowest(matrix: sp.csc_array) -> Array:
-    """(n, k) directions in which it is most negative, or some where the search for them ends."""
+    """Return directions (n, k) with the smallest eigenvalues of a matrix, or approximations
+    if the iteration stops early.
+    """
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
     options = {"which": "SA", "tol": TOLERANCE, "v0": start, "ncv": 12 * DIRECTIONS}
     try:
@@ -140,23 +152,24 @@ def _lowest(matrix: sp.csc_array) -> Array:
 
 
 def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
-    """Every s of dense matrices."""
+    """Return all s of s² + D s + K for dense matrices."""
     size = len(stiffness)
     chain = np.block([[np.zeros((size, size)), np.eye(size)], [-stiffness, -damping]])
     return np.linalg.eigvals(chain).astype(np.complex128)
 
 
 class _Turned(LinearOperator):
-    """(A + σ)/(A − σ) of A = [[0, 1], [−K, −D]] and a σ > 0.
+    """Operator (A + σ)/(A − σ) of A = [[0, 1], [−K, −D]] and σ > 0.
 
-    Its eigenvalues (s + σ)/(s − σ) are beyond the unit circle where Re(s) > 0: those that
-    Arnoldi's iterations find first.
+    Its eigenvalues (s + σ)/(s − σ) lie outside the unit circle where Re(s) > 0, so that Arnoldi's
+    method finds them first.
     """
 
     def __init__(self, stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> None:
         size = len(stiffness.diagonal())
         super().__init__(np.dtype(float), (2 * size, 2 * size))
-        self.damping, self.sigma = damping, sigma
+        self.damping = damping
+        self.sigma = sigma
         self.solver = splu(
             sp.csc_array(sigma**2 * sp.eye_array(size) + sigma * damping + stiffness)
         )
@@ -170,7 +183,9 @@ class _Turned(LinearOperator):
 
 
 def _near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
-    """The same of sparse ones, about as fast as σ."""
+    """Return the largest Re(s) of s² + D s + K for sparse matrices, with |s| of about σ; at
+    least 0.
+    """
     turning = _Turned(stiffness, damping, sigma)
     try:
         found = eigs(turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60)

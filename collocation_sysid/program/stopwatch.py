@@ -1,4 +1,4 @@
-"""Where the time goes: seconds by kind of work."""
+"""Computing time by kind of work: building, element evaluations, linear algebra."""
 
 from __future__ import annotations
 
@@ -9,14 +9,23 @@ from contextlib import AbstractContextManager, contextmanager
 
 
 class Stopwatch:
-    """Adds up the time spent on evaluating elements, on linear algebra, and on building.
+    """Accumulated times of building, element evaluations and linear algebra.
 
-    Of threads side by side, the time of all.
+    Times of parallel threads are added up.
+
+    Attributes
+    ----------
+    build : float
+        Time of symbolic work and tables [s].
+    evaluations : float
+        Time of element kernels [s].
+    linear_algebra : float
+        Time of factorisations and substitutions [s].
 
     Parameters
     ----------
     clock : callable
-        Seconds; `time.process_time` does not count what others take.
+        Returns seconds; with `time.process_time`, the time of other processes does not count.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -28,6 +37,7 @@ class Stopwatch:
 
     @contextmanager
     def _timing(self, kind: str) -> Iterator[None]:
+        """Context manager that adds the time of its block to the attribute `kind`."""
         began = self.clock()
         try:
             yield
@@ -36,26 +46,26 @@ class Stopwatch:
                 setattr(self, kind, getattr(self, kind) + self.clock() - began)
 
     def add(self, build: float, evaluations: float, linear_algebra: float) -> None:
-        """Add seconds that another has measured."""
+        """Add times measured by another stopwatch [s]."""
         with self._adding:
             self.build += build
             self.evaluations += evaluations
             self.linear_algebra += linear_algebra
 
     def taken(self) -> tuple[float, float, float]:
-        """Its seconds as `add` takes them; it begins again from zero."""
+        """Return (build, evaluations, linear_algebra) [s] and reset all three to zero."""
         spent = self.build, self.evaluations, self.linear_algebra
         self.build = self.evaluations = self.linear_algebra = 0.0
         return spent
 
     def building(self) -> AbstractContextManager[None]:
-        """Time symbolic work and tables."""
+        """Context manager that measures symbolic work and tables."""
         return self._timing("build")
 
     def evaluating(self) -> AbstractContextManager[None]:
-        """Time element kernels."""
+        """Context manager that measures element kernels."""
         return self._timing("evaluations")
 
     def solving(self) -> AbstractContextManager[None]:
-        """Time factorisations and substitutions."""
+        """Context manager that measures factorisations and substitutions."""
         return self._timing("linear_algebra")

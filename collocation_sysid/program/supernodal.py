@@ -1,7 +1,8 @@
-"""Supernodal Cholesky of wide sparse matrices, by PARDISO of the `mkl` wheel (extra `large`).
+"""Supernodal Cholesky factorisation of large sparse matrices by PARDISO of the `mkl` wheel (extra
+`large`).
 
-Nested dissection fills in less than a band, and columns alike are factorised together by dense
-kernels. It is called through its C interface, without the interpreter lock.
+Nested dissection fills in less than a band, and columns of equal structure are factorised together
+by dense kernels. PARDISO is called through its C interface, without the interpreter lock.
 """
 
 from __future__ import annotations
@@ -22,11 +23,17 @@ from ..errors import InputError
 
 POSITIVE_DEFINITE = 2
 # Phases, and the error that tells that a pivot is not positive.
-ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1
-NOT_POSITIVE, NO_MEMORY = -4, -2
+ANALYSE = 11
+FACTORISE = 22
+SOLVE = 33
+RELEASE = -1
+NOT_POSITIVE = -4
+NO_MEMORY = -2
 # Places in `iparm`.
-COUNTED, FROM_ZERO = 17, 34
-SEQUENTIAL, INTS_OF_32_BITS = 1, 0
+COUNTED = 17
+FROM_ZERO = 34
+SEQUENTIAL = 1
+INTS_OF_32_BITS = 0
 MISSING = (
     'factorisation = "supernodal" needs the mkl package (Intel and AMD processors): '
     "pip install 'collocation-sysid[large]'; or take \"auto\""
@@ -35,7 +42,7 @@ MISSING = (
 
 @cache
 def library() -> Any:
-    """MKL, or None where it is not installed."""
+    """Return the MKL library, or None where it is not installed; the result is cached."""
     found = []
     try:
         files = metadata.files("mkl") or []
@@ -55,38 +62,51 @@ def library() -> Any:
 
 
 class Pardiso:
-    """One factor's memory in PARDISO; what is factorised next takes its place.
+    """Memory of one factor in PARDISO; each factorisation replaces the one before.
+
+    Attributes
+    ----------
+    size : int
+        Number of rows.
+    numbers : int
+        Number of floating-point numbers in a factor.
 
     Parameters
     ----------
-    starts, columns : rows of the upper triangle, columns ascending from the diagonal on
+    starts, columns : arrays
+        Starts of the rows of the upper triangle, and their columns, ascending from the diagonal.
 
     Raises
     ------
     InputError
-        Where MKL is not installed.
+        If MKL is not installed.
     """
 
     def __init__(self, starts: Index, columns: Index) -> None:
         if library() is None:
             raise InputError(MISSING)
         self.size = len(starts) - 1
-        self._handle, self._options = np.zeros(64, np.int64), np.zeros(64, np.int32)
-        self._starts, self._columns = starts.astype(np.int32), columns.astype(np.int32)
+        self._handle = np.zeros(64, np.int64)
+        self._options = np.zeros(64, np.int32)
+        self._starts = starts.astype(np.int32)
+        self._columns = columns.astype(np.int32)
         self._values = np.zeros(len(columns))
         kind = ctypes.c_int(POSITIVE_DEFINITE)
         library().pardisoinit(_at(self._handle), ctypes.byref(kind), _at(self._options))
-        self._options[FROM_ZERO], self._options[COUNTED] = 1, -1
+        self._options[FROM_ZERO] = 1
+        self._options[COUNTED] = -1
         self._call(ANALYSE)
         self.numbers = int(self._options[COUNTED])
 
     def factorise(self, values: Array) -> bool:
-        """Factorise values of the upper triangle; tell whether it is positive definite."""
+        """Factorise the values of the upper triangle and return whether the matrix is
+        positive definite.
+        """
         self._values = np.ascontiguousarray(values, dtype=float)
         return self._call(FACTORISE) != NOT_POSITIVE
 
     def solve(self, right: Array) -> Array:
-        """Solve for (n,) or (n, m) right-hand sides."""
+        """Solve for right-hand sides (n,) or (n, m)."""
         columns = np.array(right, dtype=float, order="F")
         result = np.empty_like(columns)
         if columns.size:
@@ -94,10 +114,20 @@ class Pardiso:
         return result
 
     def _call(self, phase: int, right: Array | None = None, result: Array | None = None) -> int:
+        """Call one phase of PARDISO and return its error code.
+
+        Raises
+        ------
+        MemoryError
+            If there is no memory for the factor.
+        numpy.linalg.LinAlgError
+            For any other error except a pivot that is not positive.
+        """
         count = 1 if right is None else right.size // self.size
         numbers = (1, 1, POSITIVE_DEFINITE, phase, self.size)
         one, which, kind, stage, size = (ctypes.byref(ctypes.c_int(k)) for k in numbers)
-        error, silent = ctypes.c_int(0), ctypes.byref(ctypes.c_int(0))
+        error = ctypes.c_int(0)
+        silent = ctypes.byref(ctypes.c_int(0))
         matrix = _at(self._values), _at(self._starts), _at(self._columns), None
         columns = ctypes.byref(ctypes.c_int(count))
         library().pardiso(
@@ -116,19 +146,32 @@ class Pardiso:
 
 
 def _at(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
+    """Return a pointer to the data of an array, or None."""
     return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
 @dataclass(frozen=True, eq=False)
 class SupernodalFactor:
-    """A factor that gives its memory back to a pool."""
+    """Supernodal factor that returns its memory to a pool when it is deleted.
+
+    Attributes
+    ----------
+    pardiso : Pardiso
+        Memory of the factor.
+    pool : list of Pardiso
+        Pool of memory that is not in use.
+    positive_definite : bool
+        Always true.
+    """
 
     pardiso: Pardiso
     pool: list[Pardiso]
     positive_definite: bool = True
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Solve for (k,) or (k, m) right-hand sides."""
+        """Solve for right-hand sides (k,) or (k, m); the matrix is symmetric, so
+        `transposed` has no effect.
+        """
         return self.pardiso.solve(right)
 
     def __del__(self) -> None:

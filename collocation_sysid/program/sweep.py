@@ -1,17 +1,21 @@
-"""Solve linearised equations of motion forward and backward in time, block by block.
+"""Solve linearised equations of motion forward and backward in time, one time step after the other.
 
-The Jacobian c_x is block lower-triangular in time, so that with one factorisation a timestep
-c_x Y = −R (forward) and c_xᵀ y = −g (backward) are solved without ever forming it. With
-G = ∂F/∂ξ, C = ∂F/∂ν at evaluation t (see `model.schemes`), one step forward is the tangent of one
+The Jacobian c_x is block lower-triangular in time. With one factorisation per time step, c_x Y = −R
+(forward) and c_xᵀ y = −g (backward) are solved without ever forming the whole matrix. With G =
+∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `model.schemes`), one step forward is the tangent of one
 step of the scheme:
 
     −A Y_t = R_t + w_0 F' + Σ_{j≥1} w_j dF_{t−j} − M Σ_{i≥1} s_i Y_{t−i} / Δt²,
     F' = F_R + G Σ_{i≥1} p_i Y_{t−i} + C Σ_{i≥1} q_i Y_{t−i} / Δt,
     −A = −∂c_t/∂x_t = −w_0 (p_0 G + q_0 C / Δt) + s_0 M / Δt²,
 
-and dF_t follows from the row itself. For the feasibility step p, R is c and F_R is zero; for
-Z = dx/dq, R is zero and F_R is ∂F/∂q. Grasped dofs that move have their Y given. With memory F' has
-what it brings, see `model.viscoelasticity`.
+and dF_t, the change of the force, follows from the row itself. For the feasibility step p, R is c
+and F_R is zero; for the sensitivities Z = dx/dp, R is zero and F_R is ∂F/∂p. Grasped dofs whose
+displacement depends on parameters have prescribed rows of Y. With material memory, F' includes the
+force due to the history variables, see `model.viscoelasticity`.
+
+Use `Sweep.forward` for Gauss–Newton steps, `Sweep.sensitivities` where memory is scarce, and
+`Sweep.backward` for gradients (adjoint method).
 """
 
 from __future__ import annotations
@@ -51,20 +55,23 @@ ROOMS = 16
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """The feasibility step and the sensitivities of one experiment at (x, q).
+    """Feasibility step and sensitivities of one experiment at given positions and parameters.
 
     Attributes
     ----------
-    step : (N, 3n) p = −c_x⁻¹ c [m]
-    by_p : (N, 3n, m) Z = −c_x⁻¹ c_p [m]
+    step : (N, 3n) array
+        Feasibility step p = −c_x⁻¹ c [m].
+    by_p : (N, 3n, m) array
+        Sensitivities Z = −c_x⁻¹ c_p to the m parameters that change the motion [m].
     violation_n : float
-        Largest |c|.
+        Largest |c| [N].
     indefinite : int
-        Timesteps whose block −∂c_t/∂x_t is not positive definite.
+        Number of time steps whose matrix −∂c_t/∂x_t is not positive definite.
     last : LastRows
-        To continue with later rows.
+        State of the substitution, to continue with later rows.
     held : HeldForces
-        Of the dofs of grasps whose wrench is measured, by the step and by p.
+        Forces on the dofs of instrumented grasps, with their changes along the step (column 0) and
+        by p.
     """
 
     step: Array
@@ -77,14 +84,18 @@ class Tangent:
 
 @dataclass(frozen=True, eq=False)
 class LastRows:
-    """What the next row depends on, most recent row first.
+    """State of a forward substitution: all that the next row depends on, most recent row first.
 
     Attributes
     ----------
-    solutions : (3n, c) Y_{t−i}
-    increments : (free, c) dF_{t−j}
-    forces : (free,) total forces F_{t−j} at the evaluations
-    carried : columns of what is carried
+    solutions : (3n, c) arrays
+        Y_{t−i} for i = 1, 2, …
+    increments : (free, c) arrays
+        Force changes dF_{t−j}.
+    forces : (free,) arrays
+        Total forces F_{t−j} at the evaluations [N].
+    carried : arrays
+        Columns of the history variables, body first, then forces.
     """
 
     solutions: tuple[Array, ...]
@@ -94,7 +105,23 @@ class LastRows:
 
 
 class Step(NamedTuple):
-    """One timestep's F, G, C (lower triangles), −∂c_t/∂x_t factorised, and their skew parts."""
+    """Linearised and factorised equations of one time step.
+
+    Attributes
+    ----------
+    t : int
+        Index of the grid time.
+    row : StencilRow
+        Coefficients of the scheme and masses.
+    force : (3n,) array
+        Force F at the evaluation [N].
+    by_position, by_velocity : (m,) arrays
+        Lower triangles of the symmetric parts of G = ∂F/∂ξ and C = ∂F/∂ν.
+    factor : Factor
+        Factorised matrix −∂c_t/∂x_t on the free dofs.
+    skew, rate_skew : arrays
+        Lower triangles of the skew parts of G and C; empty where there is none.
+    """
 
     t: int
     row: StencilRow
@@ -108,7 +135,17 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Rows that are linearised together: their steps, and what they have at once."""
+    """Consecutive rows that are linearised and factorised together.
+
+    Attributes
+    ----------
+    here : slice
+        Their grid times.
+    at : Linearisation
+        Their forces and derivatives.
+    steps : list of Step
+        One entry per row, in ascending order.
+    """
 
     here: slice
     at: Linearisation
@@ -117,13 +154,16 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class GraspMotion:
-    """Columns Y of grasped dofs, which are given: the way to their goals, and ∂goal/∂φ.
+    """Prescribed rows of the solution Y: changes of the displacements of grasped dofs.
 
     Attributes
     ----------
-    dofs : (g,)
-    columns : (N, g, c)
-    holds : (N, g) bool, those that are held at a time
+    dofs : (g,) array
+        Grasped dofs whose displacement changes.
+    columns : (N, g, c) array
+        Changes of their positions [m]: the step to the prescribed position, and derivatives by φ.
+    holds : (N, g) array of bool
+        Whether a dof is prescribed at a grid time.
     """
 
     dofs: Index
@@ -132,47 +172,53 @@ class GraspMotion:
 
     @classmethod
     def along(cls, solver: Sweep, dofs: Index, columns: Array) -> GraspMotion:
-        """Those of dofs (g,) that move by `columns` (N, g, c)."""
+        """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m]."""
         return cls(dofs, columns, solver.dynamics.taken[:, dofs] | ~np.isin(dofs, solver.free))
 
     @property
     def count(self) -> int:
-        """C."""
+        """Number c of columns."""
         return self.columns.shape[-1]
 
     def place(self, t: int, solution: Array) -> None:
-        """Put them into Y_t (3n, columns), in place."""
-        here = self.holds[t]
-        solution[self.dofs[here]] = self.columns[t, here]
+        """Write the prescribed rows of grid time t into `solution` (3n, c), in place."""
+        prescribed = self.holds[t]
+        solution[self.dofs[prescribed]] = self.columns[t, prescribed]
 
     def force(self, solver: Sweep, step: Step) -> Array | float:
-        """What their motion at t adds to F' (free, columns)."""
+        """Return the contribution (free, c) of the prescribed changes at a time step to F'
+        [N]; 0 if nothing changes.
+        """
         now = np.where(self.holds[step.t, :, None], self.columns[step.t], 0.0)
         # What is only parameters of other kinds does not move them.
-        moved = np.flatnonzero(now.any(axis=0))
-        if not len(moved):
+        changed = np.flatnonzero(now.any(axis=0))
+        if not len(changed):
             return 0.0
-        p, q, force = step.row.p[0], step.row.q[0], np.zeros((len(solver.free), self.count))
+        p = step.row.p[0]
+        q = step.row.q[0]
+        force = np.zeros((len(solver.free), self.count))
         skew = step.row.skew(0, step.skew, step.rate_skew)
         matrix = solver.beside.of(p * step.by_position + q * step.by_velocity, skew)
-        force[:, moved] = matrix @ now[:, moved]
+        force[:, changed] = matrix @ now[:, changed]
         return force
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """What is carried through the rows.
+    """Right-hand sides of a forward substitution.
 
     Attributes
     ----------
     setting : Setting
+        Equations of motion at the parameters.
     count : int
+        Number of columns.
     by_p : bool
-        Whether the last are by the parameters that move the body.
+        Whether the last columns are derivatives by the parameters that change the motion.
     step : bool
-        Whether the first is the way to the equations.
-    grasped : GraspMotion, optional
-        Where grasped dofs move.
+        Whether the first column is the feasibility step.
+    grasped : GraspMotion or None
+        Prescribed changes of grasped dofs; None if their displacements are fixed.
     """
 
     setting: Setting
@@ -183,21 +229,35 @@ class Columns:
 
     @classmethod
     def by_parameters(cls, solver: Sweep, setting: Setting, x: Array | None = None) -> Columns:
-        """By all that moves the body, and in front, where x (N, 3n) is given, the step from it."""
-        first, count, grasped = int(x is not None), len(solver.segment.moving), None
+        """Build the columns of all parameters that change the motion.
+
+        Parameters
+        ----------
+        solver : Sweep
+            The sweep that uses them.
+        setting : Setting
+            Equations of motion at the parameters.
+        x : (N, 3n) array, optional
+            Positions [m]. If given, the feasibility step from x is prepended as column 0.
+        """
+        first = int(x is not None)
+        count = len(solver.segment.moving)
+        grasped = None
         if setting.held.moves:
-            held = setting.held
-            goals = held.positions_m[: solver.dynamics.rows]
+            prescribed = setting.held
+            goals = prescribed.positions_m[: solver.dynamics.rows]
             columns = np.zeros((*goals.shape, first + count))
-            columns[..., first + solver.segment.nq :] = held.by_phi[: len(goals)]
+            columns[..., first + solver.segment.nq :] = prescribed.by_phi[: len(goals)]
             if x is not None:
-                columns[..., 0] = np.nan_to_num(goals - x[:, held.dofs])
-            grasped = GraspMotion.along(solver, held.dofs, columns)
+                columns[..., 0] = np.nan_to_num(goals - x[:, prescribed.dofs])
+            grasped = GraspMotion.along(solver, prescribed.dofs, columns)
         return cls(setting, first + count, step=x is not None, grasped=grasped)
 
     @classmethod
     def along(cls, solver: Sweep, setting: Setting, moved: Array) -> Columns:
-        """By grasped dofs that move by `moved` (N, g, c)."""
+        """Build the columns of prescribed changes `moved` (N, g, c) of the grasped dofs
+        [m], without parameters.
+        """
         grasped = GraspMotion.along(solver, setting.held.dofs, moved)
         return cls(setting, grasped.count, by_p=False, grasped=grasped)
 
@@ -209,12 +269,20 @@ class Columns:
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """R (k, free, c) and F_R (k, 3n, c) of some rows.
+        """Return R (k, free, c) and F_R (k, 3n, c) of k rows, see the module's documentation.
 
         Parameters
         ----------
-        acceleration : (k, 3n)
-        residual : (k, free), where the first column is the way to the equations
+        rows : slice
+            Their grid times.
+        at : Linearisation
+            Forces of these rows with their derivatives.
+        acceleration : (k, 3n) array
+            Accelerations [m/s²].
+        residual : (k, free) array or None
+            Residuals c [N]; None unless the first column is the feasibility step.
+        free : (free,) array
+            Free dofs.
         """
         count, size = acceleration.shape
         right, force = (np.zeros((count, k, self.count)) for k in (len(free), size))
@@ -227,7 +295,9 @@ class Columns:
         return right, force
 
     def of_inputs(self, t: int) -> Array:
-        """(U, c) derivatives of the inputs of an evaluation."""
+        """Return the derivatives (U, c) of the U inputs at evaluation t by the columns;
+        zeros for the feasibility step.
+        """
         own = self.setting.by_p[t]
         none = np.zeros((len(own), int(self.step) if self.by_p else self.count))
         return np.hstack([none, own]) if self.by_p else none
@@ -239,11 +309,13 @@ class Sweep:
     Parameters
     ----------
     segment : Segment
+        Transcription of the experiment.
     rows : int, optional
-        Grid times to take, all by default.
+        Number of grid times to use; None means all.
     stopwatch : Stopwatch, optional
+        Accumulates the time spent; a new one by default.
     factorisation : {"auto", "band", "sparse", "supernodal"}
-        See `program.factorisation`.
+        Choice of factorisation, see `program.factorisation`.
     """
 
     def __init__(
@@ -257,8 +329,10 @@ class Sweep:
         self.factorisation: Choice = factorisation
         self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
         self.segment = segment
-        self.body, self.pattern = segment.body, segment.pattern
-        self.free, self.sensed = segment.free_dofs, segment.sensed_dofs
+        self.body = segment.body
+        self.pattern = segment.pattern
+        self.free = segment.free_dofs
+        self.sensed = segment.sensed_dofs
         self.factoriser = Factoriser.of(self.pattern, self.free, factorisation)
         self.matrix = Submatrix(self.pattern, self.free)
         self.beside = Submatrix(self.pattern, self.free, segment.grasping.dofs)
@@ -270,61 +344,99 @@ class Sweep:
 
     @one_blas_thread()
     def forward(self, x: Array, setting: Setting, known: Tangent | None = None) -> Tangent:
-        """The step p and the sensitivities Z at x (N, 3n).
+        """Compute the feasibility step p and the sensitivities Z.
 
         Parameters
         ----------
+        x : (N, 3n) array
+            Positions [m].
+        setting : Setting
+            Equations of motion at the parameters.
         known : Tangent, optional
-            That of the first rows, at the same positions and parameters: it is continued.
+            Result for the first rows at the same positions and parameters; it is continued.
 
         Raises
         ------
         SimulationError
-            Where a timestep's equations are singular or not finite.
+            If the equations of a time step are singular or not finite.
         """
         carried = Columns.by_parameters(self, setting, x)
         columns = np.zeros((*x.shape, carried.count))
-        held = HeldForces.nothing(len(x), len(self.sensed), carried.count)
-        march = Forward(self, carried, known.last if known else None, held)
+        grasp_forces = HeldForces.nothing(len(x), len(self.sensed), carried.count)
+        march = Forward(self, carried, known.last if known else None, grasp_forces)
         if known is not None:
             done = len(known.step)
-            columns[:done, :, 0], columns[:done, :, 1:] = known.step, known.by_p
-            march.violation_n, march.indefinite = known.violation_n, known.indefinite
-            held.begin(known.held)
+            columns[:done, :, 0] = known.step
+            columns[:done, :, 1:] = known.by_p
+            march.violation_n = known.violation_n
+            march.indefinite = known.indefinite
+            grasp_forces.begin(known.held)
         for _ in march.rows(x, 0 if known is None else len(known.step), columns):
             pass
         found = columns[:, :, 0], columns[:, :, 1:], march.violation_n, march.indefinite
-        return Tangent(*found, march.last, held)
+        return Tangent(*found, march.last, grasp_forces)
 
     def sensitivities(
         self, x: Array, setting: Setting, held: HeldForces | None = None
     ) -> Iterator[Array]:
-        """Z_t (3n, m), row by row; nothing but the last few rows is kept, and `held` filled.
+        """Iterate over the sensitivities Z_t (3n, m) row by row, keeping only the last few rows in
+        memory.
+
+        Rows before the first equation of motion are zero. An array may be overwritten by the next
+        iteration.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        setting : Setting
+            Equations of motion at the parameters.
+        held : HeldForces, optional
+            Filled in place with the forces on instrumented grasps and their sensitivities.
 
         Raises
         ------
         SimulationError
-            Where a timestep's equations are singular or not finite.
+            If the equations of a time step are singular or not finite.
         """
         return Forward(self, Columns.by_parameters(self, setting), held=held).rows(x)
 
     @one_blas_thread()
     def backward(self, x: Array, setting: Setting, gradient: Array) -> Array:
-        """Multipliers y (N, 3n) [1/N] of the rows with c_xᵀ y = −`gradient` (N, 3n) [1/m].
+        """Solve the adjoint equations c_xᵀ y = −`gradient` backward in time.
 
-        Dofs that a grasp holds have zeros.
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        setting : Setting
+            Equations of motion at the parameters.
+        gradient : (N, 3n) array
+            Gradient of a scalar by the positions [1/m].
+
+        Returns
+        -------
+        (N, 3n) array
+            Multipliers y of the equations of motion [1/N]; zero at prescribed dofs.
         """
-        reach, free, y = self.dynamics.reach, self.free, np.zeros_like(x)
+        reach = self.dynamics.reach
+        free = self.free
+        y = np.zeros_like(x)
         pulled = -gradient[:, free]  # what is left for the rows that are still to come
-        along, later = self.dynamics_at(setting).histories(x), deque[StencilRow](maxlen=reach)
+        along = self.dynamics_at(setting).histories(x)
+        later = deque[StencilRow](maxlen=reach)
         carried = [history.backward() for history in along]
         for chunk in self.chunks(x, setting, backward=True, along=along):
             for step in reversed(chunk.steps):
-                t, row = step.t, step.row
-                p, q, mass = row.p, row.q, row.mass_kg[free]
+                t = step.t
+                row = step.row
+                p = row.p
+                q = row.q
+                mass = row.mass_kg[free]
                 by_state = by_rate = 0.0
                 for own in (each.pulled() for each in carried):
-                    by_state, by_rate = by_state + own[0][free], by_rate + own[1][free]
+                    by_state = by_state + own[0][free]
+                    by_rate = by_rate + own[1][free]
                 known = np.zeros(x.shape[1])
                 for j, other in enumerate(later, 1):
                     known += other.w[j] * y[t + j]
@@ -351,14 +463,16 @@ class Sweep:
         return y
 
     def without_taken(self, t: int, rows: Array) -> Array:
-        """Rows (free, …) with zeros at what a passing grasp holds at t, in place."""
+        """Set rows (free, …) of grid time t to zero where a grasp that holds for a part of
+        the time prescribes the dof, in place.
+        """
         if self._takes:
             rows[self.dynamics.taken[t, self.free]] = 0
         return rows
 
     @property
     def chunk(self) -> int:
-        """Timesteps that are evaluated and factorised at a time."""
+        """Number of time steps that are linearised and factorised at a time."""
         most = ROOMS if self.factoriser.skyline else self.dynamics.rows
         # Each thread has one to factorise, however large it is.
         least = min(self.body.threads, self.dynamics.rows)
@@ -366,17 +480,18 @@ class Sweep:
 
     @property
     def chunk_bytes(self) -> int:
-        """LastRows that takes."""
+        """Memory of one chunk [bytes]."""
         return self.chunk * self._step_bytes
 
     @property
     def _step_bytes(self) -> int:
+        """Memory of one time step: element results and one factor [bytes]."""
         solver = self.factoriser
         numbers = solver.unsymmetric_numbers if self.body.unsymmetric else solver.numbers
         return 8 * (self.body.linearisation_width + numbers)
 
     def dynamics_at(self, setting: Setting) -> Dynamics:
-        """The equations of motion of the rows at a setting."""
+        """Return the equations of motion of the first rows with the inputs of a setting."""
         return setting.dynamics.first_rows(self.dynamics.rows)
 
     def chunks(
@@ -387,16 +502,35 @@ class Sweep:
         first: int = 0,
         along: Sequence[AnyHistory] = (),
     ) -> Iterator[Chunk]:
-        """Blocks and factors of every row from `first` on, computed side by side."""
+        """Iterate over the linearised and factorised time steps, a few at a time, using threads.
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        setting : Setting
+            Equations of motion at the parameters.
+        backward : bool
+            If true, yield the last chunk first.
+        first : int
+            Grid time to begin with.
+        along : sequence of histories
+            History variables at x; empty without any.
+
+        Raises
+        ------
+        SimulationError
+            If a matrix is singular or not finite.
+        """
         dynamics = self.dynamics_at(setting)
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
         rooms = [self.factoriser.room(1 + self.body.unsymmetric) for _ in range(self.chunk)]
         for start in reversed(starts) if backward else starts:
             here = slice(start, min(start + self.chunk, dynamics.rows))
-            seen = slice(start - dynamics.first_row, here.stop - dynamics.first_row)
+            evaluations = slice(start - dynamics.first_row, here.stop - dynamics.first_row)
             with self.stopwatch.evaluating():
-                at = dynamics.forces_along(along, here).linearise(xi[seen], nu[seen])
+                at = dynamics.forces_along(along, here).linearise(xi[evaluations], nu[evaluations])
             with self.stopwatch.solving():
                 rows = [StencilRow.of(dynamics, t) for t in range(start, here.stop)]
                 factors = self._factorise(dynamics, at, here, rows, rooms)
@@ -413,22 +547,27 @@ class Sweep:
         rows: list[StencilRow],
         rooms: Sequence[Room | None] = (),
     ) -> list[Factor]:
-        pattern, taken = self.pattern, dynamics.taken[here]
+        """Factorise −∂c_t/∂x_t of some rows; dofs that are prescribed for a part of the
+        time get a diagonal entry alone.
+        """
+        pattern = self.pattern
+        taken = dynamics.taken[here]
 
         def matrix(k: int) -> tuple[Array, Array]:
             values = rows[k].block(at.by_position[k], at.by_velocity[k], pattern)
             skew = rows[k].skew_block(at.by_position_skew[k], at.by_velocity_skew[k])
             if taken[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
-                gone = taken[k][pattern.rows] | taken[k][pattern.columns]
-                values[gone] = 0
+                removed = taken[k][pattern.rows] | taken[k][pattern.columns]
+                values[removed] = 0
                 values[pattern.diagonal[taken[k]]] = size
                 if skew.size:
-                    skew[gone] = 0
+                    skew[removed] = 0
             return values, skew
 
         try:
-            count, threads = len(at.force), self.body.threads
+            count = len(at.force)
+            threads = self.body.threads
             return self.factoriser.factorise_each(matrix, count, threads, rooms)
         except np.linalg.LinAlgError as error:
             raise SimulationError(
@@ -439,11 +578,25 @@ class Sweep:
 
 
 class Forward:
-    """Columns carried forward, row by row; it remembers the last few rows.
+    """Forward substitution of several columns, row by row.
 
     Attributes
     ----------
-    violation_n, indefinite : see `Tangent`
+    violation_n : float
+        Largest residual of the equations of motion so far [N].
+    indefinite : int
+        Number of time steps so far whose matrix is not positive definite.
+
+    Parameters
+    ----------
+    solver : Sweep
+        Factorised time steps.
+    columns : Columns
+        Right-hand sides.
+    last : LastRows, optional
+        State after earlier rows; by default there are none.
+    held : HeldForces, optional
+        Filled in place with the forces on instrumented grasps.
     """
 
     def __init__(
@@ -453,11 +606,15 @@ class Forward:
         last: LastRows | None = None,
         held: HeldForces | None = None,
     ) -> None:
-        self.solver, self.columns = solver, columns
+        self.solver = solver
+        self.columns = columns
         self.held = held if len(solver.sensed) else None
-        self.violation_n, self.indefinite = 0.0, 0
-        size, reach = solver.pattern.size, solver.dynamics.reach
-        self.shape, self._of_free = (size, columns.count), (len(solver.free), columns.count)
+        self.violation_n = 0.0
+        self.indefinite = 0
+        size = solver.pattern.size
+        reach = solver.dynamics.reach
+        self.shape = (size, columns.count)
+        self._of_free = (len(solver.free), columns.count)
         nothing = (np.zeros(shape) for shape in (self.shape, self._of_free, len(solver.free)))
         solutions, increments, forces = ((each,) * reach for each in nothing)
         last = last or LastRows(solutions, increments, forces)
@@ -471,16 +628,30 @@ class Forward:
 
     @property
     def last(self) -> LastRows:
-        """What later rows depend on."""
+        """State that later rows depend on."""
         carried = tuple(each.columns for each in self.carried)
         past = tuple(self.past), tuple(self.past_increments), tuple(self.past_forces)
         return LastRows(*past, carried)
 
     def rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
-        """Y_t (3n, c) at x (N, 3n) after rows that are done, also into `out` (N, 3n, c)."""
-        solver, columns, setting = self.solver, self.columns, self.columns.setting
-        dynamics, first = solver.dynamics_at(setting), solver.dynamics.first_row
-        along, acceleration = dynamics.histories(x), dynamics.acceleration(x)
+        """Iterate over the solutions Y_t (3n, c).
+
+        Parameters
+        ----------
+        x : (N, 3n) array
+            Positions [m].
+        done : int
+            Number of rows that are known already.
+        out : (N, 3n, c) array, optional
+            Overwritten with the solutions.
+        """
+        solver = self.solver
+        columns = self.columns
+        setting = self.columns.setting
+        dynamics = solver.dynamics_at(setting)
+        first = solver.dynamics.first_row
+        along = dynamics.histories(x)
+        acceleration = dynamics.acceleration(x)
         known = self._known or [None] * len(along)
         pairs = zip(along, known, strict=True)
         self.carried = [each.forward(columns.of_inputs, done, own) for each, own in pairs]
@@ -507,8 +678,11 @@ class Forward:
                 yield found
 
     def _residual(self, step: Step, acceleration: Array) -> Array:
-        """c_t on the free dofs; to be called for every row in turn."""
-        solver, row = self.solver, step.row
+        """Return c_t on the free dofs [N]; call it for every row in ascending order,
+        because it stores the forces.
+        """
+        solver = self.solver
+        row = step.row
         force = solver.without_taken(step.t, step.force[solver.free])
         total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
         if self.weighs_past:
@@ -517,10 +691,27 @@ class Forward:
         return solver.without_taken(step.t, total)
 
     def advance(self, step: Step, right: Array, force: Array, found: Array) -> None:
-        """Put Y_t into `found` (3n, c), from R_t (free, c) and F_R (3n, c)."""
-        t, solver, given = step.t, self.solver, self.columns.grasped
-        row, free = step.row, solver.free
-        w, s, mass = row.w, row.s, row.mass_kg.take(free)[:, None]
+        """Solve one row and store Y_t in `found`.
+
+        Parameters
+        ----------
+        step : Step
+            The factorised time step.
+        right : (free, c) array
+            R_t; modified.
+        force : (3n, c) array
+            F_R.
+        found : (3n, c) array
+            Y_t, overwritten.
+        """
+        t = step.t
+        solver = self.solver
+        prescribed = self.columns.grasped
+        row = step.row
+        free = solver.free
+        w = row.w
+        s = row.s
+        mass = row.mass_kg.take(free)[:, None]
         if self.weighs_past:
             right += weighted(w, self.past_increments, self._of_free)
         right -= mass * weighted(s, self.past, self.shape).take(free, axis=0)
@@ -528,16 +719,16 @@ class Forward:
             force = force + each.force()
         forced = force.take(free, axis=0)
         forced += self._of_past(step, row)
-        if given is not None:
-            forced += given.force(solver, step)
+        if prescribed is not None:
+            forced += prescribed.force(solver, step)
         solver.without_taken(t, right)
         solver.without_taken(t, forced)
         solution = step.factor.solve(right + w[0] * forced)
         if self.weighs_past:
             self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
         found[free] = solution
-        if given is not None:
-            given.place(t, found)
+        if prescribed is not None:
+            prescribed.place(t, found)
         for each in self.carried:
             each.advance(
                 lambda: self._evaluated(row.p, found), lambda: self._evaluated(row.q, found)
@@ -547,19 +738,23 @@ class Forward:
         self.past.appendleft(found)
 
     def _sense(self, held: HeldForces, step: Step, force: Array, found: Array) -> None:
-        """Note F_t and dF_t of the dofs whose grasp has a sensor."""
-        row, dofs, matrix = step.row, self.solver.sensed, self.solver.of_sensed
+        """Store F_t and dF_t of the dofs of instrumented grasps in `held`, in place."""
+        row = step.row
+        dofs = self.solver.sensed
+        matrix = self.solver.of_sensed
         held.force[step.t] = step.force[dofs]
         state, rate = (self._evaluated(weights, found) for weights in (row.p, row.q))
         slopes = force[dofs] + matrix.of(step.by_position, step.skew) @ state
         held.slopes[step.t] = slopes + matrix.of(step.by_velocity, step.rate_skew) @ rate
 
     def _evaluated(self, weights: Sequence[float], found: Array) -> Array:
-        """Σ_i weights[i] Y_{t−i} (3n, c): how ξ, or ν, of row t changes."""
+        """Return Σ_i weights[i] Y_{t−i} (3n, c): the change of ξ or ν of row t."""
         return weights[0] * found + weighted(weights, self.past, self.shape)
 
     def _of_past(self, step: Step, row: StencilRow) -> Array | float:
-        """G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i}, with as few products as the stencil allows."""
+        """Return the force G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i} of earlier rows (free, c),
+        with as few products as possible.
+        """
         matrix = self.solver.matrix
         if not row.lags:
             return 0.0

@@ -1,4 +1,4 @@
-"""What of a body touched its obstacles in a motion."""
+"""Summary of the contact of a body with its obstacles in a motion: gaps, pressures and friction."""
 
 from __future__ import annotations
 
@@ -22,21 +22,23 @@ AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Touch:
-    """How a body touched one obstacle.
+    """Contact of a body with one obstacle in a motion.
 
     Attributes
     ----------
     experiment, obstacle : str
+        Names.
     gap_m : float
-        The smallest; it touches where that is less than the width of the pressure.
+        Smallest gap [m]; contact exists where it is less than the width of the contact law.
     faces : float
-        Most faces that touched at a time, by their quadrature points; none where it never did.
+        Largest number of faces in contact at a time, from their quadrature points; 0 if there never
+        was contact.
     face_mm : float
-        Edge of those, on the average.
+        Mean edge length of the faces in contact [mm].
     pressed : bool
-        Whether an obstacle that moves touched at the first time.
+        Whether a moving obstacle was in contact at the first time.
     lost_s : float or None
-        When it was first touched no more, where it had been.
+        Time of the first loss of contact [s]; None if contact was never lost.
     """
 
     experiment: str
@@ -49,27 +51,35 @@ class Touch:
 
 
 def nearest(contact: Contact, x: Array) -> Array:
-    """(i,) the smallest gap of each point in a motion x (T, 3n)."""
+    """Return the smallest gap [m] of each contact point (i,) in a motion x (T, 3n)."""
     chunks = (x[first : first + AT_ONCE] for first in range(0, len(x), AT_ONCE))
     gaps = (contact.contact.gaps(contact.points.vectors(chunk)).min(axis=0) for chunk in chunks)
     return np.min([*gaps], axis=0)
 
 
 def on_surface(experiment: Experiment, theta: Array, x: Array) -> tuple[Array, Array]:
-    """Gaps [m] and pressures [Pa], (T, F) of all faces, in a motion x (T, 3n) of a body at θ (k,).
+    """Return gaps [m] and pressures [Pa], each (T, F), of all surface faces in a motion.
 
-    Of a face the smallest gap of its points to any obstacle, NaN where none may touch it, and the
-    mean of their pressures.
+    The gap of a face is the smallest of its points to any obstacle, NaN where no obstacle may touch
+    it; the pressure is the mean over its points, summed over obstacles.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    theta : (k,) array
+        Constants of the body.
+    x : (T, 3n) array
+        Positions [m].
     """
     shape = len(x), len(experiment.body.mesh.surface)
-    gaps_m, pressures_pa = np.full(shape, np.nan), np.zeros(shape)
+    gaps_m = np.full(shape, np.nan)
+    pressures_pa = np.zeros(shape)
     for contact in contacts(experiment):
         law = contact.contact
         for first in range(0, len(x), AT_ONCE):
-            rows, by_face = (
-                slice(first, first + AT_ONCE),
-                (-1, len(law.surface.faces), law.surface.a_face),
-            )
+            rows = slice(first, first + AT_ONCE)
+            by_face = (-1, len(law.surface.faces), law.surface.a_face)
             here = rows, law.surface.faces
             gaps = law.gaps(contact.points.vectors(x[rows])).reshape(by_face)
             gaps_m[here] = np.fmin(gaps_m[here], gaps.min(axis=2))
@@ -80,15 +90,16 @@ def on_surface(experiment: Experiment, theta: Array, x: Array) -> tuple[Array, A
 
 @dataclass(frozen=True)
 class Rubbing:
-    """What friction with an obstacle did in a motion.
+    """Friction with an obstacle in a motion.
 
     Attributes
     ----------
     used : float
-        Its largest force over what it may be, of all points together.
+        Largest ratio of the total friction force to its limit.
     slipping : float
-        Share of the time that points slip, by what friction may be there.
+        Share of slipping points, weighted by their friction limits, over the motion.
     dissipated_j : float
+        Dissipated energy [J].
     """
 
     used: float
@@ -97,9 +108,11 @@ class Rubbing:
 
 
 def rubbings(experiment: Experiment, dynamics: Dynamics, x: Array) -> dict[str, Rubbing]:
-    """By its name what each obstacle with friction did along positions x (T, 3n)."""
+    """Return the friction with each obstacle that has friction, by name, along positions x
+    (T, 3n).
+    """
     xi, nu = dynamics.evaluation_states(x)
-    told = {}
+    summaries = {}
     for contact in contacts(experiment):
         if not contact.by_velocity:
             continue
@@ -107,40 +120,45 @@ def rubbings(experiment: Experiment, dynamics: Dynamics, x: Array) -> dict[str, 
         sums = np.concatenate([contact.rubbing(row) for row in rows], axis=1)
         limit_n, slipping_n, *rub_n, power_w = sums
         # Of a mere graze nothing is said.
-        firm = limit_n > GRAZE * limit_n.max(initial=0.0)
-        used = np.linalg.norm(rub_n, axis=0)[firm] / limit_n[firm]
-        told[contact.contact.obstacle.name] = Rubbing(
+        is_firm = limit_n > GRAZE * limit_n.max(initial=0.0)
+        used = np.linalg.norm(rub_n, axis=0)[is_firm] / limit_n[is_firm]
+        summaries[contact.contact.obstacle.name] = Rubbing(
             used=float(used.max(initial=0.0)),
             slipping=float(slipping_n.sum() / max(limit_n.sum(), np.finfo(float).tiny)),
             dissipated_j=float(power_w.sum() * dynamics.step_s),
         )
-    return told
+    return summaries
 
 
 def touched(parts: Iterable[Part]) -> Iterator[Touch]:
-    """The same of all experiments."""
+    """Iterate over the contact summaries of several experiments."""
     for part in parts:
         t_s = part.setting.dynamics.t_s[: len(part.x)]
         yield from touches(part.segment.experiment, part.x, t_s)
 
 
 def touches(experiment: Experiment, x: Array, t_s: Array) -> Iterator[Touch]:
-    """How the positions x (T, 3n) at times (T,) touch each obstacle."""
+    """Iterate over the contact summaries of each obstacle for positions x (T, 3n) at times (T,)."""
     for contact, obstacle in zip(contacts(experiment), experiment.obstacles, strict=True):
-        law, least, points = contact.contact, np.inf, []
-        ever = np.zeros(contact.points.count, dtype=bool)
+        law = contact.contact
+        smallest_gap_m = np.inf
+        points = []
+        has_touched = np.zeros(contact.points.count, dtype=bool)
         for first in range(0, len(x), AT_ONCE):
             gap = law.gaps(contact.points.vectors(x[first : first + AT_ONCE]))
-            least, near = min(least, float(gap.min())), gap < law.widths_m
-            points.append(near.sum(axis=1))
-            ever |= near.any(axis=0)
+            smallest_gap_m = min(smallest_gap_m, float(gap.min()))
+            is_touching = gap < law.widths_m
+            points.append(is_touching.sum(axis=1))
+            has_touched |= is_touching.any(axis=0)
         count = np.concatenate(points)
         ends = np.flatnonzero((count[:-1] > 0) & (count[1:] == 0)) + 1
-        face_m2 = law.surface.area_m2[ever].sum() * law.surface.a_face / max(1, ever.sum())
+        face_m2 = (
+            law.surface.area_m2[has_touched].sum() * law.surface.a_face / max(1, has_touched.sum())
+        )
         yield Touch(
             experiment.name,
             obstacle.name,
-            gap_m=least,
+            gap_m=smallest_gap_m,
             faces=int(count.max()) / law.surface.a_face,
             # Of a triangle with sides alike.
             face_mm=1e3 * float(np.sqrt(4 / np.sqrt(3) * face_m2)),

@@ -1,4 +1,4 @@
-"""A depth camera: where it stands, what it is off by, and where its points are in the world."""
+"""Model of a depth camera: pose, errors of pose and depth, and points in the world."""
 
 from __future__ import annotations
 
@@ -33,15 +33,19 @@ EXACT = 1e6
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A depth camera: what it is off by, and where it stands.
+    """Depth camera with its estimated errors.
 
     Attributes
     ----------
     depth : Depth
+        The camera and its measured points.
     number : int
-        Among those of the experiment.
+        Index of the camera in the experiment.
     nuisance : NuisanceMap
-    pivot_m : (3,) in its frame: its turn is about the middle of the body
+        Nuisance parameters of the experiment, which include the camera's errors.
+    pivot_m : (3,) array
+        Point about which the rotation error acts, the middle of the body, in the camera's frame
+        [m].
     size_m : float
         Diagonal of the undeformed body [m].
     """
@@ -54,7 +58,7 @@ class View:
 
     @classmethod
     def of(cls, experiment: Experiment, number: int, nuisance: NuisanceMap) -> View:
-        """That of an experiment's camera."""
+        """Build the model of camera `number` (index) of an experiment."""
         depth = experiment.depths[number]
         rotations, translations = depth.camera.motion(depth.times[:1])
         pivot_m = (experiment.body.nodes_m.mean(axis=0) - translations[0]) @ rotations[0]
@@ -63,32 +67,52 @@ class View:
 
     @cached_property
     def instruments(self) -> dict[tuple[int, int], Any]:
-        """Of its readings, whose derivatives are generated once."""
+        """Generated functions of its depth residuals, shared by all copies of the
+        measurement model.
+        """
         return {}
 
     @cached_property
     def outline_instruments(self) -> dict[tuple[int, int], Any]:
-        """Of the readings of its outlines, whose derivatives are generated once."""
+        """Generated functions of its outline residuals, shared by all copies of the
+        measurement model.
+        """
         return {}
 
     @cached_property
     def own(self) -> Index:
-        """Positions in φ of what is not known of it."""
+        """Indices in φ of the camera's nuisance parameters."""
         return self.nuisance.places(*OF_CAMERA, of=self.number)
 
     @cached_property
     def motion(self) -> tuple[Array, Array]:
-        """Rotations (S, 3, 3) and translations (S, 3) from its frame to the world."""
+        """Rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
+        world, at each image.
+        """
         return self.depth.camera.motion(self.depth.times)
 
     @cached_property
     def rays(self) -> list[Array]:
-        """(P, 3) that points of each sample move along as their depths grow; zeros of clouds."""
-        seen, pinhole = self.depth.points_m, self.depth.camera.matrix is not None
+        """For each image, directions (P, 3) in which points move as their depth grows;
+        zeros for point clouds.
+        """
+        seen = self.depth.points_m
+        pinhole = self.depth.camera.matrix is not None
         return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in seen]
 
     def corrected(self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]) -> ca.SX:
-        """Where a point is in the frame as stated, by what the camera is off by."""
+        """Return the expression of a point in the camera's stated frame, corrected by the estimated
+        errors.
+
+        Parameters
+        ----------
+        point : (3,) SX
+            Measured point [m].
+        ray : (3,) SX
+            Direction of its depth.
+        values : mapping of NuisanceRow to SX
+            Errors in physical units; missing ones are zero.
+        """
         point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(DEPTH_BIAS, 0) * ray
         if DEPTH_TURN in values:
             pivot = ca.DM(self.pivot_m)
@@ -97,6 +121,8 @@ class View:
 
     @cached_property
     def _corrected(self) -> Generated:
+        """Generated function of `corrected`."""
+
         def expression(own: ca.SX, data: ca.SX) -> ca.SX:
             values = self.nuisance.by_row(own, self.own)
             return self.corrected(data[:3], data[3:], values)
@@ -104,58 +130,90 @@ class View:
         return Generated(expression, len(self.own), 6)
 
     def world(self, phi: Array, sample: int) -> Array:
-        """(P, 3) the points of a sample in the world, at φ (k,)."""
+        """Return the points (P, 3) of an image in the world [m].
+
+        Parameters
+        ----------
+        phi : (k,) array
+            Nuisance parameters.
+        sample : int
+            Index of the image.
+        """
         return self.corrected_at(phi, self.depth.points_m[sample], self.rays[sample], sample)
 
     def corrected_at(self, phi: Array, points: Array, rays: Array, sample: int) -> Array:
-        """The same of some points (P, 3) of its frame, that move along rays (P, 3)."""
-        seen = self._corrected.value(phi[self.own], np.vstack([points.T, rays.T])).T
+        """Return points (P, 3) of the camera's frame in the world [m], corrected at φ (k,).
+
+        Parameters
+        ----------
+        phi : (k,) array
+            Nuisance parameters.
+        points : (P, 3) array
+            Points in the camera's frame [m].
+        rays : (P, 3) array
+            Directions of their depths; zeros if no bias of the depth is to be applied.
+        sample : int
+            Index of the image.
+        """
+        corrected = self._corrected.value(phi[self.own], np.vstack([points.T, rays.T])).T
         rotations, translations = self.motion
-        return seen @ rotations[sample].T + translations[sample]
+        return corrected @ rotations[sample].T + translations[sample]
 
     def middle_m(self, sample: int) -> Array:
-        """Middle (3,) of the undeformed body in the camera's frame as stated, at a sample [m]."""
+        """Return the middle (3,) of the undeformed body in the camera's stated frame, at an
+        image [m].
+        """
         rotations, translations = self.motion
         middle_m = rotations[0] @ self.pivot_m + translations[0]
         return (middle_m - translations[sample]) @ rotations[sample]
 
     def own_m(self, phi: Array, points_m: Array, sample: int) -> Array:
-        """(P, 3) points (P, 3) of the world in its frame: what `world` says of it, but for bias."""
+        """Return points (P, 3) of the world in the camera's frame [m]: the inverse of
+        `corrected_at` without bias.
+        """
         basis = np.vstack([np.zeros(3), np.eye(3)])
         corner, *along = self.corrected_at(phi, basis, np.zeros((4, 3)), sample)
         return np.linalg.solve((along - corner).T, (points_m - corner).T).T
 
     def told(self, phi: Array) -> dict[str, float]:
-        """What φ (k,) says of it, by label."""
-        entries, values = self.nuisance.entries, phi * self.nuisance.scales
+        """Return the camera's nuisance parameters in physical units by label, from φ (k,)."""
+        entries = self.nuisance.entries
+        values = phi * self.nuisance.scales
         return {entries[k].label: float(values[k]) for k in self.own}
 
     def phi(self, told: Mapping[str, float]) -> Array:
-        """Φ (k,) with this, zero else."""
+        """Return φ (k,) with the given values in physical units by label; others are zero."""
         values = [told.get(entry.label, 0.0) for entry in self.nuisance.entries]
         return np.array(values) / self.nuisance.scales
 
     def eye_m(self, phi: Array, sample: int) -> Array | None:
-        """(3,) where the camera is, at φ (k,); None of a cloud."""
+        """Return the position (3,) of the camera in the world at φ (k,) [m]; None for a
+        point cloud without camera.
+        """
         if self.depth.camera.matrix is None:
             return None
         return self.corrected_at(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)[0]
 
     def prior(self, row: NuisanceRow) -> Array:
-        """(3,) over the deviations of its turn, or shift; so good as infinite of what is exact."""
+        """Return one over the prior standard deviations (3,) of the rotation [1/rad] or
+        translation [1/m]; a large number for exact ones.
+        """
         places = self.nuisance.places(row, of=self.number)
         return 1 / self.nuisance.scales[places] if len(places) else np.full(3, EXACT)
 
     def late_s(self, phi: Array) -> float:
-        """How much later than its times say it sees."""
+        """Return by how much images are taken later than their times state [s]."""
         places = self.nuisance.places(DEPTH_TIME, of=self.number)
         return float((phi * self.nuisance.scales)[places].sum())
 
     def with_pose(self, phi: Array, turn: Array, shift_m: Array) -> Array:
-        """Φ with another turn (rotation vector) and shift, as far as these are estimated."""
-        moved, angle = phi.copy(), np.linalg.norm(turn)
+        """Return φ (k,) with another rotation error (rotation vector [rad]) and translation
+        error [m], as far as they are estimated.
+        """
+        updated = phi.copy()
+        angle = np.linalg.norm(turn)
         cayley = turn * (2 * np.tan(angle / 2) / angle if angle else 1.0)
         for row, values in ((DEPTH_TURN, cayley), (DEPTH_SHIFT, shift_m)):
             places = self.nuisance.places(row, of=self.number)
-            moved[places] = values[: len(places)] / self.nuisance.scales[places]
-        return moved
+            updated[places] = values[: len(places)] / self.nuisance.scales[places]
+        return updated

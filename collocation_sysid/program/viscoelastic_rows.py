@@ -1,12 +1,14 @@
-"""What the points of one body carry as variables, and its recursion as equations.
+"""Memory of a viscoelastic body as variables of the program, with its recursion as equations.
 
-Of evaluations k = 1 … N − 1 and all branches, in scaled quantities,
+For evaluations k = 1 … N − 1 and all branches, in scaled quantities,
 
     r_k = (m_{k−1} − d_{k−1} m_{k−2} − a_{k−1} S_{k−1}) / S̄,   variables m_{k−1} / S̄,
 
-see `model.viscoelasticity`; m_{−1} is zero, and S̄ the branch's S, long-term, of a strain of one.
-r_k has the entries ∂S/∂x of one evaluation, the motion those ∂f_H/∂H of another, and of second
-derivatives only those by x and m are further entries: 18 numbers of a point and node each.
+with the history variables m and the second Piola–Kirchhoff stress S of the long-term energy, see
+`model.viscoelasticity`; m_{−1} is zero, and S̄ is the branch's long-term stress at a strain of one.
+The derivatives of r_k have the entries ∂S/∂x of one evaluation, and the equations of motion those
+∂f_H/∂H of another, f_H being the force of the overstress H. Of the second derivatives only those by
+x and m are additional entries: 18 numbers per point and node.
 """
 
 from __future__ import annotations
@@ -30,7 +32,14 @@ from .segment import RowWeights, Weighed
 class _Lag:
     """Entries of evaluations `start` … `stop` − 1 at one lag of a stencil.
 
-    `factors` (N,) are its coefficients, by evaluation.
+    Attributes
+    ----------
+    lag : int
+        Number of grid times before the evaluation.
+    start, stop : int
+        Range of the evaluations.
+    factors : (N,) array
+        Coefficients of the stencil, by evaluation.
     """
 
     lag: int
@@ -40,13 +49,23 @@ class _Lag:
 
     @property
     def times(self) -> Index:
-        """(T, 1) the evaluations."""
+        """Indices (T, 1) of the evaluations."""
         return np.arange(self.start, self.stop)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
 class _Moved:
-    """Rows of motion: of which slopes (K,), and what number each has at its time."""
+    """Entries of one set of equations of motion that contain the memory.
+
+    Attributes
+    ----------
+    slopes : (K,) array
+        Indices of the derivatives.
+    number : (K,) array
+        Index of the row of each within its grid time.
+    rows : RowsOfMotion
+        The equations.
+    """
 
     slopes: Index
     number: Index
@@ -55,12 +74,13 @@ class _Moved:
 
 @dataclass(frozen=True, eq=False)
 class Overstress(Carried):
-    """The m of one experiment, of a body with memory.
+    """Lifted history variables m of a viscoelastic body.
 
     Attributes
     ----------
-    reactions : Reactions, optional
-        Further rows of motion, where the program has them.
+    reactions : Reactions or None
+        Lifted reaction forces, whose equations also contain the memory; None if the program has
+        none.
     """
 
     reactions: Reactions | None = None
@@ -68,15 +88,19 @@ class Overstress(Carried):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Evaluations that bring something, and how many numbers all branches carry."""
+        """Shape (N − 1, width): evaluations with a past, and history variables of all branches."""
         return self.segment.grid_rows - 1, self.segment.body.memory.branches[-1].own.stop
 
     @cached_property
     def unit_pa(self) -> Array:
-        """(width,) S̄: the normal entries of dS/dε of an even stretch, on average over the part."""
-        segment, body = self.segment, self.segment.body
+        """Unit (width,) of the history variables [Pa]: normal entries of dS/dε of a uniform
+        stretch, averaged over the part.
+        """
+        segment = self.segment
+        body = self.segment.body
         theta = segment.constants.theta(segment.parameters.guess_q)
-        rest, memory = body.nodes_m.reshape(1, -1), body.memory
+        rest = body.nodes_m.reshape(1, -1)
+        memory = body.memory
         change = np.abs(body.stresses.along(rest, rest, theta)[0])
         normal = [
             change[b.points][: (b.points.stop - b.points.start) // 2] for b in memory.branches
@@ -87,29 +111,38 @@ class Overstress(Carried):
     # Values -------------------------------------------------------------------------------------
 
     def following(self, part: Part) -> Array:
-        """(count,) the variables as they follow from positions and parameters."""
+        """Return the scaled variables (count,) that satisfy the recursion at the part's
+        positions and parameters.
+        """
         return (_history(part).brought[1:] / self.unit_pa).ravel()
 
     def given(self, part: Part, z: Array) -> Part:
-        """The experiment with m_{k−1} (N, width) at z."""
+        """Return the part with the history variables (N, width) taken from z."""
         later = z[self.variables].reshape(self.shape) * self.unit_pa
         brought = np.concatenate([np.zeros((1, self.shape[1])), later])
         return replace(part, brought={**part.brought, self.history: brought})
 
     def values(self, part: Part, z: Array) -> Array:
-        """(count,) r at the m of the experiment."""
+        """Return the scaled equations r (count,) at the history variables of the part."""
         return (_history(part).gaps / self.unit_pa).ravel()
 
     @property
     def history(self) -> int:
-        """That of the body comes first."""
+        """Index of the history: that of the body is the first."""
         return 0
 
     def weighed(self, part: Part, multipliers: Array) -> Weighed:
-        """And μ (N, …) such that multipliers · r has −Σ μ_k (m_k − d_k m_{k−1} − …)."""
+        """Return the history and its weights in the Lagrangian.
+
+        Returns
+        -------
+        (History, (N, width) array)
+            The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k).
+        """
         return _history(part), self._mu(multipliers)
 
     def _mu(self, multipliers: Array) -> Array:
+        """Return μ (N, width), see `weighed`; zero at the last evaluation."""
         mu = -multipliers[self.rows].reshape(self.shape) / self.unit_pa
         return np.concatenate([mu, np.zeros((1, self.shape[1]))])
 
@@ -117,106 +150,121 @@ class Overstress(Carried):
 
     @cached_property
     def _slopes(self) -> tuple[Index, Index, Index, Index]:
-        """Of the entries of slopes, branch after branch: place, variable, dof and branch."""
-        entries, found = self.segment.body.stresses.slope_entries, []
+        """Index arrays of the stress derivatives of all branches: entry, variable, dof and
+        branch.
+        """
+        entries = self.segment.body.stresses.slope_entries
+        index_arrays = []
         for number, branch in enumerate(self.segment.body.memory.branches):
             points = branch.points
-            here = (entries.points >= points.start) & (entries.points < points.stop)
-            places = np.flatnonzero(here)
+            in_branch = (entries.points >= points.start) & (entries.points < points.stop)
+            places = np.flatnonzero(in_branch)
             own = entries.points[places] - points.start + branch.own.start
-            found.append((places, own, entries.dofs[places], np.full(len(places), number)))
-        place, own, dof, number = (np.concatenate(each) for each in zip(*found, strict=True))
+            index_arrays.append((places, own, entries.dofs[places], np.full(len(places), number)))
+        place, own, dof, number = (np.concatenate(each) for each in zip(*index_arrays, strict=True))
         return place, own, dof, number
 
     @cached_property
     def _moved(self) -> list[_Moved]:
-        """Rows of motion that m is in, and by which slopes."""
-        found, dofs = [], self._slopes[2]
+        """Equations of motion that contain the memory."""
+        entries = []
+        dofs = self._slopes[2]
         for rows in rows_of_motion(self.segment, self.reactions):
             slopes = np.flatnonzero(rows.number[dofs] >= 0)
-            found.append(_Moved(slopes, rows.number[dofs[slopes]], rows))
-        return found
+            entries.append(_Moved(slopes, rows.number[dofs[slopes]], rows))
+        return entries
 
     @cached_property
     def _stress_lags(self) -> list[_Lag]:
-        """Of S_k by x_{k−lag}; the last is of no equation."""
+        """Lags of S_k by x_{k−lag}; the last evaluation has no equation."""
         return self._lags(self.segment.dynamics.state_weights, 0, self.shape[0])
 
     @cached_property
     def _state_lags(self) -> list[_Lag]:
-        """Of forces at k, where there is something brought, by x_{k−lag}."""
+        """Lags of forces at evaluation k with a past by x_{k−lag}."""
         return self._lags(self.segment.dynamics.tables.p, self._first, self.segment.grid_rows)
 
     @staticmethod
     def _lags(table: Array, first: int, stop: int) -> list[_Lag]:
+        """Return the lags of a stencil table (N, lags) with non-zero coefficients, for a
+        range of evaluations.
+        """
         columns = enumerate(table.T)
         return [_Lag(lag, max(lag, first), stop, column) for lag, column in columns if column.any()]
 
     @cached_property
     def _force_lags(self) -> list[_Lag]:
-        """Of c_{k+lag} by those forces."""
-        table, count = self.segment.dynamics.tables.w, self.segment.grid_rows
+        """Lags of c_{k+lag} by the forces at evaluation k."""
+        table = self.segment.dynamics.tables.w
+        count = self.segment.grid_rows
         lags = [_Lag(j, self._first, count - j, table[j:, j]) for j in range(table.shape[1])]
         return [each for each in lags if each.factors.any()]
 
     @property
     def _first(self) -> int:
-        """The first evaluation of a force to which something is brought."""
+        """Index of the first evaluation whose force depends on history variables."""
         return max(1, self.segment.dynamics.first_row)
 
     def _brought(self, each: _Lag, own: Index) -> list[Index | int]:
-        """Places in z of what the evaluations bring, (T, K)."""
+        """Return summands of the columns (T, K) in z of history variables."""
         return [self.places.variable, (each.times - 1) * self.shape[1], own]
 
     def _states(self, each: _Lag, dofs: Index) -> list[Index | int]:
-        """Places in z of the positions at their lag, (T, K)."""
+        """Return summands of the columns (T, K) in z of positions."""
         return [self.segment.first.x, (each.times - each.lag) * self.segment.dofs, dofs]
 
     def _jacobian(self) -> list[Outer]:
-        """Of r by q, by m_{k−1}, by m_{k−2} and by x, and of the motion by m."""
+        """Return the entries of r by q, by m_{k−1}, by m_{k−2} and by x, then those of the
+        motion by m.
+        """
         _, own, dofs, _ = self._slopes
         equations, variables = (np.arange(s.start, s.stop) for s in (self.rows, self.variables))
-        found = [
+        blocks = [
             Outer([equations], [np.arange(self.segment.nq)[:, None]]),
             Outer([equations], [variables]),
             Outer([equations[self.shape[1] :]], [variables[: -self.shape[1]]]),
         ]
         for each in self._stress_lags:
             rows = [self.places.row, each.times * self.shape[1], own]
-            found.append(Outer(rows, self._states(each, dofs)))
+            blocks.append(Outer(rows, self._states(each, dofs)))
         for moved in self._moved:
             for each in self._force_lags:
-                late = each.times + each.lag - self.segment.dynamics.first_row
-                rows = [moved.rows.first, late * moved.rows.per_time, moved.number]
-                found.append(Outer(rows, self._brought(each, own[moved.slopes])))
-        return found
+                row_times = each.times + each.lag - self.segment.dynamics.first_row
+                rows = [moved.rows.first, row_times * moved.rows.per_time, moved.number]
+                blocks.append(Outer(rows, self._brought(each, own[moved.slopes])))
+        return blocks
 
     def _hessian(self) -> list[Outer]:
-        """In the columns of m: by q, and by x."""
+        """Return the Hessian's entries in the columns of m: by q, then by x."""
         variables = np.arange(self.variables.start, self.variables.stop)
-        found = [Outer([np.arange(self.segment.nq)[:, None]], [variables])]
+        blocks = [Outer([np.arange(self.segment.nq)[:, None]], [variables])]
         _, own, dofs, _ = self._slopes
         for each in self._state_lags:
-            found.append(Outer(self._states(each, dofs), self._brought(each, own)))
-        return found
+            blocks.append(Outer(self._states(each, dofs), self._brought(each, own)))
+        return blocks
 
     def jacobian_entries(self) -> tuple[Index, Index]:
-        """Rows and columns of the further entries of ∂g/∂z, in the order of their values."""
+        """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
+        values.
+        """
         return together(each.laid_out() for each in self._jacobian())
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """The same of the upper triangle of the Lagrangian's Hessian."""
+        """Return rows and columns of the additional entries of the Lagrangian's Hessian,
+        upper triangle.
+        """
         return together(each.laid_out() for each in self._hessian())
 
     @property
     def nonzeros(self) -> tuple[int, int]:
-        """How many these are, without laying them out."""
+        """Numbers of additional entries of Jacobian and Hessian, computed without index arrays."""
         groups = self._jacobian(), self._hessian()
         return sum(each.count for each in groups[0]), sum(each.count for each in groups[1])
 
     def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
-        """r, and the values of these entries."""
-        history, memory = _history(part), part.segment.body.memory
+        """Return the equations r, and the values of `jacobian_entries`."""
+        history = _history(part)
+        memory = part.segment.body.memory
         after = self.shape[0] - 1, self.shape[1]
         fading = np.broadcast_to(memory.spread(-history.fading.d[:, 1:-1]), after)
         values = [self._by_q(history, part.setting.theta_q), np.ones(self.count), fading]
@@ -227,8 +275,9 @@ class Overstress(Carried):
         return rows, np.concatenate([each.ravel() for each in values])
 
     def _by_q(self, history: History, theta_q: Array) -> Array:
-        """Of r by q, (nq, N − 1, width)."""
-        memory, found = history.memory, np.empty((theta_q.shape[1], *self.shape))
+        """Return the derivatives of r by q, (nq, N − 1, width)."""
+        memory = history.memory
+        derivatives = np.empty((theta_q.shape[1], *self.shape))
         d_q, a_q = (memory.spread(np.moveaxis(e, 1, 0)) for e in history.fading.along(theta_q))
         a = memory.spread(history.fading.a)
         for rows, slopes in history.stress_by(theta_q):
@@ -236,13 +285,14 @@ class Overstress(Carried):
             change = d_q[:, rows] * history.brought[rows]
             change += a_q[:, rows] * memory.borne(history.stress[rows])
             by_modulus = np.moveaxis(memory.borne(slopes[: rows.stop - rows.start]), 1, 0)
-            found[:, rows] = -(change + a[rows] * by_modulus)
-        return found / self.unit_pa
+            derivatives[:, rows] = -(change + a[rows] * by_modulus)
+        return derivatives / self.unit_pa
 
     def _stress_values(self, history: History) -> list[Array]:
-        """Of r by x."""
+        """Return the derivatives of r by x, one array for each lag."""
         place, own, _, number = self._slopes
-        scale, a = -self.segment.length_m / self.unit_pa[own], history.fading.a.T
+        scale = -self.segment.length_m / self.unit_pa[own]
+        a = history.fading.a.T
 
         def slopes(times: slice) -> Array:
             found = history.body.stresses.stress_slopes(history.xi[times], history.theta)
@@ -251,9 +301,10 @@ class Overstress(Carried):
         return self._spread(self._stress_lags, slopes)
 
     def _force_values(self, history: History, moved: _Moved) -> list[Array]:
-        """Of the motion by m."""
+        """Return the derivatives of equations of motion by m, one array for each lag."""
         place, own, dofs, _ = (each[moved.slopes] for each in self._slopes)
-        scale, taken = self.unit_pa[own] / self.segment.force_n, self.segment.dynamics.taken
+        scale = self.unit_pa[own] / self.segment.force_n
+        taken = self.segment.dynamics.taken
 
         def slopes(times: slice) -> Array:
             found = history.body.stresses.force_slopes(history.xi[times], history.theta)
@@ -268,8 +319,10 @@ class Overstress(Carried):
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
-        """The values of these entries; multipliers are those of all of g."""
-        segment, history, theta_q = self.segment, _history(part), part.setting.theta_q
+        """Return the values of `hessian_entries`; arguments as in `Carried.hessian_values`."""
+        segment = self.segment
+        history = _history(part)
+        theta_q = part.setting.theta_q
         d_q = history.memory.spread(np.moveaxis(history.fading.along(theta_q)[0], 1, 0))
         by_q = d_q[:, 1:] * self._mu(multipliers)[1:] * self.unit_pa
         place, own, _, _ = self._slopes
@@ -285,23 +338,35 @@ class Overstress(Carried):
 
     @staticmethod
     def _spread(lags: list[_Lag], slopes: Callable[[slice], Array]) -> list[Array]:
-        """Slopes of evaluations times the factors, (T, K) of each lag; a few at a time."""
-        found: list[Array] = []
-        first, last = min(each.start for each in lags), max(each.stop for each in lags)
+        """Return derivatives of evaluations times the stencil's factors, (T, K) for each lag.
+
+        Parameters
+        ----------
+        lags : list of _Lag
+            Lags.
+        slopes : callable
+            Returns derivatives (T, K) of a slice of evaluations; called for a few evaluations at a
+            time to save memory.
+        """
+        scaled: list[Array] = []
+        first = min(each.start for each in lags)
+        last = max(each.stop for each in lags)
         for start in range(first, last, CHUNK):
             stop = min(start + CHUNK, last)
             own = slopes(slice(start, stop))
-            found = found or [np.empty((e.stop - e.start, own.shape[1])) for e in lags]
-            for each, values in zip(lags, found, strict=True):
-                low, high = max(start, each.start), min(stop, each.stop)
+            scaled = scaled or [np.empty((e.stop - e.start, own.shape[1])) for e in lags]
+            for each, values in zip(lags, scaled, strict=True):
+                low = max(start, each.start)
+                high = min(stop, each.stop)
                 if high > low:
                     here = slice(low - each.start, high - each.start)
                     factors = each.factors[low:high, None]
                     np.multiply(own[low - start : high - start], factors, out=values[here])
-        return found
+        return scaled
 
 
 def _history(part: Part) -> History:
+    """Return the viscoelastic history of a part."""
     history = part.along[0]
     assert isinstance(history, History)
     return history

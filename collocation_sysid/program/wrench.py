@@ -1,10 +1,10 @@
-"""What the sensor of a grasp reads: a sample at s compares
+"""Force–torque sensors in the grasps: a sample at time s is compared with
 
     ŷ(s) = Σ_k ℓ_k(s + τ) Y_k + tare,
 
-Y being what `wrench_channel` has on the grid and ℓ the cubic weights of the four grid times around
-it. Each sample is compared at its own time, however many there are in a step, so that no average
-hides a motion.
+where Y is the wrench on the grid (`wrench_channel`), τ the shift of the sensor's clock, and ℓ are
+the cubic weights of the four grid times around the sample. Each sample is compared at its own time,
+however many there are in a step, so that no averaging hides a motion.
 """
 
 from __future__ import annotations
@@ -31,18 +31,22 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, eq=False)
 class WrenchReading(Reading):
-    """The samples of the sensor of one grasp: a force and a torque at a time.
+    """Measurement model of the force–torque sensor of one grasp.
 
     Attributes
     ----------
     channel : GraspWrench
+        Wrench on the grid as an observable.
     wrench : Wrench
+        Measured samples.
     """
 
     channel: GraspWrench
     wrench: Wrench
 
-    stated, has_offsets, has_fixed_windows = "sigma_n", True, False
+    stated = "sigma_n"
+    has_offsets = True
+    has_fixed_windows = False
 
     @classmethod
     def of(
@@ -52,9 +56,21 @@ class WrenchReading(Reading):
         label: str = "",
         huber: float | None = None,
     ) -> WrenchReading:
-        """That of a sensor, which a label such as " 2" tells from others."""
+        """Build the measurement model of a sensor.
+
+        Parameters
+        ----------
+        channel : GraspWrench
+            Wrench on the grid as an observable.
+        wrench : Wrench
+            Measured samples.
+        label : str
+            Suffix of the names of force and torque, such as " 2", if there are several sensors.
+        huber : float or None
+            Threshold of Huber's loss; None means a quadratic loss.
+        """
         rows = (SENSOR_TIME, TARE)
-        there = wrench.present & _covered(channel, wrench.t_s, channel.count)[:, None]
+        is_compared = wrench.present & _covered(channel, wrench.t_s, channel.count)[:, None]
         return cls(
             channel=channel,
             nuisance=channel.nuisance,
@@ -63,73 +79,90 @@ class WrenchReading(Reading):
             t_s=wrench.t_s,
             sigmas=wrench.sigmas[[0, 3]],
             measured=wrench.values[:, None],
-            components=there.reshape(-1, 2, 3),
+            components=is_compared.reshape(-1, 2, 3),
             own=np.concatenate([channel.phi_places(row) for row in rows])[None],
             wrench=wrench,
         )
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """(S, 6) numbers that are compared."""
+        """Mask (S, 6) of the numbers that are compared."""
         return self.components.reshape(-1, 6)
 
     @property
     def begins_s(self) -> float:
-        """The first sample, however late it is."""
+        """Time [s] of the first sample with the largest possible shift of the clock."""
         return super().begins_s + self.channel.clock_limit_s
 
     def covered(self, known: int) -> NDArray[np.bool_]:
-        """(S,) samples that the first times suffice for, however the clock is shifted."""
+        """Return the mask (S,) of the samples for which the first `known` times suffice,
+        for any shift of the clock.
+        """
         return _covered(self.channel, self.t_s, known)
 
     def _used(self, known: int) -> int:
+        """Return the number of grid times that a sample is interpolated from."""
         return min(2 if self.channel.on.static else NEIGHBOURS, known)
 
     def window(self, phi: Array, known: int) -> Window:
-        """Of all samples: the grid times around each, and how much later than it they are."""
-        here, used = self.channel.phi_places(SENSOR_TIME), self._used(known)
-        t_s, shift_s = self.channel.t_s[:known], (phi[here] * self.nuisance.scales[here]).sum()
+        """Return the stencil of all samples: the grid times around each, and their
+        distances from it.
+        """
+        clock = self.channel.phi_places(SENSOR_TIME)
+        used = self._used(known)
+        t_s = self.channel.t_s[:known]
+        shift_s = (phi[clock] * self.nuisance.scales[clock]).sum()
         times = times_around(t_s, self.t_s + shift_s, used)
         data = self.channel.t_s[times] - self.t_s[:, None]
         return Window(_both(times), data.T[..., None])
 
     def windows(self) -> Index:
-        """(…, 1, v) neighbouring times, wherever the clock may be."""
+        """Return the indices (…, 1, v) of neighbouring times, for any shift of the clock."""
         used = self._used(self.channel.count)
         return _both(np.arange(self.channel.count - used + 1)[:, None] + np.arange(used))
 
     def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Of Y at some grid times, and of these from the sample's."""
-        times, tared = data.numel(), np.flatnonzero(self.wrench.measured)
+        """Return the prediction (6,) from wrenches at neighbouring grid times, the shift of
+        the clock and the tare.
+        """
+        times = data.numel()
+        tared = np.flatnonzero(self.wrench.measured)
         own = phi * self.nuisance.scales[self.own[0]][:, None]
-        late = len(self.channel.phi_places(SENSOR_TIME))
-        at = own[0] if late else ca.SX(0)
-        read = ca.reshape(looked, 6, times) @ ca.vertcat(*lagrange_weights(at, ca.vertsplit(data)))
-        read[tared[: own.numel() - late]] += own[late:]
-        return read
+        has_clock = len(self.channel.phi_places(SENSOR_TIME))
+        at = own[0] if has_clock else ca.SX(0)
+        predicted = ca.reshape(looked, 6, times) @ ca.vertcat(
+            *lagrange_weights(at, ca.vertsplit(data))
+        )
+        predicted[tared[: own.numel() - has_clock]] += own[has_clock:]
+        return predicted
 
     # Of reactions -----------------------------------------------------------------------------
 
     def of_forced(self, forced: Forced, phi: Array) -> Array:
-        """What is read (S, 6), NaN where that is not known."""
+        """Return the prediction (S, 6) from reaction forces [N, N m]; NaN for samples
+        outside the known times.
+        """
         motion = Motion(np.zeros((0, 0)), lambda: forced)
         values = self.channel.values(motion, phi)
         if not len(values):
             return np.full(self.wrench.values.shape, np.nan)
-        read = self.predicted(values, phi).reshape(-1, 6)
-        return np.where(self.covered(len(values))[:, None], read, np.nan)
+        predicted = self.predicted(values, phi).reshape(-1, 6)
+        return np.where(self.covered(len(values))[:, None], predicted, np.nan)
 
     def on(self, grid: Grid) -> WrenchReading:
-        """The same where reactions are known at other times."""
+        """Return the model with reaction forces at the times of another grid."""
         return WrenchReading.of(replace(self.channel, on=grid), self.wrench)
 
     def told(self, wrench: Wrench) -> WrenchReading:
-        """The same of other samples, or in another frame."""
-        seen = replace(self.channel, frame=wrench.frame, point_m=wrench.point_m)
-        return WrenchReading.of(seen, wrench)
+        """Return the model of other samples, in their own frame."""
+        observable = replace(self.channel, frame=wrench.frame, point_m=wrench.point_m)
+        return WrenchReading.of(observable, wrench)
 
 
 def _covered(channel: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
+    """Return the mask (S,) of the samples within the first `known` grid times for any shift
+    of the clock.
+    """
     if not known:
         return np.zeros(len(t_s), dtype=bool)
     first, last = channel.t_s[[0, known - 1]]
@@ -139,25 +172,38 @@ def _covered(channel: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
 
 
 def _both(times: Index) -> Index:
-    """(S, 1, 2 used) places of force and torque at some times (S, used)."""
+    """Return the indices (S, 1, 2 used) of force and torque vectors at times (S, used)."""
     return (2 * times[..., None] + np.arange(2)).reshape(len(times), 1, -1)
 
 
 def wrench_readings(
     experiment: Experiment, grid: Grid, nuisance: NuisanceMap, huber: float | None = None
 ) -> tuple[WrenchReading, ...]:
-    """Those of an experiment's grasps that have a sensor."""
-    found, sensors = [], [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
+    """Build the measurement models of all grasps of an experiment that have a force–torque sensor.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    grid : Grid
+        Times at which reaction forces are known.
+    nuisance : NuisanceMap
+        Nuisance parameters of the experiment.
+    huber : float or None
+        Threshold of Huber's loss; None means a quadratic loss.
+    """
+    models = []
+    sensors = [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
     for number, (grasp, wrench) in enumerate(sensors):
         how = wrench.frame, wrench.point_m, grid, nuisance, number
         label = "" if len(sensors) == 1 else f" {number + 1}"
         channel = GraspWrench.of(experiment, grasp, *how)
-        found.append(WrenchReading.of(channel, wrench, label, huber))
-    return tuple(found)
+        models.append(WrenchReading.of(channel, wrench, label, huber))
+    return tuple(models)
 
 
 def without_sensors(experiment: Experiment) -> Experiment:
-    """The same experiment, its wrenches not measured, nor what looks at a grasp besides."""
+    """Return the experiment without force–torque sensors and custom sensors of grasps."""
     grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
     readings = [gauge for gauge in experiment.readings if gauge.grasp is None]
     return replace(experiment, grasps=grasps, readings=readings)

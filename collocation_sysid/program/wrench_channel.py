@@ -1,12 +1,13 @@
-"""What a grasp gives the body, where a sensor stands: force and torque on the grid.
+"""Wrench of a grasp at its force–torque sensor, on the time grid, as an observable.
 
-In the frame of the sensor with axes Q_k and the point o_k,
+In the frame of the sensor with axes Q_k and origin o_k,
 
-    W_k = Σ_g (Q_kᵀ R_g, Q_kᵀ (x_g − o_k) × R_g) + what the tool takes,
+    W_k = Σ_g (Q_kᵀ R_g, Q_kᵀ (x_g − o_k) × R_g) + wrench of the tool,
 
-R being the reactions of `reaction` and x_g the grasped nodes. A tool of the mass m between sensor
-and body, with its centre at c in the frame of the grasp, takes m (a_c − g) at its centre. What is
-read are values of L W, L being a first-order low-pass.
+with the reaction forces R of `reaction` and the grasped nodes x_g. A tool of mass m between sensor
+and body, with its centre at c in the frame of the grasp, adds the force m (a_c − g) at its centre,
+a_c being the acceleration of the centre and g gravity. Values are Y = L W, where L is a first-order
+low-pass with an estimated time constant, or the identity.
 """
 
 from __future__ import annotations
@@ -45,18 +46,21 @@ TOOL_DATA = (9, 9, 9, 3, 3)
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Times of the rows that tell reactions.
+    """Grid times, and the rows of equations of motion that determine reaction forces.
 
     Attributes
     ----------
-    t_s : (N,) evenly spaced
-    rows : (N,) bool, those that tell one
+    t_s : (N,) array
+        Evenly spaced times [s].
+    rows : (N,) array of bool
+        Rows that determine a reaction force.
     late : int
-        Row t tells of the time t − late.
+        Row t determines the reaction force at time t − late.
     reach : int
-        It depends on the grasp from the time t − reach on.
+        Row t depends on the grasp from time t − reach on.
     static : bool
-        Equilibria, at times that need not be evenly spaced; between them the wrench is linear.
+        Whether the rows are equilibria, at times that need not be evenly spaced; the wrench is then
+        linear between them.
     """
 
     t_s: Array
@@ -67,46 +71,58 @@ class Grid:
 
     @classmethod
     def of(cls, dynamics: Dynamics) -> Grid:
-        """That of discrete equations of motion."""
+        """Build the grid of discrete equations of motion."""
         return cls(dynamics.t_s, *centred_rows(dynamics), dynamics.reach, dynamics.static)
 
     @classmethod
     def at(cls, t_s: Array) -> Grid:
-        """Where the reactions at the very times are known."""
+        """Build the grid of reaction forces that are known at given times (N,) themselves."""
         return cls(t_s, np.ones(len(t_s), dtype=bool), 0, 0)
 
     @property
     def step_s(self) -> float:
-        """Time between rows, on the average."""
+        """Mean time between rows [s]."""
         return float(self.t_s[-1] - self.t_s[0]) / max(1, len(self.t_s) - 1)
 
     def told(self, grasp: Grasp) -> Index:
-        """Times, by their numbers, at which the reactions of a grasp are known."""
-        held = grasp.holds(self.t_s)
-        rows = self.rows & held
+        """Return the indices of the times at which the reaction forces of a grasp are known."""
+        is_holding = grasp.holds(self.t_s)
+        rows = self.rows & is_holding
         for lag in range(1, self.reach + 1):
-            rows[lag:] &= held[:-lag]
+            rows[lag:] &= is_holding[:-lag]
         return np.flatnonzero(rows) - self.late
 
 
 @dataclass(frozen=True, eq=False)
 class GraspWrench:
-    """Force and torque (n, 2, 3) that one grasp gives.
+    """Force and torque (n, 2, 3) of one grasp, as an observable.
 
     Attributes
     ----------
     number : int
-        Of the sensor among those of the experiment; −1 of what has no nuisance parameters of one.
+        Index of the sensor in the experiment; −1 if it has no nuisance parameters of its own.
     grasp : Grasp
-    frame, point_m
-        See `Wrench`.
+        The grasp.
+    frame : str
+        Frame of the sensor, see `Wrench`.
+    point_m : (3,) array
+        Origin of the sensor, see `Wrench` [m].
     on : Grid
+        Times at which reaction forces are known.
     nuisance : NuisanceMap
+        Nuisance parameters of the experiment.
     dofs : int
-        Of the body, 3n.
-    sensed : (g,) dofs whose reactions are known
-    places : (d,) of the dofs of the grasp's nodes among these
-    held : (d,) one along the axes that it holds, else zero
+        Number of dofs of the body, 3n.
+    sensed : (g,) array
+        Dofs whose reaction forces are known.
+    places : (d,) array
+        Indices among `sensed` of the dofs of the grasp's nodes.
+    held : (d,) array
+        1 for dofs that the grasp prescribes, else 0.
+    each : int
+        Number of vectors, 2.
+    local : None
+        The observable depends on many positions, see `channel`.
     """
 
     number: int
@@ -125,41 +141,41 @@ class GraspWrench:
 
     @property
     def late(self) -> int:
-        """How many rows after its time a value is known."""
+        """Number of rows after its time at which a value is known."""
         return self.on.late
 
     @cached_property
     def grid(self) -> Index:
-        """(n,) grid times whose wrench is known, one after the other."""
+        """Indices (n,) of the grid times whose wrench is known, consecutive."""
         return self.on.told(self.grasp)
 
     @property
     def count(self) -> int:
-        """How many these are."""
+        """Number n of times."""
         return len(self.grid)
 
     @cached_property
     def t_s(self) -> Array:
-        """(n,) when they are."""
+        """Times (n,) [s]."""
         return self.on.t_s[self.grid]
 
     @property
     def rows(self) -> Index:
-        """All of the grid: accelerations are taken from positions."""
+        """All grid times, because accelerations are differences of positions."""
         return np.arange(len(self.on.t_s))
 
     def operator(self, phi: Array) -> sp.csr_array:
-        """The sensed dofs of a row, (g, 3n)."""
+        """Return the matrix (g, 3n) that selects the sensed dofs of a row."""
         count = len(self.sensed)
         entries = np.ones(count), (np.arange(count), self.sensed)
         return sp.csr_array(entries, shape=(count, self.dofs))
 
     def reached(self, rows: int) -> int:
-        """How many of the times the first grid rows tell."""
+        """Return how many of the times are known if the first `rows` grid rows are."""
         return int(np.count_nonzero(self.grid + self.on.late < rows))
 
     def phi_places(self, row: NuisanceRow) -> Index:
-        """Positions in φ of what is not known of this sensor."""
+        """Return the indices in φ of this sensor's nuisance parameters of one kind."""
         return self.nuisance.places(row, of=self.number)
 
     @classmethod
@@ -173,23 +189,43 @@ class GraspWrench:
         nuisance: NuisanceMap,
         number: int = -1,
     ) -> GraspWrench:
-        """What one of an experiment's grasps gives."""
-        sensed, own = sensed_dofs(experiment), dofs_of(grasp.nodes)
-        held, places = np.isin(own, grasp.dofs).astype(np.float64), np.searchsorted(sensed, own)
+        """Build the observable of one grasp of an experiment.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            The experiment.
+        grasp : Grasp
+            One of its grasps.
+        frame : str
+            Frame of the sensor, see `Wrench`.
+        point_m : (3,) array
+            Origin of the sensor [m].
+        grid : Grid
+            Times at which reaction forces are known.
+        nuisance : NuisanceMap
+            Nuisance parameters of the experiment.
+        number : int
+            Index of the sensor; −1 if it has no nuisance parameters of its own.
+        """
+        sensed = sensed_dofs(experiment)
+        own = dofs_of(grasp.nodes)
+        held = np.isin(own, grasp.dofs).astype(np.float64)
+        places = np.searchsorted(sensed, own)
         where = nuisance, 3 * len(experiment.body.nodes_m), sensed, places, held
         return cls(number, grasp, frame, point_m, grid, *where)
 
     @property
     def clock_limit_s(self) -> float:
-        """Largest shift of the sensor's clock."""
-        here = self.phi_places(SENSOR_TIME)
-        return float(SENSOR_TIME.high * self.nuisance.scales[here].sum())
+        """Largest shift of the sensor's clock [s]; 0 if it is not estimated."""
+        clock = self.phi_places(SENSOR_TIME)
+        return float(SENSOR_TIME.high * self.nuisance.scales[clock].sum())
 
     # Moments ----------------------------------------------------------------------------------
 
     @cached_property
     def frames(self) -> tuple[Array, Array]:
-        """Q (n, 3, 3) and o (n, 3)."""
+        """Axes Q (n, 3, 3) and origins o (n, 3) [m] of the sensor."""
         turns, shifts = self.poses_at(self.grid)
         if self.frame == "grasp":
             return turns, shifts + turns @ self.point_m
@@ -197,20 +233,24 @@ class GraspWrench:
         return np.tile(np.eye(3), (*shape, 1)), np.tile(self.point_m, shape)
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
-        """Turns (k, 3, 3) and shifts (k, 3) of the grasp at some rows."""
+        """Return rotations (k, 3, 3) and translations (k, 3) [m] of the grasp at grid rows (k,)."""
         return self.grasp.poses.at(self.on.t_s[rows])
 
     @cached_property
     def moment_data(self) -> Array:
-        """(15, n, h) of `MOMENT`."""
+        """Data (15, n, h) of `MOMENT` for h nodes."""
         axes, points = self.frames
         nodes = len(self.held) // 3
         of_time = np.concatenate([axes.reshape(-1, 9), points], axis=1).T
-        held = np.broadcast_to(self.held.reshape(nodes, 3).T[:, None], (3, self.count, nodes))
-        return np.concatenate([np.repeat(of_time[:, :, None], nodes, axis=2), held])
+        is_prescribed = np.broadcast_to(
+            self.held.reshape(nodes, 3).T[:, None], (3, self.count, nodes)
+        )
+        return np.concatenate([np.repeat(of_time[:, :, None], nodes, axis=2), is_prescribed])
 
     def moments_at(self, forced: Forced) -> tuple[Array, Array]:
-        """Inputs (6, n, h) and data of `MOMENT`, at as many times as are told."""
+        """Return inputs (6, n, h) and data of `MOMENT`, at the times that the reaction
+        forces cover.
+        """
         k = self.grid[: self.reached(len(forced.reaction))]
         both = forced.position_m[k], forced.reaction[k + self.on.late]
         shape = len(k), len(self.places) // 3, 3
@@ -218,20 +258,20 @@ class GraspWrench:
         return np.concatenate(u), self.moment_data[:, : len(k)]
 
     def arms(self, forced: Forced) -> tuple[Array, Array]:
-        """A and B (n, 6, d) of dW = A dR + B dx, W = A R."""
+        """Return A and B (n, 6, d) of the change dW = A dR + B dx of the wrench."""
         by_u = MOMENT.slopes(*self.moments_at(forced))[1]
         by_u = np.transpose(by_u, (2, 0, 3, 1))
         return _by_dof(by_u[..., 3:]), _by_dof(by_u[..., :3])
 
     def without_tool(self, forced: Forced) -> Array:
-        """W (n, 6) of the body alone."""
+        """Return the wrench W (n, 6) without that of the tool [N, N m]."""
         return MOMENT.value(*self.moments_at(forced)).sum(axis=2).T
 
     # The tool ---------------------------------------------------------------------------------
 
     @cached_property
     def tool_phi(self) -> Index:
-        """Positions in φ of what a tool's share depends on; none where there is no tool."""
+        """Indices in φ of mass and centre of the tool and of gravity; empty without a tool."""
         if not len(mass := self.phi_places(TOOL_MASS)):
             return mass
         centre = self.phi_places(TOOL_CENTRE)
@@ -239,10 +279,13 @@ class GraspWrench:
 
     @cached_property
     def tool(self) -> Generated:
-        """What it takes (6,), m (a_c − g) at c: of `tool_phi`, see `tool_at`."""
+        """Generated wrench (6,) of the tool, m (a_c − g) at c, as a function of `tool_phi`,
+        see `tool_at`.
+        """
         return Generated(self._tool_takes, len(self.tool_phi), sum(TOOL_DATA))
 
     def _tool_takes(self, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Expression of the wrench of the tool."""
         axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(data, np.cumsum([0, *TOOL_DATA]))
         axes, turn, turn_rate = (ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate))
         count = len(self.tool_phi) - len(self.nuisance.of_gravity)
@@ -256,9 +299,10 @@ class GraspWrench:
         return ca.vertcat(axes.T @ pull, axes.T @ ca.cross(turn @ centre + shift, pull))
 
     def tool_at(self, phi: Array, count: int) -> tuple[Array, Array]:
-        """Inputs (k,) and data (33, n) of `tool`.
+        """Return inputs (k,) and data (33, n) of `tool` at the first `count` times.
 
-        These are Q, the turn of the grasp with its rate, and its shift from o with its rate.
+        The data are Q, the rotation of the grasp and its second derivative, the grasp's translation
+        from o, and the second derivative of the translation.
         """
         axes, points = (each[:count] for each in self.frames)
         turns, shifts = self.poses_at(self.grid[:count])
@@ -268,19 +312,22 @@ class GraspWrench:
         return phi[self.tool_phi], data.T
 
     def pose_rates(self, count: int) -> tuple[Array, Array]:
-        """Second derivatives (n, 3, 3) and (n, 3) of the poses, by differences."""
-        step_s, poses = self.on.step_s, self.grasp.poses
+        """Return second time derivatives (n, 3, 3) and (n, 3) of the grasp's rotations and
+        translations, by differences; zero for static experiments.
+        """
+        step_s = self.on.step_s
+        poses = self.grasp.poses
         if len(poses.t_s) < 3 or self.on.static:
             return np.zeros((count, 3, 3)), np.zeros((count, 3))
-        around = poses.t_s[0] + step_s, poses.t_s[-1] - step_s
-        middle = np.clip(self.t_s[:count], *around)
+        range_s = poses.t_s[0] + step_s, poses.t_s[-1] - step_s
+        middle = np.clip(self.t_s[:count], *range_s)
         before, now, after = (poses.at(middle + way * step_s) for way in (-1, 0, 1))
         pairs = zip(before, now, after, strict=True)
         turn, shift = ((b - 2 * n + a) / step_s**2 for b, n, a in pairs)
         return turn, shift
 
     def on_grid(self, forced: Forced, phi: Array) -> Array:
-        """W (n, 6)."""
+        """Return the wrench W (n, 6) including the tool, before the low-pass [N, N m]."""
         value = self.without_tool(forced)
         if len(self.tool_phi):
             value = value + self.tool.value(*self.tool_at(phi, len(value))).T
@@ -290,11 +337,13 @@ class GraspWrench:
 
     @cached_property
     def lag_phi(self) -> Index:
-        """Position in φ of what its time constant T is not known by; none without a low-pass."""
+        """Index in φ of the time constant of the low-pass; empty without a low-pass."""
         return self.phi_places(SENSOR_LAG)
 
     def low_passed(self, value: Array, phi: Array) -> Evolution | None:
-        """What the low-pass makes of W (n, 6); None without one."""
+        """Return the low-pass of W (n, 6) as an evolution; None without a low-pass or
+        without times.
+        """
         if not len(self.lag_phi) or not len(value):
             return None
         data = self.low_pass_data[:, : len(value), None]
@@ -302,14 +351,14 @@ class GraspWrench:
 
     @cached_property
     def low_pass_data(self) -> Array:
-        """(2, n) of `LOW_PASS`."""
+        """Data (2, n) of `LOW_PASS`."""
         per_step = self.nuisance.scales[self.lag_phi] / self.on.step_s
         return np.stack([np.arange(self.count) == 0, np.repeat(per_step, self.count)])
 
     # As channels are --------------------------------------------------------------------------
 
     def values(self, motion: Motion, phi: Array) -> Array:
-        """Y = L W (n, 2, 3)."""
+        """Return Y = L W (n, 2, 3) [N, N m]."""
         value = self.on_grid(motion.forced, phi)
         evolution = self.low_passed(value, phi)
         return (evolution.states[0] if evolution else value).reshape(-1, 2, 3)
@@ -317,13 +366,28 @@ class GraspWrench:
     def linearised(
         self, motion: Motion, phi: Array, columns: Index, size: int
     ) -> tuple[Array, Slopes]:
-        """Y (n, 2, 3), and its slopes by all parameters."""
-        forced, first = motion.forced, size - len(phi)
+        """Return Y (n, 2, 3) and its derivatives by all parameters.
+
+        Parameters
+        ----------
+        motion : Motion
+            Motion whose reaction forces have changes `reaction_by` and `position_by` with c
+            columns.
+        phi : (k,) array
+            Nuisance parameters; they are the last of all parameters.
+        columns : (c,) array
+            Indices of the parameters of the changes.
+        size : int
+            Number of all parameters.
+        """
+        forced = motion.forced
+        first = size - len(phi)
         assert forced.reaction_by is not None
         assert forced.position_by is not None
         of_force, of_place = self.arms(forced)
         k = self.grid[: len(of_force)]
-        value, slope = self.on_grid(forced, phi), np.zeros((len(k), 6, size))
+        value = self.on_grid(forced, phi)
+        slope = np.zeros((len(k), 6, size))
         slope[..., columns] = of_force @ forced.reaction_by[k + self.on.late][:, self.places]
         slope[..., columns] += of_place @ forced.position_by[k][:, self.places]
         if len(self.tool_phi):
@@ -331,14 +395,17 @@ class GraspWrench:
             slope[..., first + self.tool_phi] += np.moveaxis(by_phi, 2, 0)
         if evolution := self.low_passed(value, phi):
             by_lag = np.arange(size) == first + self.lag_phi[:, None]
-            value, slope = evolution.states[0], evolution.forward(slope[None], by_lag)[0]
+            value = evolution.states[0]
+            slope = evolution.forward(slope[None], by_lag)[0]
         slope = slope.reshape(len(k), 2, 3, size)
         return value.reshape(len(k), 2, 3), Slopes.along(np.arange(size), slope)
 
     def pulled(self, motion: Motion, phi: Array, by_values: Array) -> Pulled:
-        """Slopes of a scalar from those by Y."""
-        forced, by_phi = motion.forced, np.zeros(len(phi))
-        by_x, by_reaction = np.zeros_like(motion.x), np.zeros_like(forced.reaction)
+        """Vector–Jacobian product: derivatives of a scalar from those by Y (n, 2, 3)."""
+        forced = motion.forced
+        by_phi = np.zeros(len(phi))
+        by_x = np.zeros_like(motion.x)
+        by_reaction = np.zeros_like(forced.reaction)
         by_w = by_values.reshape(-1, 6)
         if evolution := self.low_passed(self.on_grid(forced, phi), phi):
             (by_w,), by_phi[self.lag_phi] = evolution.backward(by_w[None])
@@ -354,7 +421,23 @@ class GraspWrench:
     def carried(
         self, grasp: Grasp, motion: Motion, phi: Array, shifts: Array, turns: Array
     ) -> Array | float:
-        """Changes (n, 2, 3, c) of Y where poses are off, by the frame that is carried along."""
+        """Return the changes (n, 2, 3, c) of Y due to pose errors that move the frame of the
+        sensor.
+
+        Parameters
+        ----------
+        grasp : Grasp
+            Grasp whose poses have errors; the result is 0 for another grasp, or a frame fixed in
+            the world.
+        motion : Motion
+            Motion with its reaction forces.
+        phi : (k,) array
+            Nuisance parameters.
+        shifts : (N, c, 3) array
+            Errors of the translations [m].
+        turns : (N, c, 3) array
+            Errors of the rotations as rotation vectors [rad].
+        """
         if grasp is not self.grasp or self.frame != "grasp":
             return 0.0
         value = self.without_tool(motion.forced)
@@ -362,43 +445,50 @@ class GraspWrench:
         data = [axes.reshape(-1, 9), value, np.tile(self.point_m, (len(value), 1))]
         slopes = SEEN_FROM.slopes(np.zeros((6, len(value))), np.concatenate(data, axis=1).T)[1]
         k = self.grid[: len(value)]
-        off = np.concatenate([turns[k], shifts[k]], axis=2)
-        change = np.einsum("abn,ncb->nac", slopes, off)
+        pose_changes = np.concatenate([turns[k], shifts[k]], axis=2)
+        change = np.einsum("abn,ncb->nac", slopes, pose_changes)
         if evolution := self.low_passed(value, phi):
             (change,) = evolution.forward(change[None], np.zeros((1, change.shape[2])))
         return change.reshape(len(change), 2, 3, change.shape[2])
 
 
 def sensed_dofs(experiment: Experiment) -> Index:
-    """(g,) dofs of the nodes of all grasps that something looks at, ascending."""
-    held = [dofs_of(experiment.grasps[k].nodes) for k in experiment.sensed]
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *held]))
+    """Return the dofs (g,) of the nodes of all grasps that a sensor measures, ascending."""
+    grasp_dofs = [dofs_of(experiment.grasps[k].nodes) for k in experiment.sensed]
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *grasp_dofs]))
 
 
 def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
+    """Expression of force and torque (6,) of one node."""
     place, reaction = ca.vertsplit(u, 3)
     axes, point, held = ca.vertsplit(data, [0, 9, 12, 15])
-    axes, force = ca.reshape(axes, 3, 3), held * reaction
+    axes = ca.reshape(axes, 3, 3)
+    force = held * reaction
     return ca.vertcat(axes @ force, axes @ ca.cross(place - point, force))
 
 
 def _seen_from(off: ca.SX, data: ca.SX) -> ca.SX:
+    """Expression of a wrench (6,) in a frame that is rotated and translated."""
     turn, shift = ca.vertsplit(off, 3)
     axes, force, torque, point = ca.vertsplit(data, [0, 9, 12, 15, 18])
     axes = ca.reshape(axes, 3, 3).T
-    turned, force = rotation(turn) @ axes, axes @ force
+    turned = rotation(turn) @ axes
+    force = axes @ force
     moved = shift + (turned - axes) @ point
     return ca.vertcat(turned.T @ force, turned.T @ (axes @ torque - ca.cross(moved, force)))
 
 
 def _by_dof(by_node: Array) -> Array:
-    """(n, 6, d) from (n, 6, h, 3)."""
+    """Return values (n, 6, h, 3) by node as values (n, 6, d) by dof."""
     return np.ascontiguousarray(by_node).reshape(*by_node.shape[:2], -1)
 
 
 def _low_pass(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX) -> ca.SX:
-    """Y' = (W − Y) / T, W linear between grid times, and steady before the first."""
-    began, share = data[0], lag * data[1]
+    """One step of Y' = (W − Y) / T, with W linear between grid times and constant before
+    the first.
+    """
+    began = data[0]
+    share = lag * data[1]
     e = ca.exp(-1 / ca.fmax(share, 1e-6))
     a = share * (1 - e) - e
     return began * now + (1 - began) * (e * before + a * last + (1 - e - a) * now)

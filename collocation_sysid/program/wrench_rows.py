@@ -1,12 +1,12 @@
-"""What a sensor is given on the grid, as variables of a program.
+"""Wrenches at a force–torque sensor on the time grid, as variables of the program.
 
     W_k − Σ_g moment(x_g, R_g) − tool(φ) = 0,  variables W_k,
     Y_k − e Y_{k−1} − a W_{k−1} − b W_k = 0,   variables Y_k, where a low-pass is estimated,
 
-see `wrench_channel`; without one Y is W. The loss is that of a reading of Y, which has entries
-between the few grid times around a sample only. R are those of `reaction_rows`. W and Y are scaled
-by how well they are known, so that the loss curves as it does by positions; their equations as
-others are.
+see `wrench_channel`; without a low-pass Y is W. The loss is a function of Y, whose Hessian couples
+only the few grid times around a sample. R are the lifted reaction forces of `reaction_rows`. W and
+Y are scaled by their measurement uncertainty, so that the loss has similar curvature by them as by
+positions; their equations are scaled like other equations.
 """
 
 from __future__ import annotations
@@ -33,15 +33,16 @@ ITSELF = Generated(lambda u, _: u, 6, 0)
 
 @dataclass(frozen=True, eq=False)
 class WrenchRows(Carried):
-    """W and Y of one sensor.
+    """Lifted wrenches W and filtered wrenches Y of one sensor.
 
     Attributes
     ----------
     reading_number : int
-        Of the reading among those of the segment.
+        Index of the measurement among those of the segment.
     reading : Reading
+        The measurement.
     reactions : Reactions
-        R of its experiment.
+        Lifted reaction forces of the experiment.
     """
 
     reading_number: int
@@ -51,47 +52,50 @@ class WrenchRows(Carried):
 
     @property
     def channel(self) -> GraspWrench:
-        """What it looks at."""
+        """Wrench of the grasp as an observable."""
         return cast(GraspWrench, self.reading.channel)
 
     @property
     def _each(self) -> int:
-        """Length of W."""
+        """Number of components of W at all grid times."""
         return 6 * self.channel.count
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """W and, with a low-pass, Y; samples on the grid; forces and moments."""
+        """Shape (1 or 2, times, 6): W and, with a low-pass, Y; grid times; forces and moments."""
         return 1 + len(self.channel.lag_phi), self.channel.count, 6
 
     @cached_property
     def _unit(self) -> Array:
-        """(6,) in which W and Y are counted [N, N m]: where the mean loss bends by about one."""
-        count, sigmas = max(1, int(self.reading.components.sum())), self.reading.looked_sigmas
+        """Unit (6,) of W and Y [N, N m], for which the mean loss has a curvature of about one."""
+        count = max(1, int(self.reading.components.sum()))
+        sigmas = self.reading.looked_sigmas
         return np.where(np.isfinite(sigmas), np.sqrt(count) * sigmas, self._reaction_unit)
 
     @cached_property
     def _row_unit(self) -> Array:
-        """(6,) of the equations [N, N m], between this unit and that of R: solvers want both."""
+        """Unit (6,) of the equations [N, N m], between `_unit` and that of R for good
+        conditioning.
+        """
         return self._reaction_unit**0.75 * self._unit**0.25
 
     @property
     def _reaction_unit(self) -> Array:
-        """(6,) of R [N, N m]."""
+        """Unit (6,) of reaction forces and their moments [N, N m]."""
         return self.segment.force_n * np.repeat([1.0, self.segment.length_m], 3)
 
     def given(self, part: Part, z: Array) -> Part:
-        """The experiment with Y at z."""
-        looked = z[self._read].reshape(-1, 6) * self._unit
-        return replace(part, given={**part.given, self.reading_number: looked.reshape(-1, 2, 3)})
+        """Return the part with Y taken from z."""
+        wrench = z[self._read].reshape(-1, 6) * self._unit
+        return replace(part, given={**part.given, self.reading_number: wrench.reshape(-1, 2, 3)})
 
     @property
     def _read(self) -> slice:
-        """Y in z."""
+        """Slice of Y in z."""
         return slice(self.variables.stop - self._each, self.variables.stop)
 
     def following(self, part: Part) -> Array:
-        """W and Y as they follow from the motion."""
+        """Return the scaled W and Y (count,) that follow from the motion."""
         own = [self.channel.on_grid(part.motion.forced, part.phi)]
         if evolution := self.channel.low_passed(own[0], part.phi):
             own += [*evolution.states]
@@ -101,58 +105,63 @@ class WrenchRows(Carried):
 
     @cached_property
     def patterns(self) -> tuple[Pattern, ...]:
-        """W itself, the moments of the nodes, the tool, and the low-pass."""
-        channel, numbers = self.channel, np.arange(self.count).reshape(self.shape)
-        wrench, of_wrench = self.places.variable + numbers[0].T, numbers[0].T
-        unit, minus = self._unit[:, None], -self._row_unit[:, None]
+        """Expressions of the equations: W itself, moments of the nodes, tool, and low-pass."""
+        channel = self.channel
+        numbers = np.arange(self.count).reshape(self.shape)
+        wrench = self.places.variable + numbers[0].T
+        of_wrench = numbers[0].T
+        unit = self._unit[:, None]
+        minus = -self._row_unit[:, None]
         own = Numbers(of_wrench, -minus)
-        found = [Pattern.of(ITSELF, np.zeros((0, 1)), [Numbers(wrench, unit)], own)]
-        late = self.reactions.places_of(channel.grid + channel.on.late, channel.places)
+        terms = [Pattern.of(ITSELF, np.zeros((0, 1)), [Numbers(wrench, unit)], own)]
+        reaction_columns = self.reactions.places_of(channel.grid + channel.on.late, channel.places)
         units = np.array([[self.segment.length_m], [self.segment.force_n]])
         looked = [
             Numbers(np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit)
-            for each, unit in zip((self._placed, late), units, strict=True)
+            for each, unit in zip((self._placed, reaction_columns), units, strict=True)
         ]
         taken = Numbers(of_wrench[..., None], minus[..., None])
-        found.append(Pattern.of(MOMENT, channel.moment_data, looked, taken))
+        terms.append(Pattern.of(MOMENT, channel.moment_data, looked, taken))
         if len(tool := channel.tool_phi):
             data = channel.tool_at(np.zeros(len(self.phi_columns)), channel.count)[1]
             by_phi = Numbers(self.phi_columns[tool][:, None])
-            found.append(Pattern.of(channel.tool, data, [by_phi], Numbers(of_wrench, minus)))
+            terms.append(Pattern.of(channel.tool, data, [by_phi], Numbers(of_wrench, minus)))
         if len(lag := channel.lag_phi):
-            places, by_phi = self.places.variable + numbers, self.phi_columns[lag][:, None, None]
+            places = self.places.variable + numbers
+            by_phi = self.phi_columns[lag][:, None, None]
             read, seen = (Numbers(places[k : k + 1], self._unit) for k in (1, 0))
             at = LOW_PASS, channel.low_pass_data[..., None], read, seen, Numbers(by_phi)
-            found.append(Pattern.of_recursion(*at, Numbers(numbers[1:], self._row_unit)))
-        return tuple(found)
+            terms.append(Pattern.of_recursion(*at, Numbers(numbers[1:], self._row_unit)))
+        return tuple(terms)
 
     @property
     def _placed(self) -> Index:
-        """(n, d) places of x in z."""
+        """Columns (n, d) in z of the positions of the grasp's dofs at n grid times."""
         dofs = self.reactions.dofs[self.channel.places]
         return self.segment.first.x + self.channel.grid[:, None] * self.segment.dofs + dofs
 
     # Loss ---------------------------------------------------------------------------------------
 
     def gradient(self, part: Part) -> Array:
-        """∂loss by the variables (count,)."""
-        own, (by_looked, _) = np.zeros(self.count), part.loss_slopes[self.reading_number]
+        """Return the gradient of the loss by the scaled variables (count,)."""
+        own = np.zeros(self.count)
+        by_looked, _ = part.loss_slopes[self.reading_number]
         own[self.count - self._each :] = (by_looked.reshape(-1, 6) * self._unit).ravel()
         return own
 
     @cached_property
     def _slopes(self) -> sp.csr_array:
-        """∂(Y, φ)/∂(Y in its unit, φ)."""
+        """Derivatives of (Y, φ) by (scaled Y, φ)."""
         scale = np.tile(self._unit, self.channel.count)
         return sp.csr_array(sp.diags_array(np.append(scale, np.ones(len(self.phi_columns)))))
 
     @cached_property
     def _loss_entries(self) -> tuple[Index, Index]:
-        """Rows and columns among (Y, φ) of ∂²loss, upper triangle."""
+        """Rows and columns among (Y, φ) of the Hessian of the loss, upper triangle."""
         return self.reading.hessian_structure(self._slopes)
 
     def hessian_entries(self) -> tuple[Index, Index]:
-        """Those of the equations, and of the loss."""
+        """Return rows and columns of the entries of the equations, then of the loss."""
         rows, columns = super().hessian_entries()
         both = np.concatenate([np.arange(self._read.start, self._read.stop), self.phi_columns])
         i, j = (both[each] for each in self._loss_entries)
@@ -162,12 +171,13 @@ class WrenchRows(Carried):
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
     ) -> Array:
-        """The values of these entries; multipliers are those of all of g."""
-        bent = super().hessian_values(part, z, loss_weight, multipliers, weights)
-        (rows, columns), size = self._loss_entries, self._each + len(part.phi)
-        looked = part.looked[self.reading_number]
-        found = self.reading.hessian(looked, part.phi, self._slopes, part.bent)
-        wanted = np.searchsorted(columns * size + rows, found.columns * size + found.rows)
+        """Return the values of `hessian_entries`; arguments as in `Carried.hessian_values`."""
+        of_equations = super().hessian_values(part, z, loss_weight, multipliers, weights)
+        rows, columns = self._loss_entries
+        size = self._each + len(part.phi)
+        observables = part.looked[self.reading_number]
+        of_loss = self.reading.hessian(observables, part.phi, self._slopes, part.bent)
+        positions = np.searchsorted(columns * size + rows, of_loss.columns * size + of_loss.rows)
         values = np.zeros(len(rows))
-        np.add.at(values, wanted, loss_weight * found.values)
-        return np.append(bent, values)
+        np.add.at(values, positions, loss_weight * of_loss.values)
+        return np.append(of_equations, values)

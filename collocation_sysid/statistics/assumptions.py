@@ -235,7 +235,8 @@ class Fitted:
     @cached_property
     def grasp_force_n(self) -> Array:
         """(N, g) what the grasps give the grasped dofs."""
-        dofs, x = self.part.setting.held.dofs, self.part.x
+        dofs = self.part.setting.held.dofs
+        x = self.part.x
         force = forces_on(self.dynamics, x, dofs)
         mass = self.dynamics.mass.kg[:, dofs]
         given = reactions(self.dynamics, mass, force, self.acceleration[:, dofs])
@@ -366,11 +367,13 @@ def _anisotropy(at: Fitted, axis: int) -> Effect:
 
     Damping that is K(x) v has its slope by time.
     """
-    body, (xi, nu) = at.body, at.states
+    body = at.body
+    xi, nu = at.states
     count, points = body.geometry.shape[:2]
     geometry = body.stress_free_geometry(at.theta)
     slopes = geometry[..., :-1].reshape(count, points, -1, 3)[..., axis]
-    weight, force = at.young_pa * geometry[..., -1], np.zeros_like(xi)
+    weight = at.young_pa * geometry[..., -1]
+    force = np.zeros_like(xi)
     gamma = at.proportional_s[:, None, None]
     for x, v, own in zip(xi, nu, force, strict=True):
         stretch, rate = (
@@ -395,7 +398,8 @@ def _pace(at: Fitted, _: int) -> Effect | None:
     """All clocks are fast by a share: less time passes than they say."""
     if at.part.segment.experiment.static:
         return None
-    slower, faster = at.internal_n(slower=1 + SMALL), at.internal_n(slower=1 - SMALL)
+    slower = at.internal_n(slower=1 + SMALL)
+    faster = at.internal_n(slower=1 - SMALL)
     drag = at.body.tied_drag(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
     air = 2.0 * at.air_drag_n
     return Effect((faster - slower) / (2 * SMALL) - drag + air, stretched=-1.0)
@@ -424,7 +428,8 @@ def _grip(at: Fitted, _: int) -> Effect | None:
 
     What holds along some axes only is a platen or a plane of symmetry, and no grip.
     """
-    held, holding = at.part.setting.held, at.part.segment.experiment.gripping
+    held = at.part.setting.held
+    holding = at.part.segment.experiment.gripping
     gripped = [grasp.dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
     if not gripped:
         return None
@@ -443,7 +448,8 @@ def _driven(at: Fitted) -> NDArray[np.bool_]:
 
 def _machine(at: Fitted, _: int) -> Effect | None:
     """A test bench gives way: the displacement of what it moves is measured behind its frame."""
-    experiment, held = at.part.segment.experiment, at.part.setting.held
+    experiment = at.part.segment.experiment
+    held = at.part.setting.held
     if not experiment.static or not (driven := _driven(at)).any():
         return None
     moved = np.zeros_like(at.grasp_force_n)
@@ -460,12 +466,14 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
 
     Planes of symmetry have none: nothing presses along their axes.
     """
-    experiment, held = at.part.segment.experiment, at.part.setting.held
+    experiment = at.part.segment.experiment
+    held = at.part.setting.held
     if not experiment.static:
         return None
     pressed = {_AXES[k] for k in np.unique(held.dofs[_driven(at)] % 3)}
     platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
-    force, x = np.zeros_like(at.part.x), at.part.x
+    force = np.zeros_like(at.part.x)
+    x = at.part.x
     start = at.body.nodes_m.ravel()
     for grasp in platens:
         across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]

@@ -80,7 +80,8 @@ class LaggedProducts:
         """
         if not any(tail.any() for tail in tails):
             return np.zeros_like(self.products)
-        overlap, total = [], np.zeros(self.shifted.shape[1:])
+        overlap = []
+        total = np.zeros(self.shifted.shape[1:])
         for block, slope, last, tail in zip(
             fit.blocks, information.slopes, self.lags, tails, strict=True
         ):
@@ -99,7 +100,10 @@ def lagged_products(
     fit: LinearisedFit, information: Information, lags: Sequence[int]
 ) -> LaggedProducts:
     """The products of each experiment's residuals up to a lag, and what they are expected to be."""
-    products, shifted, own, overlaps = [], [], [], []
+    products = []
+    shifted = []
+    own = []
+    overlaps = []
     for block, slope, last in zip(fit.blocks, information.slopes, lags, strict=True):
         residual, _, present = block.channels
         width = slope.shape[2]
@@ -114,7 +118,8 @@ def lagged_products(
                 here[k] += slope[:, channel].T @ each
         for k in range(last + 1):
             twice = 1 if k == 0 else 2
-            ahead, behind = slice(k, None), slice(None, len(residual) - k)
+            ahead = slice(k, None)
+            behind = slice(None, len(residual) - k)
             products.append(twice * np.sum(residual[ahead] * residual[behind]))
             own.append(twice * np.sum(present[ahead] & present[behind]))
         shifted.append(here)
@@ -151,10 +156,12 @@ def _lagged(columns: Array, seen: Mask, lag: int) -> Array:
 
 def autoregression(autocovariance: Array, samples: float) -> Array:
     """Coefficients of the order with the least Schwarz criterion, by Levinson's recursion."""
-    coefficients, innovation = np.zeros(0), autocovariance[0]
+    coefficients = np.zeros(0)
+    innovation = autocovariance[0]
     if not innovation > 0:
         return coefficients
-    best, least = coefficients, samples * np.log(innovation)
+    best = coefficients
+    least = samples * np.log(innovation)
     for order in range(1, len(autocovariance)):
         remainder = autocovariance[order] - coefficients @ autocovariance[1:order][::-1]
         partial = np.clip(remainder / innovation, -LARGEST_PARTIAL, LARGEST_PARTIAL)
@@ -162,7 +169,8 @@ def autoregression(autocovariance: Array, samples: float) -> Array:
         innovation *= 1 - partial**2
         criterion = samples * np.log(innovation) + order * np.log(max(samples, 2.0))
         if criterion < least:
-            best, least = coefficients, criterion
+            best = coefficients
+            least = criterion
     return best
 
 
@@ -188,7 +196,8 @@ MAX_ORDER = 4
 SAMPLES_PER_ORDER = 10
 # Of finding the autocovariances at the lags beyond from the few, and the few without those.
 # They end when nothing changes by more than a share that no error bar shows.
-ROUNDS, SETTLED = 4, 0.01
+ROUNDS = 4
+SETTLED = 0.01
 SIGNIFICANCE = 0.01
 # A smaller autocorrelation changes no error bar by more than 5 %, significant or not.
 NOTICEABLE = 0.05
@@ -272,7 +281,8 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
     found = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
-    products, expected = pool @ found.products, pool @ found.expected @ pool.T
+    products = pool @ found.products
+    expected = pool @ found.expected @ pool.T
     if not expected[1, 1] > 0:  # nothing follows on anything
         return Dependence(0.0, np.inf, _shared_p(fit), space_p)
     variance = products[0] / expected[0, 0]
@@ -287,7 +297,8 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
 
 def _shared_p(fit: LinearisedFit) -> float:
     """Lagrange-multiplier test of Breusch and Pagan (1980) on all pairs of channels."""
-    statistic, pairs = 0.0, 0
+    statistic = 0.0
+    pairs = 0
     for block in fit.blocks:
         residual, _, present = block.channels
         counts = present.T.astype(float) @ present
@@ -354,14 +365,17 @@ def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> Erro
     channels = _among_channels(innovation, known)
     weight = present.sum(axis=0)
     if not weight @ np.diag(channels) > 0:  # no run of samples is long enough
-        channels, known = _among_channels(residual, present), present
+        channels = _among_channels(residual, present)
+        known = present
     level = weight @ np.diag(channels)
     channels *= autocovariance[0] * weight.sum() / level if level > 0 else 0.0
     if over_space is not None and len(residual) <= residual.shape[1]:
         # Samples are too few to tell a covariance by themselves.
-        covariance, freedom = over_space.covariance, len(residual) * over_space.freedom
+        covariance = over_space.covariance
+        freedom = len(residual) * over_space.freedom
         if block.noise_at_least_stated and np.trace(covariance) < len(covariance):
-            covariance, freedom = np.eye(len(covariance)), np.inf
+            covariance = np.eye(len(covariance))
+            freedom = np.inf
         samples = np.inf, freedom
         return ErrorProcess(along, covariance, len(coefficients), *samples)
     fitted = float(np.sum(slope**2))
@@ -401,7 +415,8 @@ def score_covariance(
         for k, direction in enumerate(directions.T):
             by_time = slope @ direction
             share = process.among_channels @ (by_time.T @ along_time(process.along_time, by_time))
-            variance, spread = np.trace(share), np.sum(share * share.T)
+            variance = np.trace(share)
+            spread = np.sum(share * share.T)
             if spread > 0:
                 freedom = process.samples * variance**2 / spread
                 doubt[k] += variance**2 / min(freedom, process.degrees_of_freedom)
@@ -416,7 +431,8 @@ def _innovations(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """What the past does not predict, (T − order, 3M), zero where a sample it needs is missing."""
     order = len(coefficients)
-    innovation, known = residual[order:].copy(), present[order:].copy()
+    innovation = residual[order:].copy()
+    known = present[order:].copy()
     for k, coefficient in enumerate(coefficients, start=1):
         past = slice(order - k, len(residual) - k)
         innovation -= coefficient * residual[past]

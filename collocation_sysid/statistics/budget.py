@@ -25,7 +25,9 @@ from .linearised import LinearisedFit, least_squares
 from .numerical import NumericalError, shifts
 from .uncertainty import Uncertainty
 
-NOISE, NUISANCES, NUMERICAL = "noise", "nuisance parameters", "step and mesh"
+NOISE = "noise"
+NUISANCES = "nuisance parameters"
+NUMERICAL = "step and mesh"
 BETWEEN = "between recordings"
 
 
@@ -122,10 +124,13 @@ class Sources:
             inverse = np.linalg.pinv(information[np.ix_(here, here)], hermitian=True)
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
         moved = shifts(fit, assumed.blocks)[: fit.shared]
-        by_q, scatter = _slopes(fit, parameters, q), uncertainty.scatter
-        between, freedom = np.zeros((fit.shared, 0)), 0
+        by_q = _slopes(fit, parameters, q)
+        scatter = uncertainty.scatter
+        between = np.zeros((fit.shared, 0))
+        freedom = 0
         if scatter is not None:
-            between, freedom = scatter.between[: fit.shared], len(scatter.recordings) - 1
+            between = scatter.between[: fit.shared]
+            freedom = len(scatter.recordings) - 1
         wider = uncertainty.wider
         known_effects = dict(means or {})
         return cls(

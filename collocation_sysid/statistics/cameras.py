@@ -24,7 +24,8 @@ from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
 # Of the surface, how much has points nearby where it is hardly seen, and where it is.
-HARDLY, WELL = 0.1, 0.5
+HARDLY = 0.1
+WELL = 0.5
 # Descriptions by which a share less of the surface has them cannot be told from the best.
 ALIKE = 0.1
 # The axes of a camera in frames of other conventions: right, down and ahead in columns.
@@ -151,11 +152,13 @@ def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
         if here >= HARDLY:
             continue
         data = {"percent": 100 * here, "within_mm": 1e3 * view.within_m}
-        of, code = f"'{depth.name}' of '{experiment.name}'", "camera"
+        of = f"'{depth.name}' of '{experiment.name}'"
+        code = "camera"
         strength = 1 / max(here, MILLI)
         if mistakes := view.likeliest():
             either = "; or if ".join(" and ".join(names) for names in mistakes)
-            data, code = {"mistakes": either}, "camera/likely"
+            data = {"mistakes": either}
+            code = "camera/likely"
         yield Hypothesis(code, of, data, strength=strength)
 
 
@@ -181,7 +184,8 @@ class _OneCamera:
 
     def __init__(self, experiment: Experiment, depth: Depth) -> None:
         camera = depth.camera
-        self.skin, self.pinhole = Skin.of(experiment.body, depth), camera.matrix is not None
+        self.skin = Skin.of(experiment.body, depth)
+        self.pinhole = camera.matrix is not None
         self.shape_m = self.skin.first_m(experiment, depth)
         points_m = depth.points_m[depth.first]
         image_m = depth.images_m[depth.first] if len(depth.images_m) else None
@@ -192,7 +196,8 @@ class _OneCamera:
         carrier = np.eye(4)
         if camera.poses is not None:
             rotations, translations = camera.poses.at(depth.times[[depth.first]])
-            carrier[:3, :3], carrier[:3, 3] = rotations[0], translations[0]
+            carrier[:3, :3] = rotations[0]
+            carrier[:3, 3] = translations[0]
         self.stated = Seeing(carrier, camera.pose)
         self.within_m = wide_m(self.shape_m)
         eye_m = (carrier @ camera.pose)[:3, 3]
@@ -202,7 +207,8 @@ class _OneCamera:
     def share(self, seeing: Seeing) -> float:
         """Of the surface that is turned to the camera what has points nearby."""
         motion = seeing.carrier @ seeing.pose
-        turn, eye_m = motion[:3, :3], motion[:3, 3]
+        turn = motion[:3, :3]
+        eye_m = motion[:3, 3]
         turned = self.skin.facing(self.shape_m, eye_m if self.pinhole else None)
         if not turned.any():
             return 0.0

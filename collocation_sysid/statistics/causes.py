@@ -39,11 +39,15 @@ NOISE = 1.15
 BETTER = 1.5
 # A marker slips if two means, before and after, explain its residuals so much better than one.
 SLIP = 2.0
-MOST_SAMPLES, CLOCK_REFITS = 100, 4
+MOST_SAMPLES = 100
+CLOCK_REFITS = 4
 # A refit may take as many sweeps as the fit took iterations, within these, and all refits together
 # so many times the work of the fit; its last step of a parameter's logarithm may be so long.
-FEWEST_SWEEPS, MOST_SWEEPS, EFFORT = 15, 40, 3
-BUDGET, TOLERANCE = 150, 1e-2
+FEWEST_SWEEPS = 15
+MOST_SWEEPS = 40
+EFFORT = 3
+BUDGET = 150
+TOLERANCE = 1e-2
 # A cause without which the misfit falls so much is certain: no other is looked for.
 CERTAIN = 4.0
 SAME_LAG_S = 5e-4
@@ -130,11 +134,14 @@ def _step(residual: Array) -> tuple[float, int]:
     if len(there) < 2 * SHORTEST:
         return 1.0, 0
     x = residual[there]
-    total, count = np.cumsum(x, axis=0)[:-1], np.arange(1, len(x))[:, None]
-    before, after = total / count, (x.sum(axis=0) - total) / (len(x) - count)
+    total = np.cumsum(x, axis=0)[:-1]
+    count = np.arange(1, len(x))[:, None]
+    before = total / count
+    after = (x.sum(axis=0) - total) / (len(x) - count)
     gain = np.sum(count * before**2 + (len(x) - count) * after**2, axis=1)
     k = SHORTEST - 1 + int(np.argmax(gain[SHORTEST - 1 : len(x) - SHORTEST]))
-    one, two = np.sum((x - x.mean(axis=0)) ** 2), np.sum(x**2) - gain[k]
+    one = np.sum((x - x.mean(axis=0)) ** 2)
+    two = np.sum(x**2) - gain[k]
     return float(np.sqrt(one / max(two, 1e-30))), int(there[k + 1])
 
 
@@ -182,7 +189,9 @@ class _Alone:
 
 def _best_lag(alone: _Alone, given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
     """The lag by which residuals and velocities agree, refitted a few times."""
-    least, lag_s, shifted = _misfit(given, read), 0.0, given
+    least = _misfit(given, read)
+    lag_s = 0.0
+    shifted = given
     best = None
     for _ in range(CLOCK_REFITS):
         more_s = _lag_s(shifted, read)
@@ -193,9 +202,11 @@ def _best_lag(alone: _Alone, given: Experiment, read: Array, of: str) -> Iterato
         fitted = None if later is None else alone.fit(later)
         if later is None or fitted is None:
             break
-        shifted, read = later, fitted
+        shifted = later
+        read = fitted
         if (now := _misfit(shifted, read)) < least:
-            best, least = clock(of, lag_s, shifted), now
+            best = clock(of, lag_s, shifted)
+            least = now
     if best is not None:
         yield best
 
@@ -222,7 +233,8 @@ def _later(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
     poses = grasp.poses
     if len(poses.t_s) < 2:
         return poses
-    times, first = poses.t_s + lag_s, slice(0, 1)
+    times = poses.t_s + lag_s
+    first = slice(0, 1)
     if lag_s <= 0:
         return replace(poses, t_s=times)
     # Before its first pose the grasp rests there.
@@ -246,7 +258,8 @@ def _lag_s(experiment: Experiment, read: Array) -> float:
 
 def _one_layer(experiment: Experiment, deeper: bool) -> Experiment | None:
     """With every grasp one layer of elements deeper or less deep; None where that is none."""
-    cells, n = experiment.body.cells, len(experiment.body.nodes_m)
+    cells = experiment.body.cells
+    n = len(experiment.body.nodes_m)
     grasps = []
     for grasp in experiment.grasps:
         held = np.isin(np.arange(n), grasp.nodes)
@@ -279,7 +292,8 @@ def _misfit(experiment: Experiment, read: Array) -> float:
 # Residuals up to so many standard deviations need no cause; what is right leaves so much less.
 MISFIT = 1.3
 # Clocks may be off by this share of a recording.
-LATEST, SHIFTS = 0.25, 60
+LATEST = 0.25
+SHIFTS = 60
 # What forces, and torques, are written in by mistake.
 UNITS = (
     (
@@ -336,7 +350,8 @@ def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> Iterator[Hy
         return _wrench_misfit(part, sensor.told(without[0]), forced, without[1])
 
     tare = part.segment.experiment.nuisance.tare or 0.0
-    misfit, of = left((sensor.wrench, tare)), f"the wrench of '{part.segment.experiment.name}'"
+    misfit = left((sensor.wrench, tare))
+    of = f"the wrench of '{part.segment.experiment.name}'"
     if misfit > MISFIT:
         yield from Trial(misfit, left, BETTER, least=1.0).of(
             _wrench_mistakes(of, sensor.wrench, tare, _weighs(part))
@@ -358,7 +373,8 @@ def _wrench_misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: floa
     there = np.isfinite(apart)
     if not there.any():
         return np.inf
-    counts, sums = there.sum(axis=0), np.nansum(apart, axis=0)
+    counts = there.sum(axis=0)
+    sums = np.nansum(apart, axis=0)
     held = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
     offsets = sums / np.maximum(counts + held, 1e-12)
     return float(np.sqrt(np.nanmean((apart - offsets) ** 2)))

@@ -110,7 +110,8 @@ def combine(
         return CombinedEstimate(value, spread, statistical95, known_correction=correction)
     if error is not None and error.interval95 is not None:
         low, high = map(at.at, error.interval95)
-        low, high = low + known_effect, high + known_effect
+        low = low + known_effect
+        high = high + known_effect
     low, high = widened((low, high), centre, systematic)
     combined95 = _interval(at, low, high, bounds)
     deviation = (high - low) / 2 / NORMAL_95 / at.slope(at.value(centre))

@@ -138,9 +138,13 @@ def changed_residuals(
 
 
 def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iterator[Array]:
-    part, count = at.part, len(effects)
-    segment, held, x = part.segment, part.setting.held, part.x
-    forces, rows = np.zeros((*x.shape, count)), np.zeros((*x.shape, count))
+    part = at.part
+    count = len(effects)
+    segment = part.segment
+    held = part.setting.held
+    x = part.x
+    forces = np.zeros((*x.shape, count))
+    rows = np.zeros((*x.shape, count))
     moved = np.zeros((*held.positions_m.shape, count))
     for k, (effect, sigma) in enumerate(effects):
         if effect is None:
@@ -178,10 +182,13 @@ def followed(
     inertia_n : (N, g, c), optional
         What the rows of sensed dofs change by themselves: reactions are what they lack.
     """
-    segment, x, phi = part.segment, part.x, part.phi
+    segment = part.segment
+    x = part.x
+    phi = part.phi
     sensed = HeldForces.nothing(len(x), len(segment.sensed_dofs), columns.count)
     response = part.sensing.read_along(Forward(solver, columns, held=sensed).rows(x), sensed)
-    numbers, size = np.arange(columns.count), columns.count + len(phi)
+    numbers = np.arange(columns.count)
+    size = columns.count + len(phi)
     motions = part.sensing.moving(x, response, by_p=False)
     for reading, motion in zip(segment.readings, motions, strict=True):
         motion = _with_inertia(motion, inertia_n)

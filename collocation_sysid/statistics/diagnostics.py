@@ -111,14 +111,17 @@ def _diagnose(
     level: NoiseLevel,
     alone: Mapping[str, Outlier],
 ) -> MarkerDiagnosis:
-    present, name = block.present[:, marker], f"{block.name}/{block.marker_names[marker]}"
+    present = block.present[:, marker]
+    name = f"{block.name}/{block.marker_names[marker]}"
     residual = block.residual[:, marker] * block.sigma_m[marker]
     samples = int(present.sum())
     power = float(np.sum(residual**2))
     total = power if power > 0 else 1.0
     mean = residual.sum(axis=0) / samples
     varying = np.where(present[:, None], residual - mean, 0.0)
-    frequency, peak, early = 0.0, 0.0, np.zeros(len(residual), dtype=bool)
+    frequency = 0.0
+    peak = 0.0
+    early = np.zeros(len(residual), dtype=bool)
     if not block.static:
         frequency, peak = _largest_peak(varying, block.t_s)
         early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
@@ -158,7 +161,8 @@ def _rms_m(block: FitBlock, marker: int) -> float:
 
 
 def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
-    pairs, samples = np.sum(present[1:] & present[:-1]), present.sum()
+    pairs = np.sum(present[1:] & present[:-1])
+    samples = present.sum()
     power = np.sum(varying**2)
     if not pairs or not power > 0:
         return 0.0
@@ -225,7 +229,8 @@ def _suggestion(
 
 def _white(found: MarkerDiagnosis) -> str:
     """White residuals, by their size; a few samples may differ from σ by chance."""
-    factor, chance = found.noise_factor, normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * found.samples)
+    factor = found.noise_factor
+    chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * found.samples)
     if factor > max(AS_STATED, 1 + chance):
         return f"white, but {factor:.2g} times as large as sigma_m says"
     if factor < min(1 / AS_STATED, 1 - chance):
@@ -292,13 +297,15 @@ class Outlier:
 
 def set_apart(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
     """The fit without the samples that spoil the rest, and these; the same fit where none does."""
-    blocks, found = [], []
+    blocks = []
+    found = []
     for block in fit.blocks:
         for marker in np.flatnonzero(block.present.any(axis=0)).tolist():
             allowed = max(1, int(EXCEPTIONS * block.present[:, marker].sum()))
             while allowed and (outlier := _outlier(block, marker, RARE / len(fit.blocks))):
                 found.append(outlier)
-                block, allowed = _without(block, marker, outlier.sample), allowed - 1
+                block = _without(block, marker, outlier.sample)
+                allowed = allowed - 1
         blocks.append(block)
     return (replace(fit, blocks=tuple(blocks)), tuple(found)) if found else (fit, ())
 
@@ -306,7 +313,8 @@ def set_apart(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
 def _outlier(block: FitBlock, marker: int, rare: float) -> Outlier | None:
     """The sample of a marker that spoils the rest; None where none does."""
     power = np.sum(block.residual[:, marker] ** 2, axis=1)
-    count, sample = int(block.present[:, marker].sum()), int(power.argmax())
+    count = int(block.present[:, marker].sum())
+    sample = int(power.argmax())
     share = float(power[sample] / max(power.sum(), 1e-300))
     freedom = int(block.seen[:, marker].sum()) / count / 2  # half the coordinates of a sample
     chance = count * block.present.shape[1] * beta_sf(share, freedom, (count - 1) * freedom)

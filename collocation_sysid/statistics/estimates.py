@@ -239,9 +239,11 @@ NOTEWORTHY = 1.1
 
 def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -> list[str]:
     """Parameters at a bound, not determined, or not identifiable."""
-    notes, reasons = [], {}
+    notes = []
+    reasons = {}
     for item in (each for each in parameters.free if each.name in estimates):
-        name, found = item.name, estimates[item.name]
+        name = item.name
+        found = estimates[item.name]
         if found.at_bound:
             nearer = min(
                 ("lower", "upper"), key=lambda side: abs(getattr(item, side) - found.value)
@@ -265,12 +267,16 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
 
 def _unidentifiable(reasons: Mapping[str, str]) -> list[str]:
     """One sentence a parameter, and one for two that are confounded with each other."""
-    notes, told = [], set()
+    notes = []
+    told = set()
     for name, reason in reasons.items():
-        because, other = reason, reason.removeprefix("confounded with ").split(" ")[0]
-        which, pronoun = f"{name} is", "it"
+        because = reason
+        other = reason.removeprefix("confounded with ").split(" ")[0]
+        which = f"{name} is"
+        pronoun = "it"
         if reasons.get(other, "").startswith(f"confounded with {name} "):
-            which, pronoun = f"{name} and {other} are", "one of them"
+            which = f"{name} and {other} are"
+            pronoun = "one of them"
             because = reason.replace(other, "each other", 1)
         if other not in told:
             notes.append(
@@ -319,10 +325,12 @@ def size_notes(asked: str, kind: Noise, level: NoiseLevel, errors: str) -> list[
     """
     if asked == "estimated" or level.kind == "given":
         return []
-    factor, stated = float(np.sqrt(level.pooled)), level.stated
+    factor = float(np.sqrt(level.pooled))
+    stated = level.stated
     low, high = (pick(level.factors, key=level.factors.__getitem__) for pick in (min, max))
     if level.unequal and level.factors[high] > NOTEWORTHY**2 * level.factors[low]:
-        least, most = f"{level.factors[low]:.2g} ({low})", f"{level.factors[high]:.2g} ({high})"
+        least = f"{level.factors[low]:.2g} ({low})"
+        most = f"{level.factors[high]:.2g} ({high})"
         size = f"between {least} and {most} times as large as {stated} says"
     elif factor > NOTEWORTHY:
         size = f"{factor:.2g} times as large as {stated} says"

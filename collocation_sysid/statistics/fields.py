@@ -188,7 +188,8 @@ class FieldEstimate:
         """A density that none has; an amplitude too small, or a length too long, by the data."""
         if self.phases is not None:
             return phase_concerns(self.phases, self.name)
-        amplitude, said = self.modes.field.deviation, dict[str, dict[str, float]]()
+        amplitude = self.modes.field.deviation
+        said = dict[str, dict[str, float]]()
         best = max(AMPLITUDES, key=lambda factor: self.likelier(factor=factor))
         if best > 1 and self.likelier(factor=best) > LIKELIER:
             said["amplitude"] = {"stated": amplitude, "likely": best * amplitude}
@@ -206,22 +207,28 @@ def fields_of(
     body: Body, parameters: Parameters, q: Array, known: Uncertainty | Array | None
 ) -> list[FieldEstimate]:
     """The fields of a body at q, with error bars or the covariance (nq, nq) where there is one."""
-    size, names = len(q), [item.name for item in parameters.free]
-    covariance, quantile = np.full((size, size), np.nan), np.nan
+    size = len(q)
+    names = [item.name for item in parameters.free]
+    covariance = np.full((size, size), np.nan)
+    quantile = np.nan
     if isinstance(known, Uncertainty):
         sizes = relative_slopes(parameters, q)
         covariance = known.covariance / np.outer(sizes, sizes)
         quantile = float(np.nanmax(known.quantiles))
     elif known is not None:
-        covariance, quantile = known, 1.96
-    found, constants = [], ThetaMap(parameters, body)
-    theta, by_q = constants.theta(q), constants.slopes(q)
+        covariance = known
+        quantile = 1.96
+    found = []
+    constants = ThetaMap(parameters, body)
+    theta = constants.theta(q)
+    by_q = constants.slopes(q)
     for number, part in enumerate(body.parts):
         if (modes := part.field) is None:
             continue
         here = body.mode_places[number]
         mean, slopes = _mean(constants, number, modes).slopes(q, NOTHING)
-        local, stated = mean[0] + modes.logarithms(theta[here]), None
+        local = mean[0] + modes.logarithms(theta[here])
+        stated = None
         if part.stress_field is None:
             stated = part.density_kg_m3
         gradient = slopes + modes.slopes(theta[here]) @ by_q[here]
@@ -292,7 +299,8 @@ def _quantiles(values: Array) -> tuple[float, float, float]:
 def fields_by_information(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
     """Those of a solution, by name, with the covariance for independent errors of the σ stated."""
     covariance = information(linearised_fit(collocation, z)).fit.covariance()
-    nq, found = collocation.nq, dict[str, FieldEstimate]()
+    nq = collocation.nq
+    found = dict[str, FieldEstimate]()
     for body in dict.fromkeys(segment.body for segment in collocation.segments):
         known = covariance[:nq, :nq]
         for field in fields_of(body, collocation.parameters, z[:nq], known):
@@ -324,7 +332,8 @@ def mean_logarithm(
 
 def _mean(constants: ThetaMap, number: int, modes: FieldModes) -> Generated:
     """The logarithm of the mean of a part's field, by q; a density's over the one stated."""
-    body, part = constants.body, constants.body.parts[number]
+    body = constants.body
+    part = constants.body.parts[number]
 
     def logarithm(q: ca.SX, _: ca.SX) -> ca.SX:
         own = body.split(constants.expression(q))[number]

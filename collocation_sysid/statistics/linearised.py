@@ -77,7 +77,8 @@ def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 Mask = NDArray[np.bool_]
 
 # A parameter this near a bound, in its logarithm, is at it: interior-point methods stay inside.
-AT_BOUND, NO_STEP = 1e-3, 1e-12
+AT_BOUND = 1e-3
+NO_STEP = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,9 +268,11 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     SimulationError
         Where the equations of motion are singular.
     """
-    p, blocks = collocation.parameters_of(z), []
+    p = collocation.parameters_of(z)
+    blocks = []
     for part, response in zip(collocation.parts(z), responses(collocation, z), strict=True):
-        segment, experiment = part.segment, part.segment.experiment
+        segment = part.segment
+        experiment = part.segment.experiment
         relaxed = segment.body.remembers and bool(np.isinf(experiment.loaded_since_s))
         found = part.sensing.linearised(part.x, response)
         for reading, (misfit, by_own) in zip(segment.readings, found, strict=True):

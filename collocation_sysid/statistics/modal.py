@@ -116,7 +116,8 @@ class ModalComparison:
 
     def _other_frames(self) -> Iterator[Hypothesis]:
         """The rigid motions before the poses, and of the tracks, that suit best."""
-        given, places_m = self.given, self.sway.places_m
+        given = self.given
+        places_m = self.sway.places_m
         if not _fixes_rotation(places_m):
             return
         own = seen = given
@@ -172,7 +173,8 @@ def _with_markers(given: Described, tracks_m: Array, markers: Index) -> Describe
 def _rigid(from_m: Array, to_m: Array) -> tuple[Array, Array]:
     """Rotation (3, 3) and translation (3,) that bring points to others, both (T, M, 3)."""
     both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
-    a, b = from_m[both], to_m[both]
+    a = from_m[both]
+    b = to_m[both]
     rotation = Rotation.align_vectors(b - b.mean(axis=0), a - a.mean(axis=0))[0].as_matrix()
     return rotation, b.mean(axis=0) - rotation @ a.mean(axis=0)
 

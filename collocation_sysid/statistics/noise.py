@@ -28,7 +28,9 @@ Noise = Literal["given", "estimated", "by-marker"]
 # Residuals this small, in units of σ, are rounding.
 ROUNDING = 1e-6
 # Levels of the tests that residuals are larger, smaller, and different among markers.
-LARGER, SMALLER, UNEQUAL = 0.05, 0.01, 0.01
+LARGER = 0.05
+SMALLER = 0.01
+UNEQUAL = 0.01
 # A variance found below this share of the mean square of the residuals is chance.
 LEAST_SHARE = 0.5
 
@@ -132,7 +134,10 @@ def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
     information : Information
         Of the fit.
     """
-    names, squares, counts, shares = [], [], [], []
+    names = []
+    squares = []
+    counts = []
+    shares = []
     stated = np.zeros_like(information.prior)
     for block, slope in zip(fit.blocks, information.slopes, strict=True):
         if block.noise_at_least_stated:
@@ -226,7 +231,8 @@ def _level(
     # Sums of squares with these means and twice these "spreads" as variances are tested as χ² of
     # the same mean and variance.
     more = besides.mean(axis=1)
-    means, spreads = left + more, left + 2 * more + besides.var(axis=1) / 2
+    means = left + more
+    spreads = left + 2 * more + besides.var(axis=1) / 2
     freedoms = means**2 / np.maximum(spreads, 1e-300)
     spread = left.sum() + 2 * more.sum() + besides.sum(axis=0).var() / 2
     freedom = float(means.sum() ** 2 / max(spread, 1e-300))
@@ -260,7 +266,8 @@ def _level(
 def _bartlett(squares: Array, freedoms: Array) -> float:
     """Probability of mean squares as different, if the variances are equal."""
     used = (freedoms >= 1) & (squares > 0)
-    count, each = int(used.sum()), freedoms[used]
+    count = int(used.sum())
+    each = freedoms[used]
     if count < 2:
         return 1.0
     total = each.sum()

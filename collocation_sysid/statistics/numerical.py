@@ -42,10 +42,12 @@ from .linearised import LinearisedFit
 OBSERVED = 1.25
 # Errors of smooth solutions fall with the square of linear elements' edges, and faster for
 # quadratic ones; where elements are too stiff or the body leaves its grasp they do not.
-MESH_ORDER, LEAST_ORDER = 2.0, 0.5
+MESH_ORDER = 2.0
+LEAST_ORDER = 0.5
 # Standard errors that the step may move an estimate where its number is chosen, and how many steps
 # a sample are chosen at most.
-LITTLE, MOST_SUBSTEPS = 0.5, 8
+LITTLE = 0.5
+MOST_SUBSTEPS = 8
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,8 @@ def numerical_error(
     x = at.at(estimate.value)
     step = _Limit.of([x, *map(at.at, by_step)], step_order, step_order / 2)
     mesh = _Limit.of([x, *map(at.at, by_mesh)], MESH_ORDER, LEAST_ORDER)
-    limit, interval = x + step.way + mesh.way, None
+    limit = x + step.way + mesh.way
+    interval = None
     if estimate.statistical95 is not None:
         low, high = map(at.at, estimate.statistical95)
         down = float(np.hypot((high - low) / 2, step.below + mesh.below))
@@ -275,7 +278,8 @@ def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     fit : LinearisedFit
     changes : of each block (T, M, 3, a), in units of σ
     """
-    free, count = np.flatnonzero(~fit.at_bound), changes[0].shape[-1] if changes else 0
+    free = np.flatnonzero(~fit.at_bound)
+    count = changes[0].shape[-1] if changes else 0
     if not free.size:
         return np.zeros((len(fit.names), count))
     known = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))

@@ -29,7 +29,8 @@ from .hypothesis import Hypothesis
 DENSITIES_KG_M3 = (10.0, 25_000.0)
 SIZES_M = (1e-4, 10.0)
 # What is as dense as this is metal or full of it, and no metal is softer than this.
-METAL_KG_M3, SOFTEST_METAL_PA = 5e3, 1e9
+METAL_KG_M3 = 5e3
+SOFTEST_METAL_PA = 1e9
 # So many times outside these ranges nothing can be meant.
 IMPOSSIBLE = 100.0
 
@@ -46,7 +47,8 @@ def oddities(body: Body) -> tuple[Hypothesis, ...]:
     """
     size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
     density_kg_m3 = body.mass_kg / body.mesh.volume_m3
-    (little_m, much_m), (thin, dense) = SIZES_M, DENSITIES_KG_M3
+    little_m, much_m = SIZES_M
+    thin, dense = DENSITIES_KG_M3
     size = {
         "size_m": size_m,
         "least": little_m,
@@ -103,7 +105,8 @@ def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
         for axis in grasp.zero:
             along = "xyz".index(axis)
-            moved_m, load_n = shifts_m[:, along], grasp.wrench.values[:, along]
+            moved_m = shifts_m[:, along]
+            load_n = grasp.wrench.values[:, along]
             there = np.isfinite(load_n)
             if there.sum() < FEWEST_SAMPLES or not (
                 np.ptp(moved_m[there]) and np.ptp(load_n[there])
@@ -163,7 +166,8 @@ def _slips(experiment: Experiment) -> Iterator[Hypothesis]:
         if not np.isfinite(sizes[:, m]).any():
             continue
         k = int(np.nanargmax(sizes[:, m]))
-        others, size_m = np.delete(sizes[k], m), float(sizes[k, m])
+        others = np.delete(sizes[k], m)
+        size_m = float(sizes[k, m])
         most_m = float(others[np.isfinite(others)].max(initial=0.0))
         usual_m = max(_lively(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
         if _lasts(markers.positions_m, m, k + 2, size_m):
@@ -185,7 +189,8 @@ def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
     others = np.delete(to_others, marker, axis=1)
     if not others.shape[1]:
         return True
-    before, after = others[:sample], others[sample:]
+    before = others[:sample]
+    after = others[sample:]
     both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
     change = np.nanmedian(after[:, both], axis=0) - np.nanmedian(before[:, both], axis=0)
     return bool(np.abs(change).max(initial=0.0) > 0.3 * step_m)
@@ -220,7 +225,9 @@ def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypot
     if not share or (huber is not None and share < TAMED):
         return ()
     at = np.flatnonzero(wrong.any(axis=1))
-    first, t_s, names = int(at[0]), experiment.t_s, experiment.markers.names
+    first = int(at[0])
+    t_s = experiment.t_s
+    names = experiment.markers.names
     same = (order[first:] == order[first]).all(axis=1)
     end = first + (len(same) if same.all() else int(same.argmin()))
     when = f"from t = {t_s[first]:.4g} s " + (
@@ -235,12 +242,14 @@ def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypot
 
 def _orders(experiment: Experiment) -> tuple[Index, float]:
     """(T, M) which marker of the first samples each one is, and how clearly it changes."""
-    markers, grasp = experiment.markers, carrying(experiment)
+    markers = experiment.markers
+    grasp = carrying(experiment)
     seen_m = np.array(markers.positions_m)
     if grasp is not None:
         rotations, translations_m = grasp.poses.at(experiment.t_s)
         seen_m = np.einsum("tji,tmj->tmi", rotations, seen_m - translations_m[:, None])
-    order, strength = np.tile(np.arange(len(markers.names)), (len(seen_m), 1)), 0.0
+    order = np.tile(np.arange(len(markers.names)), (len(seen_m), 1))
+    strength = 0.0
     last_m = np.full(seen_m.shape[1:], np.nan)
     for k, now_m in enumerate(seen_m):
         there = np.isfinite(now_m[:, 0])

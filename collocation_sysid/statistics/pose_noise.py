@@ -26,11 +26,14 @@ from .considered import followed
 from .linearised import LinearisedFit
 
 # Samples of D η, and the fewest and the memory where bodies are large.
-DRAWS, FEWEST_DRAWS, BYTES = 200, 32, 2e8
+DRAWS = 200
+FEWEST_DRAWS = 32
+BYTES = 2e8
 # Differences of this order leave noise and take away a smooth motion.
 ORDER = 5
 # Noise below these is rounding of a file.
-LEAST_M, LEAST_RAD = 2e-6, 2e-5
+LEAST_M = 2e-6
+LEAST_RAD = 2e-5
 # Noise whose residuals are below this share of sigma is of no consequence.
 NEGLIGIBLE = 0.02
 
@@ -116,7 +119,8 @@ def _noise(name: str, grasp: Grasp) -> PoseNoise:
 
 def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) -> list[Array]:
     """(K, T, M, 3) changes of the residuals of each reading."""
-    segment, held = part.segment, part.setting.held
+    segment = part.segment
+    held = part.setting.held
     numbers = held.positions_m.size * 8
     count = int(np.clip(BYTES / numbers, FEWEST_DRAWS, DRAWS))
     moved = np.zeros((*held.positions_m.shape, count))
@@ -125,7 +129,8 @@ def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) ->
         shifts, turns = _poses_drawn(part, grasp, noise, rng, count)
         _add_noise(moved, part, grasp, shifts, turns)
         off.append((grasp, shifts, turns))
-    solver, changes = Sweep(segment), []
+    solver = Sweep(segment)
+    changes = []
     columns = Columns.along(solver, part.setting, moved)
     for reading, motion, looked, by in followed(part, solver, columns):
         for grasp, shifts, turns in off:
@@ -151,8 +156,10 @@ def _poses_drawn(
 
 def _add_noise(moved: Array, part: Part, grasp: Grasp, shifts: Array, turns: Array) -> None:
     """Add how poses that are off move a grasp's nodes to `moved` (N, g, c), in place."""
-    segment, held = part.segment, part.setting.held
-    t_s, count = segment.dynamics.t_s, moved.shape[2]
+    segment = part.segment
+    held = part.setting.held
+    t_s = segment.dynamics.t_s
+    count = moved.shape[2]
     rows = np.flatnonzero(grasp.holds(t_s))
     dofs = np.searchsorted(held.dofs, grasp.dofs)
     arms = grasp.poses.at(t_s[rows])[0] @ segment.body.nodes_m[grasp.nodes].T

@@ -149,11 +149,13 @@ def _released(at: Answered, probe: Probe, limit: float) -> Probe:
     """
     if not probe.is_beyond(limit):
         return probe
-    first, collocation = len(at.fit.names), at.collocation
+    first = len(at.fit.names)
+    collocation = at.collocation
     kept = assumption_of(probe.name), CORRELATION_KEY
     alone = {name: size if name in kept else None for name, size in at.deviations.items()}
     wide = with_freedom(at.fit, at.changes, probe.name, _widening(probe.name))
-    p, (_, near) = at.p, collocation.unpack(at.z)
+    p = at.p
+    _, near = collocation.unpack(at.z)
     for _ in range(STEPS):
         step = best_step(wide)[:first]
         p = p + step

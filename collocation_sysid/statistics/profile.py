@@ -92,7 +92,8 @@ def profile(
             f"best value {value:g} of {parameter} is not within its bounds "
             f"[{bounds[0]:g}, {bounds[1]:g}]"
         )
-    known, threshold = {value: loss}, THRESHOLD * noise_scale
+    known = {value: loss}
+    threshold = THRESHOLD * noise_scale
 
     def rise(way: float) -> float:
         """By how much the root of the loss rises, over what it may; this is nearly straight."""
@@ -123,7 +124,8 @@ def profile(
 
 def _end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
     """Where the loss has risen enough, on one side; None if it has not at the bound."""
-    inside, nearer = 0.0, min if step > 0 else max
+    inside = 0.0
+    nearer = min if step > 0 else max
     for _ in range(MOST_DOUBLINGS):
         if inside == bound:
             return None
@@ -131,7 +133,8 @@ def _end(rise: Callable[[float], float], step: float, bound: float) -> float | N
         if rise(outside) >= 0:
             within = PRECISION * abs(outside)
             return root_scalar(rise, bracket=(inside, outside), xtol=within).root
-        inside, step = outside, 2 * step
+        inside = outside
+        step = 2 * step
     return None
 
 

@@ -136,7 +136,8 @@ class Answered:
         """Return the changes of the estimates that a refit determines, by name."""
         went = {}
         for name, each in {**found.estimates, **found.derived}.items():
-            error, joint = each.statistical_std_error, self.statistical[name]
+            error = each.statistical_std_error
+            joint = self.statistical[name]
             if error and error < TELLING * abs(each.value):
                 change = each.value - joint.value
                 combined95 = self.budget[name].combined95 if name in self.budget else None
@@ -253,10 +254,13 @@ def relaxed_probe(at: Answered, name: str, wide: LinearisedFit, p: Array) -> Pro
     Probe
         Its size is that of the most significant amplitude, if there are several. `told` is empty.
     """
-    first, step = len(at.fit.names), best_step(wide)
-    after, own = wide.after(step), step[first:]
+    first = len(at.fit.names)
+    step = best_step(wide)
+    after = wide.after(step)
+    own = step[first:]
     found = at.found(after, p + step[:first])
-    before, left = least_squares(at.fit), least_squares(after)
+    before = least_squares(at.fit)
+    left = least_squares(after)
     falls = before.loss(np.zeros(first)) - left.loss(np.zeros(len(step)))
     unit = at.deviations[assumption_of(name)] or 1.0
     errors = np.array([*found.nuisance.values()][first - wide.shared :])

@@ -50,7 +50,8 @@ def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters)
     names = relative_moduli(experiments, parameters)
     if not names or open_scale(experiments, parameters):
         return None
-    verb, symbols = "is" if len(names) == 1 else "are", [symbol_of(name) for name in names]
+    verb = "is" if len(names) == 1 else "are"
+    symbols = [symbol_of(name) for name in names]
     return f"no known force sets the scale: {listed(symbols)} {verb} relative to the stated density"
 
 
@@ -67,17 +68,20 @@ def _moved(
     if len(held) == len(bodies):
         return ()
     usual = usual_parameters(parameters, SOFT_PA)
-    slopes, changes = [], []
+    slopes = []
+    changes = []
     for key, body in bodies.items():
         constants = ThetaMap(usual, body)
-        theta, slope = constants.theta(usual.guess_q), constants.slopes(usual.guess_q)
+        theta = constants.theta(usual.guess_q)
+        slope = constants.slopes(usual.guess_q)
         change = _multiplied(body, theta, slope, stated)
         if key in held or change is None:
             change = np.zeros(len(slope))
         size = np.where(theta == 0, 1.0, np.abs(theta))
         slopes.append(slope / size[:, None])
         changes.append(change / size)
-    matrix, wanted = np.concatenate(slopes), np.concatenate(changes)
+    matrix = np.concatenate(slopes)
+    wanted = np.concatenate(changes)
     if not wanted.any():
         return ()
     way = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
@@ -107,7 +111,8 @@ HELD = 2.0
 
 def motionless(experiment: Experiment) -> bool:
     """Whether neither grasps and loads nor markers move or change, but for noise."""
-    markers, t_s = experiment.markers, experiment.t_s
+    markers = experiment.markers
+    t_s = experiment.t_s
     sigma_m = float(np.median(markers.sigma_m)) if markers.names else 0.0
     held, positions_m = experiment.grasped(t_s)
     lasting = held.all(axis=0)
@@ -136,6 +141,7 @@ def stillness_concerns(experiments: Iterable[Experiment], parameters: Parameters
     if not fitted or not damping or not all(e.static or motionless(e) for e in fitted):
         return []
     code = "static" if all(experiment.static for experiment in fitted) else "still"
-    names, verb = [f"'{e.name}'" for e in fitted], "is" if len(fitted) == 1 else "are"
+    names = [f"'{e.name}'" for e in fitted]
+    verb = "is" if len(fitted) == 1 else "are"
     data = {"names": names, "verb": verb, "damping": damping}
     return [Concern(f"information/{code}", data=data)]

@@ -157,13 +157,16 @@ def scatter_of(fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array
 def _between(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
     """See `Scatter`; of parameters at a bound nothing."""
     own = [rows_of(fit, recordings_of(fit)[name]) for name in names]
-    each, scores = np.array([o.information for o in own]), np.array([o.score for o in own])
+    each = np.array([o.information for o in own])
+    scores = np.array([o.score for o in own])
     together = least_squares(fit)
-    whole, score = together.information, together.score
+    whole = together.information
+    score = together.score
     free = np.flatnonzero(~fit.at_bound)
     inverse = np.linalg.pinv(whole[np.ix_(free, free)], hermitian=True)
     shared = free[free < fit.shared]
-    unlike, by_each = np.zeros(len(shared)), np.zeros((len(shared), len(shared)))
+    unlike = np.zeros(len(shared))
+    by_each = np.zeros((len(shared), len(shared)))
     for row, k in enumerate(shared.tolist()):
         others = free[free != k]
         cross = each[:, k, others] @ np.linalg.pinv(whole[np.ix_(others, others)], hermitian=True)

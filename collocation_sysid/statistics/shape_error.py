@@ -104,13 +104,15 @@ def _correlated(points_m: Array, weights: Array, length_m: float) -> Array:
 
 def _harmonic(nodes: Nodes, surface: Index, values: Array) -> Array:
     """Return values (n, m) with those inside solving Laplace's equation on the mesh graph."""
-    count, found = len(nodes.points_m), values.copy()
+    count = len(nodes.points_m)
+    found = values.copy()
     inside = np.setdiff1d(np.arange(count), surface)
     if not inside.size:
         return found
     a, b = nodes.mesh.edges.T
     ones = np.ones(2 * len(a))
-    rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
+    rows = np.concatenate([a, b])
+    columns = np.concatenate([b, a])
     adjacency = sp.csr_array((ones, (rows, columns)), shape=(count, count))
     laplacian = sp.csc_array(sp.diags_array(adjacency.sum(axis=1)) - adjacency)
     right = -(laplacian[inside][:, surface] @ values[surface])

@@ -22,7 +22,8 @@ from .linearised import FitBlock
 
 # What is looked for: shares, and lengths between that of a patch and this share of the body.
 SHARES = (0.25, 0.5, 0.75, 0.95)
-LENGTHS, LONGEST = 10, 0.5
+LENGTHS = 10
+LONGEST = 0.5
 # A direction of which the data tell more than this share has taken its part of the residuals.
 TAKEN = 0.1
 MOST_SAMPLES = 20
@@ -89,7 +90,9 @@ def _misfit(
     left: list[tuple[Array, Array, Array]], share: float, length_m: float
 ) -> tuple[float, float]:
     """−2 log-likelihood, up to a constant, and the variance that is most likely."""
-    squares, logarithms, count = 0.0, 0.0, 0
+    squares = 0.0
+    logarithms = 0.0
+    count = 0
     for z, free, apart in left:
         root = np.linalg.cholesky(free.T @ _shape(apart, share, length_m) @ free)
         squares += float(np.sum(np.linalg.solve(root, z) ** 2))

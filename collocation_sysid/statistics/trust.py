@@ -50,24 +50,33 @@ MARKER_MISFIT = 2.0
 # Autocorrelation that matters.
 PERSISTENT = 0.2
 # What a forward simulation misses more than the fit, over the fit's own RMS or that of the noise.
-ROLLOUT, GROSS_ROLLOUT = 0.35, 2.0
+ROLLOUT = 0.35
+GROSS_ROLLOUT = 2.0
 # A prediction this many times worse than the fit.
-PREDICTION, GROSS_PREDICTION = 3.0, 10.0
+PREDICTION = 3.0
+GROSS_PREDICTION = 10.0
 # Nuisance parameters this many deviations of their priors away.
-FAR, ABSURD = 3.0, 6.0
+FAR = 3.0
+ABSURD = 6.0
 # Deviations of its prior that the pose of a depth camera may be off: it trades for the shape.
 CAMERA_FAR = 2.0
 # Points of an outline may be so many pixels off the edge in the image, but for this share of them:
 # edges of pixels scatter by 0.3, lenses and wrong depths at edges by one.
-OUTLINE_FAR_PX, OUTLINE_SHARE = 3.0, 0.1
+OUTLINE_FAR_PX = 3.0
+OUTLINE_SHARE = 0.1
 LATE = 1.8
 # Share of the samples beyond Huber's threshold, of all.
-WILD, HARDLY_TAME = MOST_WILD, 0.2
+WILD = MOST_WILD
+HARDLY_TAME = 0.2
 # What a scheme adds to the damping ratio, over it; and by how much it may lengthen a period.
-DAMPING_SHARE, GROSS_DAMPING_SHARE, LITTLE_DAMPING = 0.2, 1.0, 0.005
-PERIOD_ERROR, GROSS_PERIOD_ERROR = 0.02, 0.1
+DAMPING_SHARE = 0.2
+GROSS_DAMPING_SHARE = 1.0
+LITTLE_DAMPING = 0.005
+PERIOD_ERROR = 0.02
+GROSS_PERIOD_ERROR = 0.1
 # Powers of e by which a disturbance may grow in a recording.
-E_FOLDINGS, GROSS_E_FOLDINGS = 1.0, 7.0
+E_FOLDINGS = 1.0
+GROSS_E_FOLDINGS = 7.0
 # A contact of fewer faces is as wide as the mesh makes it.
 FEWEST_FACES = 4.0
 # Combined standard uncertainties by which step and mesh may change a parameter: the half width of
@@ -129,7 +138,8 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
 
 def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """The residuals against sigma_m and against white noise."""
-    level, found = uncertainty.level, uncertainty.dependence
+    level = uncertainty.level
+    found = uncertainty.dependence
     factor = float(np.sqrt(level.pooled))
     limit = float(normal_isf(RARE / 2)) * found.lag1_deviation
     persistent = abs(found.lag1) > max(PERSISTENT, limit)
@@ -288,7 +298,8 @@ def nuisance_concerns(
     far = max(FAR, float(normal_isf(RARE / 2 / max(1, len(items))))) if items else FAR
     concerns: list[Concern] = []
     for name, phi, lowest, highest in items:
-        away, limited = abs(float(phi)), not lowest + 1e-3 < phi < highest - 1e-3
+        away = abs(float(phi))
+        limited = not lowest + 1e-3 < phi < highest - 1e-3
         concerns += concerned(limited, True, "nuisance/limit", name=name)
         concerns += concerned(
             away > far and not limited, away > ABSURD, "nuisance/far", name=name, deviations=away
@@ -417,7 +428,8 @@ def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
     """States of the answer in which disturbances grow."""
     concerns: list[Concern] = []
     for each in found:
-        grows, grossly = each.e_foldings > E_FOLDINGS, each.e_foldings > GROSS_E_FOLDINGS
+        grows = each.e_foldings > E_FOLDINGS
+        grossly = each.e_foldings > GROSS_E_FOLDINGS
         concerns += concerned(grows, grossly, "stability/grows", **vars(each))
     return concerns
 

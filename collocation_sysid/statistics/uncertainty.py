@@ -199,7 +199,8 @@ def uncertainty_of(
     InputError
         If the noise is to be estimated from fewer measurements than parameters.
     """
-    factored, shared = information(fit), fit.shared
+    factored = information(fit)
+    shared = fit.shared
     freedom = fit.measurements - round(factored.fitted, 9)
     if errors.noise == "estimated" and freedom < 1:
         raise InputError(
@@ -212,7 +213,8 @@ def uncertainty_of(
     of_q, quantiles, wider = _widened(of_all[:shared, :shared], quantiles, scatter)
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
     longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
-    sizes, deviations = relative_slopes(parameters, q), np.sqrt(np.diag(of_all)[shared:]).tolist()
+    sizes = relative_slopes(parameters, q)
+    deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
     return Uncertainty(
         **vars(basis),
         names=fit.names[:shared],
@@ -249,14 +251,17 @@ def _error_bars(
     if asked.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
     of_score, freedom = level.score_covariance(kind, factored, fit.shared)
-    covariance, used = factored.fit.covariance(of_score), "independent"
+    covariance = factored.fit.covariance(of_score)
+    used = "independent"
     if correlated:
         of_score, of_few = _autocorrelated(fit, factored, kind, level)
         persistent = factored.fit.covariance(of_score)
         before, after = (np.diag(each)[: fit.shared] for each in (covariance, persistent))
         widens = (after > CONSEQUENCE**2 * before).any()
         if asked.errors == "autocorrelated" or kind != "given" or widens:
-            covariance, freedom, used = persistent, of_few, "autocorrelated"
+            covariance = persistent
+            freedom = of_few
+            used = "autocorrelated"
     if fit.of_phases is not None:
         covariance = covariance.copy()
         covariance[: fit.shared, : fit.shared] += fit.of_phases
@@ -270,12 +275,14 @@ def _known(
 
     It is NaN of those at a bound, and infinite of shared ones that the data do not determine.
     """
-    told, shared = covariance.copy(), fit.shared
+    told = covariance.copy()
+    shared = fit.shared
     silent = _no_information(parameters, q, np.diag(covariance)[:shared])
     at_bound = fit.at_bound.copy()
     at_bound[:shared] &= ~silent
     told[at_bound] = told[:, at_bound] = np.nan
-    of_q, bounded = told[:shared, :shared], at_bound[:shared]
+    of_q = told[:shared, :shared]
+    bounded = at_bound[:shared]
     lost = np.flatnonzero((np.diag(of_q) > UNDETERMINED**2) | (silent & fit.at_bound[:shared]))
     of_q[lost] = of_q[:, lost] = np.nan
     of_q[lost, lost] = np.inf
@@ -300,7 +307,8 @@ def _scatter(
     """What recordings say one by one, with error bars of their own."""
     if len(recordings_of(fit)) < 2:
         return None
-    known, sizes = {}, relative_slopes(parameters, q)
+    known = {}
+    sizes = relative_slopes(parameters, q)
     for alone, step in single_fits(fit):
         if alone.measurements <= len(alone.names):
             continue
@@ -324,7 +332,8 @@ def _no_information(parameters: Parameters, q: Array, variances: Array) -> NDArr
 def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     """How the residuals hang together, and whether more than what is known to add to the noise."""
     factored = information(fit)
-    level, found = noise_level(fit, factored), dependence(fit, factored)
+    level = noise_level(fit, factored)
+    found = dependence(fit, factored)
     found = replace(found, lag1_deviation=found.lag1_deviation * level.unevenness)
     return found, found.found and not _expected(fit, factored, level, found)
 
@@ -413,7 +422,8 @@ class Place:
 def places_of(part: Part, uncertainty: Uncertainty | None = None) -> dict[str, Place]:
     """Places of an experiment's markers at a solution, by name."""
     segment = part.segment
-    chart, markers = segment.chart, segment.experiment.markers
+    chart = segment.chart
+    markers = segment.experiment.markers
     errors = _std_errors_m(part, uncertainty)
     return {
         name: Place(
@@ -432,7 +442,8 @@ def _std_errors_m(part: Part, uncertainty: Uncertainty | None) -> Array | None:
     """(M, 3) of the coordinates; on a surface they move together."""
     if uncertainty is None:
         return None
-    segment, chart = part.segment, part.segment.chart
+    segment = part.segment
+    chart = part.segment.chart
     row = {name: k for k, name in enumerate(uncertainty.nuisance)}
     at = np.array([row[name] for name in segment.nuisance.names], dtype=np.int64)
     errors = np.zeros(chart.points_m.shape)
