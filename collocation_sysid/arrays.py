@@ -1,4 +1,4 @@
-"""The array types that signatures name; shapes and units stand in the docstrings."""
+"""Array types for annotations; shapes and units are stated in the docstrings."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,5 +8,5 @@ Index = NDArray[np.int64]
 
 
 def root_mean(squares: Array) -> float:
-    """The root of the mean of squares, zero of none."""
+    """Return the square root of the mean of `squares`; 0 for an empty array."""
     return float(np.sqrt(squares.mean())) if squares.size else 0.0

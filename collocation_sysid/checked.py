@@ -1,6 +1,7 @@
-"""Types of the values a user gives, with their ranges; pydantic checks them.
+"""Types with ranges for user input, and the base class of method options.
 
-TOML tells text, numbers and truth values apart, so a "30" or true for a number is a slip.
+Values are checked by pydantic without conversion: TOML distinguishes text, numbers and truth
+values, so that "30" or true in place of a number is a mistake.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from .errors import InputError, hint_at
 
-# Sizes that anything measured or meant has; the square of any of them is a number too.
-SMALLEST, LARGEST = 1e-100, 1e100
+# Magnitudes of meaningful input; their squares are still finite, nonzero floating-point numbers.
+SMALLEST = 1e-100
+LARGEST = 1e100
 
 
 def _of_usual_size(value: float) -> float:
@@ -56,7 +58,13 @@ _EXPECTED = {
 
 
 def expected(fault: Mapping[str, Any]) -> str:
-    """What a value should have been, by one of pydantic's complaints about it."""
+    """Return what was expected in place of an invalid value, for an error message.
+
+    Parameters
+    ----------
+    fault : mapping
+        One entry of pydantic's `ValidationError.errors()`.
+    """
     if fault["type"] == "value_error":
         return str(fault["ctx"]["error"]).partition("expected ")[2]
     if fault["type"] in _EXPECTED:
@@ -66,7 +74,14 @@ def expected(fault: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Options:
-    """Base of methods and options: a value that is not of its field's type is an `InputError`."""
+    """Base class of methods and option groups: frozen dataclasses that check the types of their
+    fields.
+
+    Raises
+    ------
+    InputError
+        On construction, if a value does not have the type of its field.
+    """
 
     name: ClassVar[str]
     # Whether a method can only start from parameters with which everything can be simulated.
@@ -88,10 +103,11 @@ def _adapters(kind: type[Options]) -> dict[str, TypeAdapter[Any]]:
 
 
 def _refusal(name: str, found: Any, fault: Mapping[str, Any]) -> InputError:
-    """The error for a value, or for an entry of the table that it is."""
+    """Return the error for an invalid value; it names the entry if the value is a table."""
     for part in fault["loc"]:
         if isinstance(found, Mapping) and part in found:
-            name, found = f"{name}.{part}", found[part]
+            name = f"{name}.{part}"
+            found = found[part]
     if fault["type"] == "value_error":
         return InputError(str(fault["ctx"]["error"]), None, name)
     choices = re.findall("'(.*?)'", fault["ctx"]["expected"] if "literal" in fault["type"] else "")

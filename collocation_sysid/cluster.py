@@ -1,4 +1,4 @@
-"""A dask.distributed cluster that is there already, by its scheduler's address."""
+"""Connection to a running dask.distributed cluster."""
 
 from __future__ import annotations
 
@@ -15,12 +15,17 @@ CONNECT_WITHIN_S = 15
 
 @contextmanager
 def connected(scheduler: Any) -> Iterator[Any]:
-    """A client of a scheduler, by its address or as a cluster of this process.
+    """Connect to a scheduler and yield the client, which is closed afterwards.
+
+    Parameters
+    ----------
+    scheduler : str or Cluster
+        Address of a scheduler, or a cluster object of this process.
 
     Raises
     ------
     InputError
-        Without dask.distributed, or where no scheduler answers.
+        If dask.distributed is not installed, or no scheduler answers within `CONNECT_WITHIN_S`.
     """
     dask = distributed()
     try:
@@ -39,12 +44,12 @@ def connected(scheduler: Any) -> Iterator[Any]:
 
 
 def distributed() -> Any:
-    """The library.
+    """Import and return dask.distributed.
 
     Raises
     ------
     InputError
-        Without it.
+        If it is not installed.
     """
     if find_spec("distributed") is None:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Terminals that show what names and files say, and obey none of it."""
+"""Terminal output that displays control characters of names and files instead of obeying them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from .errors import printable
 
 
 class PlainConsole(Console):
-    """A console on which no text is obeyed or taken for markup; its own styles are."""
+    """Rich console without markup, in which control characters of texts are replaced by visible
+    marks.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
@@ -22,16 +24,19 @@ class PlainConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Segments as rich makes them, with marks for what a terminal would obey."""
+        """Return rich's segments with visible marks in place of control characters."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=printable(segment.text))
 
 
 class Watched:
-    """What is being done: shown live on a terminal, in lines elsewhere, and not if `quiet`."""
+    """Progress display: updated in place on a terminal, one line per step elsewhere, none if
+    `quiet`.
+    """
 
     def __init__(self, console: Console, quiet: bool = False, live: bool = True) -> None:
-        self.console, self.quiet = console, quiet
+        self.console = console
+        self.quiet = quiet
         shown = console.is_terminal and live and not quiet
         self._live = Live(console=console, refresh_per_second=8, transient=True) if shown else None
 
@@ -45,13 +50,13 @@ class Watched:
             self._live.stop()
 
     def update(self, shown: RenderableType, line: str = "") -> None:
-        """Show this live; elsewhere a line, if there is one."""
+        """Display `shown` in place; without a live display, print `line` if it is not empty."""
         if self._live is not None:
             self._live.update(shown)
         elif line:
             self.line(line)
 
     def line(self, said: str) -> None:
-        """Print a line that stays."""
+        """Print a line that stays; nothing if the display is quiet."""
         if not self.quiet:
             self.console.print(Text(said), soft_wrap=True)

@@ -1,7 +1,7 @@
-"""What is shown, described once as sentences, tables, pictures and sections, and how it looks.
+"""Plain description of output (sentences, tables, pictures, sections) and its rendering.
 
-A description is plain data: `tree.as_json` writes it as JSON. Styles are words: good, check,
-doubtful, strong, quiet, code.
+The same description is rendered for terminals, HTML and Markdown, and written as JSON by
+`tree.as_json`. Styles are words: good, check, doubtful, strong, quiet, code.
 """
 
 from __future__ import annotations
@@ -24,16 +24,19 @@ from .tree import optional
 
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red", "strong": "bold", "quiet": "dim"}
 MARKS = {"strong": "**", "code": "`"}  # of Markdown
-# Width of a text that nobody wraps; heads are parted in tables with more columns than `MANY`, and
-# longer texts in a cell take more room.
-WIDE, MANY, LONG = 200, 5, 24
+# Width of plain text [characters]: wide enough that no line is wrapped.
+WIDE = 200
+# Tables with more columns than this break their headings into two lines.
+MANY = 5
+# Cells with longer texts [characters] get a wider column in HTML.
+LONG = 24
 # Pictures wider than this can be moved sideways on a phone rather than shrunk.
 WIDE_PX = 1000
 
 
 @dataclass(frozen=True)
 class Span:
-    """A piece of a sentence, with where it leads `to`."""
+    """Piece of a sentence; `to` is the target of a link, "" for none."""
 
     text: str
     style: str = ""
@@ -42,7 +45,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Line:
-    """A sentence; `name` is where others may lead to."""
+    """A sentence; `name` is the anchor to which links may point, "" for none."""
 
     text: str | tuple[Span, ...]
     style: str = ""
@@ -50,32 +53,33 @@ class Line:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Its pieces."""
+        """Pieces of the sentence."""
         return (Span(self.text),) if isinstance(self.text, str) else self.text
 
 
 @dataclass(frozen=True)
 class Items:
-    """Sentences one below the other, each by itself."""
+    """List of sentences, one per line."""
 
     texts: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of texts: names to the left, then numbers to the right, then texts that may be long.
+    """Table with columns of names (left), of numbers (right aligned) and of long texts (last).
 
     Attributes
     ----------
     title : str
     heads : tuple of str
-        Empty where rows speak for themselves.
+        Column headings; empty for none.
     rows : tuple of tuple of str
     names, texts : int
-        How many of the first, and of the last columns these are.
-    faint : tuple of int, rows of less weight
+        Number of name columns at the beginning, and of text columns at the end.
+    faint : tuple of int
+        Indices of rows that are shown with less emphasis.
     aside : int
-        How many of the last columns only pages have room for.
+        Number of columns at the end that are omitted in terminals.
     """
 
     title: str
@@ -93,14 +97,14 @@ class Table:
             raise ValueError(f"the table {self.title!r} has rows of another length")
 
     def is_number(self, column: int) -> bool:
-        """Whether a column is one of numbers."""
+        """Return whether a column contains numbers."""
         columns = len(self.heads) or max(map(len, self.rows), default=0)
         return self.names <= column < columns - (self.texts or 0)
 
 
 @dataclass(frozen=True)
 class Cards:
-    """Numbers that matter most, each with what it is and what to say beside it."""
+    """The most important numbers; each item has name, value and remark."""
 
     items: tuple[tuple[str, str, str], ...]
 
@@ -115,7 +119,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Listing:
-    """A long text, kept as it is."""
+    """Long preformatted text."""
 
     title: str
     text: str
@@ -123,7 +127,7 @@ class Listing:
 
 @dataclass(frozen=True)
 class Section:
-    """Parts that belong together, with a title or a style of their own."""
+    """Group of parts with a title and optionally a style."""
 
     title: str
     parts: tuple[Shown, ...]
@@ -135,35 +139,35 @@ Shown = str | Line | Items | Table | Cards | Picture | Listing | Section
 
 
 def flat(parts: Iterable[Shown]) -> Iterator[Shown]:
-    """The parts without the titles of their sections, as a terminal has room for."""
+    """Yield the parts of all sections without their titles, for terminals."""
     for part in parts:
         yield from flat(part.parts) if isinstance(part, Section) else (part,)
 
 
 def own_pictures(folder: Path) -> list[Path]:
-    """The PNG of a folder; what links lead to elsewhere is not shown."""
+    """Return the PNG files of a folder, sorted; links that lead out of the folder are ignored."""
     return sorted(file for file in folder.glob("*.png") if is_own(folder, file))
 
 
 def short(value: float) -> str:
-    """Two digits, and no powers of ten for the sizes of bodies."""
+    """Return a number with two digits, without a power of ten from 100 on."""
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def number(value: float | None, digits: int = 5) -> str:
-    """A number as people write it; a dash for none."""
+    """Return a number with at most `digits` digits; a dash for None, NaN and infinity."""
     if value is None or not isfinite(value):
         return "–"
     return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
 
 
 def millimetres(metres: float | None) -> str:
-    """A length in millimetres, to the micrometre at most."""
+    """Return a length [m] in millimetres with three digits; a dash for None and NaN."""
     return "–" if metres is None or not isfinite(metres) else f"{1e3 * metres:.3g} mm"
 
 
 def duration(time_s: float | None) -> str:
-    """A rounded length of time."""
+    """Return a rounded duration with its unit; "an unknown time" for None."""
     if time_s is None:
         return "an unknown time"
     for unit, seconds in (("h", 3600), ("min", 60)):
@@ -173,7 +177,7 @@ def duration(time_s: float | None) -> str:
 
 
 def labelled(title: str, rows: dict[str, str]) -> Table:
-    """A table of names and what there is to say of each."""
+    """Return a table of two columns: names and texts."""
     return Table(title, (), tuple((f"  {name} ", text) for name, text in rows.items()), texts=1)
 
 
@@ -181,14 +185,14 @@ def labelled(title: str, rows: dict[str, str]) -> Table:
 
 
 def on_terminal(parts: Shown | Iterable[Shown]) -> RenderableType:
-    """As rich shows it."""
+    """Return parts as a rich renderable for the terminal."""
     if isinstance(parts, Shown):
         return _on_terminal(parts)
     return Group(*map(_on_terminal, parts))
 
 
 def plain_text(parts: Shown | Iterable[Shown]) -> str:
-    """What a terminal would show, without colours and as wide as it needs."""
+    """Return parts as plain text without colours, with lines as long as necessary."""
     file = StringIO()
     PlainConsole(file=file, width=WIDE).print(on_terminal(parts))
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
@@ -246,7 +250,7 @@ def _rich_table(table: Table) -> RichTable:
 
 
 def as_html(part: Shown) -> str:
-    """As a browser shows it; text is escaped."""
+    """Return a part as HTML; text is escaped."""
     match part:
         case str():
             return f"<p>{escape(part)}</p>\n"
@@ -267,7 +271,8 @@ def as_html(part: Shown) -> str:
             )
             return f'<div class="cards">\n{"".join(cards)}</div>\n'
         case Picture():
-            content, caption = part.file.read_bytes(), escape(part.caption)
+            content = part.file.read_bytes()
+            caption = escape(part.caption)
             wide = _class("wide" if int.from_bytes(content[16:20]) > WIDE_PX else "")  # its header
             data = f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
             return (
@@ -275,7 +280,8 @@ def as_html(part: Shown) -> str:
                 f"<figcaption{wide}>{caption}</figcaption></figure>\n"
             )
         case Listing():
-            title, text = escape(part.title), escape(part.text)
+            title = escape(part.title)
+            text = escape(part.text)
             return f"<details><summary>{title}</summary><pre>{text}</pre></details>\n"
         case Section():
             inner = "".join(map(as_html, part.parts))
@@ -285,7 +291,7 @@ def as_html(part: Shown) -> str:
 
 
 def escape(text: str) -> str:
-    """Text as HTML holds it."""
+    """Return a text with the characters escaped that have a meaning in HTML."""
     return escape_html(text).replace("&#x27;", "&#39;")
 
 

@@ -1,4 +1,4 @@
-"""The two ways in which a run is refused: bad input, and a simulation that cannot go on."""
+"""The two exceptions for users, invalid input and a failed simulation, and helpers for messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from typing import Any
 
 
 def hint_at(name: str, known: Iterable[str]) -> str:
-    """What to add to a message about a name cut short or misspelt: the one that was meant."""
+    """Return "; did you mean …?" for a misspelt or abbreviated name; "" if no known name is
+    similar.
+    """
     names = [other for other in known if len(other) > 2]  # each of two letters is near another
     longer = [other for other in names if len(name) > 1 and other.startswith(name)]
     close = longer or difflib.get_close_matches(name, names, n=1)
@@ -24,38 +26,39 @@ _MARKS = (
     | {0x7F: 0x2421}
     | dict.fromkeys((*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)), 0xFFFD)
 )
-# Letters that a message may have, and what it quotes of a file.
-LONGEST, LONGEST_EXCERPT = 1500, 60
+# Longest message, and longest quotation of a file in it [characters].
+LONGEST = 1500
+LONGEST_EXCERPT = 60
 _ENDLESS_WORD = re.compile(r"(\S{60})\S{340,}")
 
 
 def printable(text: str) -> str:
-    """A text with marks in place of what a terminal would obey."""
+    """Return the text with visible marks in place of characters that control a terminal."""
     return text.translate(_MARKS)
 
 
 def excerpt(text: str, longest: int = LONGEST_EXCERPT) -> str:
-    """The text, or its beginning where it is long."""
+    """Return the text, cut to `longest` letters."""
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names in a sentence: "a, b and c"."""
+    """Return names as part of a sentence: "a, b and c"."""
     *others, last = [*names] or [""]
     return f"{', '.join(others)} and {last}" if others else last
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used; the message says what, where and what was expected.
+    """Invalid input by the user; the message states what was found, where, and what was expected.
 
     Parameters
     ----------
     message : str
         What was found, what was expected, and the remedy.
     source : str or Path, optional
-        The file it was found in.
+        File that contains the input.
     where : str, optional
-        The key, line or column in that file.
+        Key, line or column in that file.
     """
 
     def __init__(
@@ -72,7 +75,7 @@ class InputError(ValueError):
         return type(self), (self.message, self.source, self.where)
 
     def located(self, source: str | Path | None = None, where: str | None = None) -> InputError:
-        """Return the same error with file and key filled in where they were missing."""
+        """Return a copy of the error with file and key filled in where they are missing."""
         return InputError(self.message, self.source or source, self.where or where)
 
 
@@ -83,12 +86,21 @@ def require_among(
     where: str | None = None,
     count: str = "one",
 ) -> None:
-    """Refuse a name that is none of the known ones, of which `count` is expected.
+    """Raise an error if a name is not among the known ones.
+
+    Parameters
+    ----------
+    name : str
+    known : iterable of str
+    source, where
+        File and key for the message, see `InputError`.
+    count : str
+        Number of names expected, for the message.
 
     Raises
     ------
     InputError
-        With the one that was probably meant.
+        With the known names, and the most similar one as a suggestion.
     """
     names = list(known)
     if name not in names:
@@ -98,7 +110,7 @@ def require_among(
 
 @contextmanager
 def located(source: str | Path | None = None, where: str | None = None) -> Iterator[None]:
-    """Input errors of what is done within get file and key where they lack them."""
+    """Add file and key to input errors raised in the context, where they are missing."""
     try:
         yield
     except InputError as error:
@@ -115,15 +127,15 @@ class SimulationError(RuntimeError):
     time_s : float
         Time of the step that failed.
     element : int or None
-        The element that is worst deformed there, where one is to blame.
+        Index of the most deformed element; None if no element is responsible.
     state_m : (3n,) array, optional
-        Positions where a static path ended; None where a time step failed.
+        Positions at which a path of static equilibria ended; None if a time step failed.
 
     Attributes
     ----------
     lost_stability : LostStability or None
-        The mode in which the body lost its stability, if that was why, see
-        `program.lost_stability`. It is not kept where an error is handed to another process.
+        Mode in which the body lost its stability, see `program.lost_stability`; None for other
+        causes and for errors that were passed to another process.
     """
 
     lost_stability: Any = None

@@ -1,4 +1,6 @@
-"""One run: solve a problem, verify the answer by simulating forward, and find the error bars."""
+"""Complete identification: solve a problem, verify the answer by forward simulation, estimate
+errors.
+"""
 
 from __future__ import annotations
 
@@ -47,18 +49,22 @@ Log = Callable[[str], None]
 
 
 class Run(Answer):
-    """A solved problem with its checks, as it is looked at and kept; see `Answer`."""
+    """Solved problem with its verification and uncertainties, for display and storage; see
+    `Answer`.
+    """
 
     def __str__(self) -> str:
         return self.table()
 
     @cached_property
     def result(self) -> Result:
-        """All that is known of it, as ``result.json`` holds it."""
+        """Content of ``result.json`` as dataclasses."""
         return result_of(self)
 
     def table(self) -> str:
-        """Parameters, intervals, what these hold, and the verdict, as the terminal shows them."""
+        """Return parameters, combined intervals, their sources and the verdict, as printed in the
+        terminal.
+        """
         from .result.run_sections import answer  # how it looks is no part of a run
 
         return plain_text(answer(self.result))
@@ -66,26 +72,29 @@ class Run(Answer):
     def plot(
         self, experiment: str | None = None, field: str | None = "von_mises_pa", count: int = 6
     ) -> Figure:
-        """Draw the body as it moved, fitted or else simulated with the answer, and its markers.
+        """Draw a sequence of deformed shapes with the markers.
+
+        The shapes are the fitted ones, or those of the forward simulation if the experiment was not
+        fitted.
 
         Parameters
         ----------
         experiment : str, optional
-            By default the first.
+            Name; the first experiment by default.
         field : {"von_mises_pa", "energy_density_j_m3", "det_f"} or None
-            What colours it, element by element; None for its regions.
+            Element quantity that is shown by colour; None for the regions.
         count : int
-            How many shapes, from the first sample to the last; 20 at most.
+            Number of shapes, from the first sample to the last; 20 at most.
 
         Returns
         -------
         Figure
-            Of matplotlib. A notebook shows it, ``savefig`` writes it.
+            Matplotlib figure. A notebook displays it, ``savefig`` writes it.
 
         Raises
         ------
         InputError
-            For an unknown experiment or field, a count that cannot be, or a run without motion.
+            For an unknown experiment or field, an invalid count, or a run without motion.
         """
         from .result.animation import chosen  # how it looks is no part of a run
         from .result.pictures.shapes import portrait
@@ -96,12 +105,19 @@ class Run(Answer):
         return portrait(replay, bodies[replay.name], self.parameters, field, count)
 
     def save(self, folder: str | Path, frames: bool = True) -> Path:
-        """Write the run folder, whole or not at all, and return it.
+        """Write the run folder, completely or not at all, and return its path.
+
+        Parameters
+        ----------
+        folder : str or Path
+            New folder, or an earlier run, which is replaced.
+        frames : bool
+            Whether to write ParaView files of the motion.
 
         Raises
         ------
         InputError
-            If there is anything but an earlier run.
+            If the folder contains anything other than an earlier run.
         """
         from .result.record import write_run  # what files hold is no part of a run
 
@@ -118,9 +134,10 @@ def run(
     scheduler: str | None = None,
     probe: bool = False,
 ) -> Run:
-    """Solve a problem, simulate every experiment with the answer, and find the error bars.
+    """Solve a problem, simulate every experiment with the answer, and estimate uncertainties.
 
-    Once there is an answer, Ctrl-C ends what comes after it: `Run.missing` says what is left out.
+    Once there is an answer, Ctrl-C only ends the steps that follow: `Run.missing` states which
+    results are missing.
 
     Parameters
     ----------
@@ -128,16 +145,21 @@ def run(
     method, watch, start, scheduler
         See `solve`.
     log : callable, optional
-        Called with what is being done now, a text.
+        Called with a text at the beginning of each step.
     seek_causes : bool
-        Whether a misfit's cause is looked for, see `likely_causes`.
+        Whether to test hypotheses about the cause of a misfit, see `likely_causes`.
     probe : bool
-        Whether the data are refitted in parts, and with each assumption freed, see `probes`.
+        Whether to refit subsets of the data and to relax each assumption, see `probes`.
+
+    Returns
+    -------
+    Run
+        Also if the method did not converge; there are no uncertainties then.
 
     Raises
     ------
     InputError
-        As `solve` does.
+        If `solve` raises it.
     """
     say = log or (lambda _: None)
     solution = solve(problem, method, watch, start, scheduler)
@@ -175,7 +197,11 @@ def run(
 
 
 def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
-    """A solution simulated forward, with its error bars and the fit they are of, where any."""
+    """Return a solution with forward simulations, uncertainties and step error, and the linearised
+    fit.
+
+    The fit is None if the solution did not converge or cannot be linearised.
+    """
     say("checking the answer by a forward simulation")
     rollouts = roll_outs(problem, solution)
     if not solution.status.converged:
@@ -201,7 +227,7 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
 
 
 def _changes(answer: Run, say: Log) -> Changes:
-    """Return how the residuals change by what is assumed, and by what every solve probes."""
+    """Return the changes of the residuals by the systematic effects and by the routine probes."""
     say("finding what is assumed is worth")
     solution = answer.solution
     deviations = probed_deviations(answer.problem.uncertainty.considered)
@@ -209,8 +235,9 @@ def _changes(answer: Run, say: Log) -> Changes:
 
 
 def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, changes: Changes) -> Sources:
-    """Return what moves the estimates beside the noise; what is stated as exact does not."""
-    solution, stated = answer.solution, answer.problem.uncertainty.assumptions.deviations
+    """Return the systematic contributions to the uncertainty, without effects stated as exact."""
+    solution = answer.solution
+    stated = answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
     budgeted = changes.without(name for name, deviation in stated.items() if deviation is None)
     means = answer.problem.uncertainty.assumptions.means
@@ -220,10 +247,12 @@ def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, changes: Chang
 def _probes(
     answer: Run, fit: LinearisedFit, changes: Changes, say: Log, deep: bool
 ) -> tuple[Probe, ...]:
-    """Return the probes of every solve; of a deep check those of parts and assumptions instead."""
-    solution, options = answer.solution, answer.problem.uncertainty
+    """Return the routine probes, or for a `deep` check those of subsets and of every assumption."""
+    solution = answer.solution
+    options = answer.problem.uncertainty
     deviations = probed_deviations(options.considered)
-    collocation, z = solution.collocation, solution.z
+    collocation = solution.collocation
+    z = solution.z
     answered = Answered(
         collocation=collocation,
         z=z,
@@ -241,7 +270,7 @@ def _probes(
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
-    """The profile likelihoods that are asked for."""
+    """Return the profile likelihoods that the problem requests."""
     profiles = []
     assert answer.uncertainty is not None
     for name in answer.problem.uncertainty.profile:
@@ -261,15 +290,25 @@ def _fine_enough(
     say: Log,
     scheduler: str | None,
 ) -> tuple[Run, LinearisedFit | None]:
-    """Return the run solved again from its answer, with as many substeps as its error bars ask for.
+    """Return the run solved again with as many substeps as its uncertainties require.
 
-    The answer may have several steps a sample already, where it was started from such a run. A
-    parameter that ended at a bound has no error bar, and coarse steps may have driven it there: it
-    starts from its guess again. Where all of them ended so, the most substeps are taken.
+    The answer may already have several substeps, if it was started from such a run. A parameter
+    that ended at a bound has no standard error, and coarse steps may have driven it there: it
+    starts
+    from its guess again. If every parameter ended at a bound, the largest number of substeps is
+    used.
+
+    Returns
+    -------
+    Run
+        `coarse` with a note if the refined problem was not solved.
+    LinearisedFit or None
+        The fit of the returned run.
     """
     if coarse.refinement is None or fit is None:
         return coarse, fit
-    first, problem = coarse.solution, coarse.problem
+    first = coarse.solution
+    problem = coarse.problem
     before = first.collocation.substeps
     factor = coarse.refinement.substeps(coarse.optimum, as_scheme(problem.scheme).order)
     substeps = min(before * factor, MOST_SUBSTEPS)
@@ -296,7 +335,8 @@ def _fine_enough(
             )
         message = finer.message
     except (InputError, SimulationError) as error:
-        finer, message = None, str(error)
+        finer = None
+        message = str(error)
     if finer is not None and finer.status is Status.INTERRUPTED:
         raise KeyboardInterrupt  # the first answer is whole
     if finer is None or not finer.status.converged:

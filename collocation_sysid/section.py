@@ -1,4 +1,4 @@
-"""What the tables of the problem file are made of: checked numbers, and sections."""
+"""Building blocks of the tables of a problem file: vectors, alternatives, and sections."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ Unit = Literal["m", "cm", "mm", "in"]
 
 @dataclass(frozen=True)
 class ByForm:
-    """Which of its two forms a key takes: a value of these types is of the first.
+    """Annotation of a key with two alternative forms; values of the types `first` have the first
+    form.
 
-    A tag in <> tells them apart; messages leave it out.
+    A tag in <> distinguishes the forms in pydantic's error locations; messages omit it.
     """
 
     first: type | tuple[type, ...]
@@ -47,7 +48,7 @@ class ByForm:
 
 @dataclass(frozen=True)
 class Among:
-    """A word of a table of the package."""
+    """Annotation of a key whose value is one of the given words."""
 
     words: tuple[str, ...]
 
@@ -56,9 +57,9 @@ class Among:
 
 
 class Section(BaseModel):
-    """A table of the problem file.
+    """Base class of the tables of a problem file.
 
-    The docstring says what it and its keys are; messages quote that as what is expected.
+    The class docstring and its Attributes become the descriptions in the schema and in messages.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
@@ -72,15 +73,18 @@ class Section(BaseModel):
 
 
 def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
-    """The table of a class: the keys of its fields; all are keys of a dataclass of options.
+    """Return the pydantic model of a table that states an instance of a class.
 
     Parameters
     ----------
     kind : type
-        A class that is `stated`, or of options, whose docstring says what they are.
+        A class decorated with `stated`, whose keys are used, or a dataclass of options, all of
+        whose
+        fields become keys. Its docstring provides the descriptions.
     title : str
+        Name of the model.
     base : type
-        The table with what else a file may say.
+        Base model with further keys of the table.
     """
     stated = [key for _, key in keys_of(kind)]
     keys: dict[str, Any] = {
@@ -97,30 +101,40 @@ def section_of(kind: type, title: str, base: type[Section] = Section) -> Any:
 
 
 def tables(name: str, kind: type) -> Key:
-    """The key of [[tables]], each of which states one of a class."""
+    """Return the key of an array of tables [[name]], each of which states an instance of `kind`."""
     form = list[section_of(kind, f"{kind.__name__}Section")]
     return Key(name, form, default=[], tables=kind)
 
 
 def _options(kind: Any) -> dict[str, Any]:
-    types, said = get_type_hints(kind, include_extras=True), documented(kind)
+    types = get_type_hints(kind, include_extras=True)
+    descriptions = documented(kind)
     keys: dict[str, Any] = {}
     for each in fields(kind):
-        form, default = types[each.name], each.default
+        form = types[each.name]
+        default = each.default
         if isinstance(form, type) and is_dataclass(form):
             form = section_of(form, f"{form.__name__}Section")
             default = form()
-        keys[each.name] = (form, Field(default, description=said.get(each.name)))
+        keys[each.name] = (form, Field(default, description=descriptions.get(each.name)))
     return keys
 
 
 def stated_in(section: Section, kind: type, where: str) -> dict[str, Any]:
-    """The fields of a class by what a table says of them; those of files are to be read yet.
+    """Return the fields of a class that a table states, by name; tables in files are not read yet.
+
+    Parameters
+    ----------
+    section : Section
+    kind : type
+        Class decorated with `stated`.
+    where : str
+        Location of the table, for messages.
 
     Raises
     ------
     InputError
-        For a value that cannot be, naming its key in the table that is `where`.
+        For an invalid value; the message names its key.
     """
     fields: dict[str, Any] = {}
     for name, key in keys_of(kind):
@@ -140,12 +154,12 @@ def _either(*names: str) -> Callable[[Any], Any]:
 
 
 def given_keys(section: Section, *names: str) -> list[str]:
-    """Those of the keys that the file gives."""
+    """Return those of the keys that the file states."""
     return [name for name in names if getattr(section, name) is not None]
 
 
 def require_one(section: Section, *names: str) -> None:
-    """Refuse a section that gives none or several of the keys."""
+    """Raise ValueError unless the section states exactly one of the keys."""
     there = given_keys(section, *names)
     if len(there) != 1:
         which = " and ".join(there) or f"no {' or '.join(names)}"

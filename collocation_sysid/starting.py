@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM for the command line, from its first moment to its last.
+"""Handling of Ctrl-C and SIGTERM by the command line.
 
-Until all modules are there an interrupt ends the program as it ends any other, without a traceback
-of imports. So this module is imported before all others and imports next to nothing.
+This module is imported before all others and imports almost nothing, so that an interrupt during
+the imports ends the program without a traceback.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ LEFT = "left behind"
 
 
 def _end_quietly() -> None:
-    """Let Ctrl-C end the process at once, if it is the command line's and not told otherwise."""
+    """Restore the default action of Ctrl-C, if this process is the command line and nothing else
+    was set.
+    """
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     command = os.path.splitext(os.path.basename(sys.argv[0]))[0]
     if command == COMMAND and handled and _in_main_thread():
@@ -28,9 +30,12 @@ def _end_quietly() -> None:
 
 
 def heed_interrupts() -> Callable[[], None]:
-    """From here on Ctrl-C and SIGTERM raise `KeyboardInterrupt`: results are kept, both times.
+    """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt`, so that results are kept.
 
-    Returns what makes it as it was.
+    Returns
+    -------
+    callable
+        Function that restores the previous signal handlers.
     """
     numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
     changed = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
@@ -45,7 +50,11 @@ def heed_interrupts() -> Callable[[], None]:
 
 
 def leave(code: object) -> NoReturn:
-    """End the process with a code; at once where a thread is left that would crash at its exit."""
+    """End the process with an exit code.
+
+    If a thread is still inside library code that would crash at exit, streams are flushed and the
+    process ends without cleaning up.
+    """
     if not any(thread.name == LEFT for thread in threading.enumerate()):
         sys.exit(code if isinstance(code, int) else 1)
     for stream in (sys.stdout, sys.stderr):

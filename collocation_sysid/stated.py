@@ -1,8 +1,8 @@
-"""Classes that a user states, in Python or in a file: a field, what it takes and says, once each.
+"""Declaration of classes that users state in Python or in a problem file.
 
-`stated` makes a frozen dataclass whose fields are converted as it is built; `key` gives a field its
-conversion, and what a problem file may say in its place. A field without a conversion is checked
-against that, wherever it comes from.
+`stated` makes a frozen dataclass whose fields are converted and checked on construction; `key`
+declares the conversion of a field and the form that it has in a problem file. A field without a
+converter is checked against that form.
 """
 
 from __future__ import annotations
@@ -25,21 +25,25 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class Key:
-    """What a problem file may say of a field; what it is stands in the docstring of the class.
+    """Form of a field in a problem file; the description is that of the class docstring.
 
     Attributes
     ----------
     name : str
-    form : type of what the file says; where it may be None, that is the field's own default
+        Name of the key.
+    form : type
+        Type of the value in the file; a form that allows None uses the default of the field.
     read : callable, optional
-        From what the file says to the field; from a file's path to times and values of a table.
+        Conversion from the value in the file to the field; for a file, from its path to times and
+        values of a table.
     constant : str, optional
-        Where the key names a file with such a table: the field whose key is a constant instead.
+        For a key that names a file with a table: the field whose key states a constant instead.
     said : str, optional
-        What it is, where that is not what the field is.
-    default : what is meant where the file says nothing; it has to say something without
+        Description, if it differs from that of the field.
+    default : object
+        Value if the file does not state the key; the key is required if there is none.
     tables : type, optional
-        Where the file has [[tables]] of the key: the class that each of them states.
+        For an array of [[tables]]: the class that each table states.
     """
 
     name: str
@@ -52,7 +56,9 @@ class Key:
 
 
 def as_given(value: Any) -> Any:
-    """Where a field is converted as soon as more is known."""
+    """Return the value unchanged; converter of fields that are converted later, with more
+    information.
+    """
     return value
 
 
@@ -63,28 +69,29 @@ def key(
     read: Callable[[Any], Any] | None = None,
     **field_options: Any,
 ) -> Any:
-    """A field that is converted as its class is built, and that a file may state.
+    """Return a dataclass field with a converter, which a problem file may state.
 
     Parameters
     ----------
-    form : type, or Key where it has another name in the file
-        The field is no key where there is none.
+    form : type or Key, optional
+        Form in the file; a `Key` if its name differs from the field's. None: not a key of the file.
     converter : callable, optional
-        From what a program gives; None is left as it is.
+        Applied to values other than None.
     read : callable, optional
-        From what the file says to the field.
+        Conversion from the value in the file to the field.
     **field_options
-        As of `dataclasses.field`.
+        See `dataclasses.field`.
     """
     return field(metadata={"converter": converter, "form": form, "read": read}, **field_options)
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(key, field))
 def stated(kind: type[T]) -> type[T]:
-    """A frozen dataclass whose fields are converted before ``__post_init__`` checks them.
+    """Return the class as a frozen dataclass that converts its fields before ``__post_init__``.
 
-    Where its `place` says what one is called, messages of either begin with that; else they name it
-    by its `called`, or by the class.
+    Messages begin with the `place` of an instance if it has one; otherwise they contain its
+    `called`,
+    or the name of the class.
     """
     check = getattr(kind, "__post_init__", lambda self: None)
 
@@ -106,7 +113,9 @@ def stated(kind: type[T]) -> type[T]:
 
 
 def _converted(field: Field[Any], owner: Any, value: Any) -> Any:
-    """A value of a field; without a converter it is to be the default or what a file may say."""
+    """Return the converted value of a field; without a converter, the default or a value of its
+    form.
+    """
     if (converter := field.metadata["converter"]) is not None:
         return converter(value)
     if value == field.default:
@@ -116,10 +125,12 @@ def _converted(field: Field[Any], owner: Any, value: Any) -> Any:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         called = re.sub("(?<!^)(?=[A-Z])", " ", type(owner).__name__).lower()
-        what, word = field.name, getattr(owner, "called", called)
+        what = field.name
+        word = getattr(owner, "called", called)
         for part in fault["loc"]:
             if isinstance(value, Mapping) and part in value:
-                what, value = f"{what}.{part}", value[part]
+                what = f"{what}.{part}"
+                value = value[part]
         whose = f"the {word} {owner.name!r}" if hasattr(owner, "name") else f"a {word}"
         of = what if hasattr(owner, "place") else f"{what} of {whose}"
         shown = f"{value:g}" if isinstance(value, float) else repr(value)
@@ -134,7 +145,7 @@ def _adapter(form: Any) -> TypeAdapter[Any]:
 
 
 def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
-    """The names of fields that a problem file may state, and their keys."""
+    """Yield the name of each field that a problem file may state, with its key."""
     said = documented(kind)
     for each in fields(kind):
         form = each.metadata.get("form")
@@ -148,19 +159,27 @@ def keys_of(kind: type) -> Iterator[tuple[str, Key]]:
             usual = ... if each.default is MISSING else each.default
             usual = usual if each.default_factory is MISSING else each.default_factory()
             default = None if type(None) in get_args(form) else usual
-            read, text = each.metadata["read"], said.get(each.name)
-            yield each.name, Key(each.name, form, read, None, text, default)
+            yield (
+                each.name,
+                Key(
+                    each.name,
+                    form,
+                    read=each.metadata["read"],
+                    said=said.get(each.name),
+                    default=default,
+                ),
+            )
 
 
 def tables_of(kind: type) -> Iterator[tuple[str, str, type]]:
-    """The fields that [[tables]] of a problem file state: field, key, and class of a table."""
+    """Yield field, key and class of each field that is stated by [[tables]] of a problem file."""
     for name, key in keys_of(kind):
         if key.tables is not None:
             yield name, key.name, key.tables
 
 
 def attributes(kind: type) -> dict[str, tuple[str, str]]:
-    """What the docstrings of a class say of each field or option: its type, and what it is."""
+    """Return type and description of each documented field or option of a class, by name."""
     said: dict[str, tuple[str, str]] = {}
     for base in reversed(kind.__mro__):
         text = inspect.cleandoc(base.__doc__ or "")
@@ -173,6 +192,6 @@ def attributes(kind: type) -> dict[str, tuple[str, str]]:
 
 
 def documented(kind: type) -> dict[str, str]:
-    """Descriptions of the fields of a class, or of the options of a method, by name."""
+    """Return the descriptions of the fields of a class, or of the options of a method, by name."""
     said = attributes(kind)
     return {each.name: said[each.name][1] for each in fields(kind) if each.name in said}

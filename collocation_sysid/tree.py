@@ -1,8 +1,8 @@
-"""Results as files hold them: dataclasses to JSON, and back.
+"""Serialisation of results: dataclasses to JSON and back.
 
-A dataclass is an object of its fields, and of the properties that its class names as ``TOLD``;
-arrays are lists. JSON has no NaN and no infinity: null takes their place, and is NaN again where a
-number is read.
+A dataclass becomes an object of its fields and of the properties listed in its class attribute
+``TOLD``; arrays become lists. JSON has neither NaN nor infinity: null is written in their place,
+and is read as NaN where a number is expected.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ T = TypeVar("T")
 
 
 def optional() -> Any:
-    """A field that is left out where it is None; all others are always there."""
+    """Return a dataclass field that is omitted from JSON if it is None; all other fields are
+    written.
+    """
     return field(default=None, metadata={"optional": True})
 
 
 def content(value: Any) -> Any:
-    """What JSON has of a value."""
+    """Return a value as plain objects that `json` can write; NaN and infinity become None."""
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
         own |= {name: getattr(value, name) for name in getattr(value, "TOLD", ())}
@@ -45,36 +47,47 @@ def content(value: Any) -> Any:
 
 
 def as_json(value: Any) -> str:
-    """Text of a result."""
+    """Return a result as JSON text, see `content`."""
     return json.dumps(content(value), indent=1, allow_nan=False)
 
 
 def alike(kind: type[T], of: Any, **others: Any) -> T:
-    """A dataclass with the attributes of something that has those of its names, and `others`."""
+    """Return an instance of a dataclass with attributes copied by name from another object.
+
+    Parameters
+    ----------
+    kind : type
+        Dataclass to be created.
+    of : object
+        Has an attribute for each field that is not in `others`.
+    **others
+        Fields that are not copied.
+    """
     names = (f.name for f in fields(kind) if f.name not in others)  # type: ignore[arg-type]
     return kind(**{name: getattr(of, name) for name in names}, **others)
 
 
 def read(kind: Any, found: Any) -> Any:
-    """A value of a type from what JSON has of it.
+    """Return a value of a given type from parsed JSON.
 
     Parameters
     ----------
     kind : type
-        A dataclass, or what annotates a field: numbers, texts, tuples, mappings, arrays.
+        A dataclass, or the annotation of a field: numbers, texts, tuples, mappings, arrays.
     found : object
-        What `json` made of a file.
+        Output of `json.load`; None is NaN where a number is expected.
 
     Raises
     ------
     TypeError, KeyError, ValueError
-        Where it is of another kind.
+        If the content does not have that type.
     """
     if is_dataclass(kind):
         hints = _hints(kind)
         there = (f for f in fields(kind) if not _is_optional(f) or f.name in found)
         return kind(**{f.name: read(hints[f.name], found[f.name]) for f in there})  # type: ignore
-    origin, inner = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inner = get_args(kind)
     if origin in (Union, types.UnionType):
         (some,) = (each for each in inner if each is not type(None))
         return None if found is None else read(some, found)
