@@ -64,7 +64,7 @@ class Constant:
 
     @property
     def least(self) -> float:
-        """Smallest admissible value."""
+        """Smallest admissible value of the constant."""
         return 0.0 if self.scale == "log" else self.at_least
 
 

@@ -70,7 +70,7 @@ class Law:
 
     @property
     def constants(self) -> int:
-        """Length of θ."""
+        """Number of constants in θ."""
         count = len(self.material.constants) + len(self.damping.constants) + self.memory
         return count + (self.rest.inputs if self.rest else 0)
 

@@ -48,7 +48,7 @@ class ForcePoints:
 
     @property
     def count(self) -> int:
-        """Number i of instances."""
+        """Number i of all instances."""
         return len(self.nodes)
 
     @property

@@ -128,8 +128,8 @@ class Material:
         ]
         energy, force, stiffness = (o.full() for o in law(np.eye(3).ravel(), sample_values))
         scale = np.abs(stiffness).max()
-        for what, unit, found in (("energy", "J/m³", energy), ("stress", "Pa", force)):
-            worst = np.abs(found).max()
+        for what, unit, residual in (("energy", "J/m³", energy), ("stress", "Pa", force)):
+            worst = np.abs(residual).max()
             if not worst <= AT_REST * scale:
                 raise InputError(
                     f"material {self.name!r} has the {what} {worst:.3g} {unit} undeformed, with "

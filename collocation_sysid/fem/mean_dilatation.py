@@ -113,7 +113,7 @@ class _Shape:
 
     @property
     def count(self) -> int:
-        """Number of sums s."""
+        """Number of the sums s."""
         return self.volumes.numel()
 
     def at_sums(self, pieces: Pieces) -> Pieces:
@@ -183,7 +183,7 @@ class _Chain:
 
     @cached_property
     def by_stretch(self) -> ca.SX:
-        """Derivatives ∂g/∂m."""
+        """Derivatives ∂g/∂m by the stretches."""
         return ca.gradient(self.scalar, self.shape.stretches)
 
     def second(self) -> Pieces:

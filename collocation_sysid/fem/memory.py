@@ -122,7 +122,7 @@ class PointLayout:
 
     @property
     def width(self) -> int:
-        """Length of the row."""
+        """Length of the row of a body."""
         return self.starts[-1]
 
     def of_part(self, number: int) -> NDArray[np.int64]:

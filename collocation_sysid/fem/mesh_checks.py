@@ -288,10 +288,10 @@ def straightened(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
         b = cells[e, end_of[k]]
         mid = cells[e, 4 + k]
         raise InputError(
-            f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of the "
-            f"edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at most "
-            f"{SLIGHTLY_CURVED:.0%} of that ({len(bad)} such in all), since sides are taken as "
-            "straight: refine the mesh, or save it with linear tetrahedra"
+            f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of "
+            f"the edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at "
+            f"most {SLIGHTLY_CURVED:.0%} of that ({len(bad)} such in all), since sides are taken "
+            "as straight: refine the mesh, or save it with linear tetrahedra"
         )
     curved = offset > ROUND_OFF * length
     if not curved.any():

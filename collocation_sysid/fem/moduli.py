@@ -47,7 +47,7 @@ class Source:
         values : mapping
             Numbers or expressions by the names of the parameters.
         """
-        by_constant = {own: values[name] for own, name in self.names.items()}
+        by_constant = {own_values: values[name] for own_values, name in self.names.items()}
         missing = [c.name for c in self.material.constants if c.name not in by_constant]
         if not missing:
             return by_constant
@@ -57,8 +57,8 @@ class Source:
             mu = by_constant["young_pa"] / (2 * (1 + by_constant["poisson"]))
         else:
             # With κ = λ = 0 what is left of the shear modulus is the own constants'.
-            own = [by_constant.get(c.name, 0.0) for c in self.material.constants]
-            mu = self.material.lame(ca.vertcat(*own))[1]
+            own_values = [by_constant.get(c.name, 0.0) for c in self.material.constants]
+            mu = self.material.lame(ca.vertcat(*own_values))[1]
         if "lambda_pa" in by_constant:
             lame = by_constant["lambda_pa"]
         elif "kappa_pa" in by_constant:

@@ -1,8 +1,8 @@
-"""A force on nodes or faces of a body that a user declares: f(x, v, at, constants) in CasADi.
+"""Custom forces on nodes or faces of a body: laws f(x, v, at, constants) in CasADi.
 
-Air drag, a foundation, a magnet: what acts at a point and depends on where that is, how fast it
-moves and on time; or, at the middle of a face, on its area and normal as they are now, as a
-pressure. Its constants stand in θ behind those of the body's parts, and are estimated like them.
+Use `NodeForce.of` for a force that depends on position, velocity and time of a node, such as air
+drag, a foundation or a magnet; or, on faces of the surface, on their current area and normal, such
+as a pressure. Its constants follow those of the body's parts in θ and are estimated like them.
 """
 
 from __future__ import annotations
@@ -28,23 +28,29 @@ from .selection import Indices, Selection
 
 Law = Callable[..., Any]
 On = Literal["nodes", "faces"]
-# A slope is symmetric when its skew part is this small beside it.
+# A derivative counts as symmetric if its skew part is at most this fraction of its largest entry.
 SYMMETRIC = 1e-9
 
 
 class AtNode(NamedTuple):
-    """What a law may know of its node or face, beside where it is and how it moves.
+    """Further quantities on which a law may depend, beside position and velocity.
 
     Attributes
     ----------
-    t_s : time
-    rest_m : (3,) place on the undeformed body
-    area_m2, volume_m3 : of a node, its share of the undeformed body's surface and volume
-        The area of a face is that which it has now, and its volume zero.
-    normal : (3,) outward, of length one; of a node undeformed, and zero inside
-        That of a face is as it is now.
-    since_s : time since the evaluation before
-    began : one where there is none, which is the start, else zero
+    t_s : SX
+        Time.
+    rest_m : (3,) SX
+        Position on the undeformed body.
+    area_m2, volume_m3 : SX
+        Share of a node in the surface and volume of the undeformed body; for a face its current
+        area, and zero volume.
+    normal : (3,) SX
+        Outward unit normal: of a node that of the undeformed surface, zero inside; of a face the
+        current one.
+    since_s : SX
+        Time since the previous evaluation.
+    began : SX
+        1 at the start, where there is no previous evaluation, else 0.
     """
 
     t_s: ca.SX
@@ -56,36 +62,37 @@ class AtNode(NamedTuple):
     began: ca.SX
 
 
-# Where the numbers of an `AtNode` end, in its order.
+# Offsets of the attributes of an `AtNode` in the data of a law, in their order.
 ENDS = (0, 1, 4, 5, 6, 9, 10, 11)
 DATA = ENDS[-1]
-# The corners of a triangle for trying laws.
+# Corners of a triangle on which laws are tested.
 TRIANGLE_M = (0.1, 0.2, 0.3, 0.2, 0.2, 0.3, 0.1, 0.3, 0.3)
 
 
 @dataclass(frozen=True, eq=False)
 class NodeForce:
-    """A force on every node of a body, on every face of its surface, or on some.
+    """Force on every node of a body, on every face of its surface, or on some of them.
 
     Attributes
     ----------
     name : str
-        For messages.
+        Name for messages.
     law : callable
         ``law(x, v, at, **constants) -> (3,)`` force [N] on a node at x [m] with velocity v [m/s],
-        ``at`` being an `AtNode`; or on a face, whose middle is at x.
+        where ``at`` is an `AtNode`; or on a face whose middle is at x.
     constants : tuple of Constant
     nodes : Selection, (k,) int array or None
+        Nodes on which the force acts; None for all.
     on : {"nodes", "faces"}
-        On faces of the surface, all of whose nodes are chosen; quadratic ones are as if folded
-        along their middles.
+        "faces": on faces of the surface whose nodes are all selected; quadratic faces are treated
+        as folded along their mid nodes.
     carries : int
-        So many numbers of a node or face are carried from evaluation to evaluation, such as how far
-        a dashpot has crept: then ``law(x, v, before, at, **constants) -> (force, after)``, where
-        `before` (carries,) are those of the evaluation before, zero at the start.
+        Number of internal variables of a node or face, such as the creep of a dashpot. If it is
+        nonzero: ``law(x, v, before, at, **constants) -> (force, after)``, where `before` (carries,)
+        are the variables of the previous evaluation, zero at the start.
     compiled : bool
-        Whether the law is compiled to native code, which must have all of its operations; for laws
-        that are evaluated in every step of most problems.
+        Whether the law is compiled to native code, which must support all of its operations;
+        worthwhile for laws that are evaluated in every step of most problems.
     """
 
     name: str
@@ -106,50 +113,59 @@ class NodeForce:
         on: On = "nodes",
         carries: int = 0,
     ) -> NodeForce:
-        """A force by a law; its arguments after x, v and at name the constants, with their units.
+        """Return a force from a law; its arguments after x, v and at are the constants, with their
+        units.
 
         Parameters
         ----------
-        law : see `NodeForce`
+        law : callable
+            See `NodeForce`.
         *constants : Constant
-            Bounds, symbols and scales where the names alone do not tell.
+            Definitions of constants whose bounds, symbols or scales do not follow from the names.
         nodes : Selection or (k,) int array, optional
             All by default.
         name : str, optional
+            Name for messages; that of the function by default.
         on : {"nodes", "faces"}
         carries : int
+            Number of internal variables.
 
         Raises
         ------
         InputError
-            If it cannot be evaluated.
+            If the law cannot be evaluated, has the wrong shape, or is not finite at rest.
         """
         name = name or str(getattr(law, "__name__", "force")).replace("_", "-")
-        told = {constant.name: constant for constant in constants}
+        definitions = {constant.name: constant for constant in constants}
         arguments = list(inspect.signature(law).parameters)[4 if carries else 3 :]
         if "at" in arguments:
             raise InputError(
                 f"force {name!r} takes something before at, as what carries numbers from step to "
                 "step does; expected carries to say how many"
             )
-        if unused := sorted(set(told) - set(arguments)):
+        if unused := sorted(set(definitions) - set(arguments)):
             raise InputError(
                 f"force {name!r} has no constant {unused[0]!r}{hint_at(unused[0], arguments)}"
             )
-        known = tuple(told.get(a) or constant_named(a) for a in arguments)
+        known = tuple(definitions.get(a) or constant_named(a) for a in arguments)
         chosen = nodes if nodes is None or isinstance(nodes, Selection) else np.asarray(nodes)
         if on not in get_args(On):
             raise InputError(
                 f"force {name!r} is on {on!r}; expected one of {', '.join(get_args(On))}"
             )
-        found = cls(name, law, known, chosen, on, carries)
-        found._check()
-        return found
+        force = cls(name, law, known, chosen, on, carries)
+        force._check()
+        return force
 
     def expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Forces (3k,) on k nodes and what they leave, of u = (x, v, constants, before) and data.
+        """Return forces (3k,) on k nodes, followed by the internal variables, as an expression.
 
-        These are the numbers of an `AtNode`.
+        Parameters
+        ----------
+        u : SX
+            Stacked (x, v, constants, before).
+        data : SX
+            Entries of an `AtNode`.
         """
         dofs = (u.numel() - len(self.constants) - self.carries) // 2
         ends = [0, dofs, 2 * dofs, u.numel() - self.carries, u.numel()]
@@ -168,58 +184,65 @@ class NodeForce:
     def _valued(
         self, x: ca.SX, v: ca.SX, before: ca.SX, at: AtNode, named: dict[str, ca.SX]
     ) -> tuple[ca.SX, ca.SX]:
-        """The force, and what is left to the next evaluation."""
+        """Return the force (3,) and the internal variables after the evaluation."""
         if not self.carries:
             return _column(self.law(x, v, at, **named)), ca.SX.zeros(0)
         force, after = self.law(x, v, before, at, **named)
         return _column(force), _column(after)
 
     def inputs(self, dofs: int) -> int:
-        """Length of u for so many dofs."""
+        """Return the length of u for this number of dofs."""
         return 2 * dofs + len(self.constants) + self.carries
 
     @property
     def _dofs(self) -> int:
-        """Those of a node, or of the simplest face."""
+        """Number of dofs of a node, or of the simplest face."""
         return 3 if self.on == "nodes" else 9
 
     @cached_property
     def turns(self) -> bool:
-        """Whether its derivative by x is not symmetric."""
+        """Whether the derivative by x is not symmetric."""
         return self._skew[0] > SYMMETRIC
 
     @cached_property
     def spins(self) -> bool:
-        """The same of its derivative by v, as of gyroscopic forces."""
+        """Whether the derivative by v is not symmetric, as for gyroscopic forces."""
         return self._skew[1] > SYMMETRIC
 
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """u, data, and the force."""
-        u, data = ca.SX.sym("u", self.inputs(self._dofs)), ca.SX.sym("data", DATA)
+        """Symbols u and data, and the expression of the force."""
+        u = ca.SX.sym("u", self.inputs(self._dofs))
+        data = ca.SX.sym("data", DATA)
         return u, data, self.expression(u, data)
 
     @cached_property
     def _slopes(self) -> ca.Function:
-        """The force and its slope by u."""
+        """Function of the force and its derivative by u."""
         u, data, y = self._symbols
         return ca.Function("slopes", [u, data], [y, ca.jacobian(y, u)])
 
     @cached_property
     def _skew(self) -> tuple[float, float]:
-        """How far the derivatives by x and by v are from symmetric, at some points."""
-        rng, found, dofs = np.random.default_rng(0), np.zeros(2), self._dofs
+        """Largest relative skew parts of the derivatives by x and by v, at three random points."""
+        rng = np.random.default_rng(0)
+        largest = np.zeros(2)
+        dofs = self._dofs
         for _ in range(3):
-            some = [rng.uniform(0.5, 1.0, size) for size in (self.inputs(dofs), DATA)]
-            values = self._slopes(*some)[1].full()
+            sample = [rng.uniform(0.5, 1.0, size) for size in (self.inputs(dofs), DATA)]
+            values = self._slopes(*sample)[1].full()
             values = values[:dofs]
             for k, part in enumerate((values[:, :dofs], values[:, dofs : 2 * dofs])):
                 size = np.abs(part).max() or 1.0
-                found[k] = max(found[k], np.abs(part - part.T).max() / size)
-        return float(found[0]), float(found[1])
+                largest[k] = max(largest[k], np.abs(part - part.T).max() / size)
+        return float(largest[0]), float(largest[1])
 
     def _check(self) -> None:
-        dofs, named = self._dofs, {c.name: ca.SX.sym(c.name) for c in self.constants}
+        """Raise an `InputError` if the law cannot be evaluated, has the wrong shape or is not
+        finite.
+        """
+        dofs = self._dofs
+        named = {c.name: ca.SX.sym(c.name) for c in self.constants}
         x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.carries))
         at = AtNode(*ca.vertsplit(ca.SX.sym("data", DATA), [*ENDS]))
         try:
@@ -239,17 +262,23 @@ class NodeForce:
                 f"force {self.name!r} returns {after.numel()} numbers to carry; expected "
                 f"{self.carries}, as carries says"
             )
-        still = np.zeros(self.inputs(dofs))
-        still[:dofs] = TRIANGLE_M[:dofs]
-        still[2 * dofs : 2 * dofs + len(self.constants)] = 1.0
-        if not all(np.isfinite(e.full()).all() for e in self._slopes(still, np.ones(DATA))):
+        at_rest = np.zeros(self.inputs(dofs))
+        at_rest[:dofs] = TRIANGLE_M[:dofs]
+        at_rest[2 * dofs : 2 * dofs + len(self.constants)] = 1.0
+        if not all(np.isfinite(e.full()).all() for e in self._slopes(at_rest, np.ones(DATA))):
             raise InputError(
                 f"force {self.name!r} or its slope is not finite where the node is at rest; "
                 "expected a smooth law, such as sqrt(v·v + 1e-12) in place of |v|"
             )
 
     def on_finer(self, nodes: Index | None) -> NodeForce:
-        """The same on a finer body, whose nodes these are where no selection finds them."""
+        """Return this force for a refined body.
+
+        Parameters
+        ----------
+        nodes : (k,) int or None
+            Nodes of the refined body, used where a selection cannot select anew.
+        """
         finds = self.nodes is None or (
             isinstance(self.nodes, Selection) and not isinstance(self.nodes, Indices)
         )
@@ -258,15 +287,17 @@ class NodeForce:
 
 @dataclass(frozen=True, eq=False)
 class PlacedForce:
-    """A `NodeForce` on the nodes, or the faces, of a body.
+    """Custom force on the nodes or faces of a body.
 
     Attributes
     ----------
     force : NodeForce
     points : ForcePoints
         The nodes, or those of each face.
-    data : (8, i) what an `AtNode` has behind the time and before the time since
-    columns : (c,) places of its constants in θ
+    data : (8, i)
+        Entries of an `AtNode` between `t_s` and `since_s`, for each instance.
+    columns : (c,)
+        Indices in θ of its constants.
     """
 
     force: NodeForce
@@ -278,11 +309,29 @@ class PlacedForce:
     def on(
         cls, force: NodeForce, mesh: Nodes, chosen: Index, volume_m3: Array, columns: Index
     ) -> PlacedForce:
-        """A force on chosen nodes of a mesh, on a body whose nodes have these volumes (n,)."""
+        """Place a force on selected nodes of a mesh.
+
+        Parameters
+        ----------
+        force : NodeForce
+        mesh : Nodes
+        chosen : (k,) int
+            Indices of the selected nodes.
+        volume_m3 : (n,)
+            Lumped volumes of all nodes of the body.
+        columns : (c,) int
+            Indices in θ of the constants.
+
+        Raises
+        ------
+        InputError
+            If the force is on faces and no face has all of its nodes selected.
+        """
         area, normal = surface_of(mesh)
         data = np.vstack([mesh.points_m.T, area, volume_m3[: len(area)], normal.T])
         if force.on == "nodes":
-            nodes, data = chosen[:, None], data[:, chosen]
+            nodes = chosen[:, None]
+            data = data[:, chosen]
         else:
             faces = mesh.on_faces(mesh.mesh.surface)
             nodes = faces[np.isin(faces, chosen).all(axis=1)]
@@ -297,28 +346,43 @@ class PlacedForce:
 
 
 def _column(values: Any) -> ca.SX:
+    """Return a list or a single expression as a column vector."""
     return ca.SX(ca.vertcat(*values) if isinstance(values, (list, tuple)) else values)
 
 
 def middle(values: ca.SX) -> ca.SX:
-    """Of a face, as what acts there is shared: that of its last three nodes (3k,)."""
+    """Return the mean over the last three nodes of a face of a nodal quantity (3k,).
+
+    These nodes share the force on the face: the corners, or the mid nodes of a quadratic face.
+    """
     return ca.sum2(ca.reshape(values, 3, values.numel() // 3)[:, -3:]) / 3
 
 
 def area_vector(places: Sequence[ca.SX]) -> ca.SX:
-    """Of a face with corners a, b, c, and nodes on ab, bc, ca if any, its normal times its area."""
-    corners, middles = places[:3], places[3:]
+    """Return the normal of a face times its area (3,).
+
+    Parameters
+    ----------
+    places : sequence of (3,) SX
+        Corners a, b, c, and the nodes on ab, bc, ca of a quadratic face.
+    """
+    corners = places[:3]
+    middles = places[3:]
     pairs = zip(corners, middles, strict=True) if middles else ((corner,) for corner in corners)
     ring = [place - places[0] for pair in pairs for place in pair]
-    beside = pairwise(ring)
-    return sum((ca.cross(a, b) for a, b in beside), start=ca.SX.zeros(3)) / 2
+    neighbours = pairwise(ring)
+    return sum((ca.cross(a, b) for a, b in neighbours), start=ca.SX.zeros(3)) / 2
 
 
 def surface_of(mesh: Nodes) -> tuple[Array, Array]:
-    """(n,) area and (n, 3) normal of every node: corners', or of quadratic faces the mid nodes'."""
+    """Return the surface area (n,) and outward normal (n, 3) of every node; zero inside.
+
+    The area belongs to the corners, or to the mid nodes of quadratic faces.
+    """
     faces = mesh.on_faces(mesh.mesh.surface)
     a, b, c = np.moveaxis(mesh.points_m[faces[:, :3]], 1, 0)
-    share, normal = np.cross(b - a, c - a) / 6, np.zeros((len(mesh.points_m), 3))
+    share = np.cross(b - a, c - a) / 6
+    normal = np.zeros((len(mesh.points_m), 3))
     area = np.zeros(len(normal))
     for node in faces[:, -3:].T:
         np.add.at(normal, node, share)

@@ -1,4 +1,4 @@
-"""The sparsity of matrices on the mesh graph: one lower triangle shared by all timesteps."""
+"""Sparsity patterns of matrices on the mesh graph: one lower triangle shared by all time steps."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ..arrays import Array, Index
 class SymmetricPattern:
     """Positions of the lower triangle of a symmetric (3n, 3n) matrix.
 
-    Row and column 3i + j belong to coordinate j of node i. Entries are sorted by column,
-    then row, and every diagonal entry is present.
+    Row and column 3i + j belong to coordinate j of node i. Entries are sorted by column, then row,
+    and every diagonal entry is present.
 
     Attributes
     ----------
     size : int
-        3n.
-    rows, columns : ndarray
-        (m,) with rows >= columns.
+        Number 3n of rows.
+    rows, columns : (m,)
+        Row and column of each entry, rows >= columns.
     """
 
     size: int
@@ -33,7 +33,7 @@ class SymmetricPattern:
 
     @classmethod
     def of_cells(cls, cells: Index, nodes: int) -> SymmetricPattern:
-        """The pattern of a stiffness matrix on the mesh."""
+        """Return the pattern of a stiffness matrix on cells (E, k) of a mesh with `nodes` nodes."""
         dofs = dofs_of(cells)
         row = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
         column = np.tile(dofs, dofs.shape[1]).ravel()
@@ -42,7 +42,7 @@ class SymmetricPattern:
 
     @classmethod
     def of_entries(cls, rows: Index, columns: Index, nodes: int) -> SymmetricPattern:
-        """The pattern with these entries, rows >= columns, and the diagonal."""
+        """Return the pattern with these entries, rows >= columns, and the diagonal."""
         size = 3 * nodes
         codes = np.unique(np.append(columns * size + rows, np.arange(size) * (size + 1)))
         return cls(size, codes % size, codes // size)
@@ -54,18 +54,25 @@ class SymmetricPattern:
 
     @cached_property
     def diagonal(self) -> Index:
-        """(3n,) position of each diagonal entry."""
+        """Position of each diagonal entry (3n,)."""
         return np.flatnonzero(self.rows == self.columns)
 
     def position(self, row: Index, column: Index) -> Index:
-        """Position of entries given in either triangle."""
-        low, high = np.minimum(row, column), np.maximum(row, column)
+        """Return the positions of entries given in either triangle.
+
+        Raises
+        ------
+        IndexError
+            If an entry is not in the pattern.
+        """
+        low = np.minimum(row, column)
+        high = np.maximum(row, column)
         codes = self.columns * self.size + self.rows
-        wanted = low * self.size + high
-        found = np.searchsorted(codes, wanted)
-        if (found >= len(codes)).any() or (codes[found] != wanted).any():
+        wanted_codes = low * self.size + high
+        positions = np.searchsorted(codes, wanted_codes)
+        if (positions >= len(codes)).any() or (codes[positions] != wanted_codes).any():
             raise IndexError("an entry lies outside the mesh graph")
-        return found
+        return positions
 
     @cached_property
     def full(self) -> tuple[Index, Index, Index]:
@@ -78,26 +85,26 @@ class SymmetricPattern:
         return rows[order], columns[order], source[order]
 
     def matrix(self, values: NDArray[np.float64]) -> sp.csc_array:
-        """The full symmetric matrix of (m,) lower-triangle values."""
+        """Return the full symmetric matrix with the lower-triangle values (m,)."""
         rows, columns, source = self.full
         return sp.csc_array((values[source], (rows, columns)), shape=(self.size, self.size))
 
     def products(self, values: Array, vectors: Array) -> Array:
-        """(T, 3n) of symmetric matrices, by their values (T, m), and vectors (T, 3n)."""
+        """Return the products (T, 3n) of matrices with values (T, m) and vectors (T, 3n)."""
         pairs = zip(values, vectors, strict=True)
         return np.stack([self.matrix(value) @ vector for value, vector in pairs])
 
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """Patterns in one that holds all their entries.
+    """Union of several patterns.
 
     Attributes
     ----------
     pattern : SymmetricPattern
-        The first itself where it holds the others.
+        Union; the first pattern itself if it contains the others.
     places : tuple of (m,) int array
-        Where in it the entries of each are.
+        Positions in the union of the entries of each pattern.
     """
 
     pattern: SymmetricPattern
@@ -106,29 +113,31 @@ class Joined:
     @staticmethod
     @lru_cache(maxsize=16)
     def of(patterns: tuple[SymmetricPattern, ...]) -> Joined:
-        """The union of patterns of one size; that of the last few is kept."""
+        """Return the union of patterns of one size; the latest 16 are cached."""
         rows = np.concatenate([pattern.rows for pattern in patterns])
         columns = np.concatenate([pattern.columns for pattern in patterns])
-        whole = SymmetricPattern.of_entries(rows, columns, patterns[0].size // 3)
-        whole = patterns[0] if whole.entries == patterns[0].entries else whole
-        return Joined(whole, tuple(whole.position(p.rows, p.columns) for p in patterns))
+        union = SymmetricPattern.of_entries(rows, columns, patterns[0].size // 3)
+        union = patterns[0] if union.entries == patterns[0].entries else union
+        return Joined(union, tuple(union.position(p.rows, p.columns) for p in patterns))
 
     def spread(self, values: Array) -> Array:
-        """(T, m) values of the first pattern as those of all; itself where that is the same."""
+        """Return values (T, m) of the first pattern as values of the union; unchanged if they are
+        equal.
+        """
         if not values.size or values.shape[1] == self.pattern.entries:
             return values
-        found = np.zeros((len(values), self.pattern.entries))
-        found[:, self.places[0]] = values
-        return found
+        expanded = np.zeros((len(values), self.pattern.entries))
+        expanded[:, self.places[0]] = values
+        return expanded
 
 
 def dofs_of(nodes: Index) -> Index:
-    """Degrees of freedom 3i, 3i + 1, 3i + 2 of each node i of the last axis: (…, k) to (…, 3k)."""
+    """Return the dofs 3i, 3i + 1, 3i + 2 of each node i of the last axis: (…, k) to (…, 3k)."""
     return (3 * nodes[..., None] + np.arange(3)).reshape(*nodes.shape[:-1], -1)
 
 
 def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index, Index]:
-    """Where an element's vector and lower-triangle entries go.
+    """Return the positions of an element's vector and lower-triangle entries in global arrays.
 
     Returns
     -------
@@ -144,7 +153,9 @@ def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index
 
 
 def in_ascending_order(cells: Index, geometry: Array) -> tuple[Index, Array]:
-    """Elements (E, nodes) and their geometry (E, q, 3·nodes + 1) with the nodes in order."""
+    """Return elements (E, nodes) and their geometry (E, q, 3·nodes + 1) with ascending node
+    indices.
+    """
     order = np.argsort(cells, axis=1)
     gradients = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
     sorted_gradients = np.take_along_axis(gradients, order[:, None, :, None], axis=2)

@@ -1,4 +1,7 @@
-"""Every tetrahedron split into eight: the same body, twice as fine."""
+"""Refinement of a body: every tetrahedron is split into eight.
+
+Use `refined` for the body, and `refined_nodes` for nodes that are selected on it.
+"""
 
 from __future__ import annotations
 
@@ -20,26 +23,29 @@ from .selection import Ball, Box, Indices, Selection
 if TYPE_CHECKING:
     from .body import Body
 
-# Each corner keeps a tetrahedron of its own: its mid nodes, in the order of `elements.EDGES`.
+# Tetrahedron at each corner: the corner and its mid nodes, in the order of `elements.EDGES`.
 _AT_CORNERS = ((0, 4, 6, 7), (1, 4, 5, 8), (2, 5, 6, 9), (3, 7, 8, 9))
-# The octahedron that is left: each of its diagonals, and the other mid nodes around it.
+# Octahedron in the middle: each of its diagonals, and the ring of the other mid nodes.
 _DIAGONALS = np.array([(4, 9), (5, 7), (6, 8)])
 _AROUND = np.array([(5, 6, 7, 8), (4, 6, 9, 8), (4, 5, 9, 7)])
 
 
 def split_in_eight(mesh: TetMesh) -> TetMesh:
-    """The mesh with a node on each edge and eight tetrahedra in place of each.
+    """Return the mesh with a node on each edge and eight tetrahedra in place of each one.
 
     The octahedron in the middle is cut along its shortest diagonal, so that elements do not
-    deteriorate (Zhang 1995). The mesh's nodes come first, then the middle of each of
-    `TetMesh.edges`; the eight elements of one follow each other. Masks of nodes hold in the middle
-    of an edge where they hold at both ends; other arrays of nodes are left out.
+    deteriorate (Zhang 1995). The nodes of the mesh come first, then the middle of each of
+    `TetMesh.edges`; the eight parts of an element follow one another. Masks of nodes are true in
+    the middle of an edge if they are at both ends; other arrays of nodes are omitted.
     """
-    finer, ends = Nodes.of_element(mesh, ELEMENTS["tet10"]), mesh.edges
-    points, nodes = finer.points_m, finer.cells
+    finer = Nodes.of_element(mesh, ELEMENTS["tet10"])
+    ends = mesh.edges
+    points = finer.points_m
+    nodes = finer.cells
     across = points[nodes[:, _DIAGONALS]]  # (E, 3, 2, 3)
     shortest = np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=2).round(12).argmin(axis=1)
-    ring, axis = _AROUND[shortest], _DIAGONALS[shortest]  # (E, 4), (E, 2)
+    ring = _AROUND[shortest]
+    axis = _DIAGONALS[shortest]  # (E, 4), (E, 2)
     middle = [np.column_stack([axis, ring[:, k], ring[:, k - 1]]) for k in range(4)]
     local = [np.broadcast_to(corner, (len(nodes), 4)) for corner in _AT_CORNERS] + middle
     children = np.take_along_axis(nodes[:, None], np.stack(local, axis=1), axis=2)
@@ -55,13 +61,15 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
 
 
 def faces_in_four(faces: Index, mesh: TetMesh) -> Index:
-    """Faces (k, 3) of a mesh cut in four, with the nodes of `split_in_eight`."""
+    """Return faces (k, 3) of a mesh split into four each, with the nodes of `split_in_eight`."""
     nodes = Nodes.of_element(mesh, ELEMENTS["tet10"]).on_faces(faces)
     return nodes[:, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]].reshape(-1, 3)
 
 
 def refined(body: Body) -> Body:
-    """The body on a mesh twice as fine, its regions of the same cells."""
+    """Return the body on a mesh with half the element size; its regions consist of the split
+    cells.
+    """
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
         Region(
@@ -75,7 +83,7 @@ def refined(body: Body) -> Body:
         for part, inside in zip(body.parts, cells, strict=True)
         if part.name
     ]
-    # A region without a density of its own has the body's, whether any cell is left for it or not.
+    # A region without a density has that of the body, even if regions claim all cells.
     rest = next((part for part in body.parts if not part.own_density), body.parts[0])
     mesh = split_in_eight(body.mesh)
     finer = type(body)(
@@ -100,19 +108,21 @@ def refined(body: Body) -> Body:
 
 
 def _finer_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
-    """Return what is stated of the stress-free shape, with the held nodes of the finer mesh."""
+    """Return the rest-shape statement of a body, with the held nodes of the refined mesh."""
     if body.scan is None:
         return None if body.rest_shape is None else "stress_free"
     if isinstance(body.scan.nodes, (Box, Ball)):
         return body.scan
     corners = len(body.mesh.points_m)
-    held = np.isin(np.arange(corners), body.scan.held_nodes(body.nodes))
-    chosen = np.concatenate([held, held[body.mesh.edges].all(axis=1)])
+    is_held = np.isin(np.arange(corners), body.scan.held_nodes(body.nodes))
+    chosen = np.concatenate([is_held, is_held[body.mesh.edges].all(axis=1)])
     return replace(body.scan, nodes=Indices(np.flatnonzero(chosen).tolist()))
 
 
 def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:
-    """A force on the finer mesh: the middle of an edge belongs where both ends do."""
+    """Return a force for the refined mesh; it acts in the middle of an edge if it does at both
+    ends.
+    """
     chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
     nodes = chosen[: len(body.mesh.points_m)]
     chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])
@@ -122,9 +132,18 @@ def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:
 
 
 def refined_nodes(nodes: Index, selection: Selection | None, body: Body, finer: Body) -> Index:
-    """The nodes of the finer body that stand for nodes of the coarser.
+    """Return the nodes of the refined body that correspond to nodes of the original one.
 
-    Boxes and balls select anew. Otherwise the middle of an edge belongs where both ends do.
+    Boxes and balls select anew. Otherwise the middle of an edge is selected if both ends are.
+
+    Parameters
+    ----------
+    nodes : (k,) int
+        Nodes of the original body.
+    selection : Selection or None
+        Selection of these nodes, if there is one.
+    body, finer : Body
+        Original and refined body.
     """
     if isinstance(selection, (Box, Ball)):
         return finer.select(selection)

@@ -1,6 +1,7 @@
-"""The regions of a body: cells with a material, a damping law and a density of their own.
+"""Regions of a body with their own material, damping law and density, and the vector θ.
 
-θ holds the constants that the parts of a body declare, and names that a user knows give them.
+Use `Region` to declare a region. `Model` maps parameters by the names that users know to the
+constants θ of all parts of a body.
 """
 
 from __future__ import annotations
@@ -28,17 +29,18 @@ from .two_phase import TwoPhaseModes
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of a body that differs from the rest.
+    """Part of a body with properties that differ from the rest.
 
     Parameters
     ----------
     name : str
-        Stands before the names of its constants: ``core.mu_pa``.
-    cells : selection of cells, or (E,) bool, or (k,) int array
+        Prefix of the names of its constants: ``core.mu_pa``.
+    cells : Selection, (E,) bool or (k,) int array
+        Selection, mask or indices of its cells.
     material, damping, density_kg_m3, prony
-        The body's where they are left out.
+        Those of the body where they are None.
     field : Field, optional
-        A constant that differs from place to place within the region.
+        Constant that varies in space within the region.
     """
 
     name: str
@@ -59,27 +61,28 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class BodyPart:
-    """A region as the body evaluates it.
+    """Region of a body, or its remainder, with resolved laws.
 
     Attributes
     ----------
     name : str
-        "" for what no region claims.
-    cells : (k,) cell numbers, ascending
+        Name of the region; "" for the cells outside all regions.
+    cells : (k,)
+        Cell indices, ascending.
     material : Material
     damping : Damping
     density_kg_m3 : float
-        As stated; θ tells where it is free.
+        Stated density; not used where the density is free.
     prony : tuple of Prony
-        The branches of its memory.
+        Branches of its memory.
     per_mass_1_m3 : float
-        The density over the mass of the body.
+        Density divided by the mass of the body.
     own_density : bool
-        Whether it is stated for this part, not for the body.
+        Whether the density is stated for this part, not for the body.
     free_density : bool
-        Whether the density is one of its constants.
+        Whether the density is an entry of θ.
     field : FieldModes or None
-        What differs from place to place within it.
+        Constant that varies in space within the part.
     """
 
     name: str
@@ -95,44 +98,46 @@ class BodyPart:
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:
-        """Of material, damping law, memory, mass and field, as they follow one another in θ."""
-        of_memory = [constant for branch in self.prony for constant in branch.constants]
-        law = (*self.material.constants, *self.damping.constants, *of_memory, GAMMA_M)
+        """Constants of material, damping law, memory, mass and field, in the order of θ."""
+        memory = [constant for branch in self.prony for constant in branch.constants]
+        law = (*self.material.constants, *self.damping.constants, *memory, GAMMA_M)
         law = (*law, DENSITY) if self.free_density else law
         return (*law, *self.field_constants)
 
     @property
     def field_constants(self) -> tuple[Constant, ...]:
-        """Constants of the field, the last ones of the part; none without a field."""
+        """Constants of the field, the last ones of the part; empty without a field."""
         return () if self.field is None else self.field.constants
 
     @property
     def of_law(self) -> int:
-        """How many of them are the material's and the damping law's."""
+        """Number of constants of the material and the damping law."""
         return len(self.material.constants) + len(self.damping.constants)
 
     @property
     def of_gamma_m(self) -> int:
-        """Where γ_m is among them; the density follows where it is free."""
+        """Index of γ_m among the constants of the part; the density follows where it is free."""
         return self.of_law + 2 * len(self.prony)
 
     @property
     def of_points(self) -> int:
-        """How many numbers the quadrature points need: those, and the stiffening by memory."""
+        """Number of constants of the quadrature points: of the law, and the stiffening by
+        memory.
+        """
         return self.of_law + bool(self.prony)
 
     @property
     def stress_field(self) -> FieldModes | None:
-        """The field, where stress depends on it: not that of a density."""
+        """Field of a constant on which the stress depends; None without one, or for a density."""
         return self.field if self.field and self.field.scaled else None
 
     @property
     def field_name(self) -> str:
-        """The constant that differs from place to place."""
+        """Name of the constant that varies in space; "" without a field."""
         return self.full_name(self.field.field.parameter) if self.field else ""
 
     def full_name(self, own: str) -> str:
-        """The name of a constant with the region in front."""
+        """Return the name of a constant with the prefix of the region."""
         return f"{self.name}.{own}" if self.name else own
 
 
@@ -146,7 +151,16 @@ def parts_of(
     prony: Sequence[str | Prony] = (),
     field: Field | None = None,
 ) -> tuple[BodyPart, ...]:
-    """The parts of a body: what no region claims, where there is any, then the regions.
+    """Return the parts of a body: the cells outside all regions, if any, then the regions.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    material, damping, prony, field
+        Laws of the cells outside all regions, and defaults of the regions.
+    density_kg_m3, mass_kg : float or None
+        Density outside regions with a density, or mass of the whole body; exactly one of them.
+    regions : sequence of Region
 
     Raises
     ------
@@ -154,24 +168,30 @@ def parts_of(
         If regions overlap, share a name, are empty, or leave no mass for the rest.
     """
     claimed = _claimed(mesh, regions)
-    own = _densities(mesh, regions, claimed, density_kg_m3, mass_kg)
+    densities = _densities(mesh, regions, claimed, density_kg_m3, mass_kg)
     rest = np.setdiff1d(
         np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
     )
     branches = as_branches(prony)
-    whole = BodyPart("", rest, as_material(material), as_damping(damping), own[0], branches)
+    remainder = BodyPart(
+        "", rest, as_material(material), as_damping(damping), densities[0], branches
+    )
     if field is not None and not rest.size:
         raise InputError(
             "the field is of what no region claims, and all is claimed; expected it of a region"
         )
-    parts = [_with_field(whole, field, mesh)] if rest.size else []
-    for region, cells, density in zip(regions, claimed, own[1:], strict=True):
+    parts = [_with_field(remainder, field, mesh)] if rest.size else []
+    for region, cells, density in zip(regions, claimed, densities[1:], strict=True):
         try:
-            law = whole.material if region.material is None else as_material(region.material)
-            drag = whole.damping if region.damping is None else as_damping(region.damping)
+            law = remainder.material if region.material is None else as_material(region.material)
+            region_damping = (
+                remainder.damping if region.damping is None else as_damping(region.damping)
+            )
             memory = branches if region.prony is None else as_branches(region.prony)
             has_own = region.density_kg_m3 is not None
-            part = BodyPart(region.name, cells, law, drag, density, memory, own_density=has_own)
+            part = BodyPart(
+                region.name, cells, law, region_damping, density, memory, own_density=has_own
+            )
             parts.append(_with_field(part, region.field, mesh))
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
@@ -180,6 +200,7 @@ def parts_of(
 
 
 def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
+    """Return the part with the shapes of a field; the part itself for None."""
     if field is None:
         return part
     law = (*part.material.constants, *part.damping.constants)
@@ -194,7 +215,7 @@ def _densities(
     density_kg_m3: float | None,
     mass_kg: float | None,
 ) -> list[float]:
-    """Densities of what no region claims, and of the regions."""
+    """Return the density outside the regions, then that of each region."""
     if (density_kg_m3 is None) == (mass_kg is None):
         raise InputError("give exactly one of density_kg_m3 and mass_kg")
     for region in regions:
@@ -210,18 +231,24 @@ def _densities(
                 "every cell is in a region with a density of its own, so mass_kg says nothing; "
                 "leave one density out"
             )
-        rest, name = (float(mass_kg or 0.0) - known_kg) / left_m3, "mass_kg"
+        default_density = (float(mass_kg or 0.0) - known_kg) / left_m3
+        key = "mass_kg"
     else:
-        rest, name, known_kg = density_kg_m3, "density_kg_m3", 0.0
-    if not rest > 0:
-        heavy = f"; the regions' densities make up {known_kg:.4g} kg of it" if known_kg else ""
-        raise InputError(f"{name} must be positive{heavy}")
-    own = [rest if region.density_kg_m3 is None else region.density_kg_m3 for region in regions]
-    return [rest, *own]
+        default_density = density_kg_m3
+        key = "density_kg_m3"
+        known_kg = 0.0
+    if not default_density > 0:
+        hint = f"; the regions' densities make up {known_kg:.4g} kg of it" if known_kg else ""
+        raise InputError(f"{key} must be positive{hint}")
+    region_densities = [
+        default_density if region.density_kg_m3 is None else region.density_kg_m3
+        for region in regions
+    ]
+    return [default_density, *region_densities]
 
 
 def _claimed(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
-    """The cells of each region, ascending."""
+    """Return the cells of each region, ascending; raise an `InputError` if regions overlap."""
     owner = np.full(len(mesh.tetrahedra), -1)
     claimed: list[Index] = []
     for k, region in enumerate(regions):
@@ -231,11 +258,11 @@ def _claimed(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
             cells = _cells(mesh, region.cells)
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
-        if (taken := cells[owner[cells] >= 0]).size:
-            other = regions[int(owner[taken[0]])].name
+        if (overlap := cells[owner[cells] >= 0]).size:
+            other = regions[int(owner[overlap[0]])].name
             raise InputError(
-                f"cell {taken[0]} is in the regions {other!r} and {region.name!r}; expected every "
-                "cell in one at most"
+                f"cell {overlap[0]} is in the regions {other!r} and {region.name!r}; expected "
+                "every cell in one at most"
             )
         owner[cells] = k
         claimed.append(cells)
@@ -243,6 +270,7 @@ def _claimed(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
 
 
 def _cells(mesh: TetMesh, given: Selection | ArrayLike) -> Index:
+    """Return cell indices, ascending, from a selection, a mask or indices."""
     if isinstance(given, Selection):
         return given.resolve_cells(mesh)
     array = np.asarray(given)
@@ -264,25 +292,25 @@ Theta = Sequence[float] | Array
 
 
 class Model:
-    """A sum of terms, part by part.
+    """Sum of terms, part by part, with the vector θ of their constants.
 
     Parameters
     ----------
     parts : tuple of BodyPart
     forces : tuple of NodeForce
-        Of users.
+        Custom forces.
     frictions : tuple of Constant
-        Coefficients of friction that are parameters.
+        Friction coefficients that are parameters.
 
     Attributes
     ----------
     constants : dict of name to Constant
-        What θ holds, in its order: those of the parts, of the forces, and frictions.
+        Definitions of the entries of θ, in their order: those of parts, of forces, and frictions.
 
     Raises
     ------
     InputError
-        If two constants have one name.
+        If two constants have the same name.
     """
 
     def __init__(
@@ -291,7 +319,9 @@ class Model:
         forces: tuple[NodeForce, ...] = (),
         frictions: tuple[Constant, ...] = (),
     ) -> None:
-        self.parts, self.forces, self.frictions = parts, forces, frictions
+        self.parts = parts
+        self.forces = forces
+        self.frictions = frictions
         self.constants: dict[str, Constant] = {
             part.full_name(c.name): c for part in parts for c in part.constants
         }
@@ -312,7 +342,12 @@ class Model:
             self.constants[constant.name] = constant
 
     def sources(self, known: Sequence[str]) -> list[Source]:
-        """For each part, which of the names that are known give its constants.
+        """Return for each part the parameters that determine its constants.
+
+        Parameters
+        ----------
+        known : sequence of str
+            Names of the given parameters.
 
         Raises
         ------
@@ -332,24 +367,26 @@ class Model:
         ]
 
     def used_names(self, known: Sequence[str]) -> set[str]:
-        """Those of the names that are known which give its constants."""
-        own = {name for source in self.sources(known) for name in source.names.values()}
-        own.update(self.mode_names, self.contrasts)
+        """Return those of the given parameters' names on which θ depends."""
+        used = {name for source in self.sources(known) for name in source.names.values()}
+        used.update(self.mode_names, self.contrasts)
         further = (force.constants for force in self.forces)
-        return own.union(*({c.name for c in some} for some in (*further, self.frictions)))
+        return used.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names that a parameter may have: constants, what may stand for them, and shared ones."""
+        """Names that a parameter may have: constants, moduli that replace them, and shared
+        names.
+        """
         names = []
         for part in self.parts:
-            owns = [c.name for c in part.constants] + list(elastic_names(part.material))
-            owns.append(DENSITY.name)
-            names += [part.full_name(own) for own in owns] + owns
+            part_names = [c.name for c in part.constants] + list(elastic_names(part.material))
+            part_names.append(DENSITY.name)
+            names += [part.full_name(part_name) for part_name in part_names] + part_names
         return tuple(dict.fromkeys([*names, MASS.name, *self.constants]))
 
     def assembled(self, values: Mapping[str, Any]) -> list[Any]:
-        """θ from values by the user's names: numbers, or CasADi expressions.
+        """Return θ as a list from parameters by name: numbers, or CasADi expressions.
 
         Raises
         ------
@@ -358,12 +395,12 @@ class Model:
         """
         theta = []
         for part, source in zip(self.parts, self.sources(list(values)), strict=True):
-            found = source.constants(values)
+            constants = source.constants(values)
             if source.names.get(DENSITY.name) == MASS.name:
-                found[DENSITY.name] *= part.per_mass_1_m3
+                constants[DENSITY.name] *= part.per_mass_1_m3
             # A field that nothing is said of is as its mean everywhere.
-            own = part.constants[: len(part.constants) - len(part.field_constants)]
-            theta += [found[constant.name] for constant in own]
+            own_constants = part.constants[: len(part.constants) - len(part.field_constants)]
+            theta += [constants[constant.name] for constant in own_constants]
             theta += [values.get(part.full_name(c.name), c.usual) for c in part.field_constants]
         for name in list(self.constants)[len(theta) :]:
             if name not in values:
@@ -374,28 +411,32 @@ class Model:
         return theta
 
     def theta(self, values: Mapping[str, float]) -> Array:
-        """(k,) constants from values by the user's names; values of other bodies do not matter.
+        """Return the constants θ (k,) from parameters by name; names of other bodies are ignored.
 
         Raises
         ------
         InputError
-            If one is missing or given twice.
+            If a constant is missing or given twice.
         """
         return np.array([float(value) for value in self.assembled(values)])
 
     def lame(self, theta: Theta) -> dict[str, tuple[float, float]]:
-        """Small-strain (λ, μ) [Pa] of each part by its name."""
-        found = {}
-        for part, mine in zip(self.parts, self.split(np.asarray(theta, dtype=float)), strict=True):
-            values = part.material.lame(mine[: len(part.material.constants)]).full().ravel()
-            found[part.name] = (float(values[0]), float(values[1]))
-        return found
+        """Return the small-strain (λ, μ) [Pa] of each part at θ, by the name of the part."""
+        by_part = {}
+        for part, part_constants in zip(
+            self.parts, self.split(np.asarray(theta, dtype=float)), strict=True
+        ):
+            values = (
+                part.material.lame(part_constants[: len(part.material.constants)]).full().ravel()
+            )
+            by_part[part.name] = (float(values[0]), float(values[1]))
+        return by_part
 
     def weighed_by(self, names: Collection[str]) -> list[str]:
-        """Parts whose densities parameters of these names give.
+        """Return the names of the parts whose densities are given by parameters of these names.
 
-        A density that is stated for a region alone stays, unless ``core.density_kg_m3`` or
-        ``mass_kg`` is among them.
+        A density that is stated for a region alone is not a parameter, unless
+        ``core.density_kg_m3`` or ``mass_kg`` is among the names.
         """
         return [
             part.name
@@ -406,12 +447,12 @@ class Model:
         ]
 
     def split(self, theta: Any) -> list[Any]:
-        """θ, numbers or a CasADi expression, part by part."""
+        """Return θ, numbers or a CasADi expression, part by part."""
         return [theta[a:b] for a, b in pairwise(self.starts)]
 
     @property
     def mode_names(self) -> tuple[str, ...]:
-        """Of the shares of shapes of fields."""
+        """Names of the coefficients of the shapes of fields."""
         return tuple(name for name in self.constants if is_mode(name))
 
     @property
@@ -425,23 +466,23 @@ class Model:
 
     @cached_property
     def mode_places(self) -> list[slice]:
-        """Where in θ those of each part are."""
+        """Slice in θ of the coefficients of each part's field."""
         counts = (len(part.field_constants) for part in self.parts)
         ends = self.starts[1:]
         return [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
 
     @cached_property
     def starts(self) -> list[int]:
-        """Where the constants of each part begin in θ, and where the last end."""
+        """Index in θ of the first constant of each part, and that after the last part."""
         return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
 
     def elastic(self, constants: Mapping[str, float]) -> Array:
-        """θ without damping.
+        """Return θ from elastic constants, with all other constants zero.
 
         Raises
         ------
         InputError
-            For a name that the model does not know, or one that is missing.
+            For a name that the model does not have, or one that is missing.
         """
         for name in constants:
             if name not in self.parameter_names:

@@ -1,4 +1,4 @@
-"""Numbers that the stress-free shape of a body gives each quadrature point, see `rest_shape`."""
+"""Data of the stress-free shape at a quadrature point, see `rest_shape`."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import casadi as ca
 
 @dataclass(frozen=True)
 class RestPoint:
-    """Layout of what the stress-free shape gives each quadrature point.
+    """Layout of the data of the stress-free shape at a quadrature point.
 
-    Per point there are D = 9 numbers of G, column after column, and for elements that average the
-    dilatation ρ = ln(det G / mean of det G over the element); then the D k derivatives by the k
-    inputs, and those of second order by pairs (i, j), i ≤ j.
+    A point has D values: the 9 entries of G = ∂X/∂Y, column after column, and, for elements that
+    average the dilatation, ρ = ln(det G / mean of det G over the element). They are followed by
+    their D k derivatives by the k inputs, and by the second derivatives by pairs (i, j), i ≤ j.
 
     Attributes
     ----------
     inputs : int
-        Number k of the entries of θ that X depends on.
+        Number k of entries of θ on which X depends.
     mean_dilatation : bool
+        Whether the element averages the dilatation.
     """
 
     inputs: int
@@ -27,26 +28,26 @@ class RestPoint:
 
     @property
     def values(self) -> int:
-        """Number D."""
+        """Number D of values of a point."""
         return 10 if self.mean_dilatation else 9
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Pairs of inputs (i, j), i ≤ j."""
+        """Pairs of inputs (i, j), i ≤ j, in the order of the second derivatives."""
         return [(i, j) for j in range(self.inputs) for i in range(j + 1)]
 
     @property
     def count(self) -> int:
-        """Numbers per point."""
+        """Number of data of a point."""
         return self.values * (1 + self.inputs + len(self.pairs))
 
     def expand(self, data: ca.SX, changes: ca.SX) -> ca.SX:
-        """Return the D values where the inputs change by `changes` (k,), to second order."""
+        """Return the D values after changes (k,) of the inputs, to second order."""
         columns = ca.reshape(data, self.values, 1 + self.inputs + len(self.pairs))
-        found = columns[:, 0]
+        values = columns[:, 0]
         for i in range(self.inputs):
-            found += columns[:, 1 + i] * changes[i]
+            values += columns[:, 1 + i] * changes[i]
         for number, (i, j) in enumerate(self.pairs):
-            share = 0.5 if i == j else 1.0
-            found += share * changes[i] * changes[j] * columns[:, 1 + self.inputs + number]
-        return found
+            factor = 0.5 if i == j else 1.0
+            values += factor * changes[i] * changes[j] * columns[:, 1 + self.inputs + number]
+        return values

@@ -1,18 +1,19 @@
 """Stress-free shape of a body whose mesh was made while it hung or stood under its own weight.
 
-The mesh Y is then an equilibrium shape. The stress-free positions X of its nodes are the solution
-of the inverse equilibrium (Govindjee & Mihalic 1996)
+Use `UnderGravity` to state the conditions of the scan; `InverseEquilibrium` computes the shape. The
+mesh Y is then an equilibrium shape. The stress-free positions X of its nodes are the solution of
+the inverse equilibrium (Govindjee & Mihalic 1996)
 
     f(Y; X, θ) + M(θ) g = 0 at free nodes,   X = Y at the nodes that were held,
 
-with the elastic force f = −∂Ψ/∂x, the gravity g in the axes of the mesh, and masses M that are
-those of the mesh: mass is conserved. X depends on the elastic constants and on free densities. By
-the implicit function theorem, with the residual r, ∂X/∂θ = −(∂r/∂X)⁻¹ ∂r/∂θ.
+with the elastic force f = −∂Ψ/∂x, the gravity g in the axes of the mesh, and the masses M of the
+mesh: mass is conserved. X depends on the elastic constants and on free densities. By the implicit
+function theorem, with the residual r, ∂X/∂θ = −(∂r/∂X)⁻¹ ∂r/∂θ.
 
-The kernels keep Y as the computational reference. With G = ∂X/∂Y at a quadrature point, the
-material's deformation gradient is F = (∂x/∂Y) G⁻¹ and the point's volume V det G, see
-`RestPoint`. G and its derivatives by θ are data of the points, so that a force and all its
-derivatives are those of the complete model, whatever uses them.
+The kernels keep Y as the reference configuration of the computation. With G = ∂X/∂Y at a quadrature
+point, the deformation gradient of the material is F = (∂x/∂Y) G⁻¹ and the volume of the point V det
+G, see `RestPoint`. G and its derivatives by θ are data of the points, so that forces and all their
+derivatives are those of the complete model in every method.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from .regions import BodyPart
 from .rest_point import RestPoint
 from .selection import Selection
 
-# Stress-free shapes that a body keeps, by the constants that these depend on: those of an iterate,
-# of its neighbours in a difference, and of the iterate before.
+# Number of cached stress-free shapes: of an iterate, of its neighbours for difference quotients,
+# and of the previous iterate.
 SHAPES_KEPT = 16
 # Relative step of the differences of ∂X/∂θ that give ∂²X/∂θ²: the cube root of the rounding error.
 DIFFERENCE = 1e-5
 LARGEST_GRAVITY_M_S2 = 1e4
-# Relative change of a constant up to which a solution is sought from the latest one.
+# Largest relative change of a constant for which Newton's method starts from the latest solution.
 NEAR = 0.2
 
 
@@ -53,12 +54,12 @@ class InverseOptions:
     Attributes
     ----------
     tolerance : float
-        Largest entry of a last Newton step over the body's size. Convergence is quadratic, so that
-        the step that follows would be at the rounding error.
+        Largest entry of the last Newton step divided by the size of the body. Convergence is
+        quadratic, so the next step would be at the rounding error.
     iterations : int
         Newton steps for one share of the weight.
     halvings : int
-        How often a step is halved, and how often the share of the weight that is added.
+        How often a step is halved, and how often the increment of the weight.
     load_steps : int
         Attempts with a share of the weight.
     least_volume_ratio : float
@@ -76,7 +77,7 @@ OPTIONS = InverseOptions()
 
 
 class RestShapeError(SimulationError):
-    """No stress-free shape was found whose equilibrium under gravity is the mesh.
+    """Error: no stress-free shape was found whose equilibrium under gravity is the mesh.
 
     Parameters
     ----------
@@ -97,14 +98,14 @@ class RestShapeError(SimulationError):
 
 @dataclass(frozen=True, eq=False)
 class UnderGravity:
-    """How a body hung or stood while its mesh was made: the mesh is that equilibrium shape.
+    """Conditions of a scan under gravity: the mesh is the equilibrium shape.
 
     Parameters
     ----------
-    nodes : Selection or (k,) node numbers
-        The nodes that were held, such as those in a clamp or on a table.
+    nodes : Selection or (k,) node indices
+        Nodes that were held, such as those in a clamp or on a table.
     gravity_m_s2 : (3,) array, default (0, 0, -9.81)
-        Gravity in the axes of the mesh: its direction is the pose of the scan.
+        Gravity in the axes of the mesh; its direction states the pose of the scan.
 
     Raises
     ------
@@ -132,7 +133,7 @@ class UnderGravity:
         object.__setattr__(self, "gravity_m_s2", gravity)
 
     def held_nodes(self, nodes: Nodes) -> Index:
-        """Return the held nodes, sorted.
+        """Return the indices of the held nodes, sorted.
 
         Raises
         ------
@@ -162,12 +163,14 @@ class UnderGravity:
 
 @dataclass(frozen=True, eq=False)
 class RestShape:
-    """Stress-free positions at one θ.
+    """Stress-free positions at one θ, with derivatives.
 
     Attributes
     ----------
-    positions_m : (n, 3) X
-    by_input : (k, n, 3) ∂X by each input
+    positions_m : (n, 3)
+        Positions X.
+    by_input : (k, n, 3)
+        Derivatives of X by each input.
     """
 
     positions_m: Array
@@ -176,15 +179,26 @@ class RestShape:
 
 @lru_cache(32)
 def _point_stress(material: Material, averages: bool, slopes: bool) -> ca.Function:
-    """Kirchhoff stress per volume of the mesh at a point, and its derivatives if `slopes`.
+    """Return the function of the Kirchhoff stress per volume of the mesh at a point.
 
-    Inputs: G (9,), column after column, the mean m of det G over the element, and the constants
-    (c,) of the material. With F = G⁻¹, or F = (det G / m)^⅓ G⁻¹ where the element averages the
-    dilatation, the stress is det G · ∂ψ/∂F Fᵀ (9,). Derivatives: by G (9, 9), m (9,), θ (9, c).
+    Inputs: G (9,), column after column; the mean m of det G over the element; the constants (c,) of
+    the material. With F = G⁻¹, or F = (det G / m)^⅓ G⁻¹ if the element averages the dilatation, the
+    stress is det G · ∂ψ/∂F Fᵀ (9,). If `slopes`, the derivatives by G (9, 9), by m (9,) and by θ
+    (9, c) follow.
+
+    Parameters
+    ----------
+    material : Material
+    averages : bool
+        Whether the element averages the dilatation.
+    slopes : bool
+        Whether to include derivatives.
     """
-    own, mean = ca.SX.sym("G", 9), ca.SX.sym("mean")
-    theta, strain = ca.SX.sym("theta", len(material.constants)), ca.SX.sym("F", 9)
-    G = ca.reshape(own, 3, 3)
+    gradient = ca.SX.sym("G", 9)
+    mean = ca.SX.sym("mean")
+    theta = ca.SX.sym("theta", len(material.constants))
+    strain = ca.SX.sym("F", 9)
+    G = ca.reshape(gradient, 3, 3)
     F = ca.inv_minor(G)
     if averages:
         F = (ca.det(G) / mean) ** (1 / 3) * F
@@ -193,21 +207,25 @@ def _point_stress(material: Material, averages: bool, slopes: bool) -> ca.Functi
     stress = ca.vec(ca.det(G) * piola @ F.T)
     outputs = [stress]
     if slopes:
-        outputs += [ca.jacobian(stress, each) for each in (own, mean, theta)]
+        outputs += [ca.jacobian(stress, each) for each in (gradient, mean, theta)]
     dense = [ca.densify(output) for output in outputs]
-    return ca.Function("inverse_stress", [own, mean, theta], dense, {"cse": True})
+    return ca.Function("inverse_stress", [gradient, mean, theta], dense, {"cse": True})
 
 
 @dataclass(frozen=True, eq=False)
 class _PartForces:
-    """Elastic force of the cells of one part at the mesh, with its derivatives.
+    """Elastic forces of the cells of one part at the mesh, with derivatives.
 
     Attributes
     ----------
-    dofs : (E, d) dofs of the cells
+    dofs : (E, d)
+        Dofs of the cells.
     force_n : (E, d)
-    by_position : (E, d, d) derivative by X, rows are those of the force; empty without slopes
-    by_theta : (E, d, c) derivative by the constants of the material; empty without slopes
+        Elastic forces.
+    by_position : (E, d, d)
+        Derivatives by X, with rows of the force; empty without derivatives.
+    by_theta : (E, d, c)
+        Derivatives by the constants of the material; empty without derivatives.
     """
 
     dofs: Index
@@ -226,7 +244,23 @@ def _part_forces(
     averages: bool,
     slopes: bool,
 ) -> _PartForces:
-    """Return the elastic forces of cells at the mesh, where X is `positions_m` (n, 3)."""
+    """Return the elastic forces of cells at the mesh, with stress-free positions X (n, 3).
+
+    Parameters
+    ----------
+    cells : (E, nodes) int
+    geometry : (E, q, 3·nodes + 1)
+        Shape gradients and volumes.
+    positions_m : (n, 3)
+        Stress-free positions X.
+    constants : (c,)
+        Constants of the material.
+    material : Material
+    averages : bool
+        Whether the element averages the dilatation.
+    slopes : bool
+        Whether to compute derivatives.
+    """
     count, points = geometry.shape[:2]
     shape_slopes = geometry[..., :-1].reshape(count, points, -1, 3)
     volumes = geometry[..., -1]
@@ -235,9 +269,9 @@ def _part_forces(
     G = np.einsum("ean,eqai->eqin", positions_m[cells], shape_slopes)
     ratios = np.linalg.det(G)
     mean = np.einsum("eq,eq->e", shares, ratios)
-    of_points = G.reshape(count * points, 9).T
+    point_gradients = G.reshape(count * points, 9).T
     function = _point_stress(material, averages, slopes)
-    outputs = function(of_points, np.repeat(mean, points)[None], constants)
+    outputs = function(point_gradients, np.repeat(mean, points)[None], constants)
     outputs = [np.array(each) for each in (outputs if slopes else [outputs])]
     stress = outputs[0].T.reshape(count, points, 3, 3)
     size = 3 * cells.shape[1]
@@ -246,8 +280,8 @@ def _part_forces(
         _average_pressure(stress[..., None], shares)
     force = -np.einsum("eq,eqaj,eqji->eai", volumes, shape_slopes, stress).reshape(count, size)
     if not slopes:
-        none = np.zeros((0, size, 0))
-        return _PartForces(dofs, force, none, none)
+        empty = np.zeros((0, size, 0))
+        return _PartForces(dofs, force, empty, empty)
     by_G = outputs[1].reshape(9, count, points, 9).transpose(1, 2, 0, 3)
     by_G = by_G.reshape(count, points, 3, 3, 3, 3)
     by_X = np.einsum("eqjilk,eqbl->eqjibk", by_G, shape_slopes, optimize=True)
@@ -261,9 +295,9 @@ def _part_forces(
         by_X = by_X + by_mean[..., None] * mean_by_X.reshape(count, 1, 1, 1, size)
         _average_pressure(by_X, shares)
         _average_pressure(by_theta, shares)
-    pulled = -volumes[..., None, None] * shape_slopes
-    matrices = np.einsum("eqaj,eqjim->eaim", pulled, by_X, optimize=True)
-    columns = np.einsum("eqaj,eqjic->eaic", pulled, by_theta, optimize=True)
+    weighted_slopes = -volumes[..., None, None] * shape_slopes
+    matrices = np.einsum("eqaj,eqjim->eaim", weighted_slopes, by_X, optimize=True)
+    columns = np.einsum("eqaj,eqjic->eaic", weighted_slopes, by_theta, optimize=True)
     return _PartForces(
         dofs, force, matrices.reshape(count, size, size), columns.reshape(count, size, -1)
     )
@@ -271,15 +305,24 @@ def _part_forces(
 
 def _average_pressure(stress: Array, shares: Array) -> None:
     """Replace the pressure of stresses (E, q, 3, 3, any) by its mean over the cell, in place."""
-    own = np.einsum("eqiim->eqm", stress) / 3
-    change = np.einsum("eq,eqm->em", shares, own)[:, None] - own
+    pressure = np.einsum("eqiim->eqm", stress) / 3
+    change = np.einsum("eq,eqm->em", shares, pressure)[:, None] - pressure
     for axis in range(3):
         stress[:, :, axis, axis] += change
 
 
 @dataclass(frozen=True, eq=False)
 class _Assembled:
-    """Elastic force (3n,) at the mesh, and its derivatives by X (3n, 3n) and inputs (3n, k)."""
+    """Elastic forces at the mesh, assembled, with derivatives.
+
+    Attributes
+    ----------
+    force_n : (3n,)
+    by_position : (3n, 3n) sparse
+        Derivatives by X.
+    by_theta : (3n, k)
+        Derivatives by the inputs.
+    """
 
     force_n: Array
     by_position: sp.csc_array
@@ -287,17 +330,25 @@ class _Assembled:
 
 
 class InverseEquilibrium:
-    """Solver of the inverse equilibrium of a body, which keeps its latest solutions.
+    """Solver of the inverse equilibrium of a body, with a cache of the latest solutions.
 
     Parameters
     ----------
     body : Body
-        With `scan`; `body` imports this module, hence no annotation.
+        Body with a `scan`. (`body` imports this module, hence no annotation.)
 
     Attributes
     ----------
-    places : (k,) the entries of θ that the stress-free shape depends on
+    points_m : (n, 3)
+        Node positions of the mesh.
+    gravity_m_s2 : (3,)
+        Gravity of the scan.
+    free : array of int
+        Dofs of the nodes that were not held.
+    places : (k,)
+        Indices in θ of the inputs on which the stress-free shape depends.
     layout : RestPoint
+        Layout of the data of the points.
     """
 
     def __init__(self, body: Any) -> None:
@@ -306,8 +357,10 @@ class InverseEquilibrium:
         self.points_m: Array = body.nodes.points_m
         self.gravity_m_s2 = np.asarray(body.scan.gravity_m_s2, dtype=float)
         size = self.points_m.size
-        held = body.scan.held_nodes(body.nodes)
-        self.free: Index = np.setdiff1d(np.arange(size), (3 * held[:, None] + np.arange(3)).ravel())
+        held_nodes = body.scan.held_nodes(body.nodes)
+        self.free: Index = np.setdiff1d(
+            np.arange(size), (3 * held_nodes[:, None] + np.arange(3)).ravel()
+        )
         self.places: Index = np.array([*body.elastic_places, *body.density_places], dtype=np.int64)
         self.layout = RestPoint(len(self.places), body.element.mean_dilatation)
         self._shapes: dict[bytes, RestShape] = {}
@@ -315,7 +368,7 @@ class InverseEquilibrium:
         self._size_m = float(np.linalg.norm(np.ptp(self.points_m, axis=0)))
 
     def shape(self, theta: ArrayLike) -> RestShape:
-        """Return the stress-free shape at θ (k,), with its derivatives.
+        """Return the stress-free shape at θ (k,), with its derivatives; the latest 16 are cached.
 
         Raises
         ------
@@ -325,34 +378,38 @@ class InverseEquilibrium:
         constants = np.asarray(theta, dtype=float)
         key = constants[self.places].tobytes()
         if key not in self._shapes:
-            found = self._solved(constants)
+            solution = self._solved(constants)
             while len(self._shapes) >= SHAPES_KEPT:
                 self._shapes.pop(next(iter(self._shapes)), None)
-            self._shapes[key] = found
+            self._shapes[key] = solution
         return self._shapes[key]
 
     def second_derivatives(self, theta: ArrayLike) -> Array:
-        """Return ∂²X by the pairs of inputs of the layout, (pairs, n, 3), by differences of ∂X."""
-        constants, columns = np.asarray(theta, dtype=float), []
+        """Return the second derivatives of X by the pairs of inputs of the layout, (pairs, n, 3).
+
+        They are central differences of ∂X.
+        """
+        constants = np.asarray(theta, dtype=float)
+        columns = []
         for place in self.places:
             step = DIFFERENCE * max(abs(float(constants[place])), 1e-12)
             ends = []
-            for way in (step, -step):
-                moved = constants.copy()
-                moved[place] += way
-                ends.append(self.shape(moved).by_input)
+            for offset in (step, -step):
+                shifted = constants.copy()
+                shifted[place] += offset
+                ends.append(self.shape(shifted).by_input)
             columns.append((ends[0] - ends[1]) / (2 * step))
         pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.pairs]
         return np.array(pairs).reshape(-1, *self.points_m.shape)
 
     def point_data(self, theta: ArrayLike, second: bool = False) -> list[Array]:
-        """Return for each part of the body what its points are given, (1, cells · q · count).
+        """Return the data of the points of each part of the body, (1, cells · q · count) each.
 
         Parameters
         ----------
         theta : (k,)
         second : bool
-            With second derivatives; they are zero otherwise.
+            Whether to include second derivatives; they are zero otherwise.
         """
         key = np.asarray(theta, dtype=float)[self.places].tobytes(), second
         if key not in self._data:
@@ -368,7 +425,9 @@ class InverseEquilibrium:
         return self._data[key]
 
     def places_of_points(self, part: int) -> Index:
-        """Return where in the data of a part, by its number, those of points are (E, q, any)."""
+        """Return the columns (E, q, any) of each point in the data of a part, given by its
+        index.
+        """
         count, points = self._parts[part][1].shape[:2]
         size = self.layout.count
         return np.arange(count * points * size).reshape(count, points, size)
@@ -383,13 +442,22 @@ class InverseEquilibrium:
         return self._step(factor, self._weight_n(constants))
 
     def data_of(self, positions_m: Array) -> list[Array]:
-        """Return what the points are given where X is `positions_m`, whatever θ."""
+        """Return the data of the points for given X (n, 3), independent of θ: derivatives are
+        zero.
+        """
         others = self.layout.inputs + len(self.layout.pairs)
         return self._of_points([positions_m, *[np.zeros_like(positions_m)] * others])
 
     def _of_points(self, fields: Sequence[Array]) -> list[Array]:
-        """Gradients of X and of its derivatives at the points of each part."""
-        layout, found = self.layout, []
+        """Return G and its derivatives at the points of each part.
+
+        Parameters
+        ----------
+        fields : sequence of (n, 3)
+            X, then its derivatives.
+        """
+        layout = self.layout
+        data = []
         for cells, geometry in self._parts:
             slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
             # (cells, q, columns of G, rows of G): column after column.
@@ -397,12 +465,13 @@ class InverseEquilibrium:
             values = np.stack([c.reshape(*c.shape[:2], 9) for c in columns], axis=2)
             if layout.mean_dilatation:
                 values = np.concatenate([values, self._stretches(values, geometry)], axis=3)
-            found.append(np.ascontiguousarray(values).reshape(1, -1))
-        return found
+            data.append(np.ascontiguousarray(values).reshape(1, -1))
+        return data
 
     def _stretches(self, values: Array, geometry: Array) -> Array:
-        """Ρ with its derivatives (E, q, 1 + k + pairs, 1), from those of G (E, q, …, 9)."""
-        layout, shares = self.layout, geometry[..., -1] / geometry[..., -1].sum(axis=1)[:, None]
+        """Return ρ with its derivatives (E, q, 1 + k + pairs, 1), from those of G (E, q, …, 9)."""
+        layout = self.layout
+        shares = geometry[..., -1] / geometry[..., -1].sum(axis=1)[:, None]
         matrices = values.reshape(*values.shape[:3], 3, 3)
         inverse = np.linalg.inv(matrices[:, :, 0])
         ratios = np.linalg.det(matrices[:, :, 0])
@@ -421,32 +490,40 @@ class InverseEquilibrium:
             )
             for number, (i, j) in enumerate(layout.pairs)
         ]
-        whole = np.concatenate([ratios[..., None], first, np.stack(second, axis=-1)], axis=-1)
-        mean = np.broadcast_to(np.einsum("eq,eqk->ek", shares, whole)[:, None], whole.shape)
-        return (self._logarithm(whole) - self._logarithm(mean))[..., None]
+        determinants = np.concatenate(
+            [ratios[..., None], first, np.stack(second, axis=-1)], axis=-1
+        )
+        mean = np.broadcast_to(
+            np.einsum("eq,eqk->ek", shares, determinants)[:, None], determinants.shape
+        )
+        return (self._logarithm(determinants) - self._logarithm(mean))[..., None]
 
     def _logarithm(self, values: Array) -> Array:
-        """Ln of a number with its derivatives (…, 1 + k + pairs)."""
-        k, found = self.layout.inputs, np.empty_like(values)
-        found[..., 0] = np.log(values[..., 0])
-        found[..., 1 : k + 1] = values[..., 1 : k + 1] / values[..., :1]
+        """Return ln of a number with its derivatives (…, 1 + k + pairs)."""
+        k = self.layout.inputs
+        logarithm = np.empty_like(values)
+        logarithm[..., 0] = np.log(values[..., 0])
+        logarithm[..., 1 : k + 1] = values[..., 1 : k + 1] / values[..., :1]
         for number, (i, j) in enumerate(self.layout.pairs):
-            here = k + 1 + number
-            product = found[..., 1 + i] * found[..., 1 + j]
-            found[..., here] = values[..., here] / values[..., 0] - product
-        return found
+            column = k + 1 + number
+            product = logarithm[..., 1 + i] * logarithm[..., 1 + j]
+            logarithm[..., column] = values[..., column] / values[..., 0] - product
+        return logarithm
 
     @cached_property
     def _parts(self) -> list[tuple[Index, Array]]:
-        """Cells and geometry of each part, in the order of its kernels."""
+        """Cells and geometry of each part, with nodes in the order of its kernels."""
         return [self.body.laid_out(part) for part in self.body.parts]
 
     # Newton's method ------------------------------------------------------------------------
 
     def _solved(self, theta: Array) -> RestShape:
+        """Return the stress-free shape at θ with derivatives, from the latest solution or from the
+        mesh.
+        """
         weight = self._weight_n(theta)
-        near = self._predicted(theta)
-        x = None if near is None else self._newton(near, theta, weight)
+        start = self._predicted(theta)
+        x = None if start is None else self._newton(start, theta, weight)
         if x is None:
             x = self._under_growing_weight(theta, weight)
         force = self._assembled(x, theta, slopes=True)
@@ -463,41 +540,53 @@ class InverseEquilibrium:
         return RestShape(x, by_input.reshape(-1, *self.points_m.shape))
 
     def _predicted(self, theta: Array) -> Array | None:
-        """Return X at θ to first order, from the latest solution; None where that is far off."""
+        """Return X at θ to first order from the latest solution; None if θ differs too much."""
         if not self._shapes:
             return None
         key, shape = next(reversed(self._shapes.items()))
-        known, wanted = np.frombuffer(key), theta[self.places]
-        change = wanted - known
+        known = np.frombuffer(key)
+        target = theta[self.places]
+        change = target - known
         if (np.abs(change) > NEAR * np.abs(known)).any():
             return None
-        moved = shape.positions_m + np.tensordot(change, shape.by_input, axes=1)
-        return moved if self._is_admissible(moved) else None
+        predicted = shape.positions_m + np.tensordot(change, shape.by_input, axes=1)
+        return predicted if self._is_admissible(predicted) else None
 
     def _under_growing_weight(self, theta: Array, weight_n: Array) -> Array:
-        """Solve under shares of the weight that grow to one, from the mesh."""
-        x, reached, step = self.points_m.copy(), 0.0, 1.0
+        """Return X, solved from the mesh under shares of the weight that grow to one.
+
+        Raises
+        ------
+        RestShapeError
+            If the full weight is not reached.
+        """
+        x = self.points_m.copy()
+        share_reached = 0.0
+        step = 1.0
         for _ in range(OPTIONS.load_steps):
-            share = min(1.0, reached + step)
-            found = self._newton(x, theta, share * weight_n)
-            if found is None:
+            share = min(1.0, share_reached + step)
+            solution = self._newton(x, theta, share * weight_n)
+            if solution is None:
                 step /= 2
                 if step < 0.5**OPTIONS.halvings:
                     break
                 continue
-            x, reached = found, share
-            if reached == 1.0:
+            x = solution
+            share_reached = share
+            if share_reached == 1.0:
                 return x
-        raise RestShapeError(self._failure(theta, reached))
+        raise RestShapeError(self._failure(theta, share_reached))
 
     def _weight_n(self, theta: Array) -> Array:
+        """Return the weight (3n,) of every dof [N]."""
         mass_kg = self.body.mass_of_dofs(theta)[: self.points_m.size]
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
     def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
-        """Solve at a given weight from (n, 3); None where Newton's method does not converge.
+        """Return X at a given weight, from `start` (n, 3); None if Newton's method does not
+        converge.
 
-        A step is accepted where the next one, by the same factors, is shorter (Deuflhard's natural
+        A step is accepted if the next one, with the same factors, is shorter (Deuflhard's natural
         monotonicity test), and no element is nearly inverted.
         """
         x = start.copy()
@@ -529,13 +618,13 @@ class InverseEquilibrium:
         return None
 
     def _step(self, factor: Any, residual_n: Array) -> Array:
-        """Newton step (n, 3) by factors of ∂r/∂X."""
+        """Return the Newton step (n, 3) of a residual, by factors of ∂r/∂X."""
         step = np.zeros(self.points_m.size)
         step[self.free] = -factor.solve(residual_n[self.free])
         return step.reshape(self.points_m.shape)
 
     def _factor(self, by_position: sp.csc_array) -> Any:
-        """LU factors of ∂r/∂X at the free dofs; None where it is singular."""
+        """Return the LU factors of ∂r/∂X at the free dofs; None if it is singular."""
         matrix = sp.csc_array(by_position[self.free][:, self.free])
         try:
             return splu(matrix)
@@ -543,7 +632,7 @@ class InverseEquilibrium:
             return None
 
     def _is_admissible(self, positions_m: Array) -> bool:
-        """Whether no element of the stress-free shape is inverted, or nearly so."""
+        """Return whether no element of the stress-free shape is inverted, or nearly so."""
         for cells, geometry in self._parts:
             slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
             gradients = np.einsum("ean,eqai->eqni", positions_m[cells], slopes)
@@ -552,9 +641,12 @@ class InverseEquilibrium:
         return True
 
     def _assembled(self, positions_m: Array, theta: Array, slopes: bool) -> _Assembled:
-        """Elastic forces at the mesh where X is `positions_m` (n, 3)."""
+        """Return the elastic forces at the mesh for X `positions_m` (n, 3), with derivatives if
+        `slopes`.
+        """
         size = self.points_m.size
-        force, by_theta = np.zeros(size), np.zeros((size, len(self.places)))
+        force = np.zeros(size)
+        by_theta = np.zeros((size, len(self.places)))
         by_position = sp.csc_array((size, size))
         places = {int(place): number for number, place in enumerate(self.places)}
         body = self.body
@@ -562,7 +654,7 @@ class InverseEquilibrium:
             body.parts, body.starts, self._parts, strict=False
         ):
             elastic = len(part.material.constants)
-            found = _part_forces(
+            part_forces = _part_forces(
                 cells,
                 geometry,
                 positions_m,
@@ -571,21 +663,22 @@ class InverseEquilibrium:
                 averages=body.element.mean_dilatation,
                 slopes=slopes,
             )
-            dofs = found.dofs
-            force += np.bincount(dofs.ravel(), found.force_n.ravel(), size)
+            dofs = part_forces.dofs
+            force += np.bincount(dofs.ravel(), part_forces.force_n.ravel(), size)
             if not slopes:
                 continue
-            shape = found.by_position.shape
+            shape = part_forces.by_position.shape
             rows = np.broadcast_to(dofs[:, :, None], shape).ravel()
             columns = np.broadcast_to(dofs[:, None, :], shape).ravel()
-            entries = sp.coo_array((found.by_position.ravel(), (rows, columns)), (size, size))
+            entries = sp.coo_array((part_forces.by_position.ravel(), (rows, columns)), (size, size))
             by_position = by_position + sp.csc_array(entries)
             for number in range(elastic):
-                values = found.by_theta[..., number].ravel()
+                values = part_forces.by_theta[..., number].ravel()
                 by_theta[:, places[start + number]] += np.bincount(dofs.ravel(), values, size)
         return _Assembled(force, by_position, by_theta)
 
     def _failure(self, theta: Array, reached: float) -> str:
+        """Return the message for a solve that reached only a share of the weight."""
         moduli = ", ".join(
             f"{name + ': ' if name else ''}λ {lam:.4g} Pa, μ {mu:.4g} Pa"
             for name, (lam, mu) in self.body.lame(theta).items()
@@ -600,12 +693,9 @@ class InverseEquilibrium:
 
 
 def require_supported(parts: Sequence[BodyPart]) -> None:
-    """Refuse a body whose stress-free shape cannot be found.
+    """Raise an `InputError` if the stress-free shape of these parts cannot be computed.
 
-    Raises
-    ------
-    InputError
-        For fields and branches of memory.
+    This is the case for fields and for branches of memory.
     """
     for part in parts:
         if part.field is not None:

@@ -1,7 +1,8 @@
-"""Selections: which nodes are grasped, loaded or observed, which cells make up a region, and on
-which faces of the boundary a pressure acts.
+"""Selections of nodes, cells or boundary faces: by position, index or name.
 
-A cell is in a box or a ball when its centre is, a face when its corners are.
+Use them to state which nodes are grasped, loaded or observed, which cells make up a region, and on
+which faces of the boundary a pressure acts. A box or ball contains a cell if it contains its
+centre, and a face if it contains its corners.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ import numpy as np
 from ..errors import InputError, hint_at
 from .mesh import Nodes, TetMesh
 
-# Of the body's diagonal: a node meant to lie on a box's face must not fall out by round-off.
+# Tolerance in diagonals of the body: nodes on a box's face must not be lost by rounding.
 ROUND_OFF = 1e-9
 OF_CELLS = "cells, by their centres"
 
 
 class _Within:
-    """A selection by where points are."""
+    """Base class of selections by position."""
 
     def resolve(self, nodes: Nodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
@@ -28,7 +29,7 @@ class _Within:
         return _chosen(self._holds(nodes.points_m), nodes.mesh, str(self), "nodes" + hint)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected cells, sorted."""
+        """Return the indices of the selected cells, sorted."""
         return _chosen(self._holds(mesh.centres_m), mesh, str(self), OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
@@ -36,16 +37,17 @@ class _Within:
         return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
 
     def _holds(self, points_m: np.ndarray) -> np.ndarray:
+        """Return the mask of the points inside."""
         raise NotImplementedError
 
     def _nearest(self, points_m: np.ndarray) -> str:
-        """What to say where nothing is near enough."""
+        """Return a hint for the message if no point is inside."""
         return ""
 
 
 @dataclass(frozen=True)
 class Box(_Within):
-    """The nodes in an axis-aligned box, faces included; bounds may be infinite.
+    """Selection of an axis-aligned box, including its faces; bounds may be infinite.
 
     Parameters
     ----------
@@ -57,7 +59,8 @@ class Box(_Within):
     high_m: Sequence[float]
 
     def __post_init__(self) -> None:
-        low, high = _triple(self.low_m, "box: low_m"), _triple(self.high_m, "box: high_m")
+        low = _triple(self.low_m, "box: low_m")
+        high = _triple(self.high_m, "box: high_m")
         for axis, below, above in zip("xyz", low, high, strict=True):
             if below > above:
                 raise InputError(
@@ -68,6 +71,7 @@ class Box(_Within):
         object.__setattr__(self, "high_m", high)
 
     def _holds(self, points_m: np.ndarray) -> np.ndarray:
+        """Return the mask of the points inside, with a tolerance for rounding."""
         slack = _round_off_m(points_m)
         above = points_m >= np.subtract(self.low_m, slack)
         below = points_m <= np.add(self.high_m, slack)
@@ -80,7 +84,15 @@ class Box(_Within):
 
 @dataclass(frozen=True)
 class Ball(_Within):
-    """The nodes at most `radius_m` away from `center_m`, both in metres."""
+    """Selection of a ball.
+
+    Parameters
+    ----------
+    center_m : three numbers
+        Centre in metres.
+    radius_m : float
+        Largest distance from the centre in metres.
+    """
 
     center_m: Sequence[float]
     radius_m: float
@@ -91,13 +103,16 @@ class Ball(_Within):
             raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
 
     def _nearest(self, points_m: np.ndarray) -> str:
+        """Return the distance of the nearest node as a hint."""
         least_m = self._distance_m(points_m).min()
         return f"; the nearest node is {least_m:.4g} m from its centre"
 
     def _distance_m(self, points_m: np.ndarray) -> np.ndarray:
+        """Return the distances of points from the centre [m]."""
         return np.linalg.norm(points_m - np.array(self.center_m), axis=1)
 
     def _holds(self, points_m: np.ndarray) -> np.ndarray:
+        """Return the mask of the points inside, with a tolerance for rounding."""
         return self._distance_m(points_m) <= self.radius_m + _round_off_m(points_m)
 
     def __str__(self) -> str:
@@ -107,41 +122,45 @@ class Ball(_Within):
 
 @dataclass(frozen=True)
 class Indices:
-    """Nodes or cells by number, counted from 0, as the mesh file (or the given array) has them.
+    """Selection of nodes or cells by index, counted from 0, as in the mesh file or the given array.
 
-    Numbers of nodes differ from the rows of `mesh.points_m` where nodes were dropped. Only corners
-    can be given: a node on an edge is selected when both of the edge's ends are.
+    Indices of nodes differ from the rows of `mesh.points_m` if nodes were dropped. Only corners can
+    be given: a node on an edge is selected if both ends of the edge are.
+
+    Parameters
+    ----------
+    indices : sequence of int
     """
 
     indices: Sequence[int]
 
     def __post_init__(self) -> None:
-        given = np.atleast_1d(np.asarray(self.indices))
-        if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+        indices = np.atleast_1d(np.asarray(self.indices))
+        if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
             raise InputError(f"indices must be a list of whole node numbers, not {self.indices!r}")
-        object.__setattr__(self, "indices", tuple(given.tolist()))
+        object.__setattr__(self, "indices", tuple(indices.tolist()))
 
     def resolve(self, nodes: Nodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         mesh = nodes.mesh
-        wanted = np.unique(np.array(self.indices, dtype=np.int64))
-        outside = wanted[(wanted < 0) | (wanted >= mesh.file_node_count)]
+        requested = np.unique(np.array(self.indices, dtype=np.int64))
+        outside = requested[(requested < 0) | (requested >= mesh.file_node_count)]
         if len(outside):
             raise InputError(
                 f"indices: node {outside[0]} does not exist; the mesh has "
                 f"{mesh.file_node_count} nodes, numbered 0 to {mesh.file_node_count - 1}"
             )
-        dropped = np.setdiff1d(wanted, mesh.file_index)
+        dropped = np.setdiff1d(requested, mesh.file_index)
         if len(dropped):
             raise InputError(
                 f"indices: node {dropped[0]} was dropped from the mesh because it is no element's "
                 "corner; leave it out (a node on an edge is selected when both of its ends are)"
             )
-        chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, wanted))
+        chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, requested))
         return _chosen(chosen, mesh, "an empty list of indices")
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected cells, sorted."""
+        """Return the indices of the selected cells, sorted."""
         count = len(mesh.tetrahedra)
         outside = [index for index in self.indices if not 0 <= index < count]
         if outside:
@@ -153,7 +172,7 @@ class Indices:
         return _chosen(chosen, mesh, "an empty list of indices", OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
-        """Return the rows of `mesh.surface` whose corners are all among the nodes."""
+        """Return the rows of `mesh.surface` whose corners are all selected."""
         nodes = self.resolve(Nodes.corners(mesh))
         chosen = np.isin(np.arange(len(mesh.points_m)), nodes)
         return _chosen_faces(chosen, mesh, "the list of indices")
@@ -161,11 +180,16 @@ class Indices:
 
 @dataclass(frozen=True)
 class Named:
-    """Where a point array of the mesh, or for cells a cell array, is true: booleans or 0 and 1.
+    """Selection by a point array of the mesh, or for cells a cell array, of booleans or 0 and 1.
 
-    A node on an edge is selected when both of the edge's ends are. A physical group of a .msh file
-    selects the nodes of its elements, be they points, lines, triangles or tetrahedra, and a group
-    of tetrahedra the cells.
+    A node on an edge is selected if both ends of the edge are. A physical group of a .msh file
+    selects the nodes of its elements, whether points, lines, triangles or tetrahedra, and a group
+    of tetrahedra selects cells.
+
+    Parameters
+    ----------
+    name : str
+        Name of the array or group.
     """
 
     name: str
@@ -177,7 +201,7 @@ class Named:
         return _chosen(nodes.with_mid_nodes(mask), nodes.mesh, what)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the selected cells, sorted."""
+        """Return the indices of the selected cells, sorted."""
         what = f'cell array "{self.name}"'
         mask = self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what)
         return _chosen(mask, mesh, what, OF_CELLS)
@@ -188,11 +212,12 @@ class Named:
         They are the triangles of a face set, or those whose corners are all in a point array.
         """
         if self.name not in mesh.face_sets:
-            what, count = f'point array "{self.name}"', len(mesh.points_m)
+            what = f'point array "{self.name}"'
+            count = len(mesh.points_m)
             mask = self._mask(mesh.point_arrays, count, what, "group of faces")
             return _chosen_faces(mask, mesh, what)
-        wanted = np.unique(np.sort(mesh.face_sets[self.name], axis=1), axis=0)
-        rows = rows_of_faces(wanted, mesh.surface)
+        faces = np.unique(np.sort(mesh.face_sets[self.name], axis=1), axis=0)
+        rows = rows_of_faces(faces, mesh.surface)
         if inner := int((rows < 0).sum()):
             raise InputError(
                 f'{inner} of the {len(rows)} faces of "{self.name}" are not on the boundary of the '
@@ -203,6 +228,18 @@ class Named:
     def _mask(
         self, arrays: Mapping[str, np.ndarray], count: int, what: str, lacking: str = ""
     ) -> np.ndarray:
+        """Return an array of the mesh as a mask, or raise an `InputError` if it cannot be one.
+
+        Parameters
+        ----------
+        arrays : mapping of name to array
+        count : int
+            Required length.
+        what : str
+            Description of the array for messages, beginning with "point" or "cell".
+        lacking : str
+            What is missing if there is no such array, for the message.
+        """
         kind = what.split(" ", 1)[0]
         if self.name not in arrays:
             names = ", ".join(f'"{name}"' for name in arrays if not name.startswith("gmsh:"))
@@ -230,13 +267,16 @@ Selection = Box | Ball | Indices | Named
 
 
 def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """Rows of the surface (F, 3) that faces (k, 3), in any orientation, are; −1 where none."""
-    there = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
-    wanted = np.sort(faces, axis=1).tolist()
-    return np.array([there.get(tuple(face), -1) for face in wanted], dtype=np.int64)
+    """Return the rows of the surface (F, 3) that equal faces (k, 3) in any orientation; −1 for
+    none.
+    """
+    row_of_face = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
+    sorted_faces = np.sort(faces, axis=1).tolist()
+    return np.array([row_of_face.get(tuple(face), -1) for face in sorted_faces], dtype=np.int64)
 
 
 def _chosen_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
+    """Return the boundary faces whose corners are all selected, or raise an `InputError`."""
     mask = np.asarray(chosen_nodes[mesh.surface].all(axis=1))
     return _chosen(mask, mesh, what, missed="holds no face of the boundary with all its corners")
 
@@ -244,6 +284,19 @@ def _chosen_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndar
 def _chosen(
     mask: np.ndarray, mesh: TetMesh, what: str, of: str = "nodes", missed: str = ""
 ) -> np.ndarray:
+    """Return the indices of a mask, or raise an `InputError` if it is false everywhere.
+
+    Parameters
+    ----------
+    mask : (n,) bool
+    mesh : TetMesh
+    what : str
+        Description of the selection, for the message.
+    of : str
+        What is selected, for the message.
+    missed : str
+        Predicate of the message if nothing is selected.
+    """
     if not mask.any():  # no mid node lies beyond the corners
         missed = missed or f"selects none of the {len(mask)} {of}"
         raise InputError(f"{what} {missed}; the body spans {_span(mesh.bounds_m)}")
@@ -251,21 +304,25 @@ def _chosen(
 
 
 def _span(bounds_m: np.ndarray) -> str:
+    """Return the bounds of a body as text."""
     axes = zip("xyz", *bounds_m, strict=True)
     return ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes)
 
 
 def _round_off_m(points_m: np.ndarray) -> float:
+    """Return the tolerance of positions for rounding [m]."""
     return ROUND_OFF * float(np.linalg.norm(np.ptp(points_m, axis=0)))
 
 
 def _is_number(value: object) -> bool:
+    """Return whether a value is a number and not a boolean."""
     return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
 
 
 def _triple(values: Iterable[float], what: str) -> tuple[float, float, float]:
-    given = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
-    if len(given) != 3 or not all(_is_number(x) and not np.isnan(x) for x in given):
+    """Return three numbers as floats, or raise an `InputError` that begins with `what`."""
+    numbers = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
+    if len(numbers) != 3 or not all(_is_number(x) and not np.isnan(x) for x in numbers):
         raise InputError(f"{what} must be three numbers [x, y, z] in metres, not {values!r}")
-    x, y, z = (float(value) for value in given)
+    x, y, z = (float(value) for value in numbers)
     return x, y, z

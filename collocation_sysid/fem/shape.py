@@ -1,15 +1,15 @@
-"""Scalars of a body's shape as functions of its node positions: a length, and a volume.
+"""Length and volume of a deformed body as functions of its node positions, with derivatives.
 
-The length of a polyline through points of a body: point k is at y_k = Σ_a N_a x_a, so that the ends
-of a segment differ by d = B x, and its length l = |d| has, with e = d / l and P = 1 − e eᵀ, the
+Length of a polyline through points of a body, for tendons: point k is at y_k = Σ_a N_a x_a, so that
+the ends of a segment differ by d = B x. With e = d / l and P = 1 − e eᵀ, its length l = |d| has the
 derivatives
 
     ∂l/∂d = e,   ∂²l/∂d² = P / l,   δ · ∂³l/∂d³ = −(P (e·δ) + P δ eᵀ + e δᵀ P) / l².
 
-The volume behind faces: the cone from the origin over a face y(ξ, η) = Σ N_i x_i has the volume
-⅓ ∫ y · (y_ξ × y_η), which is a cubic form of the nodes, Σ A_ijk det[x_i, x_j, x_k], with A
-antisymmetric: of a flat triangle det[a, b, c] / 6. So its second derivatives H(x) are linear in x,
-and
+Volume enclosed by faces, for pressures: the cone from the origin over a face y(ξ, η) = Σ N_i x_i
+has the volume ⅓ ∫ y · (y_ξ × y_η). This is a cubic form of the nodes, Σ A_ijk det[x_i, x_j, x_k]
+with antisymmetric A; for a flat triangle it is det[a, b, c] / 6. Its second derivatives H(x) are
+therefore linear in x, and
 
     V = x · H(x) x / 6,   ∂V/∂x = H(x) x / 2,   Σ w_i ∂³V/∂x_i∂x² = H(w).
 """
@@ -26,22 +26,27 @@ from ..arrays import Array, Index
 from .pattern import SymmetricPattern
 
 # The lower triangle of a symmetric (3, 3), column after column.
-_ROWS, _COLUMNS = np.array([0, 1, 2, 1, 2, 2]), np.array([0, 0, 0, 1, 1, 2])
+_ROWS = np.array([0, 1, 2, 1, 2, 2])
+_COLUMNS = np.array([0, 0, 0, 1, 1, 2])
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 class Length:
-    """L(x) [m] of the polyline through points with fixed weights on nodes.
+    """Length L(x) [m] of the polyline through points with fixed weights of nodes.
 
     Parameters
     ----------
-    nodes : (P, npe) node numbers of each point, P > 1
+    nodes : (P, npe)
+        Node indices of each point, P > 1.
     weights : (P, npe)
+        Weights of these nodes.
     node_count : int
+        Number of nodes of the body.
     """
 
     def __init__(self, nodes: Index, weights: Array, node_count: int) -> None:
-        self.node_count, self._segments = node_count, len(nodes) - 1
+        self.node_count = node_count
+        self._segments = len(nodes) - 1
         points = np.repeat(np.arange(len(nodes)), nodes.shape[1])
         shape = (len(nodes), node_count)
         placed = sp.csr_array((weights.ravel(), (points, nodes.ravel())), shape=shape)
@@ -50,74 +55,79 @@ class Length:
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
-        """The dofs whose second derivatives are not zero, and the diagonal."""
+        """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         rows, columns, *_ = self._pairs
         return SymmetricPattern.of_entries(rows, columns, self.node_count)
 
     @cached_property
     def _pairs(self) -> tuple[Index, Index, Array, Index]:
-        """Lower-triangle dofs, weight, and place in (6 J) of what each pair of nodes adds."""
-        found = []
+        """Lower-triangle dofs, weight and index in (6 J) of the contribution of each pair of
+        nodes.
+        """
+        segment_parts = []
         for j in range(self._segments):
-            one = self._differences[[j]].tocoo()
-            dofs = (3 * one.coords[1][:, None] + np.arange(3)).ravel()
-            axes, weights = np.tile(np.arange(3), one.nnz), np.repeat(one.data, 3)
+            segment = self._differences[[j]].tocoo()
+            dofs = (3 * segment.coords[1][:, None] + np.arange(3)).ravel()
+            axes = np.tile(np.arange(3), segment.nnz)
+            weights = np.repeat(segment.data, 3)
             a, b = np.nonzero(dofs[:, None] >= dofs)
             place = 6 * j + _PLACE[axes[a], axes[b]]
-            found.append((dofs[a], dofs[b], weights[a] * weights[b], place))
+            segment_parts.append((dofs[a], dofs[b], weights[a] * weights[b], place))
         rows, columns, weights, places = (
-            np.concatenate(parts) for parts in zip(*found, strict=True)
+            np.concatenate(parts) for parts in zip(*segment_parts, strict=True)
         )
         return rows, columns, weights, places
 
     @cached_property
     def _spread(self) -> sp.csr_array:
-        """(6 J, entries) from second derivatives by d to those by x."""
+        """Matrix (6 J, entries) from second derivatives by d to those by x."""
         rows, columns, weights, places = self._pairs
         entries = self.couplings.position(rows, columns)
         shape = (6 * self._segments, self.couplings.entries)
         return sp.csr_array((weights, (places, entries)), shape=shape)
 
     def value(self, x: Array) -> Array:
-        """L (T,) at positions (T, 3n)."""
+        """Return the lengths L (T,) at positions (T, 3n)."""
         return np.linalg.norm(self._vectors(x), axis=2).sum(axis=1)
 
     def gradient(self, x: Array) -> Array:
-        """∂L/∂x (T, 3n)."""
-        along = _unit(self._vectors(x))[0].transpose(1, 0, 2)  # (J, T, 3)
-        spread = self._differences.T @ along.reshape(len(along), -1)
-        return spread.reshape(-1, len(x), 3).transpose(1, 0, 2).reshape(len(x), -1)
+        """Return ∂L/∂x (T, 3n) at positions (T, 3n)."""
+        directions = _unit(self._vectors(x))[0].transpose(1, 0, 2)  # (J, T, 3)
+        nodal = self._differences.T @ directions.reshape(len(directions), -1)
+        return nodal.reshape(-1, len(x), 3).transpose(1, 0, 2).reshape(len(x), -1)
 
     def hessian(self, x: Array) -> Array:
-        """∂²L/∂x² (T, entries) on `couplings`."""
+        """Return ∂²L/∂x² (T, entries) on `couplings`, at positions (T, 3n)."""
         e, length = _unit(self._vectors(x))
         across = np.eye(3) - e[..., :, None] * e[..., None, :]
         return self._assembled(across / length[..., None])
 
     def hessian_along(self, x: Array, w: Array) -> Array:
-        """Σ w_i ∂³L/∂x_i∂x² (T, entries) for w (T, 3n)."""
+        """Return Σ w_i ∂³L/∂x_i∂x² (T, entries) at positions x, in the directions w, (T, 3n)
+        each.
+        """
         e, length = _unit(self._vectors(x))
         delta = self._vectors(w)
-        along = (e * delta).sum(axis=2, keepdims=True)
-        aside = (delta - along * e)[..., :, None] * e[..., None, :]
+        projection = (e * delta).sum(axis=2, keepdims=True)
+        mixed = (delta - projection * e)[..., :, None] * e[..., None, :]
         across = np.eye(3) - e[..., :, None] * e[..., None, :]
-        bent = along[..., None] * across + aside + np.swapaxes(aside, 2, 3)
-        return self._assembled(-bent / length[..., None] ** 2)
+        derivative = projection[..., None] * across + mixed + np.swapaxes(mixed, 2, 3)
+        return self._assembled(-derivative / length[..., None] ** 2)
 
     def _vectors(self, x: Array) -> Array:
-        """(T, J, 3) from each point to the next."""
+        """Return the vectors (T, J, 3) from each point to the next."""
         by_node = x.reshape(len(x), -1, 3).transpose(1, 0, 2)
-        found = self._differences @ by_node.reshape(len(by_node), -1)
-        return found.reshape(-1, len(x), 3).transpose(1, 0, 2)
+        differences = self._differences @ by_node.reshape(len(by_node), -1)
+        return differences.reshape(-1, len(x), 3).transpose(1, 0, 2)
 
     def _assembled(self, by_vector: Array) -> Array:
-        """(T, entries) from (T, J, 3, 3)."""
+        """Return values (T, entries) on `couplings` from second derivatives by d (T, J, 3, 3)."""
         lower = by_vector[..., _ROWS, _COLUMNS]
         return np.asarray(lower.reshape(len(lower), -1) @ self._spread)
 
 
 def _unit(vectors: Array) -> tuple[Array, Array]:
-    """Directions (T, J, 3) and lengths (T, J, 1)."""
+    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors."""
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     return vectors / length, length
 
@@ -128,52 +138,60 @@ _PERMUTATIONS = [
 
 
 class Volume:
-    """V(x) [m³] of the cones from a point over faces; of a closed surface, what it encloses.
+    """Volume V(x) [m³] of the cones from an apex over faces; for a closed surface the enclosed
+    volume.
 
     Parameters
     ----------
-    faces : (F, 3) or (F, 6) node numbers
-        Corners counter-clockwise seen from outside the volume; of quadratic ones then the nodes on
-        the edges ab, bc, ca.
+    faces : (F, 3) or (F, 6)
+        Node indices: corners counter-clockwise as seen from outside the volume; for quadratic faces
+        then the nodes on the edges ab, bc, ca.
     node_count : int
-    apex_m : (3,)
-        It matters where the surface is open only.
+        Number of nodes of the body.
+    apex_m : (3,), optional
+        Apex of the cones; the origin by default. It matters only if the surface is open.
     """
 
     def __init__(self, faces: Index, node_count: int, apex_m: Array | None = None) -> None:
-        self.faces, self.node_count = faces, node_count
+        self.faces = faces
+        self.node_count = node_count
         self.apex_m = np.zeros(3) if apex_m is None else apex_m
         self._apex = np.tile(self.apex_m, node_count)
 
     def from_apex(self, apex_m: Array) -> Volume:
-        """The same of cones from another point."""
-        same = (apex_m == self.apex_m).all()
-        return self if same else Volume(self.faces, self.node_count, apex_m)
+        """Return this volume with cones from another apex; self if it is the same."""
+        is_same = (apex_m == self.apex_m).all()
+        return self if is_same else Volume(self.faces, self.node_count, apex_m)
 
     @cached_property
     def _terms(self) -> tuple[Index, Index, Index, Array]:
-        """Rows and columns (lower triangle) of H, the dof that each is linear in, and its slope."""
+        """Rows and columns (lower triangle) of H, the dof on which each term depends, and its
+        factor.
+        """
         form = _form(self.faces.shape[1])
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
-        found = []
+        term_parts = []
         for (a, b, c), sign in _PERMUTATIONS:
             row, column, by = (3 * self.faces[:, n] + axis for n, axis in ((i, a), (j, b), (k, c)))
-            found.append((row, column, by, np.broadcast_to(6 * sign * form[i, j, k], row.shape)))
+            term_parts.append(
+                (row, column, by, np.broadcast_to(6 * sign * form[i, j, k], row.shape))
+            )
         rows, columns, by, factor = (
-            np.concatenate([part.ravel() for part in parts]) for parts in zip(*found, strict=True)
+            np.concatenate([part.ravel() for part in parts])
+            for parts in zip(*term_parts, strict=True)
         )
         lower = rows >= columns
         return rows[lower], columns[lower], by[lower], factor[lower]
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
-        """The dofs whose second derivatives are not zero, and the diagonal."""
+        """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         rows, columns, *_ = self._terms
         return SymmetricPattern.of_entries(rows, columns, self.node_count)
 
     @cached_property
     def _slopes(self) -> sp.csr_array:
-        """(3n, entries) of H by x."""
+        """Matrix (3n, entries) from x to H."""
         rows, columns, by, factor = self._terms
         entries = self.couplings.position(rows, columns)
         shape = (self.couplings.size, self.couplings.entries)
@@ -181,56 +199,64 @@ class Volume:
 
     @cached_property
     def rim(self) -> Index:
-        """(k, 2) or (k, 3) nodes of edges with a face on one side only; none where it is closed."""
+        """Nodes (k, 2) or (k, 3) of edges with a face on one side only; empty for a closed
+        surface.
+        """
         corners = self.faces[:, :3]
         edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2)
         codes = np.sort(edges, axis=1) @ [self.node_count, 1]
-        _, which = np.unique(codes, return_inverse=True)
+        _, edge_index = np.unique(codes, return_inverse=True)
         # Neighbours go along their edge in opposite directions.
-        left = np.bincount(which, np.sign(edges[:, 1] - edges[:, 0]))
-        alone = left[which] != 0
+        orientation_sum = np.bincount(edge_index, np.sign(edges[:, 1] - edges[:, 0]))
+        is_rim = orientation_sum[edge_index] != 0
         mid = self.faces[:, 3:].reshape(len(edges), -1)
-        return np.hstack([edges, mid])[alone]
+        return np.hstack([edges, mid])[is_rim]
 
     def value(self, x: Array) -> Array:
-        """V (T,) at positions (T, 3n)."""
-        away = x - self._apex
-        return (self._pulled(away) * away).sum(axis=1) / 3
+        """Return the volumes V (T,) at positions (T, 3n)."""
+        relative = x - self._apex
+        return (self._pulled(relative) * relative).sum(axis=1) / 3
 
     def gradient(self, x: Array) -> Array:
-        """∂V/∂x (T, 3n)."""
+        """Return ∂V/∂x (T, 3n) at positions (T, 3n)."""
         return self._pulled(x - self._apex)
 
     def hessian(self, x: Array) -> Array:
-        """∂²V/∂x² (T, entries) on `couplings`."""
+        """Return ∂²V/∂x² (T, entries) on `couplings`, at positions (T, 3n)."""
         return np.asarray((x - self._apex) @ self._slopes)
 
     def hessian_along(self, x: Array, w: Array) -> Array:
-        """Σ w_i ∂³V/∂x_i∂x² (T, entries) for w (T, 3n)."""
+        """Return Σ w_i ∂³V/∂x_i∂x² (T, entries) at positions x, in the directions w, (T, 3n)
+        each.
+        """
         return np.asarray(w @ self._slopes)
 
     def _pulled(self, away: Array) -> Array:
-        """H x / 2 = 3 Σ A_ijk x_j × x_k of every node i, for x (T, 3n) from the apex."""
+        """Return H x / 2 = 3 Σ A_ijk x_j × x_k of every node i, for positions (T, 3n) relative to
+        the apex.
+        """
         corners = away.reshape(len(away), -1, 3)[:, self.faces]  # (T, F, k, 3)
-        turned = np.einsum("ijk,tfkc->tfijc", 3 * _form(self.faces.shape[1]), corners)
-        of_faces = np.cross(corners[:, :, None], turned).sum(axis=3)
-        found = np.zeros((self.node_count, len(away), 3))
-        np.add.at(found, self.faces, of_faces.transpose(1, 2, 0, 3))
-        return found.transpose(1, 0, 2).reshape(len(away), -1)
+        weighted = np.einsum("ijk,tfkc->tfijc", 3 * _form(self.faces.shape[1]), corners)
+        of_faces = np.cross(corners[:, :, None], weighted).sum(axis=3)
+        nodal = np.zeros((self.node_count, len(away), 3))
+        np.add.at(nodal, self.faces, of_faces.transpose(1, 2, 0, 3))
+        return nodal.transpose(1, 0, 2).reshape(len(away), -1)
 
 
 @cache
 def _form(nodes: int) -> Array:
-    """(k, k, k) A of a triangle with 3 or 6 nodes."""
+    """Return A (k, k, k) of a triangle with 3 or 6 nodes."""
     points, weights = _triangle_rule()
     values, slopes = _shape(points, nodes)
     form = np.einsum("q,qi,qj,qk->ijk", weights / 3, values, slopes[..., 0], slopes[..., 1])
-    turned = [sign * form.transpose(p) for p, sign in _PERMUTATIONS]
-    return np.asarray(np.mean(turned, axis=0))
+    permuted = [sign * form.transpose(p) for p, sign in _PERMUTATIONS]
+    return np.asarray(np.mean(permuted, axis=0))
 
 
 def _triangle_rule() -> tuple[Array, Array]:
-    """Points (q, 2) and weights (q,) that integrate polynomials of degree four."""
+    """Return points (q, 2) and weights (q,) that integrate polynomials of degree four on a
+    triangle.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(3)
     u, v = np.meshgrid((nodes + 1) / 2, (nodes + 1) / 2, indexing="ij")
     area = np.outer(weights, weights) / 4 * (1 - u)
@@ -238,14 +264,18 @@ def _triangle_rule() -> tuple[Array, Array]:
 
 
 def _shape(points: Array, nodes: int) -> tuple[Array, Array]:
-    """Shape functions (q, k) of a triangle, and their derivatives (q, k, 2)."""
+    """Return shape functions (q, k) of a triangle with 3 or 6 nodes, and their derivatives (q, k,
+    2).
+    """
     xi, eta = points.T
-    of_corners = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
+    corner_slopes = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
     L = np.column_stack([1 - xi - eta, xi, eta])
     if nodes == 3:
-        return L, np.broadcast_to(of_corners, (len(points), 3, 2))
-    following = np.roll(L, -1, axis=1)
-    values = np.hstack([L * (2 * L - 1), 4 * L * following])
-    corner = (4 * L - 1)[..., None] * of_corners
-    mid = following[..., None] * of_corners + L[..., None] * np.roll(of_corners, -1, axis=0)
+        return L, np.broadcast_to(corner_slopes, (len(points), 3, 2))
+    next_coordinate = np.roll(L, -1, axis=1)
+    values = np.hstack([L * (2 * L - 1), 4 * L * next_coordinate])
+    corner = (4 * L - 1)[..., None] * corner_slopes
+    mid = next_coordinate[..., None] * corner_slopes + L[..., None] * np.roll(
+        corner_slopes, -1, axis=0
+    )
     return values, np.concatenate([corner, 4 * mid], axis=1)

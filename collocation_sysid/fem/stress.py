@@ -1,11 +1,11 @@
-"""Stresses of quadrature points, point by point: what the memory of a material works with.
+"""Stresses at quadrature points and their derivatives, for the memory of a material.
 
-Fields (T, 3n), and rows (T, width) of what points carry, see `memory`. With S the second
-Piola–Kirchhoff stress of the long-term energy, and E Green's strain,
+Node fields are (T, 3n); values at points are rows (T, width), see `memory`. With the second
+Piola–Kirchhoff stress S of the long-term energy and Green's strain E,
 
     dS = ∂S/∂x dx,   the force of H: f_H = −∂/∂x Σ V ½ H : FᵀF,   ∂f_H/∂H = −Vᵀ(∂E/∂x),
 
-S, H and E by their entries xx, yy, zz, xy, xz, yz.
+where S, H and E are given by their entries xx, yy, zz, xy, xz, yz.
 """
 
 from __future__ import annotations
@@ -29,48 +29,50 @@ Expression = Callable[[QuadraturePoint, Law], ca.SX]
 
 
 def _stress_by_theta(point: QuadraturePoint, law: Law) -> ca.SX:
-    """∂S by the material's constants and the logarithm of a field, column after column."""
+    """Return ∂S by the material's constants and the logarithm of a field, column after column."""
     slope = ca.jacobian(second_piola(point, law), point.varied)
     of_field = slope[:, law.constants :]
     return ca.vec(ca.horzcat(slope[:, : len(law.material.constants)], of_field))
 
 
 def _stress_along(point: QuadraturePoint, law: Law) -> ca.SX:
-    """∂S/∂x v: dS = F⁻¹ (dP − dF S)."""
-    F, first, rate = point.gradients["x"], first_piola(point, law), point.gradients["v"]
+    """Return ∂S/∂x v, from dS = F⁻¹ (dP − dF S)."""
+    F = point.gradients["x"]
+    piola = first_piola(point, law)
+    rate = point.gradients["v"]
     inverse = ca.inv_minor(point.felt)
-    stress = inverse @ ca.reshape(first, 3, 3)
-    change = ca.reshape(ca.jtimes(first, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
+    stress = inverse @ ca.reshape(piola, 3, 3)
+    change = ca.reshape(ca.jtimes(piola, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
     return six_of(inverse @ change)
 
 
 def _pulled(point: QuadraturePoint, law: Law) -> ca.SX:
-    """(∂S/∂x)ᵀ σ of what the points carry."""
+    """Return (∂S/∂x)ᵀ σ, with the weights σ as data of the points."""
     return ca.gradient(ca.dot(point.brought, second_piola(point, law)), point.gradients["x"])
 
 
 def _carried_force(point: QuadraturePoint, law: Law) -> ca.SX:
-    """f_H of what the points carry."""
+    """Return f_H, with H as data of the points."""
     return -ca.gradient(carried_energy(point), point.gradients["x"])
 
 
 def _against(point: QuadraturePoint, law: Law) -> ca.SX:
-    """(∂f_H/∂H)ᵀ v."""
+    """Return (∂f_H/∂H)ᵀ v, with velocities v."""
     power = ca.jtimes(-carried_energy(point), point.gradients["x"], point.gradients["v"])
     return ca.gradient(power, point.brought)
 
 
 def _stress_slope(point: QuadraturePoint, law: Law) -> ca.SX:
-    """(∂S/∂x)ᵀ, column after column."""
+    """Return (∂S/∂x)ᵀ, column after column."""
     return ca.jacobian(second_piola(point, law), point.gradients["x"]).T
 
 
 def _force_slope(point: QuadraturePoint, law: Law) -> ca.SX:
-    """∂f_H/∂H, column after column."""
+    """Return ∂f_H/∂H, column after column."""
     return ca.jacobian(_carried_force(point, law), point.brought)
 
 
-# Of each: its expression, fields, how many numbers the points carry, and its contraction.
+# Expression, node fields, number of data of a point, and contraction of each kernel.
 KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
     "stress": (second_piola, ("x",), 0, "none"),
     "stress_by_theta": (_stress_by_theta, ("x",), 0, "none"),
@@ -84,24 +86,26 @@ KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
 
 
 def stress_kernel(name: str, element: Element, law: Law) -> PointKernel:
-    """That of a line of the table."""
+    """Return the kernel of a line of `KERNELS` for an element and a law."""
     expression, fields, carried, contraction = KERNELS[name]
     point = point_of(element, law, *fields, carried=carried)
     piece = expression(point, law)
     if not ca.depends_on(piece, point.carried):  # H has gone from what is linear in it
         point = replace(point, stretches=(), carried=ca.SX(0, 1), scaled=())
-    last = point.phase(name, {name: (contraction, piece)})
-    return PointKernel(last.pieces, fields, last.contractions)
+    phase = point.phase(name, {name: (contraction, piece)})
+    return PointKernel(phase.pieces, fields, phase.contractions)
 
 
 @dataclass(frozen=True, eq=False)
 class SlopeEntries:
-    """Which number of a row of slopes is the derivative of, or by, what.
+    """Row and column of each entry of the derivatives `stress_slopes` and `force_slopes`.
 
     Attributes
     ----------
-    points : (K,) place in what the points carry
-    dofs : (K,) degree of freedom
+    points : (K,)
+        Column in the row of values at points.
+    dofs : (K,)
+        Degree of freedom.
     """
 
     points: Index
@@ -109,9 +113,13 @@ class SlopeEntries:
 
 
 class Stresses:
-    """The stresses of a body, and their transposed derivatives.
+    """Stresses of a body with memory, and their derivatives and transposed derivatives.
 
     Kernels are compiled when they are first needed.
+
+    Parameters
+    ----------
+    body : Discretisation
     """
 
     def __init__(self, body: Discretisation) -> None:
@@ -120,84 +128,97 @@ class Stresses:
         self._evaluators: dict[tuple[str, int], Evaluator] = {}
 
     def stress(self, x: Array, theta: Array) -> Array:
-        """S, (T, width) [Pa]."""
+        """Return S (T, width) [Pa] at positions x (T, 3n) and constants θ."""
         return self._of_points("stress", [x], theta)
 
     def stress_by(self, x: Array, theta: Array, theta_q: Array) -> Array:
-        """∂S/∂θ θ_q, (T, q, width), for θ_q (k, q)."""
-        body, found = self.body, np.zeros((len(x), theta_q.shape[1], self.width))
+        """Return ∂S/∂θ θ_q (T, q, width), for directions θ_q (k, q)."""
+        body = self.body
+        derivatives = np.zeros((len(x), theta_q.shape[1], self.width))
         for number, part in enumerate(body.parts):
             if part.prony:
-                count, places = len(part.material.constants), body.memory.of_part(number)
+                count = len(part.material.constants)
+                places = body.memory.of_part(number)
                 field = part.stress_field
                 out = np.zeros((len(x), (count + bool(field)) * places.size))
                 self._run("stress_by_theta", number, [x], theta, out, add=False)
                 first = body.starts[number]
-                here = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
+                part_columns = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
                 by_constant = out.reshape(len(x), -1, places.size)
                 for k, j in zip(*np.nonzero(theta_q[first : first + count]), strict=True):
-                    found[:, j, here] += theta_q[first + k, j] * by_constant[:, k]
+                    derivatives[:, j, part_columns] += theta_q[first + k, j] * by_constant[:, k]
                 if field:
-                    own = body.mode_places[number]
-                    logs = field.slopes(theta[own]) @ theta_q[own]
+                    field_columns = body.mode_places[number]
+                    logs = field.slopes(theta[field_columns]) @ theta_q[field_columns]
                     for j in np.flatnonzero(logs.any(axis=0)):
-                        of_points = np.tile(np.repeat(logs[:, j], body.geometry.shape[1]), 6)
-                        found[:, j, here] += of_points * by_constant[:, count]
-        return found
+                        point_values = np.tile(np.repeat(logs[:, j], body.geometry.shape[1]), 6)
+                        derivatives[:, j, part_columns] += point_values * by_constant[:, count]
+        return derivatives
 
     def along(self, x: Array, direction: Array, theta: Array, out: Array | None = None) -> Array:
-        """∂S/∂x along a direction, (T, width), added to `out` where it is given."""
+        """Return ∂S/∂x along a direction (T, 3n) as (T, width), added to `out` in place if it is
+        given.
+        """
         return self._of_points("stress_along", [x, direction], theta, out)
 
     def pulled(self, x: Array, weights: Array, theta: Array) -> Array:
-        """(∂S/∂x)ᵀ weights, (T, 3n)."""
+        """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width)."""
         return self._of_nodes("pulled", [x], theta, weights)
 
     def force(self, x: Array, overstress: Array, theta: Array) -> Array:
-        """f_H, (T, 3n) [N]; it is linear in H."""
+        """Return f_H (T, 3n) [N], which is linear in H (`overstress`, (T, width))."""
         return self._of_nodes("carried_force", [x], theta, overstress)
 
     def against(self, x: Array, direction: Array, theta: Array) -> Array:
-        """(∂f_H/∂H)ᵀ direction, (T, width)."""
+        """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n)."""
         return self._of_points("against", [x, direction], theta)
 
     @cached_property
     def slope_entries(self) -> SlopeEntries:
-        """Those of `stress_slopes` and `force_slopes`."""
-        points, dofs = [], []
+        """Row and column of each entry of `stress_slopes` and `force_slopes`."""
+        points = []
+        dofs = []
         for number, part in enumerate(self.body.parts):
             if part.prony:
-                own = self.body.memory.of_part(number)
+                part_columns = self.body.memory.of_part(number)
                 of_cells = dofs_of(self.body.cells[part.cells])
-                shape = (*own.shape, of_cells.shape[1])
-                points.append(np.broadcast_to(own[..., None], shape).ravel())
+                shape = (*part_columns.shape, of_cells.shape[1])
+                points.append(np.broadcast_to(part_columns[..., None], shape).ravel())
                 dofs.append(np.broadcast_to(of_cells[:, None, None], shape).ravel())
         return SlopeEntries(np.concatenate(points), np.concatenate(dofs))
 
     def stress_slopes(self, x: Array, theta: Array) -> Array:
-        """∂S/∂x, (T, K)."""
+        """Return the entries (T, K) of ∂S/∂x."""
         return self._slopes("stress_slope", x, theta)
 
     def force_slopes(self, x: Array, theta: Array) -> Array:
-        """∂f_H/∂H, (T, K); it is linear in x."""
+        """Return the entries (T, K) of ∂f_H/∂H, which is linear in x."""
         return self._slopes("force_slope", x, theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
+        """Return the entries (T, K) of a derivative."""
         out = np.zeros((len(x), len(self.slope_entries.points)))
         return self._summed(name, [x], theta, out)
 
     def _of_points(
         self, name: str, fields: list[Array], theta: Array, out: Array | None = None
     ) -> Array:
+        """Return values at points (T, width) of a kernel, added to `out` in place if it is
+        given.
+        """
         out = np.zeros((len(fields[0]), self.width)) if out is None else out
         return self._summed(name, fields, theta, out)
 
     def _of_nodes(self, name: str, fields: list[Array], theta: Array, carried: Array) -> Array:
+        """Return node values (T, 3n) of a kernel."""
         return self._summed(name, fields, theta, np.zeros_like(fields[0]), carried)
 
     def _summed(
         self, name: str, fields: list[Array], theta: Array, out: Array, carried: Array | None = None
     ) -> Array:
+        """Add the results of a kernel for all parts with memory to `out`, in place, and return
+        it.
+        """
         for number, part in enumerate(self.body.parts):
             if part.prony:
                 self._run(name, number, fields, theta, out, True, carried)
@@ -213,7 +234,25 @@ class Stresses:
         add: bool,
         carried: Array | None = None,
     ) -> None:
-        body, key = self.body, (name, number)
+        """Evaluate a kernel for one part.
+
+        Parameters
+        ----------
+        name : str
+            Kernel in `KERNELS`.
+        number : int
+            Index of the part.
+        fields : list of (T, 3n)
+            Node fields.
+        theta : (k,)
+        out : array
+            Result; overwritten, or added to if `add`.
+        add : bool
+        carried : (T, width), optional
+            Data of the points: H or weights.
+        """
+        body = self.body
+        key = (name, number)
         with COMPILING:
             if key not in self._evaluators:
                 self._evaluators[key] = body.make_evaluator(self._batch(name, number))
@@ -231,29 +270,35 @@ class Stresses:
         )
 
     def _batch(self, name: str, number: int) -> Batch:
-        """Every point as an element of its own."""
+        """Return the batch of a kernel and part, in which every point is an element."""
         body = self.body
-        part, places = body.parts[number], body.memory.of_part(number)
+        part = body.parts[number]
+        places = body.memory.of_part(number)
         kernel = stress_kernel(name, body.element, body.law(number))
         points = body.geometry.shape[1]
         cells = np.repeat(body.cells[part.cells], points, axis=0)
         geometry = body.geometry[part.cells].reshape(len(cells), 1, -1)
-        own = places.reshape(len(cells), 1, 6)
+        point_columns = places.reshape(len(cells), 1, 6)
         if name.endswith("_slope"):
             # 3n for each of what the points carry, part after part.
-            per_number, length = dofs_of(cells).shape[1], len(self.slope_entries.points)
+            per_number = dofs_of(cells).shape[1]
+            length = len(self.slope_entries.points)
             numbers = np.arange(per_number * places.size).reshape(len(cells), -1)
             destinations = per_number * places[0, 0, 0] + numbers
         elif "nodes" in kernel.contractions.values():
-            destinations, length = dofs_of(cells), body.pattern.size
+            destinations = dofs_of(cells)
+            length = body.pattern.size
         elif name == "stress_by_theta":
             count = len(part.material.constants) + bool(part.stress_field)
             columns = places.size * np.arange(count)
-            destinations = (columns[:, None] + own - places[0, 0, 0]).reshape(len(cells), -1)
+            destinations = (columns[:, None] + point_columns - places[0, 0, 0]).reshape(
+                len(cells), -1
+            )
             length = places.size * len(columns)
         else:
-            destinations, length = own.reshape(len(cells), 6), self.width
-        carried = own if KERNELS[name][2] else own[..., :0]
+            destinations = point_columns.reshape(len(cells), 6)
+            length = self.width
+        carried = point_columns if KERNELS[name][2] else point_columns[..., :0]
         if part.stress_field:
             width = self.width if KERNELS[name][2] else 0
             logs = width + np.repeat(np.arange(len(part.cells)), points)
@@ -262,5 +307,5 @@ class Stresses:
         return Batch(kernel, cells, geometry, destinations, length, carried)
 
 
-# Fewer states than this are not worth a second thread.
+# Number of states up to which one thread is faster than several.
 FEW = 16

@@ -1,4 +1,8 @@
-"""Structured meshes of boxes and cylinders."""
+"""Structured meshes of boxes and cylinders.
+
+Use `box_of_edge` and `cylinder_of_edge` for a given edge length, `box_mesh` and `cylinder_mesh` for
+given numbers of elements.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +15,18 @@ from ..errors import InputError
 from .mesh import TetMesh
 from .mesh_checks import orient
 
-# A quarter of a cylinder needs a multiple of four; the volume is right with any.
+# Sectors of a cylinder by edge length: a multiple of four, which a quarter of a cylinder needs.
 _SECTORS = 8
 _MOST_ELEMENTS = 1_000_000
 
 
 def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
-    """Mesh a box with a corner at the origin, in edges of about this length.
+    """Mesh a box with a corner at the origin, with edges of about this length.
 
     Raises
     ------
     InputError
-        If that makes more than a million elements.
+        If this takes more than a million elements.
     """
     divisions = _divided(np.asarray(size_m, dtype=float), edge_length_m)
     _refuse_many(6 * float(np.prod(divisions)))
@@ -32,7 +36,7 @@ def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
 def cylinder_of_edge(
     diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
 ) -> TetMesh:
-    """Mesh an upright cylinder of the right volume, in edges of about this length.
+    """Mesh an upright cylinder of exact volume, with edges of about this length.
 
     Parameters
     ----------
@@ -43,7 +47,7 @@ def cylinder_of_edge(
     Raises
     ------
     InputError
-        If that makes more than a million elements.
+        If this takes more than a million elements.
     """
     rings, layers = _divided(np.array([diameter_m / 2, height_m]), edge_length_m)
     _refuse_many(3 * _SECTORS * float(rings**2 * layers))
@@ -53,16 +57,18 @@ def cylinder_of_edge(
     if not quarter:
         return whole
     points_m = np.where(np.abs(whole.points_m) < 1e-12 * diameter_m, 0.0, whole.points_m)
-    kept = (points_m[whole.tetrahedra][..., :2] >= 0).all(axis=(1, 2))
-    corners_kept, tetrahedra = np.unique(whole.tetrahedra[kept], return_inverse=True)
+    is_in_quarter = (points_m[whole.tetrahedra][..., :2] >= 0).all(axis=(1, 2))
+    corners_kept, tetrahedra = np.unique(whole.tetrahedra[is_in_quarter], return_inverse=True)
     return TetMesh(points_m[corners_kept], tetrahedra.reshape(-1, 4), is_generated=True)
 
 
 def _divided(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
+    """Return the numbers of elements along lengths, rounded, at least 1."""
     return np.maximum(np.round(size_m / edge_length_m), 1)
 
 
 def _refuse_many(elements: float) -> None:
+    """Raise an `InputError` for more than a million elements."""
     if elements > _MOST_ELEMENTS:
         raise InputError(
             f"makes {elements:.3g} elements; expected at most {_MOST_ELEMENTS:,}: a larger length",
@@ -74,7 +80,7 @@ def _refuse_many(elements: float) -> None:
 def box_mesh(
     size_m: ArrayLike, divisions: ArrayLike, origin_m: ArrayLike = (0.0, 0.0, 0.0)
 ) -> TetMesh:
-    """Mesh a box: each of its cells is split into the six tetrahedra around its main diagonal.
+    """Mesh a box; each of its cells is split into the six tetrahedra around its main diagonal.
 
     Parameters
     ----------
@@ -83,14 +89,20 @@ def box_mesh(
     divisions : three integers
         Cells along x, y and z.
     origin_m : three numbers
-        The corner with the lowest coordinates.
+        Corner with the lowest coordinates.
 
     Returns
     -------
     TetMesh
-        Nodes ordered with z fastest, then y, then x.
+        Nodes are ordered with z fastest, then y, then x.
+
+    Raises
+    ------
+    InputError
+        For lengths or divisions that are not positive.
     """
-    size, origin = np.asarray(size_m, dtype=float), np.asarray(origin_m, dtype=float)
+    size = np.asarray(size_m, dtype=float)
+    origin = np.asarray(origin_m, dtype=float)
     cells = np.asarray(divisions)
     if size.shape != (3,) or origin.shape != (3,) or not (size > 0).all():
         raise InputError(f"a box needs three positive lengths in metres, not {size_m!r}")
@@ -113,9 +125,9 @@ def cylinder_mesh(
 ) -> TetMesh:
     """Mesh an upright cylinder: axis z, base at z = 0.
 
-    Ring k of each cross-section has 6k nodes, so a mesh has (1 + 3 rings (rings + 1)) (layers + 1)
-    nodes and 18 rings² layers elements. The outermost ring is a polygon inscribed in the circle:
-    with one ring the volume is 17 % below the cylinder's, with two 4.5 %, with three 2 %.
+    Ring k of each cross-section has `sectors` · k nodes. The outermost ring is a polygon inscribed
+    in the circle: with six sectors and one ring the volume is 17 % below that of the cylinder, with
+    two rings 4.5 %, with three 2 %.
 
     Parameters
     ----------
@@ -123,13 +135,19 @@ def cylinder_mesh(
     rings, layers : int
         Elements along the radius and along the height.
     sectors : int
-        Nodes of the innermost ring; ring k of each cross-section has k times as many. With a
-        multiple of four no element crosses the planes x = 0 and y = 0.
+        Nodes of the innermost ring. With a multiple of four no element crosses the planes x = 0 and
+        y = 0. With six, a mesh has (1 + 3 rings (rings + 1)) (layers + 1) nodes and 18 rings²
+        layers elements.
 
     Returns
     -------
     TetMesh
-        Nodes ordered by layer from z = 0 up; in each layer the centre, then ring by ring.
+        Nodes are ordered by layer from z = 0 up; in each layer the centre, then ring by ring.
+
+    Raises
+    ------
+    InputError
+        For lengths or numbers that are not positive.
     """
     for name, value in (("radius_m", radius_m), ("height_m", height_m)):
         if not 0 < value < np.inf:
@@ -158,7 +176,7 @@ def cylinder_mesh(
 
 
 def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (·, 2) and triangles (sectors · rings², 3) of the unit disc."""
+    """Return nodes (·, 2) and triangles (sectors · rings², 3) of the unit disc."""
     counts = [sectors * k for k in range(1, rings + 1)]
     angles = [2 * np.pi * np.arange(count) / count for count in counts]
     circles = [
@@ -167,6 +185,7 @@ def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
     ]
 
     def node(ring: int, sector: int, step: int) -> int:
+        """Return the index of a node of a ring; of the centre for ring 0."""
         if not ring:
             return 0
         before = 1 + sectors * ring * (ring - 1) // 2
@@ -176,8 +195,8 @@ def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
     for k in range(1, rings + 1):
         for s in range(sectors):
             for i in range(k):
-                outer = node(k, s, i + 1)
-                triangles.append((node(k - 1, s, i), node(k, s, i), outer))
+                outer_node = node(k, s, i + 1)
+                triangles.append((node(k - 1, s, i), node(k, s, i), outer_node))
                 if i < k - 1:
-                    triangles.append((node(k - 1, s, i), outer, node(k - 1, s, i + 1)))
+                    triangles.append((node(k - 1, s, i), outer_node, node(k - 1, s, i + 1)))
     return np.concatenate([np.zeros((1, 2)), *circles]), np.array(triangles)

@@ -1,4 +1,4 @@
-"""Filling a closed surface with tetrahedra by fTetWild (package pytetwild)."""
+"""Tetrahedral meshes of closed surfaces by fTetWild (package pytetwild)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,19 @@ from ..files import whole_file
 from .mesh_checks import cleaned
 from .mesh_files import read_tetrahedra, write_tetrahedra
 
-# fTetWild stops as soon as its elements are well shaped, however small they are. Coarsening
-# afterwards merges edges up to about the length it is asked for, which leaves a mean about a
-# quarter above it; and only edges that a straight one may replace within the tolerance.
+# Edge length passed to fTetWild, as a fraction of the desired one. fTetWild stops as soon as its
+# elements are well shaped, however small; coarsening then merges edges up to about the length
+# passed, which gives a mean length about a quarter above it.
 ASKED_LENGTH = 0.8
+# Largest distance of the new surface from the old one, in edge lengths; it limits coarsening.
 TOLERANCE = 0.02
 _RECIPE = f"coarsen, length {ASKED_LENGTH}, tolerance {TOLERANCE}"
 
+# Largest accepted number of tetrahedra; more suggest a wrong edge length or length unit.
 MOST_ELEMENTS = 2_000_000
 
-# fTetWild leaves a file in its working directory and cannot be interrupted.
+# Program of a separate process: fTetWild writes a file to its working directory and cannot be
+# interrupted.
 _WORKER = """
 import pytetwild
 points, tetrahedra = pytetwild.tetrahedralize(
@@ -46,22 +49,22 @@ def tetrahedralize_surface(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fill a closed surface with tetrahedra.
 
-    fTetWild keeps neither the surface's vertices nor its triangles: the new surface stays within
-    2 % of `edge_length_m` of the old one, which takes shorter edges where that is curved. So give
-    a selection by coordinates that margin. fTetWild is not deterministic either: keep the mesh, by
-    `cache_dir` or `TetMesh.write`, to repeat a result.
+    fTetWild keeps neither the vertices nor the triangles of the surface: the new surface stays
+    within 2 % of `edge_length_m` of the old one, for which it uses shorter edges where the surface
+    is curved. So give a selection by coordinates that margin. fTetWild is not deterministic either:
+    keep the mesh, by `cache_dir` or `TetMesh.write`, to reproduce a result.
 
     Parameters
     ----------
     points_m : (p, 3) array
-        Vertices in metres; those that coincide are merged.
+        Vertices in metres; coincident ones are merged.
     triangles : (F, 3) integer array
         Vertices of each triangle, counted from 0, in any orientation.
     edge_length_m : float
-        Wanted edge length; the mean comes out within some tens of percent of it.
+        Desired edge length; the mean of the result is within some tens of percent of it.
     cache_dir : str or Path, optional
-        Folder that keeps the mesh as .vtu under a hash of the surface, the edge length and the
-        version of pytetwild. A mesh found there is returned instead of a new one.
+        Folder in which the mesh is kept as .vtu under a hash of the surface, the edge length and
+        the version of pytetwild. A mesh found there is returned instead of a new one.
 
     Returns
     -------
@@ -92,7 +95,9 @@ def tetrahedralize_surface(
 
 
 def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices that coincide up to single precision, and drop triangles this flattens."""
+    """Merge vertices that coincide in single precision, and drop triangles that become
+    degenerate.
+    """
     tolerance = 1e-6 * np.linalg.norm(np.ptp(points, axis=0))
     pairs = KDTree(points).query_pairs(tolerance, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
@@ -104,7 +109,9 @@ def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndar
 
 
 def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    points, faces = np.asarray(points_m, dtype=float), np.asarray(triangles)
+    """Return vertices and triangles as arrays, or raise an `InputError` if they are invalid."""
+    points = np.asarray(points_m, dtype=float)
+    faces = np.asarray(triangles)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError(f"a surface needs (p, 3) finite vertex coordinates, not {points.shape}")
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.dtype.kind not in "iu":
@@ -118,9 +125,11 @@ def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndar
 
 
 def _refuse_open(triangles: np.ndarray) -> None:
+    """Raise an `InputError` unless every edge belongs to exactly two triangles."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, count = np.unique(edges, axis=0, return_counts=True)
-    open_edges, crowded = int((count == 1).sum()), int((count > 2).sum())
+    open_edges = int((count == 1).sum())
+    crowded = int((count > 2).sum())
     if not len(count) or open_edges or crowded:
         raise InputError(
             f"the surface is not closed: {open_edges} open edges belong to one triangle only and "
@@ -130,6 +139,9 @@ def _refuse_open(triangles: np.ndarray) -> None:
 
 
 def _refuse_edge_length(points: np.ndarray, triangles: np.ndarray, edge_length_m: float) -> None:
+    """Raise an `InputError` if the edge length is not positive, too large or too small for the
+    body.
+    """
     if not 0 < edge_length_m < np.inf:
         raise InputError(f"the edge length must be a positive number of metres: {edge_length_m!r}")
     extent = " × ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
@@ -149,6 +161,7 @@ def _refuse_edge_length(points: np.ndarray, triangles: np.ndarray, edge_length_m
 
 
 def _pytetwild_version() -> str:
+    """Return the version of pytetwild, or raise an `InputError` if it is not installed."""
     try:
         version("pyvista")  # pytetwild imports it without depending on it
         return version("pytetwild")
@@ -162,6 +175,7 @@ def _pytetwild_version() -> str:
 def _run_ftetwild(
     points: np.ndarray, triangles: np.ndarray, edge_length_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and tetrahedra of fTetWild, run in a separate process."""
     diagonal = np.linalg.norm(np.ptp(points, axis=0))
     lengths = (ASKED_LENGTH * edge_length_m, TOLERANCE * edge_length_m / diagonal)
     words = [repr(float(length)) for length in lengths]

@@ -1,4 +1,4 @@
-"""Where the surface of a body may touch something: quadrature points of its faces."""
+"""Quadrature points of surface faces at which a body may touch an obstacle."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from .body import Body
 from .force_points import ForcePoints
 from .selection import Selection
 
-# From the origin of a frame to a point of the surface, and to the ends of the frame's axes.
+# Number of vectors of a contact point: from the frame's origin to it and to the ends of three axes.
 VECTORS = 4
 
 # Barycentric points and weights of a triangle, exact to order 2 and 4 (Dunavant 1985).
-_A, _B = (0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)
+_A = (0.445948490915965, 0.223381589678011)
+_B = (0.091576213509771, 0.109951743655322)
 _TURNS = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]])
 RULES = {
     3: (np.where(_TURNS, 1 / 6, 2 / 3), np.full(3, 1 / 3)),
@@ -28,22 +29,25 @@ RULES = {
 
 @dataclass(frozen=True, eq=False)
 class Touching:
-    """Where the surface of a body may touch an obstacle.
+    """Surface points of a body that may touch an obstacle.
 
     Attributes
     ----------
     points : ForcePoints
-        Quadrature points of faces; of each the ways from the frame's origin to it and to the ends.
+        Quadrature points of faces; the vectors of each are from the frame's origin to the point and
+        to the ends of the frame's axes.
     area_m2 : (i,)
+        Area assigned to each point.
     edge_m : float
-        Mean length of an edge of the faces.
+        Mean edge length of all faces.
     edges_m : (f,)
-        Mean length of the edges of each face.
+        Mean edge length of each face.
     part : int
-        Of the body, that has most of the faces.
+        Index of the part of the body with most of the area.
     a_face : int
-        Points of each face.
-    faces : (f,) rows of the mesh's surface
+        Number of points of each face.
+    faces : (f,)
+        Rows of the mesh's surface.
     """
 
     points: ForcePoints
@@ -56,7 +60,16 @@ class Touching:
 
     @classmethod
     def of(cls, body: Body, frame: Index, chosen: Selection | None) -> Touching:
-        """That of a body, or some of its faces, and the frame (4,) of an obstacle."""
+        """Return the contact points of a body and the frame of an obstacle.
+
+        Parameters
+        ----------
+        body : Body
+        frame : (4,) int
+            Nodes of the obstacle's frame.
+        chosen : Selection or None
+            Faces that may touch; None for all.
+        """
         rows = np.arange(len(body.mesh.surface))
         if chosen is not None:
             rows = chosen.resolve_faces(body.mesh)
@@ -76,8 +89,10 @@ class Touching:
         points = ForcePoints(
             np.repeat(nodes, count, axis=0), np.tile(mix, (len(faces), 1, 1)), len(body.nodes_m)
         )
-        held = [np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts]
-        part = int(np.argmax([area[each].sum() for each in held]))
+        in_part = [
+            np.isin(triangles, body.mesh.tetrahedra[p.cells]).all(axis=1) for p in body.parts
+        ]
+        part = int(np.argmax([area[each].sum() for each in in_part]))
         edges_m = np.linalg.norm(sides, axis=2).mean(axis=1)
         return cls(
             points=points,
@@ -91,14 +106,21 @@ class Touching:
 
 
 def on_faces(places: Array, nodes: int) -> tuple[Array, Array]:
-    """Weights (q, v) of so many nodes of a face at places (q, 3), and slopes (q, v, 3) by these.
+    """Return the shape functions (q, v) of faces with v nodes, and derivatives (q, v, 3).
 
-    Nodes are the corners, and of six of them the middles of ab, bc and ca.
+    Nodes are the corners and, for six of them, the middles of ab, bc and ca.
+
+    Parameters
+    ----------
+    places : (q, 3)
+        Barycentric coordinates, by which the derivatives are taken.
+    nodes : {3, 6}
+        Number v of nodes.
     """
     unit = np.broadcast_to(np.eye(3), (len(places), 3, 3))
     if nodes == 3:
         return places, unit
-    beside = np.roll(places, -1, axis=1)
-    weights = np.hstack([places * (2 * places - 1), 4 * places * beside])
-    of_sides = beside[:, :, None] * unit + places[:, :, None] * np.roll(unit, 1, axis=2)
-    return weights, np.hstack([(4 * places - 1)[:, :, None] * unit, 4 * of_sides])
+    next_places = np.roll(places, -1, axis=1)
+    weights = np.hstack([places * (2 * places - 1), 4 * places * next_places])
+    side_slopes = next_places[:, :, None] * unit + places[:, :, None] * np.roll(unit, 1, axis=2)
+    return weights, np.hstack([(4 * places - 1)[:, :, None] * unit, 4 * side_slopes])

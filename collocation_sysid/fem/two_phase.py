@@ -1,9 +1,9 @@
-"""Two materials with a sharp boundary: every element is of the surroundings or of an inclusion.
+"""Fields of two materials with a sharp boundary: every element belongs to one of two phases.
 
-In a part of a body whose field has `prior = "two-phase"` a constant c has one value in the
-surroundings and another in inclusions, ln c_e = ln c_0 + ln r · h_e, with the contrast r = c_1/c_0,
-which is a parameter, and h_e ∈ {0, 1}, the phase of element e. Phases are no parameters: for a
-solver they are given, and `statistics.phases` finds them from derivatives by `ElementLogarithms`.
+If the field of a part has `prior = "two-phase"`, a constant c has one value in the surroundings and
+another in inclusions, ln c_e = ln c_0 + ln r · h_e, with the contrast r = c_1/c_0, which is a
+parameter, and the phase h_e ∈ {0, 1} of element e. Phases are not parameters: solvers keep them
+fixed, and `statistics.phases` determines them with derivatives by `ElementLogarithms`.
 """
 
 from __future__ import annotations
@@ -23,19 +23,23 @@ from .mesh import TetMesh
 
 @dataclass(frozen=True, eq=False)
 class PhaseSamples:
-    """Draws from the posterior of the phases, with what goes with each of them.
+    """Samples of the posterior of the phases.
 
     Attributes
     ----------
-    logarithms : (K, E) of the constant in every element
-    contrasts : (K,) logarithm of the contrast
-    volumes_m3 : (K,) of the inclusions
-    names : (p,) of parameters
+    logarithms : (K, E)
+        Logarithm of the constant in every element, relative to its mean.
+    contrasts : (K,)
+        Logarithm of the contrast.
+    volumes_m3 : (K,)
+        Volume of the inclusions.
+    names : (p,)
+        Names of the parameters of `deviations`.
     deviations : (p, p)
-        Covariance of the means of these parameters, in the solver's coordinates, given each draw
-        of the phases: what not knowing the phases adds to their covariance.
+        Covariance of the conditional means of these parameters given each sample of the phases, in
+        the solver's coordinates: the part of their covariance due to unknown phases.
     misfit : float
-        χ² per measurement of the answer, with the standard deviations given.
+        χ² per measurement of the solution, with the given standard deviations.
     smooth_misfit : float
         χ² per measurement of the smooth field with which the search for the phases started.
     """
@@ -51,19 +55,19 @@ class PhaseSamples:
 
 @dataclass(frozen=True)
 class PhaseFinding:
-    """What is found of two phases.
+    """Summary of the phases of a two-phase field.
 
     Attributes
     ----------
     contrast : (lower, median, upper)
         Ratio of the inclusion to the surroundings, with the 95 % interval of its statistical error
         and of the phases.
-    volume_m3 : (lower, median, upper) of the inclusion, likewise
+    volume_m3 : (lower, median, upper)
+        Volume of the inclusion, with the same interval.
     deviation : float
-        Standard deviation of the logarithm in an element of which nothing but the two values is
-        known: each phase as likely.
+        Standard deviation of the logarithm in an element whose two phases are equally likely.
     misfit, smooth_misfit : float
-        χ² per measurement of the answer, and of the smooth field before it.
+        χ² per measurement of the solution, and of the smooth field before it.
     elements : int
         Number of elements of the smaller phase.
     """
@@ -78,14 +82,14 @@ class PhaseFinding:
 
 @dataclass(frozen=True, eq=False)
 class TwoPhaseModes(FieldModes):
-    """A two-phase field as the body evaluates it; its only coefficient is the contrast r.
+    """Two-phase field of a part; its only coefficient is the contrast r.
 
     Attributes
     ----------
     phase : (E,)
         0 in the surroundings, 1 in inclusions; 0 everywhere until phases are known.
     samples : PhaseSamples or None
-        Draws from the posterior of the phases; None before there is an answer.
+        Samples of the posterior of the phases; None before there is a solution.
     """
 
     phase: Array = field(default_factory=lambda: np.zeros(0))
@@ -95,12 +99,13 @@ class TwoPhaseModes(FieldModes):
     def of(
         cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]
     ) -> TwoPhaseModes:
-        """Return the two-phase field of some cells, of constants of material and damping law.
+        """Return the two-phase field of some cells, see `FieldModes.of`.
 
         Raises
         ------
         InputError
-            If none of these is the field's, or the field is of a density or has several lengths.
+            If the field's parameter is not a constant of material or damping law, is a density, or
+            has several correlation lengths.
         """
         if field.parameter == DENSITY.name:
             raise InputError(
@@ -112,13 +117,13 @@ class TwoPhaseModes(FieldModes):
                 f"length_m of a two-phase field has {len(field.lengths_m)} values; expected one: "
                 "lengths to choose from are for prior = 'smooth'"
             )
-        found = super().of(field, mesh, cells, law)
-        assert isinstance(found, cls)
-        return replace(found, phase=np.zeros(len(cells)))
+        modes = super().of(field, mesh, cells, law)
+        assert isinstance(modes, cls)
+        return replace(modes, phase=np.zeros(len(cells)))
 
     @property
     def has_phases(self) -> bool:
-        """Whether phases are known."""
+        """Whether the phases are known."""
         return bool(self.phase.any())
 
     @property
@@ -129,7 +134,7 @@ class TwoPhaseModes(FieldModes):
 
     @property
     def share(self) -> float:
-        """Share of the variance that the smooth field of the start has."""
+        """Share of the prior variance that the shapes of the smooth field represent."""
         return self.smooth.share
 
     @property
@@ -139,11 +144,11 @@ class TwoPhaseModes(FieldModes):
 
     @property
     def constants(self) -> tuple[Constant, ...]:
-        """The contrast r."""
+        """Constant of the contrast r."""
         return (CONTRAST,)
 
     def split_in_eight(self) -> TwoPhaseModes:
-        """Return the same field of a mesh whose cells are cut in eight."""
+        """Return this field on a mesh whose cells are split into eight."""
         finer = super().split_in_eight()
         assert isinstance(finer, TwoPhaseModes)
         samples = self.samples
@@ -166,30 +171,39 @@ class TwoPhaseModes(FieldModes):
 
 @dataclass(frozen=True, eq=False)
 class ElementLogarithms(FieldModes):
-    """A field with one coefficient per element, about given logarithms: for derivatives by each.
+    """Field with one coefficient per element, relative to given logarithms: for derivatives by each
+    one.
 
     Attributes
     ----------
-    base : (E,) logarithm of the constant over its mean in every cell where coefficients are zero
+    base : (E,)
+        Logarithm of the constant relative to its mean where all coefficients are zero.
     """
 
     base: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def about(cls, modes: FieldModes, base: Array) -> ElementLogarithms:
-        """Return one for the cells of a field."""
+        """Return such a field on the cells of another field.
+
+        Parameters
+        ----------
+        modes : FieldModes
+        base : (E,)
+            Logarithms where all coefficients are zero.
+        """
         field = replace(modes.field, prior=SMOOTH, modes=len(base))
         volumes_m3 = modes.volumes_m3
         return cls(field, modes.laplacian, modes.scaled, modes.length_m, volumes_m3, base)
 
     @cached_property
     def shapes(self) -> Array:
-        """Identity (E, E)."""
+        """Derivatives of the logarithms by the coefficients: the identity (E, E)."""
         return np.eye(len(self.base))
 
     @property
     def constants(self) -> tuple[Constant, ...]:
-        """One coefficient per element."""
+        """Constants of the coefficients, one per element."""
         return tuple(mode(k) for k in range(len(self.base)))
 
     def logarithms(self, coefficients: Array) -> Array:
@@ -198,5 +212,5 @@ class ElementLogarithms(FieldModes):
 
 
 def inclusion(phase: Array) -> NDArray[np.bool_]:
-    """Return which elements (E,) are of an inclusion, by phases (E,) between 0 and 1."""
+    """Return a mask (E,) of the elements of inclusions, from phases (E,) between 0 and 1."""
     return phase > 0.5

@@ -1,30 +1,36 @@
-"""How many rows there is time for: rows at once share what it takes to begin."""
+"""Computing time of time steps, to decide how many of them fit into the rest of a frame.
+
+Time steps that are computed together share a fixed cost, so the first one takes longer than each
+further one.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-# What is left after a frame of the longest delay: rows are not begun that might not end within the
-# budget, and one that took long by chance is forgotten. What some frames take only, later.
-FADING, SELDOM = 0.85, 0.97
+# Decay per frame of the longest observed delay: time steps that might exceed the budget are not
+# started, and an occasional long one is forgotten.
+FADING = 0.85
+# Decay per frame of the time after the time steps, which contains work that only some frames need.
+SELDOM = 0.97
 
 
 @dataclass
 class Budget:
-    """Times of rows that are passed at once.
+    """Computing times of time steps that are computed together [s].
 
     Attributes
     ----------
     first_s, more_s : float
-        Of the first, and of each more; zero where nothing is known yet.
+        Time of the first one, and of each further one; zero if not known yet.
     delay : float
-        By how many times the last ones took longer.
+        Largest recent ratio of measured to expected time.
     turn_s : float
-        Of a pass to turn to another p.
+        Time to change the linearisation point of a pass.
     frame_s : float
-        Of the last frame without rows that are passed again; its user sets it.
+        Time of the last frame without repeated time steps; set by the user of this class.
     after_s : float
-        Of what follows the rows of a frame.
+        Time of the work that follows the time steps of a frame.
     """
 
     first_s: float = 0.0
@@ -36,12 +42,12 @@ class Budget:
 
     @classmethod
     def of(cls, one_s: float, many_s: float, many: int) -> Budget:
-        """From times of one row and of many."""
+        """Return the budget from the time of one time step and the time of `many`."""
         more_s = (many_s - one_s) / (many - 1) if many > 1 else one_s
         return cls(one_s, min(max(more_s, 0.0), one_s))
 
     def rows(self, left_s: float) -> int:
-        """How many there is time for."""
+        """Return how many time steps fit into the remaining time [s]."""
         left_s -= self.after_s
         spare_s = left_s / self.delay - self.first_s
         if left_s <= 0 or spare_s < 0:
@@ -49,20 +55,22 @@ class Budget:
         return 1 + int(min(spare_s / self.more_s, 1e6)) if self.more_s else 1
 
     def took(self, rows: int, took_s: float) -> None:
-        """Note how long some took."""
+        """Record how long some time steps took [s]."""
         expected_s = self.first_s + (rows - 1) * self.more_s
         if expected_s:
             self.delay = max(self.delay, took_s / expected_s)
 
     def turned(self, took_s: float) -> None:
-        """Note how long a turn took."""
+        """Record how long a change of the linearisation point took [s]."""
         self.turn_s = max(self.turn_s, took_s)
 
     def ended(self, took_s: float) -> None:
-        """Note how long what followed the rows took; not every frame has all of it."""
+        """Record how long the work after the time steps took [s]; not every frame needs all of
+        it.
+        """
         self.after_s = max(SELDOM * self.after_s, took_s)
 
     def forget(self) -> None:
-        """Begin another frame."""
+        """Start another frame: let the recorded delays decay."""
         self.delay = max(1.0, FADING * self.delay)
         self.turn_s *= FADING

@@ -1,14 +1,15 @@
-"""Parameters while the recording is being made: one frame in, one estimate out.
+"""Live estimation of parameters: one frame in, one estimate out.
 
-All frames are linearised near one p; the estimate is the Gauss–Newton step from there, within
-bounds and a trust region. When it has moved, what the window holds is passed again at the
-estimate, in what is left of each frame's time, until that pass has caught up: it takes the place
-of the first where the sum of squares is less, and else the trust region shrinks. So each pass is
-an iteration of the reduced-space method on all that has come, and what they converge to is the
-batch's answer.
+All frames are linearised at one point p; the estimate is the Gauss–Newton step from there, within
+bounds and a trust region. When the estimate has moved away from p, the rows in the window are
+computed again at the estimate, in what is left of each frame's time, until this second pass has
+caught up. It replaces the first pass if its sum of squares is acceptable; otherwise the trust
+region shrinks. Each pass is thus an iteration of the reduced-space method on all data so far, and
+the iterations converge to the result of the batch.
 
-The estimate does not wait for that: both passes turn to where it is now, and go on from a state
-that has moved along its slopes, as in an extended Kalman filter; another pass then follows.
+In the meantime both passes change their linearisation point to the current estimate and continue
+from a state that is moved along its derivatives, as in an extended Kalman filter; another pass then
+follows.
 """
 
 from __future__ import annotations
@@ -43,47 +44,58 @@ from .track import JoinedPasses, Track
 from .trust import UNSETTLED, Scatter, data_concerns, estimate_concerns, widened
 from .whole import recording_of, solved
 
-# Standard deviation of a prior about the last pass for where the next one is, until many samples
-# tell of it.
+# Standard deviation, in steps of the trust region, of a prior that keeps the next linearisation point
+# near the last one until many samples are available.
 STAY = 0.5
-# Estimates this far from where all is linearised, in standard errors, begin another pass.
+# Distance of the estimate from the linearisation point, in standard errors, that starts another pass.
 MOVED = 0.1
-# Passes turn where the estimate is so far from them: one that is catching up, and the first.
-TURN, TURN_FIRST = 1.0, 3.0
-# First and widest trust region, see `methods.search`, and what a rejected step leaves of it.
-TRUST, WIDEST, SHRINK = 1.0, 2.0, 0.25
-# A pass is accepted where the sum of squares is no more than so many times, and this above, what it
-# was or what was to be expected of it: rows that came since then are fitted by the next.
-TIMES, SLACK = 1.25, 1.0
-# Share of the time between samples that a frame may take, and blocks that a window has.
-SHARE, BLOCKS = 0.8, 12
-# After so many passes that were rejected in a row another start is sought.
+# Distance, in standard errors, at which a pass that is catching up changes its linearisation point.
+TURN = 1.0
+# The same distance for the first pass, which receives the frames.
+TURN_FIRST = 3.0
+# Initial radius of the trust region, see `methods.search`.
+TRUST = 1.0
+# Largest radius of the trust region.
+WIDEST = 2.0
+# Factor of the radius after a rejected step.
+SHRINK = 0.25
+# A pass is accepted if its sum of squares is at most TIMES · expected + SLACK: rows that arrived in
+# the meantime are fitted by the next pass.
+TIMES = 1.25
+SLACK = 1.0
+# Default of the computing time of a frame, as a fraction of the time between samples.
+SHARE = 0.8
+# Number of blocks of a window.
+BLOCKS = 12
+# Number of consecutively rejected passes after which other initial values are searched for.
 REJECTED = 3
-# So often the window is passed at most when frames have ended.
+# Largest number of passes over the window after the last frame.
 PASSES = 50
-# Times that rows are timed before frames come.
+# Number of timing measurements before the first frame.
 TIMED = 3
-# Residuals this many times the usual are no noise. So many sizes of the body from where its grasp
-# carries it there is nothing of it, whatever it is made of, nor does a grasp go so far in a sample.
-JUMP, FAR = 6.0, 5.0
-# Frames between two looks at all residuals.
+# Ratio of a residual to the usual one above which a sample is an outlier.
+JUMP = 6.0
+# Distance, in body sizes, from the grasp beyond which no marker can be, and beyond which no grasp
+# moves between two samples.
+FAR = 5.0
+# Number of frames between two evaluations of all residuals.
 LOOK_EVERY = 5
 
 
 @dataclass(frozen=True)
 class LiveOptions(Options):
-    """What live estimation may take.
+    """Options of live estimation.
 
     Attributes
     ----------
     budget_s : float, optional
-        Time of a frame; 80 % of the time between samples by default. The frame itself is taken
-        whatever it costs.
+        Computing time of a frame; 80 % of the time between samples by default. The rows of the
+        frame itself are computed even if they take longer.
     window_s : float
-        Frames that are passed again when the estimate moves.
+        Duration of the window of frames that are computed again when the estimate moves.
     rows : int, optional
-        Rows of the grid that are passed again a frame, whatever time that takes: estimates are the
-        same on any machine then.
+        Number of rows of the grid that are computed again in each frame, in place of the time
+        limit: estimates are then the same on any machine.
     """
 
     name: ClassVar[str] = "live"
@@ -95,22 +107,24 @@ class LiveOptions(Options):
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What is known after a frame.
+    """Result after a frame.
 
     Attributes
     ----------
     t_s : float
-        Of the frame.
-    estimates : by name, value, standard error and 95 % interval
+        Time of the frame.
+    estimates : mapping of name to Estimate
+        Value, standard error and 95 % interval of each parameter.
     trust : Trust
+        Verdict with its reasons.
     marker_rms_m : float
-        Distance of the markers of this frame from where the estimate has them; NaN without any.
+        Root mean square distance of this frame's markers from the estimate's; NaN without markers.
     notes : tuple of str
-        What was odd about the frame, or happened now.
+        Irregularities of the frame, and events.
     latency_s : float
-        Time the frame took.
+        Computing time of the frame.
     relinearised : int
-        Rows that were passed again.
+        Number of rows that were computed again.
     """
 
     t_s: float
@@ -127,12 +141,8 @@ class Update:
 
 
 def _require_phases(problem: Problem) -> None:
-    """Refuse a two-phase field without phases, which no stream can search for.
-
-    Raises
-    ------
-    InputError
-        If there is one.
+    """Raise an `InputError` for a two-phase field without phases, which live estimation cannot
+    find.
     """
     for name, modes in problem.two_phase_fields.items():
         if not modes.has_phases:
@@ -143,21 +153,30 @@ def _require_phases(problem: Problem) -> None:
 
 
 class Estimator:
-    """Estimates a problem's parameters from frames, one after another.
+    """Estimator of a problem's parameters from frames, one after another.
 
     Parameters
     ----------
     problem : Problem
-        One experiment; its recording only says which grasps and markers there are, and how many
-        samples a second.
+        One experiment; of its recording only the grasps, the markers and the sampling rate are
+        used.
     options : LiveOptions
     clock : callable
-        Seconds that the budget is taken from; `time.thread_time` does not count what others take.
+        Time in seconds for the budget; `time.thread_time` excludes the time of other processes.
+
+    Attributes
+    ----------
+    p : (P,)
+        Current estimate of the parameters, in the solver's coordinates.
+    counts : Counter
+        Numbers of irregularities of frames, by kind.
+    last : Update or None
+        Result after the last frame; None before the first one.
 
     Raises
     ------
     InputError
-        Where the problem has what cannot be live.
+        If the problem has a feature that live estimation does not support.
     """
 
     def __init__(
@@ -166,15 +185,20 @@ class Estimator:
         options: LiveOptions = LiveOptions(),
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self.problem, self.options, self.clock = problem, options, clock
+        self.problem = problem
+        self.options = options
+        self.clock = clock
         _require_phases(problem)
         self.model = Model.of(problem)
-        model, self.names = self.model, self.model.experiment.markers.names
-        far_m, around = FAR * model.size_m, model.samples_around
+        model = self.model
+        self.names = self.model.experiment.markers.names
+        far_m = FAR * model.size_m
+        neighbours = model.samples_around
         self._reach_m = far_m + float(np.linalg.norm(model.segment.body.nodes_m.mean(axis=0)))
-        arounds = [each.around for each in model.instruments]
-        self.intake = Intake(model.interval_s, model.substeps, around, far_m, arounds)
-        self.counts, self.samples = self.intake.counts, 0
+        stencils = [each.around for each in model.instruments]
+        self.intake = Intake(model.interval_s, model.substeps, neighbours, far_m, stencils)
+        self.counts = self.intake.counts
+        self.samples = 0
         self.budget_s = options.budget_s or SHARE * model.interval_s
         self.rows = options.rows
         samples = max(LONGEST, round(options.window_s / model.interval_s / BLOCKS))
@@ -190,7 +214,9 @@ class Estimator:
         self.log: list[LoggedRow] = []
         self.search = self._search() if problem.parameters.unguessed else None
         self.scatter = Scatter()
-        self._trust, self._rejected, self.budget = TRUST, 0, Budget()
+        self._trust = TRUST
+        self._rejected = 0
+        self.budget = Budget()
         self.last: Update | None = None
         self._rest = self._warmed_up()
 
@@ -204,39 +230,40 @@ class Estimator:
         wrench: Any = None,
         readings: Mapping[str, Any] | None = None,
     ) -> Update:
-        """Take a frame.
+        """Process a frame and return the result.
 
         Parameters
         ----------
         t_s : float
+            Time of the frame.
         pose : 4×4 matrix, (position, quaternion x y z w), or None
-            Of the grasp that moves, None where it is not seen; of several by number from "1" on,
-            or by the order of the problem.
+            Pose of the moving grasp, None if it is missing; for several grasps a mapping by their
+            number from "1" on, or a list in the order of the problem.
         markers : (M, 3) array, or mapping of name to (3,)
-            NaN, or left out, where missing.
+            Marker positions; NaN, or omitted, where missing.
         wrench : (6,) or (3,) array, optional
-            What the grasp gives: fx, fy, fz [N], tx, ty, tz [N m], at the time of the frame; or a
-            mapping with ``t_s`` and ``values``, or a list of such; of several sensors by the number
-            of their grasp. NaN, or None, where missing.
+            Wrench of the grasp on the body: fx, fy, fz [N], tx, ty, tz [N m], at the time of the
+            frame; or a mapping with ``t_s`` and ``values``, or a list of such mappings; for several
+            sensors a mapping by the number of their grasp. NaN, or None, where missing.
         readings : mapping of name to numbers, optional
-            Of readings of one's own, at the time of the frame; or a mapping with ``t_s`` and
-            ``values``, or a list of such. NaN, or None, where missing.
+            Values of custom sensors at the time of the frame; or mappings with ``t_s`` and
+            ``values``, or lists of such mappings. NaN, or None, where missing.
 
         Raises
         ------
         InputError
-            For values that are no frame; the estimator is as it was before.
+            If the values are not a valid frame; the estimator is then unchanged.
         """
         poses = as_pose(pose, self.model.moved_grasps + 1)
         tracks = as_tracks(markers, self.names)
         gauges = self.model.experiment.readings
-        told = as_readings(readings, gauges, as_time(t_s))
-        told += as_wrenches(wrench, self.model.wrenches, len(gauges), as_time(t_s))
-        return self.take(Frame(as_time(t_s), poses, tracks, wrench is not None, told))
+        instrument_samples = as_readings(readings, gauges, as_time(t_s))
+        instrument_samples += as_wrenches(wrench, self.model.wrenches, len(gauges), as_time(t_s))
+        return self.take(Frame(as_time(t_s), poses, tracks, wrench is not None, instrument_samples))
 
     @one_blas_thread()
     def take(self, frame: Frame) -> Update:
-        """Take a frame that was read."""
+        """Process a validated frame and return the result."""
         began = self.clock()
         frame, notes = self._of_frame(frame)
         if self.intake.is_lost(frame.t_s):
@@ -244,25 +271,29 @@ class Estimator:
                 notes.append("the grasp is lost: nothing is read until its pose is back")
             else:
                 self._begin_anew()
-                notes.append("nothing was seen for long: begun anew, as if at rest here")
-        rows, readings, said = self.intake.take(frame.t_s, frame.pose, frame.tracks_m, frame.told)
-        notes += said
+                notes.append("begun anew after a gap: the body is assumed to be at rest here")
+        rows, readings, new_notes = self.intake.take(
+            frame.t_s, frame.pose, frame.tracks_m, frame.told
+        )
+        notes += new_notes
         self.budget.forget()
-        caught = self._catch_up(began, notes)
-        squares, before = [], self.clock()
+        caught_up = self._catch_up(began, notes)
+        squares = []
+        before = self.clock()
         while rows:
-            done, said = self._go_on(rows, squares)
-            notes, rows = notes + said, rows[done:]
+            done, new_notes = self._go_on(rows, squares)
+            notes = notes + new_notes
+            rows = rows[done:]
         notes += self._read(readings, squares)
         self._estimate()
         if self.track is not None and not self.track.failed and self.search is None:
             self._turn(self.track, self.track, began, TURN_FIRST)
         self.budget.frame_s = self.clock() - before
-        done = self._pass_again(began, notes, caught)
+        done = self._pass_again(began, notes, caught_up)
         before = self.clock()
         self._shorten()
-        near = np.concatenate([*squares, np.zeros(0)])
-        rms_m = float(np.sqrt(near.mean())) if len(near) else float("nan")
+        squared_distances = np.concatenate([*squares, np.zeros(0)])
+        rms_m = float(np.sqrt(squared_distances.mean())) if len(squared_distances) else float("nan")
         estimates, trust = self._known(frame.t_s)
         self.budget.ended(self.clock() - before)
         latency_s = self.clock() - began
@@ -271,26 +302,34 @@ class Estimator:
 
     @one_blas_thread()
     def settle(self) -> Update | None:
-        """What all frames say together, however long that takes; for when they have ended.
+        """Return the final result of all frames, however long that takes; call it after the last
+        frame.
 
-        Where the window holds the recording, that is the batch's run of it. Else, and where
-        markers were seen between samples, the window is passed again until the estimate stays. The
-        update is that of the last frame, with the distance of all markers where there was a run;
-        None where there was no frame.
+        If the window holds the whole recording, this is the run of the batch. Otherwise, and if
+        markers were measured between samples, the rows in the window are computed again until the
+        estimate stays.
+
+        Returns
+        -------
+        Update or None
+            The update of the last frame with new estimates and, after a batch run, the root mean
+            square distance of all markers. None if there was no frame.
         """
-        began, notes = self.clock(), ["settled after the last frame"]
+        began = self.clock()
+        notes = ["settled after the last frame"]
         if self.last is None or self.track is None:
             return self.last
-        last, found = self.last, self._run_of_all(self.track, notes)
-        if found is None:
+        last = self.last
+        batch_run = self._run_of_all(self.track, notes)
+        if batch_run is None:
             rows = self._pass_to_the_end(began, notes)
             estimates, trust = self._known(last.t_s)
         else:
-            rows = len(found.solution.history) * len(self.log)
-            estimates = {name: found.estimates[name] for name in last.estimates}
+            rows = len(batch_run.solution.history) * len(self.log)
+            estimates = {name: batch_run.estimates[name] for name in last.estimates}
             left_out = Trust.of(data_concerns(Scatter(), self.counts, self.samples))
-            trust = found.trust.joined(left_out)
-            last = replace(last, marker_rms_m=found.solution.rms_m)
+            trust = batch_run.trust.joined(left_out)
+            last = replace(last, marker_rms_m=batch_run.solution.rms_m)
         return replace(
             last,
             estimates=estimates,
@@ -301,23 +340,26 @@ class Estimator:
         )
 
     def _run_of_all(self, track: Track, notes: list[str]) -> Run | None:
-        """The batch's run, None where the window does not hold what it needs."""
-        whole = None if track.prior.rows else recording_of(self.model, self.intake, self.log)
+        """Return the run of the batch; None if the window does not hold the whole recording."""
+        recording = None if track.prior.rows else recording_of(self.model, self.intake, self.log)
         try:
-            return None if whole is None else solved(self.problem, whole)
+            return None if recording is None else solved(self.problem, recording)
         except InputError as error:
             notes.append(f"the recording cannot be solved as a whole: {error.message}")
             return None
 
     def _pass_to_the_end(self, began: float, notes: list[str]) -> int:
-        hurried, self.rows = self.rows, PASSES * len(self.log)
+        """Compute the rows in the window again until the estimate stays; return the number of
+        rows.
+        """
+        rows_per_frame, self.rows = self.rows, PASSES * len(self.log)
         try:
             return self._pass_again(began, notes)
         finally:
-            self.rows = hurried
+            self.rows = rows_per_frame
 
     def _of_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
-        """What of a frame can be read."""
+        """Return the frame without implausible markers, and notes."""
         notes = []
         if frame.has_wrench and not self.model.wrenches:
             self.counts["with a wrench"] += 1
@@ -325,23 +367,27 @@ class Estimator:
                 notes.append("wrenches are left out: no grasp of the problem has a sensor")
         if frame.pose is not None:
             self._held_m = frame.pose[0]
-        away_m = np.linalg.norm(frame.tracks_m[:, None] - self._held_m, axis=2)
+        distances_m = np.linalg.norm(frame.tracks_m[:, None] - self._held_m, axis=2)
         self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
-        nowhere = (away_m > self._reach_m).all(axis=1)
-        if nowhere.any():
-            notes.append(self._left_out(nowhere))
-            frame = replace(frame, tracks_m=np.where(nowhere[:, None], np.nan, frame.tracks_m))
+        is_implausible = (distances_m > self._reach_m).all(axis=1)
+        if is_implausible.any():
+            notes.append(self._left_out(is_implausible))
+            frame = replace(
+                frame, tracks_m=np.where(is_implausible[:, None], np.nan, frame.tracks_m)
+            )
         return frame, notes
 
     def _left_out(self, wild: NDArray[np.bool_]) -> str:
-        """Count samples (M,) that are left out."""
+        """Count outliers given by a mask (M,) of the markers; return a note."""
         self.counts["wild"] += int(wild.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
         return f"left out, far from where they can be: {names}"
 
     def _go_on(self, rows: Sequence[LoggedRow], squares: list[Array]) -> tuple[int, list[str]]:
-        """Take rows and log them, as many as it does at once; how many, and what is said."""
-        done, said, track = 1, [], self.track
+        """Compute and log new rows, as many as possible at once; return their number and notes."""
+        done = 1
+        notes = []
+        track = self.track
         try:
             if track is None:
                 self._begin(rows[0])
@@ -350,66 +396,84 @@ class Estimator:
         except SimulationError as error:
             if track is None:
                 self.intake.begin_anew()
-                return 1, [f"there is no start: {error}"]
+                return 1, [f"the start of the motion cannot be computed: {error}"]
             track.failed = True
-            said = [f"the body cannot be simulated with these parameters: {error}"]
+            notes = [f"the body cannot be simulated with these parameters: {error}"]
         for k, row in enumerate(rows[:done], 1):
             self.log.append(LoggedRow(row.poses, []))
-            said += self._read(row.readings, squares, done - k)
-        return done, said
+            notes += self._read(row.readings, squares, done - k)
+        return done, notes
 
     def _read(self, readings: Sequence[Sample], squares: list[Array], rows: int = 0) -> list[str]:
-        """Take what is read so many rows before the last one, without samples that jump."""
+        """Add samples without outliers to the pass and to the log; return notes.
+
+        Parameters
+        ----------
+        readings : sequence of Sample
+        squares : list
+            Squared marker residuals [m²] of the frame; extended in place.
+        rows : int
+            Number of rows computed since the row after which the samples are evaluated.
+        """
         track = self.track
         if track is None:
             return []
-        notes, sigma_m = [], self.model.segment.experiment.markers.sigma_m[:, None]
+        notes = []
+        sigma_m = self.model.segment.experiment.markers.sigma_m[:, None]
         if track.failed:
             self.log[-1].readings.extend(readings)
             return notes
-        each_says = track.sweep.linearised([(reading, rows) for reading in readings])
-        for reading, said in zip(readings, each_says, strict=True):
+        all_linearised = track.sweep.linearised([(reading, rows) for reading in readings])
+        for reading, linearised in zip(readings, all_linearised, strict=True):
             if not reading.of:
-                here = said.at(self.model.flat(self.p))
-                wild = self._wild(here)
-                if wild.any():
-                    notes.append(self._left_out(wild))
-                    seen = np.where(wild[:, None], np.nan, reading.values)
-                    reading = reading._replace(values=seen)
-                    said.at_zero[wild] = here[wild] = np.nan
-                near = np.sum((here * sigma_m) ** 2, axis=1)
-                squares.append(near[np.isfinite(near)])
+                residual = linearised.at(self.model.flat(self.p))
+                outliers = self._wild(residual)
+                if outliers.any():
+                    notes.append(self._left_out(outliers))
+                    remaining = np.where(outliers[:, None], np.nan, reading.values)
+                    reading = reading._replace(values=remaining)
+                    linearised.at_zero[outliers] = residual[outliers] = np.nan
+                squared = np.sum((residual * sigma_m) ** 2, axis=1)
+                squares.append(squared[np.isfinite(squared)])
             self.log[-1].readings.append(reading)
-        track.read(each_says)
+        track.read(all_linearised)
         return notes
 
     def _wild(self, residual: Array) -> NDArray[np.bool_]:
-        """(M,) samples that the estimate cannot explain while it explains the others."""
+        """Return a mask (M,) of samples that the estimate does not explain while it explains the
+        others.
+        """
         if self.moved > UNSETTLED or not 0 < self.scatter.rms < GROSS_MISFIT:
             return np.zeros(len(residual), dtype=bool)
         length = np.sqrt(np.sum(residual**2, axis=1) / 3)
-        wild = length > JUMP * max(1.0, self.scatter.rms)
-        if wild.sum() > np.isfinite(length).sum() / 2:
-            return np.zeros_like(wild)
-        return wild
+        outliers = length > JUMP * max(1.0, self.scatter.rms)
+        if outliers.sum() > np.isfinite(length).sum() / 2:
+            return np.zeros_like(outliers)
+        return outliers
 
     # Beginnings -------------------------------------------------------------------------------
 
     def _bounds(self) -> None:
+        """Set the bounds of p from the model."""
         self.lower, self.upper = self.model.collocation.bounds_p
 
     def _search(self) -> Search:
+        """Return a new search for initial values."""
         return Search(self.model, self.p[self.model.collocation.nq :])
 
     def _warmed_up(self) -> tuple[Poses, Array] | None:
-        """Have the kernels compiled before frames come; the body at rest, and where it is held."""
+        """Compile the kernels before the first frame; return poses and positions (3n,) of the
+        start.
+
+        None if the start cannot be computed.
+        """
         poses = self.model.first_poses
-        moved = tuple(poses[k] for k in self.model.moved_grasps)
-        nowhere = np.full((len(self.names), 3), np.nan)
-        nowhere[0] = 0.0
+        moving_poses = tuple(poses[k] for k in self.model.moved_grasps)
+        no_markers = np.full((len(self.names), 3), np.nan)
+        no_markers[0] = 0.0
         try:
             trial = Track(self.model, self.p, self.prior, self._block_rows)
-            row = LoggedRow(moved, [Sample(0.0, nowhere)])
+            row = LoggedRow(moving_poses, [Sample(0.0, no_markers)])
             for _ in range(self.model.rows + 2):
                 trial.again([row])
         except SimulationError:
@@ -419,7 +483,7 @@ class Estimator:
         return poses, trial.blocks[0].kept[0].x
 
     def _timed(self, trial: Track, row: LoggedRow) -> Budget:
-        """How long rows take that are passed again, the shortest times."""
+        """Return the computing times of repeated rows, the shortest of several measurements."""
         took_s: dict[int, float] = {}
         most = min(trial.rows - 1, TOGETHER, self._block_rows - 1)
         for count in (1, most) * TIMED:
@@ -431,16 +495,23 @@ class Estimator:
         return Budget.of(took_s[1], took_s[most], most)
 
     def _begin(self, row: LoggedRow) -> None:
-        model, guesses = self.model, []
+        """Start the first pass with the first row, and set unknown marker places from its
+        markers.
+        """
+        model = self.model
+        guesses = []
         poses = model.poses_of(row.poses)
         if self._rest is not None and len(poses) == 1:
-            (was_turned, was_at), x = self._rest[0][0], self._rest[1]
-            (turned, at) = poses[0]
-            guesses = [((x.reshape(-1, 3) - was_at) @ was_turned @ turned.T + at).ravel()]
+            old_rotation, old_position = self._rest[0][0]
+            x = self._rest[1]
+            (rotation, position) = poses[0]
+            guesses = [
+                ((x.reshape(-1, 3) - old_position) @ old_rotation @ rotation.T + position).ravel()
+            ]
         track = Track(model, self.p, self.prior, self._block_rows)
         track.advance([row.poses], guesses)
-        seen = [reading.values for reading in row.readings if not reading.of]
-        first = seen[0] if seen else np.full((len(self.names), 3), np.nan)
+        marker_samples = [reading.values for reading in row.readings if not reading.of]
+        first = marker_samples[0] if marker_samples else np.full((len(self.names), 3), np.nan)
         self.model = model.placed(first, track.blocks[0].kept[0].x)
         if self.model is not model:
             self._bounds()
@@ -449,10 +520,11 @@ class Estimator:
             self.prior = LeastSquares.none(self.model.size)
             track = Track(self.model, self.p, self.prior, self._block_rows)
             track.advance([row.poses], guesses)
-        self.track, self._joined = track, JoinedPasses.of(track, None)
+        self.track = track
+        self._joined = JoinedPasses.of(track, None)
 
     def _begin_anew(self) -> None:
-        """Keep what is known, and wait for a start."""
+        """Keep the information so far as a prior, and wait for a new start."""
         if self.track is not None:
             self.prior = self.track.measured
         self.track = self.again = None
@@ -464,37 +536,50 @@ class Estimator:
 
     @property
     def moved(self) -> float:
-        """How far the estimate is from where all is linearised, in standard errors."""
+        """Largest distance of the estimate from the linearisation points, in standard errors.
+
+        Infinite if there is no pass, or if it failed.
+        """
         if self.track is None or self.track.failed:
             return np.inf
         return self._apart(self.track, self.p, self._joined.points)
 
     def _apart(self, track: Track, p: Array, points: Sequence[Array]) -> float:
-        """How far p is at most from points, in the standard errors of a pass."""
+        """Return the largest distance of p from some points, in the standard errors of a pass."""
         nq = self.model.collocation.nq
-        apart = np.abs(np.array(points) - self.model.flat(p))[:, :nq]
-        return float(np.max(apart / track.information.errors[:nq], initial=0.0))
+        distances = np.abs(np.array(points) - self.model.flat(p))[:, :nq]
+        return float(np.max(distances / track.information.errors[:nq], initial=0.0))
 
     def _estimate(self) -> None:
+        """Update the estimate p from the joint information of both passes."""
         if self.track is not None and not self.track.failed:
             self._joined = JoinedPasses.of(self.track, self.again)
             self.p = self._best(self.track, self._joined.information)
 
     def _best(self, track: Track, known: LeastSquares) -> Array:
+        """Return the minimum of a quadratic loss within bounds and the trust region about a
+        pass.
+        """
         reach = self._trust * self.model.collocation.reach_p
-        low, high = np.maximum(self.lower, track.p - reach), np.minimum(self.upper, track.p + reach)
+        low = np.maximum(self.lower, track.p - reach)
+        high = np.minimum(self.upper, track.p + reach)
         best = known.best(self.model.flat(low), self.model.flat(high))
         return np.clip(self.model.curved(best), low, high)
 
     def _next(self, track: Track) -> Array:
-        """Where to pass again: what is hardly known yet stays near where it was."""
-        size, samples = self.model.size, len(self.log) / self.model.substeps
-        stay = STAY * max(1.0, samples / SEEN)
-        slopes = np.diag(1 / (stay * self.model.collocation.reach_p * track.sweep.rates))
-        known = self._joined.information.add(np.zeros(size), slopes, track.sweep.flat)
-        return self._best(track, known)
+        """Return the next linearisation point.
+
+        Poorly determined parameters stay near their last value.
+        """
+        size = self.model.size
+        samples = len(self.log) / self.model.substeps
+        deviation = STAY * max(1.0, samples / SEEN)
+        slopes = np.diag(1 / (deviation * self.model.collocation.reach_p * track.sweep.rates))
+        information = self._joined.information.add(np.zeros(size), slopes, track.sweep.flat)
+        return self._best(track, information)
 
     def _known(self, t_s: float) -> tuple[Mapping[str, Estimate], Trust]:
+        """Return estimates and verdict at a time."""
         code = ""
         if self.track is None:
             code = "solve/no-start"
@@ -507,8 +592,8 @@ class Estimator:
         grave = concerned(bool(code), True, code)
         if self.track is None or self.track.failed:
             values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
-            told = {name: Estimate(v) for name, v in values.items() if not is_mode(name)}
-            return told, Trust.of(grave)
+            estimates_only = {name: Estimate(v) for name, v in values.items() if not is_mode(name)}
+            return estimates_only, Trust.of(grave)
         if self.counts["looked"] % LOOK_EVERY == 0:
             self.scatter = self._joined.scatter(self.model.flat(self.p))
         self.counts["looked"] += 1
@@ -518,10 +603,13 @@ class Estimator:
         return estimates, Trust.of(grave)
 
     def _estimates_at(self, known: LeastSquares, p: Array) -> dict[str, Estimate]:
-        collocation, nq = self.model.collocation, self.model.collocation.nq
-        flat, fitted = self.model.flat(p), self.model.size
-        factor, quantile = widened(known, flat, fitted, self.scatter)
-        rates = self.model.rates(flat)[:nq]
+        """Return the estimates with intervals from given information, at p."""
+        collocation = self.model.collocation
+        nq = self.model.collocation.nq
+        transformed = self.model.flat(p)
+        parameter_count = self.model.size
+        factor, quantile = widened(known, transformed, parameter_count, self.scatter)
+        rates = self.model.rates(transformed)[:nq]
         of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
         bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
@@ -530,25 +618,42 @@ class Estimator:
     # Passing again ----------------------------------------------------------------------------
 
     def _pass_again(self, began: float, notes: list[str], done: int = 0) -> int:
-        """Go on with a pass in what is left of the budget; how many rows are done then."""
+        """Continue or start a second pass within the rest of the budget.
+
+        Parameters
+        ----------
+        began : float
+            Time at which the frame began.
+        notes : list of str
+            Extended in place.
+        done : int
+            Number of rows that were already computed again in this frame.
+
+        Returns
+        -------
+        int
+            Number of rows computed again in this frame.
+        """
         while self.track is not None:
-            begins = self.clock()
-            if self.again is None and self._left(done, begins - began + self.budget.turn_s):
+            pass_began = self.clock()
+            if self.again is None and self._left(done, pass_began - began + self.budget.turn_s):
                 self.again = self._wanted(self.track, notes)
-                self.budget.turned(self.clock() - begins)
+                self.budget.turned(self.clock() - pass_began)
             again = self.again
             if again is None:
                 break
             if not done and again.base is not None:
                 self._turn(self.track, again, began, TURN)
-            left = min(self._left(done, self.clock() - began), again.left)
-            if not left:
+            affordable = min(self._left(done, self.clock() - began), again.left)
+            if not affordable:
                 break
-            done += self._advance(again, left, notes)
+            done += self._advance(again, affordable, notes)
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
-        """End a pass that lags by few rows before others come: they are then rows of it."""
+        """Complete a second pass that lags by few rows before new rows come; return the number of
+        rows.
+        """
         again = self.again
         if again is None or again.base is None:
             return 0
@@ -559,10 +664,13 @@ class Estimator:
         return self._advance(again, lag, notes)
 
     def _advance(self, again: Track, count: int, notes: list[str]) -> int:
-        """Go on with a pass by rows, and judge it where it has caught up; how many it did."""
-        before, were = self.clock(), again.rows
+        """Continue a second pass by some rows and judge it if it has caught up; return the number
+        of rows.
+        """
+        before = self.clock()
+        first_row = again.rows
         try:
-            again.again(self.log[were : were + count])
+            again.again(self.log[first_row : first_row + count])
         except SimulationError:
             again.failed = True
         self.budget.took(count, self.clock() - before)
@@ -572,29 +680,31 @@ class Estimator:
                 self.again = None
         elif (again.failed or again.rows == len(self.log)) and self.track is not None:
             self._judge(self.track, again, notes)
-        return again.rows - were
+        return again.rows - first_row
 
     def _left(self, done: int, elapsed_s: float) -> int:
-        """Rows that there is time for."""
+        """Return the number of rows for which there is time."""
         if self.rows is not None:
             return self.rows - done
         return self.budget.rows(self.budget_s - elapsed_s)
 
     def _wanted(self, track: Track, notes: list[str]) -> Track | None:
-        """Begin a pass where one is wanted."""
+        """Return a new second pass if one is needed, otherwise None."""
         search = self.search
         at_start = track.start[0] is None
         if search is None and track.failed and at_start:
             search = self.search = self._search()
-            notes.append("a start is sought among stiffnesses")
-        p, base = self.p, track
+            notes.append("searching for initial values over a range of stiffness")
+        p = self.p
+        base = track
         if search is not None:
             if not search.done and (len(self.log) < search.rows or not at_start):
                 return None
-            p, base = search.best if search.done else search.next(), None
+            p = search.best if search.done else search.next()
+            base = None
             if p is None:
                 self.search = None
-                notes.append("no start was found among stiffnesses")
+                notes.append("found no initial values over a range of stiffness")
                 return None
         elif track.failed:
             return None
@@ -605,48 +715,73 @@ class Estimator:
         return Track(self.model, p, track.prior, self._block_rows, base)
 
     def _turn(self, track: Track, turned: Track, began: float, far: float) -> None:
-        """Go on with a pass where the estimate is now, if that is far, and time is left then."""
-        here = [turned.sweep.flat]
-        if turned.rows < turned.turned + TOGETHER or self._apart(track, self.p, here) <= far:
+        """Move the linearisation point of a pass to the estimate if it is far and there is time.
+
+        Parameters
+        ----------
+        track : Track
+            First pass, which gives the standard errors.
+        turned : Track
+            Pass to change.
+        began : float
+            Time at which the frame began.
+        far : float
+            Distance in standard errors.
+        """
+        current_point = [turned.sweep.flat]
+        if (
+            turned.rows < turned.turned + TOGETHER
+            or self._apart(track, self.p, current_point) <= far
+        ):
             return
         before = self.clock()
         if self.rows is None and not self._left(0, before - began + self.budget.turn_s):
             return
         p = self._next(track)
-        if self._apart(track, p, here) > far:
+        if self._apart(track, p, current_point) > far:
             turned.turn(p)
             self.budget.turned(self.clock() - before)
 
     def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
-        """Take a pass that has caught up in place of the first, or not."""
+        """Replace the first pass by a second one that has caught up, or reject it."""
         self.again = None
-        sought, self.search = self.search is not None, None
+        was_search = self.search is not None
+        self.search = None
         points = [*track.points, again.points[0]]
         expected = max(track.information.loss(point) for point in points)
         # Of a pass that turned the sum of squares is not that of a simulation.
-        near = track.turned and self._apart(track, track.p, again.points) <= MOVED
-        fits = track.failed or near or again.loss <= TIMES * expected + SLACK
+        is_near = track.turned and self._apart(track, track.p, again.points) <= MOVED
+        fits = track.failed or is_near or again.loss <= TIMES * expected + SLACK
         if not again.failed and fits:
-            again.base, self.track = None, again
-            self._trust = TRUST if sought else min(2 * self._trust, WIDEST)
+            again.base = None
+            self.track = again
+            self._trust = TRUST if was_search else min(2 * self._trust, WIDEST)
             self._rejected = 0
-            if sought:
-                notes.append("begun from another stiffness")
+            if was_search:
+                notes.append("restarted from another stiffness")
             self.scatter = JoinedPasses.of(again, None).scatter(again.sweep.flat)
         else:
             reach = self.model.collocation.reach_p
             length = float(np.abs((again.p - track.p) / reach).max())
             self._trust = max(SHRINK * length, 1e-6)
             self._rejected += 1
-            lost = self._rejected >= REJECTED and self.scatter.rms > GROSS_MISFIT
-            if lost and not sought and not self.counts["searched"] and track.start[0] is None:
+            is_stuck = self._rejected >= REJECTED and self.scatter.rms > GROSS_MISFIT
+            if (
+                is_stuck
+                and not was_search
+                and not self.counts["searched"]
+                and track.start[0] is None
+            ):
                 self.counts["searched"] += 1
                 self.search = self._search()
-                notes.append("the search is stuck: another start is sought among stiffnesses")
+                notes.append(
+                    "the estimation does not converge: searching for other initial values over a "
+                    "range of stiffness"
+                )
         self._estimate()
 
     def _shorten(self) -> None:
-        """Let the oldest rows leave when the window is full."""
+        """Remove the oldest rows if the window is full."""
         if self.track is None:
             return
         most = self._blocks * self._block_rows

@@ -1,8 +1,8 @@
-"""What grasps with a sensor give the body, row after row: their reactions as sensors look at them.
+"""Reaction forces of instrumented grasps, one time step after the other.
 
-A row lacks on the grasped dofs what the grasp gives, see `program.reaction`. It is taken a row
-late: rules of the midpoint tell it of the time before, and a tool's acceleration needs a pose on
-either side.
+The reaction is the residual of the equations of motion at the grasped dofs (see
+`program.reaction`). It is available one time step late: the midpoint rule evaluates forces between
+two steps, and the acceleration of a tool needs the next pose.
 """
 
 from __future__ import annotations
@@ -18,27 +18,29 @@ from ..program.channel import Forced
 from ..program.reaction import HeldForces
 from ..program.wrench_channel import GraspWrench, Grid
 
-# Rows after the time of a wrench when it is taken.
+# Number of time steps after which the wrench of a time is available.
 LATE = 1
 
-# Of each grasp, its rotation (3, 3) and its translation (3,).
+# Rotation (3, 3) and translation (3,) of each grasp.
 Poses = tuple[tuple[Array, Array], ...]
-# What looks at a grasp, and the number of that.
+# Wrench of a grasp, and the index of the grasp.
 Sensor = tuple[GraspWrench, int]
-# Two matrices (rows, rows) of the template.
+# Weights of the forces and of the positions: two matrices (rows, rows) of the template.
 Weights = tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
 class WrenchOfRows(GraspWrench):
-    """What a grasp gives at some rows in turn.
+    """Wrench of a grasp at consecutive time steps.
 
     Attributes
     ----------
-    turns, shifts : (n + 2, 3, 3) and (n + 2, 3)
-        Of its poses, one row more on either side.
+    turns : (n + 2, 3, 3)
+        Rotations of the poses, with one more time step on either side.
+    shifts : (n + 2, 3)
+        Translations of the poses.
     step_s : float
-        Between rows.
+        Time step.
     """
 
     turns: Array
@@ -49,20 +51,29 @@ class WrenchOfRows(GraspWrench):
     def of_rows(
         cls, channel: GraspWrench, turns: Array, shifts: Array, step_s: float
     ) -> WrenchOfRows:
-        """That of a channel."""
-        known = {name: getattr(channel, name) for name in GraspWrench.__dataclass_fields__}
-        known["on"] = Grid.at(step_s * np.arange(len(turns) - 2, dtype=np.float64))
-        found = cls(**known, turns=turns, shifts=shifts, step_s=step_s)
+        """Return the wrench of a grasp at consecutive time steps.
+
+        Parameters
+        ----------
+        channel : GraspWrench
+            Wrench in the still recording, whose other properties are copied.
+        turns : (n + 2, 3, 3)
+        shifts : (n + 2, 3)
+        step_s : float
+        """
+        properties = {name: getattr(channel, name) for name in GraspWrench.__dataclass_fields__}
+        properties["on"] = Grid.at(step_s * np.arange(len(turns) - 2, dtype=np.float64))
+        wrench = cls(**properties, turns=turns, shifts=shifts, step_s=step_s)
         if len(channel.tool_phi):
-            vars(found)["tool"] = channel.tool
-        return found
+            vars(wrench)["tool"] = channel.tool
+        return wrench
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
-        """Turns and shifts of rows."""
+        """Return rotations and translations at time steps, given by index."""
         return self.turns[1 + rows], self.shifts[1 + rows]
 
     def pose_rates(self, count: int) -> tuple[Array, Array]:
-        """Second derivatives of the poses, by differences."""
+        """Return the second time derivatives of the first `count` poses, by differences."""
         turn, shift = (
             (each[2:] - 2 * each[1:-1] + each[:-2])[:count] / self.step_s**2
             for each in (self.turns, self.shifts)
@@ -72,13 +83,21 @@ class WrenchOfRows(GraspWrench):
 
 @dataclass(frozen=True, eq=False)
 class Felt:
-    """What rows of a template have of the dofs g whose grasp has a sensor, and all poses.
+    """Forces and columns at the sensed dofs g in the rows of a template, and the poses of all G
+    grasps.
+
+    The template is a fixed-size array of the latest time steps.
 
     Attributes
     ----------
     held : HeldForces
-    moved : (rows, g, 1 + m) columns of the dofs
-    turns, shifts : (rows, G, 3, 3) and (rows, G, 3)
+        Forces at the sensed dofs, with derivatives.
+    moved : (rows, g, 1 + m)
+        Columns of the positions of these dofs: Newton correction and sensitivities.
+    turns : (rows, G, 3, 3)
+        Rotations of the grasps.
+    shifts : (rows, G, 3)
+        Translations of the grasps.
     """
 
     held: HeldForces
@@ -88,34 +107,51 @@ class Felt:
 
     @classmethod
     def nothing(cls, rows: int, dofs: int, columns: int, grasps: int) -> Felt:
-        """Room for rows."""
-        moved, turns = np.zeros((rows, dofs, columns)), np.zeros((rows, grasps, 3, 3))
+        """Return zero arrays for a number of rows, dofs, columns and grasps."""
+        moved = np.zeros((rows, dofs, columns))
+        turns = np.zeros((rows, grasps, 3, 3))
         return cls(HeldForces.nothing(rows, dofs, columns), moved, turns, turns[..., 0].copy())
 
     @property
     def arrays(self) -> tuple[Array, ...]:
-        """All there is of each row."""
+        """All arrays whose first axis is the row."""
         return self.held.force, self.held.slopes, self.moved, self.turns, self.shifts
 
     def copy(self) -> Felt:
-        """The same, to be changed."""
+        """Return a copy that can be modified."""
         force, slopes, *others = (each.copy() for each in self.arrays)
         return Felt(HeldForces(force, slopes), *others)
 
     def place(self, first: int, poses: Sequence[Poses]) -> None:
-        """Note the poses of rows from the first on."""
-        here = slice(first, first + len(poses))
-        self.turns[here] = [[turn for turn, _ in each] for each in poses]
-        self.shifts[here] = [[shift for _, shift in each] for each in poses]
+        """Store the poses of consecutive rows from the index `first` on, in place."""
+        rows = slice(first, first + len(poses))
+        self.turns[rows] = [[turn for turn, _ in each] for each in poses]
+        self.shifts[rows] = [[shift for _, shift in each] for each in poses]
 
     def corrected(self, here: slice, moved: Array) -> None:
-        """Be at rows that are solved: their corrections are the first column, moved the others."""
+        """Add the Newton correction to the forces of `here` and store the sensitivities, in place.
+
+        Parameters
+        ----------
+        here : slice
+            Rows that have just been solved.
+        moved : (rows, g, 1 + m)
+            Newton correction (column 0) and sensitivities of the sensed dofs.
+        """
         self.held.force[here] += self.held.slopes[here, :, 0]
         self.held.slopes[here, :, 0] = 0.0
         self.moved[here, :, 1:] = moved[..., 1:]
 
     def at(self, step: Array, grown: Array) -> Felt:
-        """The same at another p: to first order, by a step of its columns, which have grown."""
+        """Return the forces at another linearisation point, to first order.
+
+        Parameters
+        ----------
+        step : (m,)
+            Change of the parameters of the columns.
+        grown : (1 + m,)
+            Factors of the columns, whose parameters change their scale.
+        """
         force = self.held.force + self.held.slopes[..., 1:] @ step
         held = HeldForces(force, self.held.slopes * grown)
         return Felt(held, self.moved * grown, self.turns.copy(), self.shifts.copy())
@@ -123,26 +159,44 @@ class Felt:
     def wrenches(
         self, sensors: Sequence[Sensor], setting: Setting, x: Array, weights: Weights, rows: Index
     ) -> tuple[Forced, list[WrenchOfRows]]:
-        """Reactions, and what sensors look at of them, as some rows (n,) in turn tell it.
+        """Return the reactions at some time steps with derivatives, and the wrenches of the
+        sensors.
 
         Parameters
         ----------
-        x : (known, g) of the sensed dofs at the first rows of the template
-        weights : w and s of the template, the latter with its time
+        sensors : sequence of Sensor
+        setting : Setting
+            Equations of motion at the linearisation point.
+        x : (known, g)
+            Positions of the sensed dofs in the first rows of the template [m].
+        weights : (w, s)
+            Stencil matrices of the template; s includes the time step.
+        rows : (n,) int
+            Consecutive rows at which the reactions become available.
         """
-        dynamics, (channel, _), known = setting.dynamics, sensors[0], slice(len(x))
-        at, dofs = rows - LATE, channel.sensed
+        dynamics = setting.dynamics
+        channel, _ = sensors[0]
+        known = slice(len(x))
+        at = rows - LATE
+        dofs = channel.sensed
         of_force, of_x = (each[at + channel.on.late, known] for each in weights)
-        mass_kg, acceleration = dynamics.mass.kg[0, dofs], of_x @ x
+        mass_kg = dynamics.mass.kg[0, dofs]
+        acceleration = of_x @ x
         reaction = mass_kg * acceleration - of_force @ self.held.force[known]
-        moved, slopes = self.moved[known, :, 1:], self.held.slopes[known, :, 1:]
-        by = mass_kg[:, None] * np.tensordot(of_x, moved, 1) - np.tensordot(of_force, slopes, 1)
+        position_slopes = self.moved[known, :, 1:]
+        slopes = self.held.slopes[known, :, 1:]
+        by = mass_kg[:, None] * np.tensordot(of_x, position_slopes, 1) - np.tensordot(
+            of_force, slopes, 1
+        )
         by += setting.inertia_slopes(0, acceleration, dofs)
-        around = slice(at[0] - 1, at[-1] + 2)
+        pose_rows = slice(at[0] - 1, at[-1] + 2)
         channels = [
             WrenchOfRows.of_rows(
-                channel, self.turns[around, grasp], self.shifts[around, grasp], dynamics.step_s
+                channel,
+                self.turns[pose_rows, grasp],
+                self.shifts[pose_rows, grasp],
+                dynamics.step_s,
             )
             for channel, grasp in sensors
         ]
-        return Forced(reaction, x[at], by, moved[at]), channels
+        return Forced(reaction, x[at], by, position_slopes[at]), channels

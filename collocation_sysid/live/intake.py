@@ -1,9 +1,10 @@
-"""From frames, as they come, to rows of the time grid.
+"""Frame buffer: turns frames, as they arrive, into time steps with poses and samples.
 
-The grid is the problem's, from the first frame on. Rows that no frame is at (substeps, frames that
-are missing or between) take the poses from a polynomial through the last four frames, or straight
-between two where more than a few are missing. Nothing waits: a row is there as soon as a pose at
-its time or later is. Markers are read where their own times are.
+The time grid is that of the problem, starting at the first frame with a pose. Time steps without a
+frame (substeps, missing frames, frames between samples) get their poses from a cubic polynomial
+through the last four frames, or a straight line between two frames if more than a few are missing.
+There is no waiting: a time step is available as soon as a pose at its time or later has arrived.
+Markers are evaluated at their own times.
 """
 
 from __future__ import annotations
@@ -23,30 +24,33 @@ from .frames import Told
 from .model import Around
 from .sweep import LATEST, LoggedRow, Sample
 
-# Frames this near in time, in samples, are of one time.
+# Largest difference, in samples, of two times that count as equal.
 TOLERANCE = 0.1
-# Poses between frames are cubic over so few samples, straight over more, and beyond the second
-# nothing is known of the motion.
-FEW, LONGEST = 3, 10
+# Largest gap between frames, in samples, over which poses are interpolated by a cubic polynomial;
+# over a larger gap they are interpolated linearly.
+FEW = 3
+# Largest gap between poses, in samples, after which the motion counts as unknown.
+LONGEST = 10
 
 
 @dataclass(eq=False)
 class Intake:
-    """Frames that have come.
+    """Buffer of the frames that have arrived.
 
     Attributes
     ----------
     interval_s : float
-        Of samples.
+        Time between samples.
     substeps : int
+        Time steps between samples.
     around : int
-        Samples before and after one that its reading needs.
+        Number of samples before and after one that its evaluation needs.
     leap_m : float
-        Farther no grasp goes from a sample to the next.
+        Largest distance that a grasp can move between two samples.
     instruments : sequence of Around
-        Rows that a sample of each is read from.
+        Rows that a sample of each instrument needs.
     counts : Counter
-        Of what was wrong with frames.
+        Numbers of irregularities of frames, by kind.
     """
 
     interval_s: float
@@ -60,7 +64,7 @@ class Intake:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Forget all frames."""
+        """Discard all frames and wait for a new start."""
         self.start_s: float | None = None
         self.rows = 0
         self.last_s = -np.inf
@@ -71,17 +75,27 @@ class Intake:
 
     @property
     def last_pose_s(self) -> float | None:
-        """When the last pose was."""
+        """Time of the last pose; None if there is none."""
         return self._poses[-1][0] if self._poses else None
 
     def seen(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
-        """When markers were seen, in samples from the first row on, and where, (M, 3)."""
+        """Yield time and positions (M, 3) of all marker samples; times in samples from the first
+        row on.
+        """
         for of, when, tracks_m in self.told(log):
             if not of:
                 yield when, tracks_m
 
     def told(self, log: Sequence[LoggedRow]) -> Iterator[Told]:
-        """All that was read, markers being number 0, its times in samples from the first row on."""
+        """Yield instrument number, time and values of all samples; markers have the number 0.
+
+        Times are in samples from the first row on. Samples that still wait for rows come last.
+
+        Parameters
+        ----------
+        log : sequence of LoggedRow
+            Rows so far, with their samples.
+        """
         for number, row in enumerate(log):
             for back, values, of in row.readings:
                 yield of, (number - back) / self.substeps, values
@@ -89,9 +103,10 @@ class Intake:
             yield of, (t_s - (self.start_s or 0.0)) / self.interval_s, values
 
     def is_lost(self, t_s: float) -> bool:
-        """Whether a time is so long after the last pose that nothing is known of the motion.
+        """Return whether a time is too long after the last pose for the motion to be known.
 
-        So it is where many frames in turn are too late: their clock was set back.
+        This is also the case after many frames in turn that were too late, because their clock was
+        set back.
         """
         if self._too_late >= LONGEST:
             return True
@@ -105,50 +120,59 @@ class Intake:
         tracks_m: Array,
         told: Sequence[Told] = (),
     ) -> tuple[list[LoggedRow], list[Sample], list[str]]:
-        """The rows a frame completes, what can be read after the last row, and what was odd.
+        """Add a frame; return the completed rows, the samples after the last row, and notes.
+
+        The samples are returned separately only if no row is completed; otherwise the rows contain
+        them.
 
         Parameters
         ----------
         t_s : float
-        pose : positions (G, 3) and quaternions (G, 4) of the grasps that move; None where missing
-        tracks_m : (M, 3), NaN where missing
-        told : what else came with it
+            Time of the frame.
+        pose : (positions, quaternions) or None
+            Positions (G, 3) and quaternions (G, 4) of the grasps that move; None if missing.
+        tracks_m : (M, 3)
+            Marker positions, NaN where missing.
+        told : sequence of Told
+            Samples of instruments.
         """
-        sample_s, said = self.interval_s, []
+        sample_s = self.interval_s
+        notes = []
         if any(abs(t_s - other) <= TOLERANCE * sample_s for other in self._times):
             self.counts["doubled"] += 1
-            return [], [], [f"a frame at {t_s:.6g} s has come already: left out"]
+            return [], [], [f"a frame at {t_s:.6g} s was received before: ignored"]
         late = t_s < self.last_s
         if late:
             if self.last_s - t_s > LATEST * sample_s:
                 self.counts["late"] += 1
                 self._too_late += 1
-                return [], [], [f"the frame of {t_s:.6g} s is too late: left out"]
+                return [], [], [f"the frame at {t_s:.6g} s is too late: ignored"]
             self.counts["unordered"] += 1
-            said.append(f"the frame of {t_s:.6g} s is late: its markers count, its pose does not")
+            notes.append(f"the frame at {t_s:.6g} s is late: its markers are used, its pose is not")
         self._too_late = 0
         self._times.append(t_s)
-        begun = self.start_s is not None or pose is not None
-        if begun and not self.is_lost(t_s):
+        has_started = self.start_s is not None or pose is not None
+        if has_started and not self.is_lost(t_s):
             if np.isfinite(tracks_m).any():
                 self._waiting.append((0, t_s, tracks_m))
-            near = [each for each in told if abs(each[1] - t_s) <= LATEST * sample_s]
-            self.counts["late"] += len(told) - len(near)
-            self._waiting += near
+            on_time = [each for each in told if abs(each[1] - t_s) <= LATEST * sample_s]
+            self.counts["late"] += len(told) - len(on_time)
+            self._waiting += on_time
         if not late:
             if pose is not None and self._leaps(t_s, pose[0]):
                 pose = None
-                said.append(f"the grasp of {t_s:.6g} s is too far from the last: left out")
-            said += self._gap(t_s)
+                notes.append(f"the pose at {t_s:.6g} s is too far from the last one: ignored")
+            notes += self._gap(t_s)
             self.last_s = t_s
             if pose is not None:
                 self._add_pose(t_s, *pose)
             else:
                 self.counts["without a pose"] += 1
         rows = self._due()
-        return rows, self._ready() if not rows else [], said
+        return rows, self._ready() if not rows else [], notes
 
     def _leaps(self, t_s: float, positions_m: Array) -> bool:
+        """Return whether a grasp is farther from its last position than it can have moved."""
         if not self._poses:
             return False
         before_s, before_m, _ = self._poses[-1]
@@ -156,21 +180,28 @@ class Intake:
         return bool(np.abs(positions_m - before_m).max() > samples * self.leap_m)
 
     def _gap(self, t_s: float) -> list[str]:
+        """Count missing frames and frames between samples, and return notes about them."""
         if not np.isfinite(self.last_s):
             return []
         missing = round((t_s - self.last_s) / self.interval_s) - 1
-        off = (t_s - self.start_s) / self.interval_s if self.start_s is not None else 0.0
-        said = []
+        offset = (t_s - self.start_s) / self.interval_s if self.start_s is not None else 0.0
+        notes = []
         if missing > 0:
             self.counts["dropped"] += missing
-            said.append(f"{missing} frames before {t_s:.6g} s are missing: bridged")
-        if abs(off - round(off)) > TOLERANCE:
+            notes.append(
+                f"{missing} frames before {t_s:.6g} s are missing: bridged by interpolation"
+            )
+        if abs(offset - round(offset)) > TOLERANCE:
             if not self.counts["off the grid"]:
-                said.append(f"the frame of {t_s:.6g} s lies between samples: such are read there")
+                notes.append(
+                    f"the frame at {t_s:.6g} s lies between samples: markers are evaluated at the "
+                    "times of their frames"
+                )
             self.counts["off the grid"] += 1
-        return said
+        return notes
 
     def _add_pose(self, t_s: float, positions_m: Array, quaternions: Array) -> None:
+        """Store a pose, with the sign of its quaternion nearest to the previous one."""
         if self._poses:
             before = self._poses[-1][2]
             signs = np.where(np.sum(quaternions * before, axis=1) < 0, -1.0, 1.0)
@@ -180,35 +211,40 @@ class Intake:
         self._poses.append((t_s, positions_m, quaternions))
 
     def _time_s(self, row: int) -> float:
+        """Return the time of a row, given by index."""
         assert self.start_s is not None
         return self.start_s + row * self.interval_s / self.substeps
 
     def _due(self) -> list[LoggedRow]:
-        """The rows that there are poses for."""
-        found: list[tuple[Array, Array, list[Sample]]] = []
+        """Return the rows for which poses are available now, with the samples that are read after
+        them.
+        """
+        rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:
             return []
         until_s = self._poses[-1][0] + TOLERANCE * self.interval_s
         while self._time_s(self.rows) <= until_s:
             pose = self._pose_at(self._time_s(self.rows))
             self.rows += 1
-            found.append((*pose, self._ready()))
-        if not found:
+            rows.append((*pose, self._ready()))
+        if not rows:
             return []
-        places, quaternions, readings = zip(*found, strict=True)
-        flat = Rotation.from_quat(np.concatenate(quaternions)).as_matrix()
-        turns = flat.reshape(len(found), -1, 3, 3)
-        poses = (tuple(zip(*each, strict=True)) for each in zip(turns, places, strict=True))
+        places, quaternions, readings = zip(*rows, strict=True)
+        matrices = Rotation.from_quat(np.concatenate(quaternions)).as_matrix()
+        rotations = matrices.reshape(len(rows), -1, 3, 3)
+        poses = (tuple(zip(*each, strict=True)) for each in zip(rotations, places, strict=True))
         return [LoggedRow(*each) for each in zip(poses, readings, strict=True)]
 
     def _pose_at(self, t_s: float) -> tuple[Array, Array]:
-        """Positions (G, 3) and quaternions (G, 4), not of unit length, between those there are."""
+        """Return positions (G, 3) and quaternions (G, 4), not normalised, interpolated at a
+        time.
+        """
         for at_s, positions_m, quaternions in self._poses:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:
                 return positions_m, quaternions
         times, places, quaternions = (list(each) for each in zip(*self._poses, strict=True))
-        far = any(b - a > (FEW + TOLERANCE) * self.interval_s for a, b in pairwise(times))
-        used = slice(-2, None) if far else slice(None)
+        has_large_gap = any(b - a > (FEW + TOLERANCE) * self.interval_s for a, b in pairwise(times))
+        used = slice(-2, None) if has_large_gap else slice(None)
         weights = lagrange_weights(t_s, times[used])
         position_m, quaternion = (
             np.einsum("k,kgi->gi", weights, each[used]) for each in (places, quaternions)
@@ -216,22 +252,26 @@ class Intake:
         return position_m, quaternion
 
     def _ready(self) -> list[Sample]:
-        """What can be read after the rows there are."""
+        """Return and remove the waiting samples that can be evaluated after the rows so far."""
         if self.start_s is None or not self.rows:
             return []
         now_s = self._time_s(self.rows - 1)
-        step_s, room_s = self.interval_s / self.substeps, TOLERANCE * self.interval_s
+        step_s = self.interval_s / self.substeps
+        room_s = TOLERANCE * self.interval_s
         latest_s = now_s - self.around * self.interval_s + room_s
 
         def ready(of: int, t_s: float) -> bool:
+            """Return whether the rows that a sample needs are available."""
             if not of:
                 return t_s <= latest_s
-            around = self.instruments[of - 1]
-            rows = around.rows(self.rows - 1 - (now_s - t_s) / step_s)
-            return rows.stop + around.late <= self.rows
+            instrument = self.instruments[of - 1]
+            rows = instrument.rows(self.rows - 1 - (now_s - t_s) / step_s)
+            return rows.stop + instrument.late <= self.rows
 
-        found = [each for each in self._waiting if ready(*each[:2])]
+        available = [each for each in self._waiting if ready(*each[:2])]
         self._waiting = [each for each in self._waiting if not ready(*each[:2])]
         # Before the first row nothing is known.
-        found = [each for each in found if each[1] >= self.start_s - (0 if each[0] else room_s)]
-        return [Sample((now_s - t_s) / step_s, values, of) for of, t_s, values in found]
+        available = [
+            each for each in available if each[1] >= self.start_s - (0 if each[0] else room_s)
+        ]
+        return [Sample((now_s - t_s) / step_s, values, of) for of, t_s, values in available]

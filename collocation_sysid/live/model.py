@@ -1,7 +1,8 @@
-"""What a problem says of a recording that is still being made.
+"""Problem of a live recording, prepared for time marching without an end.
 
-A short still recording of the same body, grasps and markers stands for every recording: its first
-rows have the stencils of the start, and its last row those of all later ones.
+A short still recording with the same body, grasps and markers represents recordings of any length:
+its first rows have the stencils of the start, and its last row has those of all later rows. `Model`
+holds this recording and everything that does not depend on the parameters.
 """
 
 from __future__ import annotations
@@ -41,28 +42,32 @@ from .felt import LATE, Poses, Sensor
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import Room
 
-# Rows that are linearised at a time, at most.
+# Largest number of rows that are linearised together; limits memory.
 TOGETHER = 8
-# A prior of this standard deviation of the logarithm holds each parameter near its guess: what the
-# first frames do not tell stays finite, and of what a recording tells it changes nothing.
+# Standard deviation of a weak prior on the logarithm of each parameter, a factor of 10: it keeps
+# parameters finite that the first frames do not determine, and is negligible later.
 WEAK = 2.3
-# To what accuracy rows are solved where the way of the grasp has to be taken in parts.
+# Accuracy of rows whose grasp displacement has to be applied in parts.
 CAREFUL = NewtonOptions(tolerance=1e-6)
-# Young's modulus that a search without a guess begins at.
+# Young's modulus at which a search without a guess starts [Pa].
 MIDDLE_PA = 1e4
-# Readings this near to a row, in rows, are of that row; others lie between some of them.
+# Largest distance of a sample from a row, in rows, at which no interpolation is needed.
 NEAR = 1e-3
 
 
 class Around(NamedTuple):
-    """The rows that samples of an instrument are read from, as in a recording that goes on.
+    """Rows that samples of an instrument need, in a recording that continues.
 
+    Attributes
+    ----------
     neighbours : int
-        Rows, where its clock is right.
+        Number of rows around a sample if its clock is right.
     off : float
-        Rows that its clock may be off.
-    first, late : int
-        From which row on there is what it looks at, and how many rows later that is known.
+        Largest error of its clock, in rows.
+    first : int
+        Index of the first row at which the observed quantity exists.
+    late : int
+        Number of rows after which it is available.
     """
 
     neighbours: int
@@ -71,7 +76,7 @@ class Around(NamedTuple):
     late: int = 0
 
     def rows(self, at: float) -> range:
-        """Those of a sample at such a row."""
+        """Return the rows that a sample at a position `at`, in rows, needs."""
         begins, ends = (
             max(int(np.floor(at + off + NEAR)) - (self.neighbours - 1) // 2, self.first)
             for off in (-self.off, self.off)
@@ -80,12 +85,16 @@ class Around(NamedTuple):
 
 
 class LiveInstrument(NamedTuple):
-    """What frames bring numbers of besides markers.
+    """Instrument whose samples come with frames: a custom sensor, or the sensor of a grasp.
 
+    Attributes
+    ----------
     reading : Reading
+        Sensor model.
     around : Around
+        Rows that its samples need.
     looked : slice or int
-        Places among all that are looked at, or the sensor.
+        Slice of its points among all observed points, or the index of the grasp sensor.
     """
 
     reading: Reading
@@ -95,14 +104,14 @@ class LiveInstrument(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A problem whose recording comes frame by frame.
+    """Problem whose recording arrives frame by frame.
 
     Attributes
     ----------
     experiment : Experiment
-        The one that is fitted, as the problem has it.
+        Fitted experiment, as stated in the problem.
     collocation : Collocation
-        Of the still recording.
+        Program of the still recording.
     """
 
     experiment: Experiment
@@ -110,12 +119,12 @@ class Model:
 
     @classmethod
     def of(cls, problem: Problem) -> Model:
-        """The model of a problem.
+        """Return the model of a problem.
 
         Raises
         ------
         InputError
-            Where what the problem has cannot be live, in words.
+            If the problem has a feature that live estimation does not support.
         """
         experiment = _only_experiment(problem)
         collocation = problem.collocation()
@@ -126,12 +135,21 @@ class Model:
         return cls(experiment, still)
 
     def at_start(self, poses: Poses) -> Experiment:
-        """The experiment that begins with its grasps at these poses."""
+        """Return the experiment that begins with its grasps at these poses."""
         still = self.segment.experiment
         return replace(still, grasps=_held_at(still, poses))
 
     def placed(self, tracks_m: Array, x: Array) -> Model:
-        """The same with unknown places where markers (M, 3) lie on the start x (3n,)."""
+        """Return the model with unknown marker places set from the first frame; self if all are
+        known.
+
+        Parameters
+        ----------
+        tracks_m : (M, 3)
+            Marker positions of the first frame, NaN where missing.
+        x : (3n,)
+            Node positions of the start [m].
+        """
         unknown = ~self.segment.experiment.markers.located & np.isfinite(tracks_m).all(axis=1)
         if not unknown.any():
             return self
@@ -142,7 +160,7 @@ class Model:
 
     @cached_property
     def segment(self) -> Segment:
-        """The still recording."""
+        """Transcription of the still recording."""
         return self.collocation.segments[0]
 
     @cached_property
@@ -152,12 +170,16 @@ class Model:
 
     @cached_property
     def newton(self) -> Solver:
-        """Of the start, and of rows where the way of the grasp has to be taken in parts."""
+        """Newton solver for the start, and for rows whose grasp displacement is applied in
+        parts.
+        """
         return Solver(self.segment.experiment, CAREFUL)
 
     @cached_property
     def rows(self) -> int:
-        """Rows of the start, and those that are linearised at a time."""
+        """Number of rows of the template: those of the start, and those that are linearised
+        together.
+        """
         return 2 * self.segment.dynamics.reach + 2 + TOGETHER
 
     @cached_property
@@ -167,125 +189,146 @@ class Model:
 
     @property
     def substeps(self) -> int:
-        """Rows between samples."""
+        """Number of rows per sample."""
         return self.collocation.substeps
 
     @property
     def interval_s(self) -> float:
-        """Time between samples."""
+        """Time between samples [s]."""
         return self.experiment.timestep_s
 
     @cached_property
     def _drags(self) -> tuple[Index, Array]:
-        """Where p has the logarithms of damping by mass, and those of its guesses."""
+        """Indices in p of the logarithms of mass-proportional dampings, and their values at the
+        guess.
+        """
         free = self.collocation.parameters.free
         places = np.flatnonzero([bare(item.name) == GAMMA_M.name for item in free])
         return places, self.collocation.guess_p[places]
 
     def flat(self, p: Array) -> Array:
-        """What residuals are nearly linear in: of γ_m its value over the guess, else p."""
-        (places, guesses), flat = self._drags, p.copy()
+        """Return the variables in which residuals are nearly linear.
+
+        For mass-proportional damping γ_m this is its value divided by the guess, otherwise p
+        itself.
+        """
+        places, guesses = self._drags
+        flat = p.copy()
         flat[places] = np.exp(p[places] - guesses)
         return flat
 
     def curved(self, flat: Array) -> Array:
-        """The p of what is flat."""
-        (places, guesses), p = self._drags, flat.copy()
+        """Return the parameters p of transformed variables: the inverse of `flat`."""
+        places, guesses = self._drags
+        p = flat.copy()
         p[places] = guesses + np.log(flat[places])
         return p
 
     def rates(self, flat: Array) -> Array:
-        """(P,) of what is flat by p, each by its own."""
-        (places, _), rates = self._drags, np.ones(len(flat))
+        """Return the derivatives (P,) of the transformed variables by p."""
+        places, _ = self._drags
+        rates = np.ones(len(flat))
         rates[places] = flat[places]
         return rates
 
     def stated(self, p: Array) -> LeastSquares:
-        """What is known before the first frame, to first order about p."""
+        """Return the information before the first frame, linearised about p: priors and a weak
+        prior.
+        """
         residual, slopes = self.collocation.prior(p)
-        nq, flat = self.collocation.nq, self.flat(p)
-        away = (p[:nq] - self.collocation.parameters.guess_q) / WEAK
+        nq = self.collocation.nq
+        flat = self.flat(p)
+        from_guess = (p[:nq] - self.collocation.parameters.guess_q) / WEAK
         rows = np.vstack([np.diag(slopes), np.eye(nq, self.size) / WEAK]) / self.rates(flat)
-        none = LeastSquares.none(self.size)
-        return none.add(np.concatenate([residual, away]), rows, flat)
+        empty = LeastSquares.none(self.size)
+        return empty.add(np.concatenate([residual, from_guess]), rows, flat)
 
     @cached_property
     def samples_around(self) -> int:
-        """Samples before and after one that its reading needs."""
+        """Number of samples before and after one that its evaluation needs; 0 if no clock is
+        estimated.
+        """
         return NEIGHBOURS // 2 if len(self.segment.nuisance.of_clock) else 0
 
     @cached_property
     def markers(self) -> MarkerReading:
-        """Reads one sample, in the middle of those around, of markers measured at the origin."""
-        around, markers = self.samples_around, self.segment.experiment.markers
+        """Sensor model of one marker sample, in the middle of its neighbours, measured at the
+        origin.
+        """
+        neighbours = self.samples_around
+        markers = self.segment.experiment.markers
         origin = replace(
             markers, t_s=markers.t_s[:1], positions_m=np.zeros((1, len(markers.names), 3))
         )
-        rows, segment = np.arange(2 * around + 1), self.segment
-        where = rows, segment.nuisance, segment.chart
-        return MarkerReading.of(origin, *where, earlier=around)
+        rows = np.arange(2 * neighbours + 1)
+        segment = self.segment
+        return MarkerReading.of(origin, rows, segment.nuisance, segment.chart, earlier=neighbours)
 
     @cached_property
     def instruments(self) -> tuple[LiveInstrument, ...]:
-        """Readings of one's own, then the sensors of grasps."""
-        found, place, step_s = [], len(self.experiment.markers.names), self.segment.dynamics.step_s
+        """Custom sensors, then the sensors of grasps."""
+        instruments = []
+        place = len(self.experiment.markers.names)
+        step_s = self.segment.dynamics.step_s
         points = iter(self.looked)
         for reading in (*self.segment.gauges, *self.segment.sensors):
-            channel, own = reading.channel, reading in self.segment.gauges
-            around = Around(GAUGE_NEIGHBOURS)
+            channel = reading.channel
+            is_custom = reading in self.segment.gauges
+            stencil = Around(GAUGE_NEIGHBOURS)
             if isinstance(channel, GraspWrench):
-                looked = [other for other, _ in self.sensors].index(channel)
-                around = around._replace(first=int(channel.grid[0]), late=LATE)
-                if not own:
-                    off = channel.clock_limit_s / step_s
-                    around = around._replace(neighbours=WRENCH_NEIGHBOURS, off=off)
+                observable = [other for other, _ in self.sensors].index(channel)
+                stencil = stencil._replace(first=int(channel.grid[0]), late=LATE)
+                if not is_custom:
+                    clock_error = channel.clock_limit_s / step_s
+                    stencil = stencil._replace(neighbours=WRENCH_NEIGHBOURS, off=clock_error)
             else:
-                here = next(points)
-                reading, looked = replace(reading, channel=here), slice(place, place + here.each)
-                place += here.each
-            found.append(LiveInstrument(reading, around, looked))
-        return tuple(found)
+                points_of_sensor = next(points)
+                reading = replace(reading, channel=points_of_sensor)
+                observable = slice(place, place + points_of_sensor.each)
+                place += points_of_sensor.each
+            instruments.append(LiveInstrument(reading, stencil, observable))
+        return tuple(instruments)
 
     @cached_property
     def late(self) -> int:
-        """Most rows that these need beside those that markers do."""
+        """Largest number of rows that instruments need in addition to those of the markers."""
         spans = (2 * each.around.off + each.around.late for each in self.instruments)
         return int(np.ceil(max(spans, default=0.0)))
 
     @cached_property
     def looked(self) -> tuple[Points, ...]:
-        """The places that readings of points look at."""
+        """Points that custom sensors of points observe."""
         still = self.segment.experiment
         gauges = [gauge for gauge in still.readings if gauge.grasp is None]
         return tuple(points_of(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges)
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
-        """What looks at a grasp, and its number."""
+        """Wrenches of grasps that are observed, and the index of the grasp."""
         channels = [reading.channel for reading in self.segment.readings]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
-        feels = (channel for channel in channels if isinstance(channel, GraspWrench))
-        return tuple((channel, grasps.index(id(channel.grasp))) for channel in feels)
+        wrenches = (channel for channel in channels if isinstance(channel, GraspWrench))
+        return tuple((channel, grasps.index(id(channel.grasp))) for channel in wrenches)
 
     @cached_property
     def wrenches(self) -> dict[int, Wrench]:
-        """Those that the problem's recording has, by the number of their grasp from 1 on."""
+        """Wrench sensors of the problem's recording, by the number of their grasp, from 1 on."""
         pairs = enumerate(self.experiment.grasps, 1)
         return {number: grasp.wrench for number, grasp in pairs if grasp.wrench is not None}
 
     @cached_property
     def moved_grasps(self) -> Index:
-        """Numbers of the grasps whose poses come with the frames; others never move."""
+        """Indices of the grasps whose poses come with the frames; the others never move."""
         grasps = self.experiment.grasps
         return np.flatnonzero([len(grasp.poses.t_s) > 1 for grasp in grasps])
 
     @cached_property
     def first_poses(self) -> Poses:
-        """Those of all grasps that the problem's recording begins with."""
+        """Poses of all grasps at the start of the problem's recording."""
         return _first_poses(self.experiment)
 
     def poses_of(self, moved: Poses) -> Poses:
-        """Those of all grasps from those that move."""
+        """Return the poses of all grasps from those of the moving ones."""
         still = list(self.first_poses)
         for number, pose in zip(self.moved_grasps, moved, strict=True):
             still[number] = pose
@@ -293,30 +336,38 @@ class Model:
 
     @cached_property
     def known_rows(self) -> dict[int, StencilRow]:
-        """Rows whose masses are always the same, by number."""
+        """Cached coefficients of rows with constant masses, by index; filled on demand."""
         return {}
 
     @cached_property
     def room(self) -> Room | None:
-        """For the factor of a row; passes take turns."""
+        """Memory for the factor of a row, shared by all passes; None without native code."""
         return self.solver.factoriser.room(1 + self.segment.body.unsymmetric)
 
     @cached_property
     def out(self) -> Array:
-        """For rows that are linearised."""
+        """Memory for rows that are linearised together."""
         return np.empty((TOGETHER, self.segment.dynamics.forces.linearisation_width))
 
     @cached_property
     def size_m(self) -> float:
-        """Of the body, across."""
+        """Diagonal of the body [m]."""
         return float(np.linalg.norm(np.ptp(self.segment.body.nodes_m, axis=0)))
 
     def carried(self, phi: Array) -> tuple[Array, Array]:
-        """H X (g, 3) of the node of each grasped dof, and its slopes (g, 3, m)."""
+        """Return H X (g, 3) of the node of each grasped dof, and its derivatives (g, 3, m) by φ."""
         return self.segment.grasping.places(phi)
 
     def goals(self, carried: tuple[Array, Array], poses: Sequence[Poses]) -> tuple[Array, Array]:
-        """Where grasped dofs are at K poses, (K, g), and the slopes by the φ that move them."""
+        """Return the prescribed positions (K, g) at K poses, and their derivatives by φ (K, g, m).
+
+        Parameters
+        ----------
+        carried : tuple
+            Result of `carried`.
+        poses : sequence of Poses
+            K poses of all grasps.
+        """
         turns = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
         shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
         goal = np.einsum("kgj,gj->kg", turns, carried[0]) + shifts
@@ -324,7 +375,7 @@ class Model:
 
     @cached_property
     def _axes(self) -> tuple[Index, Index]:
-        """The grasp and the axis of each grasped dof."""
+        """Index of the grasp and axis of each grasped dof, (g,) each."""
         dofs = self.segment.grasping.dofs
         grasp = np.zeros_like(dofs)
         for k, each in enumerate(self.experiment.grasps):
@@ -333,9 +384,12 @@ class Model:
 
     @cached_property
     def stencils(self) -> tuple[Array, Array, Array, Array]:
-        """Of all rows the coefficients p, q, w and s of `program.row`, as (rows, rows) matrices."""
+        """Coefficients p, q, w and s of all rows, as (rows, rows) matrices; q and s include the
+        time step.
+        """
         dynamics = self.segment.dynamics.first_rows(self.rows)
-        tables, step_s = dynamics.tables, dynamics.step_s
+        tables = dynamics.tables
+        step_s = dynamics.step_s
         p, q, w, s = (
             np.sum([np.diag(each[lag:, lag], -lag) for lag in range(each.shape[1])], axis=0)
             for each in (tables.p, tables.q, tables.w, tables.s)
@@ -344,6 +398,9 @@ class Model:
 
 
 def _only_experiment(problem: Problem) -> Experiment:
+    """Return the single fitted experiment of a problem, or raise an `InputError` if it is
+    unsuitable.
+    """
     fitted = [each for each in problem.experiments if not each.validation]
 
     if len(fitted) != 1:
@@ -354,37 +411,40 @@ def _only_experiment(problem: Problem) -> Experiment:
             "experiment",
         )
     (experiment,) = fitted
-    for found, there, expected in _not_live(experiment):
-        if there:
-            where, message = f"experiment '{experiment.name}'", f"{found} cannot be live"
+    for feature, is_present, expected in _not_live(experiment):
+        if is_present:
+            where = f"experiment '{experiment.name}'"
+            message = f"{feature} cannot be live"
             raise InputError(f"{message}; expected {expected}", problem.path, where)
     return experiment
 
 
 def _not_live(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
-    """What live does without, whether this has it, and what is expected instead."""
-    body, grasps, nuisance = experiment.body, experiment.grasps, experiment.nuisance
+    """Yield description, presence and alternative of each feature that live estimation lacks."""
+    body = experiment.body
+    grasps = experiment.grasps
+    nuisance = experiment.nuisance
     yield "a static experiment", experiment.static, "a motion"
-    given = experiment.start == "given"
-    yield "a start that is given", given, "one in equilibrium, or undeformed"
+    has_given_start = experiment.start == "given"
+    yield "a start that is given", has_given_start, "one in equilibrium, or undeformed"
     yield "a material with memory", body.remembers, "one without Prony branches"
     yield "a mesh made under gravity", body.scan is not None, "a stress-free one"
-    carry = any(placed.force.carries for placed in body.placed_forces)
-    yield "a force that carries something from step to step", carry, "none"
+    has_internal_variables = any(placed.force.carries for placed in body.placed_forces)
+    yield "a force that carries something from step to step", has_internal_variables, "none"
     yield "tensions and pressures, which frames do not bring,", experiment.actuators, "none"
     yield "depth cameras, which frames do not bring,", experiment.depths, "none"
     delayed = experiment.obstacles and nuisance.obstacle_time_s
     yield "an obstacle whose delay is estimated", delayed, "one whose clock is known"
     filtered = nuisance.sensor_lag_s and experiment.wrenches
     yield "a sensor with a low-pass (sensor_lag)", filtered, "one without"
-    own = (generated(each.force, each.points.dofs) for each in body.placed_forces)
-    timed = any(law.takes(0) for law in own)
-    yield "a force that depends on time", timed, "one that does not"
+    laws = (generated(each.force, each.points.dofs) for each in body.placed_forces)
+    depends_on_time = any(law.takes(0) for law in laws)
+    yield "a force that depends on time", depends_on_time, "one that does not"
     yield "an experiment without markers", not experiment.markers.names, "markers"
-    brief = any(np.isfinite([g.from_s, g.until_s]).any() for g in grasps)
-    yield "a grasp that holds for a while only", brief, "grasps throughout"
-    zeroed = any(grasp.zero for grasp in grasps)
-    yield "a grasp whose zero is estimated", zeroed, "one whose zero is known"
+    is_temporary = any(np.isfinite([g.from_s, g.until_s]).any() for g in grasps)
+    yield "a grasp that holds for a while only", is_temporary, "grasps throughout"
+    has_zero = any(grasp.zero for grasp in grasps)
+    yield "a grasp whose zero is estimated", has_zero, "one whose zero is known"
     moves = any(len(grasp.poses.t_s) > 1 for grasp in grasps)
     yield "an experiment whose grasps never move", not moves, "a pose that moves"
     loads = (each(experiment.t_s) for each in (experiment.tied_mass_kg, experiment.node_forces_n))
@@ -393,7 +453,7 @@ def _not_live(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
 
 
 def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
-    """A few samples in which nothing moves."""
+    """Return the experiment as a few samples in which nothing moves."""
     reach = collocation.segments[0].dynamics.reach
     # The rows of the start, and room for a reading.
     count = max(2 * reach + 2 + TOGETHER, NEIGHBOURS, 3)
@@ -418,19 +478,23 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
 
 
 def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
+    """Return a wrench sensor with zero measurements at these times."""
     values = np.where(wrench.measured, np.zeros((len(t_s), 1)), np.nan)
     return replace(wrench, t_s=t_s, values=values)
 
 
 def _first_poses(experiment: Experiment) -> Poses:
-    found = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
-    return tuple((turns[0], shifts[0]) for turns, shifts in found)
+    """Return the poses of all grasps at the start of a recording."""
+    poses = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
+    return tuple((turns[0], shifts[0]) for turns, shifts in poses)
 
 
 def _held_at(experiment: Experiment, poses: Poses) -> list:
-    found = []
+    """Return the grasps of an experiment, at rest at given poses."""
+    grasps = []
     for grasp, (turn, shift) in zip(experiment.grasps, poses, strict=True):
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = turn, shift
-        found.append(replace(grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])))
-    return found
+        matrix[:3, :3] = turn
+        matrix[:3, 3] = shift
+        grasps.append(replace(grasp, poses=PoseSequence.from_matrices([0.0], matrix[None])))
+    return grasps

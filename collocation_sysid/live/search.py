@@ -1,4 +1,7 @@
-"""A start where there is no guess, or one that leads nowhere: a scan within frames' budgets."""
+"""Search for initial values over a range of stiffness, within the computing time of frames.
+
+It is used if there is no guess, or if the estimation does not converge from the guess.
+"""
 
 from __future__ import annotations
 
@@ -9,24 +12,27 @@ from ..methods.scan import STIFFEST_PA, usual_parameters, without_guesses
 from .model import Model
 from .track import Track
 
-# So many samples tell which stiffness to start from; trials whose squares are so many times the
-# least are lost.
-SEEN, WORSE = 20, 9.0
+# Number of samples that decide which stiffness to start from.
+SEEN = 20
+# Ratio of a trial's sum of squares to the smallest one above which the trial has failed.
+WORSE = 9.0
+# Stiffnesses of the trials [Pa], two per decade.
 TRIED_PA = STIFFEST_PA * 10.0 ** (-0.5 * np.arange(11))
 
 
 class Search:
-    """Where to start, among stiffnesses from stiff to soft.
+    """Search for initial values, from stiff to soft.
 
     Parameters
     ----------
     model : Model
-    phi : (k,) nuisance parameters of every trial
+    phi : (k,)
+        Nuisance parameters of every trial.
 
     Attributes
     ----------
     rows : int
-        That every trial passes.
+        Number of rows of every trial.
     """
 
     def __init__(self, model: Model, phi: Array) -> None:
@@ -38,15 +44,17 @@ class Search:
 
     @property
     def done(self) -> bool:
-        """Whether there is nothing left to try."""
+        """Whether no trial is left."""
         return not self._waiting
 
     def next(self) -> Array | None:
-        """The next p to try."""
+        """Return the parameters p of the next trial; None if there is none."""
         return np.concatenate([self._waiting[0], self._phi]) if self._waiting else None
 
     def compare(self, track: Track) -> None:
-        """Note what a trial gave; two in a row that are lost end it."""
+        """Record the result of a trial; two failures in a row, after the first one, end the
+        search.
+        """
         self._waiting.pop(0)
         self._tried.append((np.inf if track.failed else track.loss, track.p))
         least = min(loss for loss, _ in self._tried)
@@ -56,6 +64,6 @@ class Search:
 
     @property
     def best(self) -> Array | None:
-        """Where the sum of squares was least."""
+        """Parameters p with the smallest sum of squares; None if every trial failed."""
         loss, p = min(self._tried, key=lambda each: each[0])
         return p if np.isfinite(loss) else None

@@ -1,4 +1,4 @@
-"""Where frames come from: lines of a stream, datagrams on this machine, or a recording."""
+"""Sources of frames: lines of a stream, datagrams on this machine, or a recording."""
 
 from __future__ import annotations
 
@@ -21,29 +21,33 @@ from .estimator import Update
 from .frames import Frame
 from .model import Model
 
-# Largest datagram, and this machine's own address: nobody else is listened to.
-DATAGRAM_BYTES, HERE = 65536, "127.0.0.1"
+# Largest accepted datagram [bytes].
+DATAGRAM_BYTES = 65536
+# Address of this machine; datagrams from others are not received.
+HERE = "127.0.0.1"
 
 
 def as_text(lines: Iterable[bytes]) -> Iterator[str]:
-    """Lines of UTF-8; what is none of it becomes a sign that no number and no name has."""
+    """Decode lines of UTF-8; invalid bytes are replaced by a character that no number or name
+    contains.
+    """
     return (line.decode("utf-8", errors="replace") for line in lines)
 
 
 def datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
-    """Lines that come as UDP datagrams to a port of this machine, until an empty one comes.
+    """Yield lines that arrive as UDP datagrams at a port of this machine, until an empty datagram.
 
     Parameters
     ----------
     port : int
-        Any free one where it is 0.
+        Port; 0 for any free one.
     opened : callable, optional
         Called with the port once it is open.
 
     Raises
     ------
     OSError
-        Where the port is taken.
+        If the port is in use.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind((HERE, port))
@@ -54,12 +58,12 @@ def datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterato
 
 
 def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
-    """The problem of a file, or the one that a run's folder is of.
+    """Return the problem of a file, or that of the folder of a run.
 
     Raises
     ------
     InputError
-        Where there is none.
+        If there is none.
     """
     if not recording.is_dir():
         return Problem.read(recording, overrides, allow_code)
@@ -68,23 +72,25 @@ def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> P
 
 
 def recorded(experiment: Experiment, model: Model) -> Iterator[Frame]:
-    """The frames of an experiment's recording."""
-    moved = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moved_grasps]
-    turns = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in moved]
+    """Yield the frames of an experiment's recording."""
+    poses = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moved_grasps]
+    quaternion_series = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses]
     series = [(gauge.times, gauge.measured) for gauge in experiment.readings]
     series += [(wrench.t_s, wrench.values) for wrench in model.wrenches.values()]
-    told = [
+    samples = [
         (number, float(at_s), values)
         for number, each in enumerate(series, 1)
         for at_s, values in zip(*each, strict=True)
     ]
-    frame_of = np.searchsorted(experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in told])
+    frame_of = np.searchsorted(experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in samples])
     for k, t_s in enumerate(experiment.t_s):
-        positions_m = np.array([translations[k] for _, translations in moved])
-        quaternions = np.array([each[k] for each in turns])
-        own = tuple(each for each, frame in zip(told, frame_of, strict=True) if frame == k)
-        seen_m = experiment.markers.positions_m[k]
-        yield Frame(float(t_s), (positions_m, quaternions), seen_m, told=own)
+        positions_m = np.array([translations[k] for _, translations in poses])
+        quaternions = np.array([each[k] for each in quaternion_series])
+        frame_samples = tuple(
+            each for each, frame in zip(samples, frame_of, strict=True) if frame == k
+        )
+        tracks_m = experiment.markers.positions_m[k]
+        yield Frame(float(t_s), (positions_m, quaternions), tracks_m, told=frame_samples)
 
 
 def paced(
@@ -93,7 +99,15 @@ def paced(
     clock: Callable[[], float] = time.monotonic,
     wait: Callable[[float], None] = time.sleep,
 ) -> Iterator[Frame]:
-    """Frames at a rate; where they are taken too slowly, the next ones come at once."""
+    """Yield frames at a rate; after a delay the next ones follow immediately.
+
+    Parameters
+    ----------
+    frames : iterator of Frame
+    rate_hz : float
+    clock, wait : callable
+        Time in seconds, and a function that waits.
+    """
     began = clock()
     for number, frame in enumerate(frames):
         left_s = began + number / rate_hz - clock()
@@ -104,7 +118,7 @@ def paced(
 
 @contextmanager
 def collected_before() -> Iterator[None]:
-    """Nothing that is there before frames come is looked through for garbage while they do.
+    """Exclude all existing objects from garbage collection within this context.
 
     A collection of all objects takes longer than some frames.
     """
@@ -117,7 +131,7 @@ def collected_before() -> Iterator[None]:
 
 
 def as_json(update: Update) -> str:
-    """A line that tells an update; what is not known is null."""
+    """Return an update as a line of JSON; unknown values are null."""
     parameters = {
         name: {
             "value": each.value,

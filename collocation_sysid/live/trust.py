@@ -1,4 +1,4 @@
-"""How far a live estimate is to be trusted: what residuals and estimates say against it."""
+"""Reliability of a live estimate: concerns due to residuals and estimates."""
 
 from __future__ import annotations
 
@@ -15,27 +15,30 @@ from ..statistics.distributions import chi2_sf, student_ppf
 from ..statistics.estimates import Estimate
 from ..statistics.trust import GROSS_MISFIT, HARDLY_TAME, MISFIT, PERSISTENT, WILD
 
-# Estimates this many standard errors from where all is linearised may still move.
+# Distance from the linearisation point, in standard errors, above which estimates may still change.
 UNSETTLED = 0.5
-# Probability of taking noise of the σ given for larger, at each look.
+# Probability, at each test, that noise of the stated σ is taken for larger noise.
 RARE = 1e-3
-# Autocorrelations that matter are larger than this, and than so many of their deviations.
-CORRELATED, DEVIATIONS = 0.1, 3.3
+# Smallest autocorrelation that is taken into account.
+CORRELATED = 0.1
+# Smallest ratio of an autocorrelation to its standard deviation to be taken into account.
+DEVIATIONS = 3.3
+# Largest autocorrelation used, to keep the variance finite.
 MOST = 0.98
-# Fewer samples say nothing about that.
+# Smallest number of samples for an estimate of the autocorrelation.
 FEWEST = 10
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """The size of residuals.
+    """Size and autocorrelation of residuals.
 
     Attributes
     ----------
     rms : float
-        In standard deviations.
+        Root mean square in standard deviations.
     lag1 : float
-        Autocorrelation from sample to sample; zero where it does not matter.
+        Autocorrelation between consecutive samples; zero if it is not significant.
     """
 
     rms: float = 0.0
@@ -43,61 +46,88 @@ class Scatter:
 
     @classmethod
     def of(cls, residuals: Sequence[Array]) -> Scatter:
-        """Of residuals (M, 3) of samples in turn, NaN where missing."""
+        """Return the scatter of residuals (M, 3) of consecutive samples, NaN where missing."""
         if not residuals:
             return cls()
-        found = np.array(residuals)
-        square = np.nanmean(found**2) if np.isfinite(found).any() else 0.0
-        both = found[1:] * found[:-1]
-        count = int(np.isfinite(both).sum())
-        if len(found) < FEWEST or not count or not square:
+        values = np.array(residuals)
+        square = np.nanmean(values**2) if np.isfinite(values).any() else 0.0
+        products = values[1:] * values[:-1]
+        count = int(np.isfinite(products).sum())
+        if len(values) < FEWEST or not count or not square:
             return cls(float(np.sqrt(square)))
-        lag1 = float(np.nanmean(both) / square)
-        matters = lag1 > max(CORRELATED, DEVIATIONS / np.sqrt(count))
-        return cls(float(np.sqrt(square)), min(lag1, MOST) if matters else 0.0)
+        lag1 = float(np.nanmean(products) / square)
+        is_significant = lag1 > max(CORRELATED, DEVIATIONS / np.sqrt(count))
+        return cls(float(np.sqrt(square)), min(lag1, MOST) if is_significant else 0.0)
 
 
 def widened(known: LeastSquares, p: Array, fitted: float, scatter: Scatter) -> tuple[float, float]:
-    """By what variances are multiplied, and the half width of 95 % intervals in deviations.
+    """Return the factor of all variances, and the half width of 95 % intervals in standard
+    deviations.
 
     Parameters
     ----------
     known : LeastSquares
-        With the priors.
-    p : (P,) the estimate
+        Information, including the priors.
+    p : (P,)
+        Estimate.
     fitted : float
-        Rows that are spent on it.
+        Number of fitted parameters.
+    scatter : Scatter
     """
     freedom = max(1.0, known.rows - fitted)
     loss = known.loss(p)
-    factor, quantile = 1.0, 1.96
+    factor = 1.0
+    quantile = 1.96
     if chi2_sf(loss, freedom) < RARE:
-        factor, quantile = loss / freedom, float(student_ppf(0.975, freedom))
+        factor = loss / freedom
+        quantile = float(student_ppf(0.975, freedom))
     return factor * (1 + scatter.lag1) / (1 - scatter.lag1), quantile
 
 
 def data_concerns(scatter: Scatter, counts: Counter[str], samples: int) -> list[Concern]:
-    """The residuals, and samples that were left out."""
-    wild, anew = counts["wild"] / max(1, samples), counts["begun anew"]
+    """Return the concerns due to residuals, and to samples that were left out.
+
+    Parameters
+    ----------
+    scatter : Scatter
+    counts : Counter
+        Numbers of irregularities, by kind.
+    samples : int
+        Number of marker samples so far.
+    """
+    outlier_share = counts["wild"] / max(1, samples)
+    restarts = counts["begun anew"]
     size = {"factor": scatter.rms, "stated": "sigma_m"}
-    times = "once" if anew == 1 else f"{anew} times"
+    times = "once" if restarts == 1 else f"{restarts} times"
     return [
         *concerned(scatter.rms > MISFIT, scatter.rms > GROSS_MISFIT, "noise/larger", **size),
         *concerned(
             scatter.lag1 > PERSISTENT, False, "residuals/persist", autocorrelation=scatter.lag1
         ),
-        *concerned(wild > WILD, wild > HARDLY_TAME, "residuals/far", percent=100 * wild),
-        *concerned(anew > 0, False, "solve/anew", times=times),
+        *concerned(
+            outlier_share > WILD,
+            outlier_share > HARDLY_TAME,
+            "residuals/far",
+            percent=100 * outlier_share,
+        ),
+        *concerned(restarts > 0, False, "solve/anew", times=times),
     ]
 
 
 def estimate_concerns(estimates: Mapping[str, Estimate], moved: float) -> list[Concern]:
-    """What the estimates say of themselves; `moved` is in standard errors."""
-    found = concerned(moved > UNSETTLED, False, "solve/moves")
+    """Return the concerns due to the estimates themselves.
+
+    Parameters
+    ----------
+    estimates : mapping of name to Estimate
+    moved : float
+        Distance of the estimate from the linearisation point, in standard errors.
+    """
+    concerns = concerned(moved > UNSETTLED, False, "solve/moves")
     for name, estimate in estimates.items():
         if estimate.at_bound:
-            found += concerned(True, False, "information/at-bound", name=name)
+            concerns += concerned(True, False, "information/at-bound", name=name)
         elif estimate.reason is not None:
             reason = estimate.reason
-            found += concerned(True, False, "information/not-yet", name=name, reason=reason)
-    return found
+            concerns += concerned(True, False, "information/not-yet", name=name, reason=reason)
+    return concerns

@@ -1,4 +1,4 @@
-"""What all frames say together: a recording that is solved as any other."""
+"""Batch solution of a live recording after its last frame."""
 
 from __future__ import annotations
 
@@ -18,16 +18,25 @@ from .intake import Intake
 from .model import Model
 from .sweep import LoggedRow
 
-# A motion has no fewer samples.
+# Smallest number of samples of a motion.
 FEWEST = 3
 
 
 def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Experiment | None:
-    """The experiment with the poses and markers of all rows, from the first frame on.
+    """Return the experiment with the poses, markers and samples of all rows, from the first frame
+    on.
 
-    None where there are too few, or where markers were seen between samples.
+    None if there are too few, or if markers were measured between samples.
+
+    Parameters
+    ----------
+    model : Model
+    intake : Intake
+    log : sequence of LoggedRow
+        All rows, with their samples.
     """
-    experiment, at_samples = model.experiment, log[:: model.substeps]
+    experiment = model.experiment
+    at_samples = log[:: model.substeps]
     t_s = experiment.t_s[0] + model.interval_s * np.arange(len(at_samples))
     tracks_m = np.full((len(t_s), len(experiment.markers.names), 3), np.nan)
     for when, tracks in intake.seen(log):
@@ -45,30 +54,31 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
         smooth = grasps[number].poses.interpolation
         poses = PoseSequence.from_matrices(t_s, matrices, smooth)
         grasps[number] = replace(grasps[number], poses=poses)
-    markers, readings = replace(experiment.markers, t_s=t_s, positions_m=tracks_m), []
+    markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
+    readings = []
     for number, gauge in enumerate((*experiment.readings, *model.wrenches), 1):
-        told = {when: values for of, when, values in intake.told(log) if of == number}
-        inside = [when for when in sorted(told) if when <= len(t_s) - 1]
-        values = np.array([told[when] for when in inside])
+        samples = {when: values for of, when, values in intake.told(log) if of == number}
+        inside = [when for when in sorted(samples) if when <= len(t_s) - 1]
+        values = np.array([samples[when] for when in inside])
         if len(inside) < FEWEST or not np.isfinite(values).any():
             continue
-        seen = {"t_s": t_s[0] + model.interval_s * np.array(inside), "values": values}
+        series = {"t_s": t_s[0] + model.interval_s * np.array(inside), "values": values}
         if isinstance(gauge, Gauge):
-            readings.append(replace(gauge, **seen))
+            readings.append(replace(gauge, **series))
         else:
-            wrench = replace(model.wrenches[gauge], **seen)
+            wrench = replace(model.wrenches[gauge], **series)
             grasps[gauge - 1] = replace(grasps[gauge - 1], wrench=wrench)
     return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings)
 
 
 def solved(problem: Problem, recording: Experiment) -> Run:
-    """The batch's run of a recording.
+    """Return the run of a recording, solved as a batch.
 
     Raises
     ------
     InputError
-        Where it is refused, see `run`.
+        If the recording is refused, see `run`.
     """
     options = replace(problem.uncertainty, profile=())
-    whole = replace(problem, experiments=[recording], uncertainty=options)
-    return run(whole, problem.solver(ReducedSpace.name), seek_causes=False)
+    batch_problem = replace(problem, experiments=[recording], uncertainty=options)
+    return run(batch_problem, problem.solver(ReducedSpace.name), seek_causes=False)

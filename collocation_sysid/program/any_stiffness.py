@@ -20,13 +20,18 @@ from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from .modes import natural_modes
 
+# Natural modes of the prediction.
 MODES = 20
-# The softest body sags by half its size; first frequencies from there on, and a rigid body.
+# Sag of the softest body, relative to its size.
 SOFTEST_SAG = 0.5
+# Number of stiffnesses, besides a rigid body.
 STIFFNESSES = 12
+# Largest first frequency relative to that of the softest body.
 STIFFEST = 30.0
+# Damping ratios that are tried with each stiffness.
 DAMPING_RATIOS = (0.03, 0.25)
 STANDARD_GRAVITY_M_S2 = 9.81
+# Largest number of samples that are predicted.
 MOST_SAMPLES = 300
 
 
@@ -153,14 +158,14 @@ class Sway:
         markers = experiment.markers
         forces = Forces.of(experiment, experiment.t_s[:1], body.theta(constants)).undriven()
         modes = natural_modes(forces, body.nodes_m, experiment.free_dofs, MODES)
-        weighed = modes.shapes * forces.mass.kg[0, ::3, None]
+        weighted = modes.shapes * forces.mass.kg[0, ::3, None]
         omega = modes.angular_frequencies_rad_s
         return cls(
             markers.observe(body.nodes_m),
             omega / omega[:1],
             markers.observe(modes.shapes),
-            weighed.sum(axis=1),
-            np.einsum("kni,nj->kij", weighed, body.nodes_m),
+            weighted.sum(axis=1),
+            np.einsum("kni,nj->kij", weighted, body.nodes_m),
             float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
             experiment.start == "equilibrium",
         )
@@ -202,8 +207,8 @@ class Sway:
         step_s = float(described.t_s[1] - described.t_s[0])
         lift = described.gravity_m_s2 - _acceleration(described.translations_m, step_s)
         pushed = np.einsum("tij,tj->ti", inverse, lift)
-        spun = inverse @ _acceleration(described.rotations, step_s) * described.mesh_scale
-        return pushed @ self.pushed.T - np.einsum("tij,kij->tk", spun, self.turned)
+        rotated = inverse @ _acceleration(described.rotations, step_s) * described.mesh_scale
+        return pushed @ self.pushed.T - np.einsum("tij,kij->tk", rotated, self.turned)
 
 
 def later(seen: Array, t_s: Array, lag_s: float) -> Array:

@@ -371,11 +371,17 @@ class Submatrix:
         place, number = np.full((2, pattern.size), -1)
         place[rows] = np.arange(len(rows))
         number[slice(None) if columns is None else columns] = np.arange(count)
-        kept = (place[along] >= 0) & (number[across] >= 0)
-        self._source = source[kept]
-        self._in_both = source[kept] + np.where((along > across)[kept], 0, pattern.entries)
-        ends = np.cumsum(np.bincount(place[along[kept]], minlength=len(rows)))
-        parts = np.zeros(kept.sum()), number[across[kept]], np.concatenate([[0], ends])
+        is_selected = (place[along] >= 0) & (number[across] >= 0)
+        self._source = source[is_selected]
+        self._in_both = source[is_selected] + np.where(
+            (along > across)[is_selected], 0, pattern.entries
+        )
+        ends = np.cumsum(np.bincount(place[along[is_selected]], minlength=len(rows)))
+        parts = (
+            np.zeros(is_selected.sum()),
+            number[across[is_selected]],
+            np.concatenate([[0], ends]),
+        )
         self._matrix = sp.csr_array(parts, shape=(len(rows), count))
 
     def of(self, lower: Array, skew: Array) -> sp.csr_array:

@@ -17,18 +17,21 @@ from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from .skin import GRAZING, Skin
 from .view import View
 
-# Points of the surface, iterations, the share of a body's size that it may be off at first, and the
-# weight of how far points are beside those of how far they are along normals. They count as so many
-# independent ones beside the prior.
+# Points of the surface that are associated with the cloud.
 SAMPLES = 250
+# Iterations, with a gate that narrows geometrically.
 ITERATIONS = 25
+# Initial gate, relative to the diagonal of the body.
 REACH = 0.35
+# Weight of the complete distance relative to that along the normal: points may slide.
 SLIDING = 0.2
+# Number of independent points that the points count as, relative to the prior.
 INDEPENDENT = 10000
-# Turns [rad] that it is begun from besides none, and how many are followed to the end.
+# Rotations from which the search starts, about each axis in both directions [rad].
 TURNED = 0.2
+# Starts that are followed to the end.
 KEPT = 2
-# More points of a cloud only make it slower.
+# Points of a cloud that are used; more only cost time.
 ENOUGH = 2000
 
 
@@ -68,13 +71,15 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
     size_m = float(np.linalg.norm(np.ptp(x, axis=0)))
     tree = KDTree(thinned(view.depth.points_m[sample]))
     gates = np.geomspace(REACH * size_m, view.depth.gate_m, ITERATIONS)
-    turns = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
+    rotation_vectors = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
     near_cloud = np.asarray(tree.data)[KDTree(places).query(tree.data)[0] < gates[0]]
     shifts = [
         np.zeros(3),
         places.mean(axis=0) - near_cloud.mean(axis=0) if len(near_cloud) else np.zeros(3),
     ]
-    candidates = [(1.0, Rotation.from_rotvec(turn), shift) for turn in turns for shift in shifts]
+    candidates = [
+        (1.0, Rotation.from_rotvec(turn), shift) for turn in rotation_vectors for shift in shifts
+    ]
     for half in np.array_split(gates, 2):
         candidates = [
             _aligned(view, tree, places, normals, half, *start) for _, *start in candidates

@@ -309,10 +309,8 @@ class Points:
             ),
             (3 * self.each * self.count + np.arange(size), variables + np.arange(size)),
         )
-        rows, columns = zip(*pairs, strict=True)
-        return np.concatenate([r.ravel() for r in rows]), np.concatenate(
-            [c.ravel() for c in columns]
-        )
+        rows = np.concatenate([row.ravel() for row, _ in pairs])
+        return rows, np.concatenate([column.ravel() for _, column in pairs])
 
     def slopes(self, x: Array | None, phi: Array, variables: int) -> sp.csr_array:
         """Return the sparse matrix ∂(c, φ)/∂(x, φ).

@@ -22,13 +22,14 @@ from ..recording.experiment import Experiment
 from ..recording.placement import Placement, Shape
 from .sighting import Sighting, sightings_of
 
-# A place leaves its element when another holds it better by this, in barycentric coordinates: so
-# it cannot swing between two. The clock leaves its sample when it is off by more than this.
+# A place leaves its element when another contains it better by this barycentric coordinate, so that
+# it cannot alternate between two.
 BETTER = 0.01
+# The clock leaves its sample when its shift differs by more than this [samples].
 SAMPLES_OFF = 1.0
-# A place that leaves the surface across an edge where it did before, so many times more, keeps to
-# the plane it is in. What is nearer than this, over an edge of the mesh, is the same.
+# A place that has left the surface across the same edge so often stays in its plane.
 AGAIN = 2
+# Edges nearer than this are the same, relative to the mean edge length.
 SAME = 1e-6
 
 
@@ -101,7 +102,8 @@ class Chart:
     def of(cls, experiment: Experiment) -> Chart:
         """Build the chart of the stated places of an experiment's markers and depth cameras.
 
-        Places that are not stated are NaN until `Segment.placed` initialises them.
+        Markers without a stated place get the place that `Markers.placement` gives them, until
+        `Segment.placed` initialises it.
         """
         body = experiment.body
         markers = experiment.markers

@@ -165,17 +165,25 @@ class Collocation:
     def segments(self) -> tuple[Segment, ...]:
         """Transcriptions of the experiments that are fitted."""
         fitted = [each for each in self.experiments if not each.validation]
-        options = (self.explicit_grasps, self.huber)
-        found = list[Segment]()
+        segments = list[Segment]()
         for experiment, local in zip(fitted, locals_of(fitted, self.nq), strict=True):
             chart = self.charts.get(experiment.name)
             if chart is None or not chart.suits(experiment):
                 chart = Chart.of(experiment)
-            grid = self.scheme, 1 if experiment.static else self.substeps
-            first = found[-1].after if found else First(self.nq, 0)
-            here = first, local, chart
-            found.append(Segment(experiment, self.parameters, *grid, *options, *here))
-        return _read_alike(found, [segment.chart for segment in found])
+            segments.append(
+                Segment(
+                    experiment,
+                    self.parameters,
+                    scheme=self.scheme,
+                    substeps=1 if experiment.static else self.substeps,
+                    explicit_grasps=self.explicit_grasps,
+                    huber=self.huber,
+                    first=segments[-1].after if segments else First(self.nq, 0),
+                    local=local,
+                    chart=chart,
+                )
+            )
+        return _read_alike(segments, [segment.chart for segment in segments])
 
     @cached_property
     def carried(self) -> tuple[Carried, ...]:
@@ -263,8 +271,8 @@ class Collocation:
             Scaled variables; lifted ones follow from positions and parameters.
         """
         parts = self.parts_at(p, positions) if self.carried else []
-        following = [each.following(parts[each.number]) for each in self.carried]
-        return np.concatenate([self._packed(p, positions), *following])
+        lifted = [each.following(parts[each.number]) for each in self.carried]
+        return np.concatenate([self._packed(p, positions), *lifted])
 
     def _packed(self, p: Array, positions: Sequence[Array]) -> Array:
         """Return z without lifted variables."""
@@ -534,8 +542,10 @@ class Collocation:
         for part in parts:
             segment = part.segment
             here = own[used : used + segment.jacobian.nnz]
-            found, by_p = segment.constraints_and_jacobian(part.x, part.setting, part.forces, here)
-            rows[segment.rows] = found
+            constraints, by_p = segment.constraints_and_jacobian(
+                part.x, part.setting, part.forces, here
+            )
+            rows[segment.rows] = constraints
             columns[:, segment.rows] = by_p[:, : self.nq].T
             further.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
@@ -643,15 +653,32 @@ class Collocation:
             mine = [each for each in self.carried if each.number == number]
             of_rows = sum((each.row_weights(multipliers) for each in mine), start=0.0)
             weights.append(segment.weights(multipliers[segment.rows], of_rows))
-            carried = [each.weighed(part, multipliers) for each in mine if each.history is not None]
-            at = part.x, part.phi, part.setting, weights[number], weight
-            found, more = segment.hessian_values(*at, here, carried, bent)
-            by_q = by_q + found
-            further = further + more
+            lifted_histories = [
+                each.weighed(part, multipliers) for each in mine if each.history is not None
+            ]
+            by_q_own, further_own = segment.hessian_values(
+                part.x,
+                part.phi,
+                part.setting,
+                weights=weights[number],
+                loss_weight=weight,
+                values=here,
+                carried=lifted_histories,
+                bent=bent,
+            )
+            by_q = by_q + by_q_own
+            further = further + further_own
             used = used + len(here)
         for each in self.carried:
-            at = parts[each.number], z, weight, multipliers, weights[each.number]
-            further.append(each.hessian_values(*at))
+            further.append(
+                each.hessian_values(
+                    parts[each.number],
+                    z,
+                    loss_weight=weight,
+                    multipliers=multipliers,
+                    weights=weights[each.number],
+                )
+            )
         _, slopes = self.parameters.prior(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
@@ -671,10 +698,10 @@ class Collocation:
         slope = self.gradient(z) + self.pulled_back(z, multipliers)
         lower, upper = self.bounds()
         slope[lower == upper] = 0
-        near = 1e-6
+        tolerance = 1e-6
         for part in (slice(self.nq), self.of_phi):
-            at_lower = (z - lower)[part] < near
-            at_upper = (upper - z)[part] < near
+            at_lower = (z - lower)[part] < tolerance
+            at_upper = (upper - z)[part] < tolerance
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
             slope[part][at_upper] = np.maximum(slope[part][at_upper], 0)
         return float(max(np.abs(slope).max(initial=0.0), np.abs(rows).max(initial=0.0)))

@@ -30,13 +30,13 @@ from .outline import Outline
 from .reading import GROUP, Instrument, Pooled, Reading, Window, lagrange_weights, times_around
 from .sighting import Sighting
 
-# Times around a sample.
+# Grid times around an image that it is interpolated from.
 NEIGHBOURS = 4
-# Threshold of Huber's loss where none is given: what is seen beside the body is wild.
+# Default threshold of Huber's loss [σ]: depth images contain other things too.
 HUBER = 3.0
-# Patches of the surface that statistics take the points of together, at most, and by how much these
-# grow until they are as few.
+# Largest number of patches that statistics combine the points into.
 PATCHES = 60
+# Factor by which patches grow until there are few enough.
 GROWING = 1.2
 
 

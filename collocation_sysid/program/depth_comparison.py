@@ -133,22 +133,22 @@ class SurfaceComparison:
 
     @cached_property
     def error(self) -> DepthError:
-        """Summary of the distances."""
+        """Distances summarised as numbers, see `DepthError`."""
         depth = self.sighting.view.depth
-        apart_m = np.abs(self.apart_m[np.isfinite(self.apart_m)])
-        within_m = apart_m[apart_m <= depth.gate_m]
-        sigmas = apart_m / depth.sigma_m
+        distances_m = np.abs(self.apart_m[np.isfinite(self.apart_m)])
+        within_m = distances_m[distances_m <= depth.gate_m]
+        sigmas = distances_m / depth.sigma_m
         shortened = np.where(sigmas > HUBER, HUBER * sigmas, sigmas**2)
         return DepthError(
-            points=len(apart_m),
+            points=len(distances_m),
             seen=sum(map(len, depth.clouds)),
-            rms_m=root_mean(apart_m**2) if len(apart_m) else None,
+            rms_m=root_mean(distances_m**2) if len(distances_m) else None,
             reach_m=max(self.sighting.gate_m, depth.gate_m),
             gate_m=depth.gate_m,
-            share_beyond_gate=1 - len(within_m) / len(apart_m) if len(apart_m) else 0.0,
+            share_beyond_gate=1 - len(within_m) / len(distances_m) if len(distances_m) else 0.0,
             rms_within_gate_m=root_mean(within_m**2) if len(within_m) else None,
-            sigmas=root_mean(sigmas**2) if len(apart_m) else 0.0,
-            tame_sigmas=root_mean(shortened) if len(apart_m) else 0.0,
+            sigmas=root_mean(sigmas**2) if len(distances_m) else 0.0,
+            tame_sigmas=root_mean(shortened) if len(distances_m) else 0.0,
         )
 
 

@@ -89,10 +89,10 @@ class OffBand:
         own = before + np.cumsum(absent) - absent
         added = own[absent]
         columns = codes[absent] // height
-        is_kept = np.ones(len(indices) + len(added), dtype=bool)
-        is_kept[added] = False
-        all_indices = np.empty(len(is_kept), dtype=np.int64)
-        all_indices[is_kept] = indices
+        is_initial = np.ones(len(indices) + len(added), dtype=bool)
+        is_initial[added] = False
+        all_indices = np.empty(len(is_initial), dtype=np.int64)
+        all_indices[is_initial] = indices
         all_indices[added] = codes[absent] - columns * height
         counts = np.bincount(columns, minlength=width)
         counts[: len(indptr) - 1] += np.diff(indptr)
@@ -100,7 +100,7 @@ class OffBand:
         return cls(
             np.concatenate([[0], np.cumsum(counts)]),
             all_indices,
-            None if is_kept[: len(indices)].all() else np.flatnonzero(is_kept),
+            None if is_initial[: len(indices)].all() else np.flatnonzero(is_initial),
             tuple(own[each] for each in numbers),
             tuple(bool(np.bincount(each, minlength=1).max() > 1) for each in numbers),
         )

@@ -32,30 +32,42 @@ def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> t
     groups: list[Carried] = []
     for number, segment in enumerate(segments):
         reactions = None
-        here = (segment, number, first_phi)
+        lift = {"segment": segment, "number": number, "first_phi": first_phi}
         wrenches = [
             (k, reading)
             for k, reading in enumerate(segment.readings)
             if reading.channel.local is None and reading.channel.count
         ]
         if wrenches:
-            reactions = Reactions(*here, places)
+            reactions = Reactions(**lift, places=places)
             groups.append(reactions)
             places = reactions.after
         histories = 0
         if segment.body.remembers:
-            groups.append(Overstress(*here, places, reactions))
+            groups.append(Overstress(**lift, places=places, reactions=reactions))
             places = groups[-1].after
             histories = 1
         for history, force in enumerate(segment.dynamics.forces.carrying, histories):
-            groups.append(ForceRows(*here, places, history, force, reactions))
+            groups.append(
+                ForceRows(
+                    **lift, places=places, along=history, force_number=force, reactions=reactions
+                )
+            )
             places = groups[-1].after
             histories = history + 1
         for history, force in enumerate(segment.dynamics.forces.pressing, histories):
-            groups.append(PressureRows(*here, places, history, force, reactions))
+            groups.append(
+                PressureRows(
+                    **lift, places=places, along=history, force_number=force, reactions=reactions
+                )
+            )
             places = groups[-1].after
-        for wrench in wrenches:
+        for k, reading in wrenches:
             assert reactions is not None
-            groups.append(WrenchRows(*here, places, *wrench, reactions))
+            groups.append(
+                WrenchRows(
+                    **lift, places=places, reading_number=k, reading=reading, reactions=reactions
+                )
+            )
             places = groups[-1].after
     return tuple(groups)

@@ -34,24 +34,29 @@ if TYPE_CHECKING:
 
 Choice = Literal["auto", "band", "sparse", "supernodal"]
 
-# LAPACK works on a band about this many times as fast as SuperLU on its columns (measured: 40
-# against 4 GFlop/s on one core), and below this work there is nothing to choose.
+# Speed of LAPACK on a band over that of SuperLU on its columns (measured: 40 against 4 GFlop/s on
+# one core).
 BAND_SPEED = 10.0
+# Work of a band below which it is always used.
 LITTLE_WORK = 1e8
-# From this work of a band on, some 3,000 nodes of a stout body, supernodal sweeps are faster.
+# Work of a band from which on supernodal sweeps are faster: some 3,000 nodes of a stout body.
 MUCH_WORK = 2e9
 
-# In wider bands LAPACK is faster (measured: 17 GFlop/s at 200, its Cholesky 21 at 300).
+# Half bandwidth up to which the skyline is faster than LAPACK (measured: 17 GFlop/s at 200,
+# LAPACK's Cholesky 21 at 300).
 NARROW = 250
-# Without exchanges a diagonal entry may grow so many times; of definite matrices it never does.
+# Largest growth of a diagonal entry without row exchanges; definite matrices have none.
 GROWTH = 10.0
-# Corrections by the skew part end where the next would be so small, far below what a Newton or
-# Gauss–Newton step is accurate to; they must shrink so fast, else another factor pays.
+# Relative size of the last correction by the skew part, far below the accuracy of a Newton or
+# Gauss–Newton step.
 ACCURACY = 1e-10
+# Factor by which each correction must be smaller; otherwise another factorisation is cheaper.
 CONTRACTION = 0.2
+# Smallest size of a correction, against division by zero.
 TINY = 1e-300
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
+# Skew part of a symmetric matrix.
 NONE = np.zeros(0)
 
 

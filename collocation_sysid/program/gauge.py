@@ -27,8 +27,9 @@ from .charts import Chart
 from .reading import GROUP, Channel, Reading, Window, lagrange_weights, times_around
 from .wrench_channel import GraspWrench, Grid
 
-# Times around a sample; of equilibria, which have no velocities, the two beside it.
+# Grid times around a sample, for positions, velocities and accelerations.
 NEIGHBOURS = 5
+# The same for equilibria, which have no velocities.
 STATIC_NEIGHBOURS = 2
 
 
@@ -219,8 +220,17 @@ def gauge_readings(
             origin = np.zeros(3)
             channel = GraspWrench.of(experiment, grasp, gauge.frame, origin, grid, nuisance)
             at_s = channel.t_s
-        how = channel, at_s, nuisance, huber, experiment.static
-        models.append(GaugeReading.of(gauge, number, *how))
+        models.append(
+            GaugeReading.of(
+                gauge,
+                number,
+                channel=channel,
+                at_s=at_s,
+                nuisance=nuisance,
+                huber=huber,
+                static=experiment.static,
+            )
+        )
     return tuple(models)
 
 

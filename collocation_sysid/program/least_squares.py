@@ -21,11 +21,11 @@ from ..arrays import Array, Index
 # Triangles are so small that NumPy's checks would take longer than the work.
 _names = ("geqrf", "trtrs", "trtri", "trcon")
 _geqrf, _trtrs, _trtri, _trcon = get_lapack_funcs(_names, dtype=np.float64)
-# Eigenvalue of the information SᵀS, in units of its diagonal, that is zero up to rounding; and the
-# share of a parameter in such a direction that does not matter.
+# Eigenvalue of the information SᵀS, in units of its diagonal, that is zero up to rounding.
 SINGULAR = 1e-12
+# Share of a parameter in a direction without information that does not matter.
 NEGLIGIBLE = 1e-3
-# Triangles of a smaller reciprocal condition are not solved by substitution.
+# Triangles with a smaller reciprocal condition are not solved by substitution.
 ROUNDING = 1e-12
 
 
@@ -141,7 +141,7 @@ class LeastSquares:
 
     @cached_property
     def _split(self) -> tuple[Array, NDArray[np.bool_]]:
-        """`root` and `undetermined`."""
+        """Matrix of `root` and mask of `undetermined`, computed together."""
         units = np.linalg.norm(self.slope, axis=0)
         units[units == 0] = 1.0
         square = (self.slope / units)[: len(units)]
@@ -169,10 +169,10 @@ class LeastSquares:
         """
         root = self.root
         is_undetermined = self.undetermined
-        found = root @ root.T if of_score is None else root @ of_score @ root.T
-        found[is_undetermined] = found[:, is_undetermined] = np.nan
-        found[is_undetermined, is_undetermined] = np.inf
-        return found
+        matrix = root @ root.T if of_score is None else root @ of_score @ root.T
+        matrix[is_undetermined] = matrix[:, is_undetermined] = np.nan
+        matrix[is_undetermined, is_undetermined] = np.inf
+        return matrix
 
     @cached_property
     def errors(self) -> Array:

@@ -28,13 +28,14 @@ from ..recording.experiment import Experiment
 
 # λ_1/λ_3 at which the surface of a half-space is unstable: the root of ξ³ + ξ² + 3 ξ − 1.
 BIOT_RATIO = 0.29559774
-# Of the critical stretch: a mesh is stiffer or softer than a half-space by so much.
+# Stretch over the critical one below which a surface instability is reported: a mesh is stiffer or
+# softer than a half-space by this factor.
 NEAR = 1.15
-# Of the lowest eigenvalue of the undeformed body: below it a failure is a loss of stability.
+# Lowest eigenvalue over that of the undeformed body below which a failure is a loss of stability.
 LOST = 0.5
-# Of the largest displacement of a mode: faces that move by more belong to it.
+# Displacement over the largest one from which on a face belongs to the mode.
 MOVING = 0.5
-# Shift of the eigenvalues away from zero, of the lowest of the undeformed body.
+# Shift of the eigenvalues away from zero, over the lowest of the undeformed body.
 SHIFT = 0.01
 
 
@@ -88,12 +89,13 @@ class LostStability:
             return (
                 f"the body loses its stability: {where}. Rubber wrinkles at a surface stretch of "
                 f"{self.critical_stretch:.3g} there (Biot): a physical instability of the surface, "
-                "which a finer mesh does not remove. End the recording before, or take a material "
-                "that stiffens"
+                "which a finer mesh does not remove. End the recording before that, or use a "
+                "material that stiffens"
             )
         return (
             f"the body loses its stability: {where}. It buckles; surfaces wrinkle only at "
-            f"{self.critical_stretch:.3g} (Biot). End the recording before, or hold what gives way"
+            f"{self.critical_stretch:.3g} (Biot). End the recording before that, "
+            "or support the body there"
         )
 
 
@@ -104,14 +106,14 @@ def explained(experiment: Experiment, theta: Array, error: SimulationError) -> S
     if error.state_m is None:
         return error
     try:
-        lost = lost_stability(experiment, theta, error.state_m, error.time_s)
+        instability = lost_stability(experiment, theta, error.state_m, error.time_s)
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
         return error
-    if lost is None:
+    if instability is None:
         return error
-    found = SimulationError(lost.sentence, error.time_s, error.element)
-    found.lost_stability = lost
-    return found
+    explained_error = SimulationError(instability.sentence, error.time_s, error.element)
+    explained_error.lost_stability = instability
+    return explained_error
 
 
 def lost_stability(

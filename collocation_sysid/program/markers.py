@@ -178,13 +178,13 @@ class MarkerReading(Reading):
         φ, and the data.
         """
         place, t_s = ca.vertsplit(data)
-        own = phi, self.own[0] if len(self.own) else np.zeros(0, dtype=np.int64)
+        own = self.own[0] if len(self.own) else np.zeros(0, dtype=np.int64)
         reading = looked[:, 0]
         if len(self.nuisance.of_clock):
-            late = self.nuisance.late_s(*own, t_s) / self.nuisance.interval_s
+            late = self.nuisance.late_s(phi, own, t_s) / self.nuisance.interval_s
             places = [ca.SX(k) for k in range(self._neighbours)]
             reading = looked @ ca.vertcat(*lagrange_weights(place + late, places))
-        return self.nuisance.read(reading, *own, t_s)
+        return self.nuisance.read(reading, phi, own, t_s)
 
     # Of positions -----------------------------------------------------------------------------
 

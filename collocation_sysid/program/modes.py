@@ -22,10 +22,12 @@ from .factorisation import Factor, Factoriser
 
 # ω² below this share of the largest K_ii / M_ii is zero up to rounding.
 RIGID = 1e-12
-# Lanczos iterations need some room beside the modes they find; fewer dofs are solved densely.
+# Largest number of dofs that are solved densely; Lanczos iterations need more vectors than modes.
 DENSE = 150
-# Where a body can move rigidly, K is singular: it is shifted by this share of K_ii / M_ii.
+# Share of the largest K_ii / M_ii by which K is shifted, because it is singular where a body can
+# move rigidly.
 SHIFT = 1e-10
+# Number of rigid motions of a free body.
 RIGID_MOTIONS = 6
 
 
@@ -79,13 +81,13 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     damping = -at.by_velocity[0]
     stiffness = sp.csc_array(pattern.matrix(lower)[:, free_dofs][free_dofs])
     largest = float((stiffness.diagonal() / mass).max(initial=0.0))
-    wanted = count + RIGID_MOTIONS
-    if len(free_dofs) <= max(DENSE, 3 * wanted):
-        squares, vectors = _dense(stiffness, mass, wanted)
+    requested = count + RIGID_MOTIONS
+    if len(free_dofs) <= max(DENSE, 3 * requested):
+        squares, vectors = _dense(stiffness, mass, requested)
     else:
         lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
         factor = Factoriser.of(pattern, free_dofs).factorise(lower)
-        squares, vectors = _lanczos(stiffness, mass, factor, -SHIFT * largest, wanted)
+        squares, vectors = _lanczos(stiffness, mass, factor, -SHIFT * largest, requested)
     oscillating = squares > RIGID * largest
     shapes = np.zeros((int(oscillating.sum()), pattern.size))
     shapes[:, free_dofs] = vectors[:, oscillating].T

@@ -89,12 +89,20 @@ class MotionRows:
                 )
                 for j, a, b in self.dynamics.block_terms(lag)
             ]
-            kept = has_motion.copy() if terms else has_motion & (rows == columns)
+            is_stored = has_motion.copy() if terms else has_motion & (rows == columns)
             if lag == 0:
-                kept |= is_prescribed & (rows == columns)
+                is_stored |= is_prescribed & (rows == columns)
             # Grasp rows hold constants only: they are written after the terms.
-            entries = place[rows[kept]], columns[kept], source[kept]
-            blocks.append(BandBlock(lag, *entries, terms, np.flatnonzero(kept)))
+            blocks.append(
+                BandBlock(
+                    offset=lag,
+                    rows=place[rows[is_stored]],
+                    columns=columns[is_stored],
+                    source=source[is_stored],
+                    terms=terms,
+                    whole=np.flatnonzero(is_stored),
+                )
+            )
         return blocks
 
     def _inertia_rows(self, lag: int) -> Index:
@@ -112,9 +120,11 @@ class MotionRows:
         for lag in range(self.dynamics.reach + 1):
             columns = self._inertia_rows(lag) - lag
             positions.append(self.band.positions(columns, lag, place, self.moving_dofs).ravel())
-        held = np.setdiff1d(self.row_dofs, self.moving_dofs)
+        prescribed = np.setdiff1d(self.row_dofs, self.moving_dofs)
         rows = np.arange(self.dynamics.first_row, self.dynamics.rows)
-        grasps = self.band.positions(rows, 0, np.searchsorted(self.row_dofs, held), held)
+        grasps = self.band.positions(
+            rows, 0, np.searchsorted(self.row_dofs, prescribed), prescribed
+        )
         return np.concatenate(positions), grasps.ravel()
 
     def _inertia(self, dynamics: Dynamics) -> Array:
@@ -164,8 +174,9 @@ class MotionRows:
         of_rates = skew_values(self.pattern, forces.by_velocity_skew)
         if skew.size:
             self._skew.fill(values, skew, of_rates if of_rates.size else skew, threads)
-        skews = skew, of_rates
-        self._passing.correct(values, forces.by_position, forces.by_velocity, *skews)
+        self._passing.correct(
+            values, forces.by_position, forces.by_velocity, skew=skew, of_rates=of_rates
+        )
         values[grasps] = 1.0
 
 
@@ -248,12 +259,14 @@ class ReleasedGrasps:
         scale : float
             Factor of the rows, `length_m` / `force_n`.
         """
-        taken = dynamics.taken
+        is_prescribed = dynamics.taken
         nothing = np.zeros(0, dtype=np.int64)
         place = np.full(pattern.size, -1)
         place[row_dofs] = np.arange(len(row_dofs))
-        times, dofs = np.nonzero(taken)
-        times, dofs = times[times >= dynamics.first_row], dofs[times >= dynamics.first_row]
+        times, dofs = np.nonzero(is_prescribed)
+        has_row = times >= dynamics.first_row
+        times = times[has_row]
+        dofs = dofs[has_row]
         zeros = np.flatnonzero(np.isin(band.indices, row_starts[times] + place[dofs]))
         ones = [
             band.positions(np.array([t]), 0, place[[dof]], np.array([dof])).ravel()
@@ -303,14 +316,22 @@ def _dropped(
             released = dynamics.taken[k] & ~dynamics.taken[k + j]
             if weight == 0 or not released.any():
                 continue
-            kept = np.flatnonzero(released[rows])
+            entries = np.flatnonzero(released[rows])
             for i in range(min(dynamics.reach - j, k) + 1):
                 a = weight * tables.p[k, i]
                 b = weight * tables.q[k, i] / step_s
                 if a or b:
                     positions = band.positions(
-                        np.array([k - i]), i + j, place[rows[kept]], columns[kept]
+                        np.array([k - i]), i + j, place[rows[entries]], columns[entries]
                     )
-                    here = positions.ravel(), k - dynamics.first_row
-                    dropped.append(_Dropped(*here, source[kept], kept, a, b))
+                    dropped.append(
+                        _Dropped(
+                            positions.ravel(),
+                            evaluation=k - dynamics.first_row,
+                            source=source[entries],
+                            whole=entries,
+                            a=a,
+                            b=b,
+                        )
+                    )
     return dropped

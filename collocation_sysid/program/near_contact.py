@@ -18,8 +18,9 @@ from ..fem.pattern import SymmetricPattern, dofs_of
 from ..fem.touching import VECTORS
 from ..model.contact import Contact, ContactLaw
 
-# Points so many edges away may come to touch, until a coordinate has changed by a third of that.
+# Distance within which points are candidates, in edges of the surface.
 MARGIN = 0.25
+# Share of this distance by which a coordinate may change before candidates are searched again.
 CHANGE = 1 / 3
 
 
@@ -174,7 +175,8 @@ class NearContact:
         """
         force = np.zeros(xi.size)
         rubs = any(each.contact.by_velocity for each in self._contacts)
-        parts = np.zeros(self._pattern.entries), np.zeros(self._pattern.entries * rubs)
+        symmetric = np.zeros(self._pattern.entries)
+        skew = np.zeros(self._pattern.entries * rubs)
         for near, u, data in self._at(xi[0], nu[0]):
             push, slopes = near.law.push.slopes(u, data)
             force += near.summed(push, xi.size)
@@ -187,11 +189,11 @@ class NearContact:
             blocks = np.einsum("pa,ijp,pb->paibj", weights, by_way, weights)
             blocks = blocks.reshape(near.entries[touch].shape)
             counted = (near.symmetric, near.skew)[: 1 + near.law.by_velocity]
-            for part, counts in zip(parts, counted, strict=False):
+            for part, counts in zip((symmetric, skew), counted, strict=False):
                 part += np.bincount(
                     here, weights=(counts[touch] * blocks).ravel(), minlength=len(part)
                 )
-        return force, *parts
+        return force, symmetric, skew
 
     def _at(self, xi: Array, nu: Array) -> Iterator[tuple[NearPoints, Array, Array]]:
         """Iterate over the candidates of each contact, with inputs and data of its law; the

@@ -230,7 +230,7 @@ class _Stepper:
         forces, touching = ahead(self._forces(load_s, step_s=h), state.left, h).without_contact()
         contact = NearContact(touching, self.theta, forces.pattern)
         mass = forces.mass.kg[0]
-        x_held, v_held, a_held = self._held_motion(solver, end_s, h, load_s)
+        x_prescribed, v_prescribed, a_prescribed = self._held_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
         known_v = -slope * state.x - state.v
         known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
@@ -239,8 +239,8 @@ class _Stepper:
             v = slope * x + known_v
             a = slope**2 * x + known_a
             # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-            v[solver.held] = v_held
-            a[solver.held] = a_held
+            v[solver.held] = v_prescribed
+            a[solver.held] = a_prescribed
             return v, a
 
         def middle(x: Array) -> tuple[Array, Array]:
@@ -270,10 +270,10 @@ class _Stepper:
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         if state.contact_n is not None:
             guess += 0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
-        guess[solver.held] = x_held
+        guess[solver.held] = x_prescribed
         if not solver.is_upright(guess):
             guess = state.x.copy()
-            guess[solver.held] = x_held
+            guess[solver.held] = x_prescribed
         x = solver.newton(guess, residual, linearise)
         v, a = kinematics(x)
         contact_n = None

@@ -22,12 +22,13 @@ Residual = Callable[[Array], Array]
 Linearise = Callable[[Array], tuple[Array, Array, Array]]
 T = TypeVar("T")
 
-# With the factor of the iterate before, a last step must be this much shorter.
+# With the factor of the previous iterate, a last step must be shorter by this factor.
 STALE = 0.01
-# Steps with the factor of the solution before are taken while each is this much shorter than the
-# last, so often at most, and until what is left is this share of a last step.
+# Chord steps are continued while each is shorter than the last by this factor.
 FAST = 0.1
+# Largest number of chord steps with one factor.
 OFTEN = 8
+# Chord steps end when the expected remaining error is this share of the tolerance.
 LEFT = 1e-5
 
 
@@ -372,7 +373,9 @@ def followed(
             if increment < 0.5**halvings:
                 raise
         else:
-            x, rate, reached = solution, (solution - x) / step, reached + step
+            rate = (solution - x) / step
+            x = solution
+            reached = reached + step
             # One step as long as that which failed would fail again.
             increment = 2 * step if easy else step
             easy = True

@@ -30,14 +30,15 @@ from ..recording.depth import DepthCamera
 from .skin import Skin
 from .view import View
 
-# The edge is looked for so many pixels to either side of the outline, in such steps: farther away
-# it may be the edge of another part of the body.
+# Distance to either side of the outline within which the edge is searched [pixels]; farther away it
+# may belong to another part of the body.
 SEARCH_PX = 6.0
+# Step of this search [pixels].
 STEP_PX = 0.25
-# Pixels so far outside of an outline are not covered by the body itself.
+# Distance outside an outline at which the body itself must not cover the image [pixels].
 OUTSIDE_PX = 1.5
-# Where as many pixels show something far behind the body as have no depth, times this share, the
-# sensor sees its background, and missing depths are failures.
+# If at least this many pixels show background per pixel without depth, the sensor measures its
+# background, and missing depths are failures.
 SEEN_BACKGROUND = 0.1
 # What pixels show, compared with a point of the outline.
 BODY = 0
@@ -193,17 +194,17 @@ def _outline_points(
     first, second = beside.T
     front_triangle = np.where(is_front[:, 0], first, second)
     parts = len(skin.flat) // len(skin.faces)
-    outer = np.flatnonzero(
+    outline_edges = np.flatnonzero(
         (is_front[:, 0] != is_front[:, 1]) & skin.chosen[front_triangle // parts]
     )
-    if not len(outer):
+    if not len(outline_edges):
         return None
-    ends = ends[outer]
-    front_triangle = front_triangle[outer]
+    ends = ends[outline_edges]
+    front_triangle = front_triangle[outline_edges]
     corners = skin.flat[front_triangle]
     lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
     counts = np.maximum(1, np.ceil(lengths_m / view.depth.spacing_m).astype(int))
-    edge = np.repeat(np.arange(len(outer)), counts)
+    edge = np.repeat(np.arange(len(outline_edges)), counts)
     number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (number + 0.5) / counts[edge]
     # Barycentric coordinates in the triangle that faces the camera.
@@ -213,9 +214,12 @@ def _outline_points(
     faces, places = skin.at(front_triangle[edge], shares)
     weights, points_m, _ = skin.points(shape_m, faces, places)
     pixels = camera.distorted_pixels(own_m)
-    along = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
-    length_px = np.linalg.norm(along, axis=1)
-    normals = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(length_px, 1e-9)[:, None]
+    tangents_px = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
+    length_px = np.linalg.norm(tangents_px, axis=1)
+    normals = (
+        np.column_stack([-tangents_px[:, 1], tangents_px[:, 0]])
+        / np.maximum(length_px, 1e-9)[:, None]
+    )
     centres = pixels[corners[edge]].mean(axis=1)
     at_m = view.own_m(phi, points_m, sample)
     places_px = camera.distorted_pixels(at_m)
@@ -248,9 +252,9 @@ def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
         return covered
     middles = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - middles[:, None], axis=2).max()
-    near = KDTree(middles).query_ball_point(points, reach)
-    point = np.repeat(np.arange(len(points)), [len(each) for each in near])
-    a, b, c = triangles[np.concatenate([*near, []]).astype(int)].transpose(1, 0, 2)
+    candidates = KDTree(middles).query_ball_point(points, reach)
+    point = np.repeat(np.arange(len(points)), [len(each) for each in candidates])
+    a, b, c = triangles[np.concatenate([*candidates, []]).astype(int)].transpose(1, 0, 2)
 
     def side(start: Array, end: Array) -> Array:
         way = end - start
@@ -358,9 +362,9 @@ def _planes(
 
     Depths (P,) [m] tell how wide a pixel is, and where the point of each plane is chosen.
     """
-    along = np.column_stack([-outwards[:, 1], outwards[:, 0]])
+    tangents_px = np.column_stack([-outwards[:, 1], outwards[:, 0]])
     at, before, after, outside = _rays(
-        camera, [edges, edges - along, edges + along, edges + outwards]
+        camera, [edges, edges - tangents_px, edges + tangents_px, edges + outwards]
     )
     normals = np.cross(before, after)
     normals /= np.linalg.norm(normals, axis=1)[:, None]

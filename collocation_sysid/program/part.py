@@ -113,8 +113,8 @@ class Part:
         distances = []
         for reading, looked in self.surface_sights[len(self.segment.depths) :]:
             assert isinstance(reading, OutlineReading)
-            apart_px = reading.apart_px(looked, self.phi)
-            distances.append((reading, apart_px[np.isfinite(apart_px)]))
+            distances_px = reading.apart_px(looked, self.phi)
+            distances.append((reading, distances_px[np.isfinite(distances_px)]))
         return distances
 
     @property

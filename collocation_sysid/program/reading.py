@@ -375,9 +375,14 @@ class Reading(ABC):
     def instrument(self, vectors: int, data: int) -> Instrument:
         """Return the generated functions for stencils of `vectors` vectors and `data` data."""
         if (vectors, data) not in self._instruments:
-            sizes = vectors, self.own.shape[1], data, self.measured.shape[2]
             self._instruments[vectors, data] = Instrument(
-                self.expression, *sizes, self.huber, self.group
+                self.expression,
+                vectors=vectors,
+                own=self.own.shape[1],
+                data=data,
+                measured=self.measured.shape[2],
+                huber=self.huber,
+                group=self.group,
             )
         return self._instruments[vectors, data]
 
@@ -448,8 +453,8 @@ class Reading(ABC):
             Number of all parameters.
         """
         if not len(values):
-            samples = len(self.window(phi, 0).places), len(self.names), self.group
-            return np.zeros(samples), np.zeros((*samples, size))
+            none = np.zeros((len(self.window(phi, 0).places), len(self.names), self.group))
+            return none, np.zeros((*none.shape, size))
         window, residual, by_u = self._read(values, phi)
         samples, each, vectors = window.places.shape
         by_looked = by_u[..., : GROUP * vectors]
@@ -466,8 +471,8 @@ class Reading(ABC):
             _add(derivatives, entities, first + slopes.places, by_looked[:, entities] @ around)
         if self.own.size:
             _add(derivatives, np.arange(each), first + self.own, by_own)
-        shape = samples, len(self.names), self.group
-        return residual.reshape(shape), derivatives.reshape(*shape, size)
+        grouped = residual.reshape(samples, len(self.names), self.group)
+        return grouped, derivatives.reshape(*grouped.shape, size)
 
     def _read(self, values: Array, phi: Array) -> tuple[Window, Array, Array]:
         """Return the stencil, residuals (s, E, m) and their derivatives (s, E, m, u) by the

@@ -185,9 +185,15 @@ class Segment:
     @cached_property
     def depths(self) -> tuple[DepthReading, ...]:
         """Measurement models of the depth cameras, in their order."""
-        how = self.dynamics.t_s, self.nuisance, self.huber
-        seen = zip(self.chart.sightings, self.views, strict=True)
-        return tuple(DepthReading.of(replace(each, view=view), *how) for each, view in seen)
+        return tuple(
+            DepthReading.of(
+                replace(sighting, view=view),
+                self.dynamics.t_s,
+                nuisance=self.nuisance,
+                huber=self.huber,
+            )
+            for sighting, view in zip(self.chart.sightings, self.views, strict=True)
+        )
 
     @cached_property
     def outlines(self) -> tuple[OutlineReading, ...]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -68,7 +69,7 @@ class Sensing:
         along : sequence of histories
             History variables at x; by default they are computed from x if there are any.
         """
-        return Motion(x, lambda: self._forced(x, along))
+        return Motion(x, partial(self._forced, x, along))
 
     def _forced(self, x: Array, along: Sequence[AnyHistory] = ()) -> Forced:
         """Return the reaction forces on the sensed dofs at positions x (rows, 3n)."""
@@ -146,9 +147,7 @@ class Sensing:
             return self._along(x, response.held, moved, step, by_p)
 
         at = x if step is None else x + step
-        return [
-            Motion(at, lambda moved=looked: forced(moved), looked) for looked in response.looked
-        ]
+        return [Motion(at, partial(forced, changes), changes) for changes in response.looked]
 
     def _along(
         self, x: Array, held: HeldForces, moved: Array, step: Array | None, by_p: bool
@@ -219,8 +218,12 @@ class Sensing:
         nothing = np.zeros((*forced.reaction.shape, 0))
         linearised = []
         forced = replace(forced, reaction_by=nothing, position_by=nothing)
+
+        def reactions() -> Forced:
+            return forced
+
         for reading in self.segment.readings:
-            motion = Motion(x, lambda: forced)
+            motion = Motion(x, reactions)
             count = len(self.phi)
             values_and_slopes = reading.channel.linearised(motion, self.phi, none, count)
             linearised.append(reading.linearised(*values_and_slopes, self.phi, count))

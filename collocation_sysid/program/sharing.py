@@ -100,13 +100,15 @@ def _require_alike(one: tuple[Experiment, Entry], other: tuple[Experiment, Entry
     row = second.row
     label = second.label
     if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
-        found = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
-        raise _refusal(experiment, row, found, f"the one here, {second.sigma:g}")
+        difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
+        raise _refusal(experiment, row, difference, f"the one here, {second.sigma:g}")
     if row == PLACE:
         given = [_given(*one), _given(*other)]
         if not np.allclose(*given, rtol=0, atol=1e-9, equal_nan=True):
-            found = f"'{leader.name}', which gives another {label.partition(',')[0]}"
-            raise _refusal(experiment, row, found, "the same place given in both, or in neither")
+            difference = f"'{leader.name}', which gives another {label.partition(',')[0]}"
+            raise _refusal(
+                experiment, row, difference, "the same place given in both, or in neither"
+            )
 
 
 def _given(experiment: Experiment, entry: Entry) -> Array:

@@ -25,20 +25,22 @@ from .outline import Outline
 from .skin import GRAZING, Skin
 from .view import View
 
-# Off an edge the way to the nearest point leaves the normal by more than this share of itself.
+# Share of the distance perpendicular to the normal beyond which a point lies beyond an edge.
 BESIDE = 0.5
-# Share of the body's size that points may be off by before anything is fitted; later so many
-# times the median, where that narrows the gate by a share.
+# Gate before anything is fitted, relative to the diagonal of the body.
 WIDE = 0.25
+# Later gate, relative to the median distance of the points.
 SPREAD = 6.0
+# The gate is narrowed only if it decreases by this factor.
 NARROWER = 0.8
-# What moved by less than this share of sigma is where it was.
+# Shapes that change by less than this share of σ keep their correspondences.
 SAME = 0.2
-# An alignment farther than this many deviations of its prior is of something else.
+# Largest alignment in standard deviations of its prior; more belongs to something else.
 FARTHEST = 4.0
+# Reasons for leaving points out, in the order in which they are tested.
 LEFT_OUT = ("far", "grazing", "turned away", "not chosen", "hidden")
-# What is in front by less than this share of the spacing of points is beside it, and a shape that
-# moves by less has settled.
+# Share of the spacing of points by which a part must be in front to hide another; shapes that
+# change by less have converged.
 FRONT = 0.5
 
 
@@ -132,8 +134,10 @@ class Sighting:
             Whether to leave out points that the body hides.
         """
         skin = Skin.of(body, view.depth)
-        how = phi, gate_m, settled
-        images = [_seen(view, skin, body, k, x, *how) for k, x in enumerate(shapes_m)]
+        images = [
+            _seen(view, skin, body, k, x, phi=phi, gate_m=gate_m, settled=settled)
+            for k, x in enumerate(shapes_m)
+        ]
         most = max(1, *(len(each["used"]) for each in images))
         arrays: dict[str, Any] = {
             name: np.stack(
@@ -235,8 +239,8 @@ class Sighting:
         """Return six times the median distance of the compared points from the surface [m];
         infinite without any.
         """
-        apart_m = self.apart_m(shapes_m, phi)
-        all_of_them = np.abs(apart_m[np.isfinite(apart_m)])
+        distances_m = self.apart_m(shapes_m, phi)
+        all_of_them = np.abs(distances_m[np.isfinite(distances_m)])
         return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
 
     def apart_m(self, shapes_m: Array, phi: Array) -> Array:
@@ -244,13 +248,13 @@ class Sighting:
 
         NaN where a point is not compared.
         """
-        apart_m = np.full(self.used.shape, np.nan)
+        distances_m = np.full(self.used.shape, np.nan)
         for k, x in enumerate(shapes_m):
             surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
             measured = self.view.corrected_at(phi, self.points[k], self.rays[k], k)
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
-            apart_m[k] = np.where(self.used[k], behind_m, np.nan)
-        return apart_m
+            distances_m[k] = np.where(self.used[k], behind_m, np.nan)
+        return distances_m
 
 
 def _seen(
@@ -275,19 +279,19 @@ def _seen(
     cloud = view.depth.clouds[sample]
     world = view.world(phi, sample)
     eye_m = view.eye_m(phi, sample)
-    near, faces, places = _near(world, skin, x, eye_m, gate_m)
+    indices, faces, places = _near(world, skin, x, eye_m, gate_m)
     weights, feet, normals = skin.points(x, faces, places)
     ways = normals if eye_m is None else eye_m - feet
     is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
-    away = world[near] - feet
-    distance = np.linalg.norm(away, axis=1)
-    lateral = np.linalg.norm(away - np.sum(away * normals, axis=1)[:, None] * normals, axis=1)
+    offsets = world[indices] - feet
+    distance = np.linalg.norm(offsets, axis=1)
+    lateral = np.linalg.norm(offsets - np.sum(offsets * normals, axis=1)[:, None] * normals, axis=1)
     # A point beyond an edge of what the camera sees pulls that along the way to it.
     is_beyond_edge = lateral > BESIDE * distance + depth.sigma_m
-    normals[is_beyond_edge] = away[is_beyond_edge] / distance[is_beyond_edge, None]
-    has_similar_normal = is_visible = is_any = np.ones(len(near), dtype=bool)
+    normals[is_beyond_edge] = offsets[is_beyond_edge] / distance[is_beyond_edge, None]
+    has_similar_normal = is_visible = is_any = np.ones(len(indices), dtype=bool)
     if cloud.shape[1] == 6:
-        measured = cloud[near, 3:] @ view.motion[0][sample].T
+        measured = cloud[indices, 3:] @ view.motion[0][sample].T
         has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
         is_visible = ~skin.hidden(x, eye_m, feet, FRONT * depth.spacing_m)
@@ -297,14 +301,14 @@ def _seen(
         axis=0,
     )
     reasons = -np.diff(remaining.sum(axis=1))
-    reasons[0] += len(cloud) - len(near)
+    reasons[0] += len(cloud) - len(indices)
     rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[skin.nodes][skin.faces[faces]])
     of_points = {
         "nodes": skin.faces[faces],
         "weights": weights,
         "normals": normals,
-        "points": cloud[near, :3],
-        "rays": view.rays[sample][near],
+        "points": cloud[indices, :3],
+        "rays": view.rays[sample][indices],
         "places_m": rest_m,
         "used": remaining[-1].astype(bool),
     }
@@ -333,10 +337,10 @@ def _near(
     low = x.min(axis=0) - gate_m
     high = x.max(axis=0) + gate_m
     near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
-    turned = np.flatnonzero(skin.facing(x, eye_m))
-    if not len(turned) or not len(near):
+    facing = np.flatnonzero(skin.facing(x, eye_m))
+    if not len(facing) or not len(near):
         return near[:0], near[:0], np.zeros((0, 3))
-    return near, *skin.nearest(x, world[near], turned)
+    return near, *skin.nearest(x, world[near], facing)
 
 
 def sightings_of(experiment: Experiment) -> tuple[Sighting, ...]:

@@ -285,7 +285,11 @@ def _gauged(
     parameters.
     """
     readings = gauge_readings(experiment, experiment.t_s, reactions[0], ideal)
-    motion = Motion(positions_m.reshape(len(positions_m), -1), lambda: reactions[1])
+
+    def known_reactions() -> Forced:
+        return reactions[1]
+
+    motion = Motion(positions_m.reshape(len(positions_m), -1), known_reactions)
     return tuple(
         reading.said(reading.of_motion(motion, np.zeros(ideal.size))) for reading in readings
     )
@@ -295,10 +299,10 @@ def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experime
     """Return the experiment with other samples (S, 6) of the force–torque sensors, in the
     order of the grasps that have one.
     """
-    found = iter(wrenches)
+    samples = iter(wrenches)
     grasps = []
     for grasp in experiment.grasps:
-        sensor = grasp.wrench and replace(grasp.wrench, values=next(found))
+        sensor = grasp.wrench and replace(grasp.wrench, values=next(samples))
         grasps.append(replace(grasp, wrench=sensor))
     return replace(experiment, grasps=grasps)
 

@@ -16,12 +16,13 @@ from ..recording.depth import Depth
 from ..recording.experiment import Experiment
 from ..recording.placement import nearest_on
 
-# Triangles, by their middles, of which the nearest point is taken.
+# Number of triangles, nearest by their middles, among which the nearest point is searched.
 NEARBY = 10
-# Steps to it on a curved face, and shorter ones that end them.
+# Newton steps to the nearest point on a curved face.
 SETTLING = 3
+# Changes of barycentric coordinates that end these steps.
 STILL = 1e-6
-# Below this cosine between normal and view a point is seen at a grazing angle; measured normals
+# Cosine between normal and view below which a point is seen at a grazing angle; measured normals
 # may be off by as much.
 GRAZING = 0.3
 
@@ -118,8 +119,8 @@ class Skin:
         ((P, v) array, (P, 3) array, (P, 3) array)
             Shape functions of the nodes, points [m], and outward unit normals.
         """
-        weights, points, along = self._along(x, faces, places)
-        normals = np.cross(along[:, 0], along[:, 1])
+        weights, points, tangents = self._along(x, faces, places)
+        normals = np.cross(tangents[:, 0], tangents[:, 1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
         return weights, points, normals
 
@@ -129,8 +130,8 @@ class Skin:
         """
         weights, slopes = on_faces(places, self.faces.shape[1])
         corners = x[self.faces[faces]]
-        along = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
-        return weights, np.einsum("pa,pai->pi", weights, corners), along
+        tangents = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
+        return weights, np.einsum("pa,pai->pi", weights, corners), tangents
 
     def triangles(self, x: Array, parts: int = 4) -> Array:
         """Return corners (F·parts², 3, 3) of triangles on a deformed surface, each side of
@@ -235,22 +236,22 @@ class Skin:
         middles = corners.mean(axis=1)
         sizes = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
         neighbours = KDTree(middles).query(points, min(NEARBY, len(corners)))
-        away, near = (np.reshape(each, (len(points), -1)) for each in neighbours)
+        away, nearest_triangles = (np.reshape(each, (len(points), -1)) for each in neighbours)
         # Triangles whose middles are farther than this by their own size cannot be nearer.
-        triangles = near[:, 0].copy()
+        triangles = nearest_triangles[:, 0].copy()
         least = np.full(len(points), np.inf)
         feet = np.zeros_like(points)
-        for rank, own in enumerate(near.T):
+        for rank, own in enumerate(nearest_triangles.T):
             here = np.flatnonzero(away[:, rank] - sizes[own] < least)
             on = nearest_on(points[here], corners[own[here]])
-            apart = np.linalg.norm(on - points[here], axis=1)
-            nearer = apart < least[here]
-            here = here[nearer]
-            on = on[nearer]
-            apart = apart[nearer]
+            distances = np.linalg.norm(on - points[here], axis=1)
+            is_nearer = distances < least[here]
+            here = here[is_nearer]
+            on = on[is_nearer]
+            distances = distances[is_nearer]
             triangles[here] = own[here]
             feet[here] = on
-            least[here] = apart
+            least[here] = distances
         a, b, c = corners[triangles].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         squares = np.sum(normal**2, axis=1)
@@ -260,8 +261,8 @@ class Skin:
         moving = np.arange(len(points) if self.faces.shape[1] > 3 else 0)
         for _ in range(SETTLING):
             # Faces are curved: what is nearest on the flat triangle is beside what is on them.
-            _, feet, along = self._along(x, faces[moving], places[moving])
-            by_a, by_b = along.transpose(1, 0, 2)
+            _, feet, tangents = self._along(x, faces[moving], places[moving])
+            by_a, by_b = tangents.transpose(1, 0, 2)
             aa, ab, bb = (
                 np.sum(u * v, axis=1) for u, v in ((by_a, by_a), (by_a, by_b), (by_b, by_b))
             )
@@ -270,9 +271,9 @@ class Skin:
             step /= (aa * bb - ab**2)[:, None]
             settled = np.clip(places[moving] + np.column_stack([step, -step.sum(axis=1)]), 0.0, 1.0)
             settled /= settled.sum(axis=1, keepdims=True)
-            far = np.abs(settled - places[moving]).max(axis=1) > STILL
+            has_moved = np.abs(settled - places[moving]).max(axis=1) > STILL
             places[moving] = settled
-            moving = moving[far]
+            moving = moving[has_moved]
         return faces, places
 
 

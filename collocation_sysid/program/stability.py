@@ -20,14 +20,16 @@ from ..model.forces import Forces
 from .collocation import Collocation, Part
 from .factorisation import Factoriser
 
-# States of a motion that are looked at.
+# Number of states of a motion that are examined.
 STATES = 8
-# Fewer dofs are solved densely; of more, so many of the most negative directions are tried.
+# Largest number of dofs that are solved densely.
 DENSE = 150
+# Number of most negative directions that are tried otherwise.
 DIRECTIONS = 8
-# Singular matrices, of rigid motions, are not indefinite: a share of their largest entry per mass.
+# Share of the largest diagonal entry per mass by which matrices are shifted, because those with
+# rigid motions are singular, not indefinite.
 SHIFT = 1e-9
-# Lanczos' iterations need no more to tell a sign.
+# Accuracy of Lanczos iterations, enough to determine a sign.
 TOLERANCE = 1e-3
 
 
@@ -56,8 +58,8 @@ class Instability:
 
 def instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
     """Return the instabilities of the motions at z, at most one for each experiment."""
-    found = (_instability(part) for part in collocation.parts(z))
-    return tuple(each for each in found if each is not None)
+    unstable = (_instability(part) for part in collocation.parts(z))
+    return tuple(each for each in unstable if each is not None)
 
 
 def _instability(part: Part) -> Instability | None:
@@ -69,12 +71,12 @@ def _instability(part: Part) -> Instability | None:
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
     t_s = experiment.t_s[samples]
     rows = part.segment.markers.grid_rows[samples]
-    held = experiment.held(t_s).reshape(len(t_s), -1)
+    is_prescribed = experiment.held(t_s).reshape(len(t_s), -1)
     theta = part.setting.theta
     growths = np.array(
         [
             growth_rate_1_s(Forces.of(experiment, time, theta), x, np.flatnonzero(~there))
-            for time, x, there in zip(t_s, part.x[rows], held, strict=True)
+            for time, x, there in zip(t_s, part.x[rows], is_prescribed, strict=True)
         ]
     )
     worst = int(np.argmax(growths))
@@ -111,8 +113,8 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
         for lower in lowers
     )
     noise = SHIFT * np.sqrt(stiffness.diagonal().max())
-    found = _fastest(stiffness, damping)
-    return found if found > noise else 0.0
+    growth = _fastest(stiffness, damping)
+    return growth if growth > noise else 0.0
 
 
 def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
@@ -188,8 +190,10 @@ def _near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float
     """
     turning = _Turned(stiffness, damping, sigma)
     try:
-        found = eigs(turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60)
-        turned = np.asarray(found[0])
+        eigenpairs = eigs(
+            turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60
+        )
+        turned = np.asarray(eigenpairs[0])
     except ArpackNoConvergence as stopped:
         turned = np.asarray(stopped.eigenvalues)
     exponents = sigma * (turned + 1) / (turned - 1)

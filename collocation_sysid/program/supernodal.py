@@ -43,13 +43,13 @@ MISSING = (
 @cache
 def library() -> Any:
     """Return the MKL library, or None where it is not installed; the result is cached."""
-    found = []
+    paths = []
     try:
         files = metadata.files("mkl") or []
-        found = [str(each.locate()) for each in files if "mkl_rt" in each.name]
+        paths = [str(each.locate()) for each in files if "mkl_rt" in each.name]
     except metadata.PackageNotFoundError:
-        found = [name for name in [find_library("mkl_rt")] if name]
-    for path in sorted(found):
+        paths = [name for name in [find_library("mkl_rt")] if name]
+    for path in sorted(paths):
         try:
             mkl = ctypes.CDLL(path)
         except OSError:
@@ -128,11 +128,24 @@ class Pardiso:
         one, which, kind, stage, size = (ctypes.byref(ctypes.c_int(k)) for k in numbers)
         error = ctypes.c_int(0)
         silent = ctypes.byref(ctypes.c_int(0))
-        matrix = _at(self._values), _at(self._starts), _at(self._columns), None
         columns = ctypes.byref(ctypes.c_int(count))
         library().pardiso(
-            *(_at(self._handle), one, which, kind, stage, size, *matrix),
-            *(columns, _at(self._options), silent, _at(right), _at(result), ctypes.byref(error)),
+            _at(self._handle),
+            one,
+            which,
+            kind,
+            stage,
+            size,
+            _at(self._values),
+            _at(self._starts),
+            _at(self._columns),
+            None,
+            columns,
+            _at(self._options),
+            silent,
+            _at(right),
+            _at(result),
+            ctypes.byref(error),
         )
         if error.value == NO_MEMORY:
             raise MemoryError("no memory for the factors of a timestep")

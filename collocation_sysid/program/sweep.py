@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -46,10 +47,10 @@ from .stopwatch import Stopwatch
 if TYPE_CHECKING:
     from ..fem.kernels.skyline import Room
 
-# Element results and factors of this size at most are kept at a time.
+# Largest size of the element results and factors that are stored at a time [bytes].
 CHUNK_BYTES = 128e6
-# So many narrow factors at most, each chunk's in the memory of the one before: fetching it anew
-# costs as much as half a factorisation.
+# Largest number of narrow factors that are stored at a time. They reuse memory: allocating it again
+# costs half as much as a factorisation.
 ROOMS = 16
 
 
@@ -360,10 +361,10 @@ class Sweep:
         SimulationError
             If the equations of a time step are singular or not finite.
         """
-        carried = Columns.by_parameters(self, setting, x)
-        columns = np.zeros((*x.shape, carried.count))
-        grasp_forces = HeldForces.nothing(len(x), len(self.sensed), carried.count)
-        march = Forward(self, carried, known.last if known else None, grasp_forces)
+        sweep_columns = Columns.by_parameters(self, setting, x)
+        columns = np.zeros((*x.shape, sweep_columns.count))
+        grasp_forces = HeldForces.nothing(len(x), len(self.sensed), sweep_columns.count)
+        march = Forward(self, sweep_columns, known.last if known else None, grasp_forces)
         if known is not None:
             done = len(known.step)
             columns[:done, :, 0] = known.step
@@ -373,8 +374,14 @@ class Sweep:
             grasp_forces.begin(known.held)
         for _ in march.rows(x, 0 if known is None else len(known.step), columns):
             pass
-        found = columns[:, :, 0], columns[:, :, 1:], march.violation_n, march.indefinite
-        return Tangent(*found, march.last, grasp_forces)
+        return Tangent(
+            step=columns[:, :, 0],
+            by_p=columns[:, :, 1:],
+            violation_n=march.violation_n,
+            indefinite=march.indefinite,
+            last=march.last,
+            held=grasp_forces,
+        )
 
     def sensitivities(
         self, x: Array, setting: Setting, held: HeldForces | None = None
@@ -382,8 +389,8 @@ class Sweep:
         """Iterate over the sensitivities Z_t (3n, m) row by row, keeping only the last few rows in
         memory.
 
-        Rows before the first equation of motion are zero. An array may be overwritten by the next
-        iteration.
+        Rows before the first equation of motion are zero. The arrays must not be modified, because
+        later rows depend on them.
 
         Parameters
         ----------
@@ -422,11 +429,11 @@ class Sweep:
         reach = self.dynamics.reach
         free = self.free
         y = np.zeros_like(x)
-        pulled = -gradient[:, free]  # what is left for the rows that are still to come
-        along = self.dynamics_at(setting).histories(x)
+        remaining = -gradient[:, free]  # what is left for the rows that are still to come
+        histories = self.dynamics_at(setting).histories(x)
         later = deque[StencilRow](maxlen=reach)
-        carried = [history.backward() for history in along]
-        for chunk in self.chunks(x, setting, backward=True, along=along):
+        adjoints = [history.backward() for history in histories]
+        for chunk in self.chunks(x, setting, backward=True, along=histories):
             for step in reversed(chunk.steps):
                 t = step.t
                 row = step.row
@@ -434,31 +441,33 @@ class Sweep:
                 q = row.q
                 mass = row.mass_kg[free]
                 by_state = by_rate = 0.0
-                for own in (each.pulled() for each in carried):
+                for own in (each.pulled() for each in adjoints):
                     by_state = by_state + own[0][free]
                     by_rate = by_rate + own[1][free]
                 known = np.zeros(x.shape[1])
                 for j, other in enumerate(later, 1):
                     known += other.w[j] * y[t + j]
                 known[self.dynamics.taken[t]] = 0
-                pulled[t] -= p[0] * by_state + q[0] * by_rate
+                remaining[t] -= p[0] * by_state + q[0] * by_rate
                 if known.any():
                     by_position = self.matrix.of(step.by_position, -step.skew) @ known
-                    pulled[t] -= p[0] * by_position
-                    pulled[t] -= q[0] * (self.matrix.of(step.by_velocity, -step.rate_skew) @ known)
+                    remaining[t] -= p[0] * by_position
+                    remaining[t] -= q[0] * (
+                        self.matrix.of(step.by_velocity, -step.rate_skew) @ known
+                    )
                 # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left; the factor is of its negative.
-                right = self.without_taken(t, pulled[t])
+                right = self.without_taken(t, remaining[t])
                 y[t, free] = -step.factor.solve(right, transposed=True)
                 force_weight = known + row.w[0] * y[t]
                 by_position = self.matrix.of(step.by_position, -step.skew) @ force_weight
                 by_position += by_state
                 by_velocity = self.matrix.of(step.by_velocity, -step.rate_skew) @ force_weight
                 by_velocity += by_rate
-                for each in carried:
+                for each in adjoints:
                     each.retreat(force_weight)
                 for i in range(1, min(reach, t) + 1):
-                    pulled[t - i] -= p[i] * by_position + q[i] * by_velocity
-                    pulled[t - i] += row.s[i] * mass * y[t, free]
+                    remaining[t - i] -= p[i] * by_position + q[i] * by_velocity
+                    remaining[t - i] += row.s[i] * mass * y[t, free]
                 later.appendleft(row)
         return y
 
@@ -534,9 +543,17 @@ class Sweep:
             with self.stopwatch.solving():
                 rows = [StencilRow.of(dynamics, t) for t in range(start, here.stop)]
                 factors = self._factorise(dynamics, at, here, rows, rooms)
-            numbers = range(start, here.stop)
-            parts = numbers, rows, at.force, at.by_position, at.by_velocity, factors
-            steps = map(Step, *parts, at.by_position_skew, at.by_velocity_skew)
+            steps = map(
+                Step,
+                range(start, here.stop),
+                rows,
+                at.force,
+                at.by_position,
+                at.by_velocity,
+                factors,
+                at.by_position_skew,
+                at.by_velocity_skew,
+            )
             yield Chunk(here, at, list(steps))
 
     def _factorise(
@@ -551,16 +568,16 @@ class Sweep:
         time get a diagonal entry alone.
         """
         pattern = self.pattern
-        taken = dynamics.taken[here]
+        is_prescribed = dynamics.taken[here]
 
         def matrix(k: int) -> tuple[Array, Array]:
             values = rows[k].block(at.by_position[k], at.by_velocity[k], pattern)
             skew = rows[k].skew_block(at.by_position_skew[k], at.by_velocity_skew[k])
-            if taken[k].any():
+            if is_prescribed[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
-                removed = taken[k][pattern.rows] | taken[k][pattern.columns]
+                removed = is_prescribed[k][pattern.rows] | is_prescribed[k][pattern.columns]
                 values[removed] = 0
-                values[pattern.diagonal[taken[k]]] = size
+                values[pattern.diagonal[is_prescribed[k]]] = size
                 if skew.size:
                     skew[removed] = 0
             return values, skew
@@ -629,9 +646,12 @@ class Forward:
     @property
     def last(self) -> LastRows:
         """State that later rows depend on."""
-        carried = tuple(each.columns for each in self.carried)
-        past = tuple(self.past), tuple(self.past_increments), tuple(self.past_forces)
-        return LastRows(*past, carried)
+        return LastRows(
+            solutions=tuple(self.past),
+            increments=tuple(self.past_increments),
+            forces=tuple(self.past_forces),
+            carried=tuple(each.columns for each in self.carried),
+        )
 
     def rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
         """Iterate over the solutions Y_t (3n, c).
@@ -650,32 +670,37 @@ class Forward:
         setting = self.columns.setting
         dynamics = solver.dynamics_at(setting)
         first = solver.dynamics.first_row
-        along = dynamics.histories(x)
+        histories = dynamics.histories(x)
         acceleration = dynamics.acceleration(x)
-        known = self._known or [None] * len(along)
-        pairs = zip(along, known, strict=True)
+        known = self._known or [None] * len(histories)
+        pairs = zip(histories, known, strict=True)
         self.carried = [each.forward(columns.of_inputs, done, own) for each, own in pairs]
         for t in range(done, first):  # the start is given
             for each in self.carried:
-                each.advance(lambda: np.zeros(self.shape), lambda: np.zeros(self.shape))
+                each.advance(partial(np.zeros, self.shape), partial(np.zeros, self.shape))
             start = np.zeros(self.shape)
             if columns.grasped is not None:
                 columns.grasped.place(t, start)
             self.past.appendleft(start)
             yield np.zeros(self.shape)
-        for chunk in solver.chunks(x, setting, first=done, along=along):
+        for chunk in solver.chunks(x, setting, first=done, along=histories):
             residual = None
             if columns.step:
                 residual = np.stack([self._residual(s, acceleration[s.t]) for s in chunk.steps])
                 self.violation_n = max(self.violation_n, float(np.abs(residual).max(initial=0.0)))
-            of_rows = acceleration[chunk.here], residual, solver.free
-            sides = columns.sides(chunk.here, chunk.at, *of_rows)
+            sides = columns.sides(
+                chunk.here,
+                chunk.at,
+                acceleration=acceleration[chunk.here],
+                residual=residual,
+                free=solver.free,
+            )
             for step, right, force in zip(chunk.steps, *sides, strict=True):
                 self.indefinite += not step.factor.positive_definite
-                found = np.zeros(self.shape) if out is None else out[step.t]
+                solution = np.zeros(self.shape) if out is None else out[step.t]
                 with solver.stopwatch.solving():
-                    self.advance(step, right, force, found)
-                yield found
+                    self.advance(step, right, force, solution)
+                yield solution
 
     def _residual(self, step: Step, acceleration: Array) -> Array:
         """Return c_t on the free dofs [N]; call it for every row in ascending order,
@@ -731,7 +756,7 @@ class Forward:
             prescribed.place(t, found)
         for each in self.carried:
             each.advance(
-                lambda: self._evaluated(row.p, found), lambda: self._evaluated(row.q, found)
+                partial(self._evaluated, row.p, found), partial(self._evaluated, row.q, found)
             )
         if self.held is not None:
             self._sense(self.held, step, force, found)

@@ -14,9 +14,9 @@ from ..model.force_term import States
 from ..recording.experiment import Experiment
 from .part import Part
 
-# Of the largest normal force.
+# Times with a normal force below this share of the largest are ignored.
 GRAZE = 0.01
-# Samples whose gaps are looked at together.
+# Number of samples whose gaps are evaluated together, to limit memory.
 AT_ONCE = 64
 
 

@@ -96,9 +96,9 @@ class View:
         """For each image, directions (P, 3) in which points move as their depth grows;
         zeros for point clouds.
         """
-        seen = self.depth.points_m
+        clouds = self.depth.points_m
         pinhole = self.depth.camera.matrix is not None
-        return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in seen]
+        return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
 
     def corrected(self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]) -> ca.SX:
         """Return the expression of a point in the camera's stated frame, corrected by the estimated
@@ -172,8 +172,8 @@ class View:
         `corrected_at` without bias.
         """
         basis = np.vstack([np.zeros(3), np.eye(3)])
-        corner, *along = self.corrected_at(phi, basis, np.zeros((4, 3)), sample)
-        return np.linalg.solve((along - corner).T, (points_m - corner).T).T
+        corner, *axes = self.corrected_at(phi, basis, np.zeros((4, 3)), sample)
+        return np.linalg.solve((axes - corner).T, (points_m - corner).T).T
 
     def told(self, phi: Array) -> dict[str, float]:
         """Return the camera's nuisance parameters in physical units by label, from φ (k,)."""

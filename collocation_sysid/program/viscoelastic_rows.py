@@ -119,8 +119,8 @@ class Overstress(Carried):
     def given(self, part: Part, z: Array) -> Part:
         """Return the part with the history variables (N, width) taken from z."""
         later = z[self.variables].reshape(self.shape) * self.unit_pa
-        brought = np.concatenate([np.zeros((1, self.shape[1])), later])
-        return replace(part, brought={**part.brought, self.history: brought})
+        memory = np.concatenate([np.zeros((1, self.shape[1])), later])
+        return replace(part, brought={**part.brought, self.history: memory})
 
     def values(self, part: Part, z: Array) -> Array:
         """Return the scaled equations r (count,) at the history variables of the part."""
@@ -295,8 +295,8 @@ class Overstress(Carried):
         a = history.fading.a.T
 
         def slopes(times: slice) -> Array:
-            found = history.body.stresses.stress_slopes(history.xi[times], history.theta)
-            return found[:, place] * a[times, number] * scale
+            derivatives = history.body.stresses.stress_slopes(history.xi[times], history.theta)
+            return derivatives[:, place] * a[times, number] * scale
 
         return self._spread(self._stress_lags, slopes)
 
@@ -307,14 +307,14 @@ class Overstress(Carried):
         taken = self.segment.dynamics.taken
 
         def slopes(times: slice) -> Array:
-            found = history.body.stresses.force_slopes(history.xi[times], history.theta)
-            return np.where(moved.rows.taken & taken[times, dofs], 0.0, found[:, place] * scale)
+            scaled = history.body.stresses.force_slopes(history.xi[times], history.theta)
+            return np.where(moved.rows.taken & taken[times, dofs], 0.0, scaled[:, place] * scale)
 
-        found = self._spread(self._force_lags, slopes)
-        for each, values in zip(self._force_lags, found, strict=True):
-            late = taken[each.start + each.lag : each.stop + each.lag, dofs]
-            values[moved.rows.taken & late] = 0.0
-        return found
+        scaled = self._spread(self._force_lags, slopes)
+        for each, values in zip(self._force_lags, scaled, strict=True):
+            is_prescribed_later = taken[each.start + each.lag : each.stop + each.lag, dofs]
+            values[moved.rows.taken & is_prescribed_later] = 0.0
+        return scaled
 
     def hessian_values(
         self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights

@@ -142,7 +142,11 @@ class WrenchReading(Reading):
         """Return the prediction (S, 6) from reaction forces [N, N m]; NaN for samples
         outside the known times.
         """
-        motion = Motion(np.zeros((0, 0)), lambda: forced)
+
+        def reactions() -> Forced:
+            return forced
+
+        motion = Motion(np.zeros((0, 0)), reactions)
         values = self.channel.values(motion, phi)
         if not len(values):
             return np.full(self.wrench.values.shape, np.nan)
@@ -195,9 +199,16 @@ def wrench_readings(
     models = []
     sensors = [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
     for number, (grasp, wrench) in enumerate(sensors):
-        how = wrench.frame, wrench.point_m, grid, nuisance, number
         label = "" if len(sensors) == 1 else f" {number + 1}"
-        channel = GraspWrench.of(experiment, grasp, *how)
+        channel = GraspWrench.of(
+            experiment,
+            grasp,
+            frame=wrench.frame,
+            point_m=wrench.point_m,
+            grid=grid,
+            nuisance=nuisance,
+            number=number,
+        )
         models.append(WrenchReading.of(channel, wrench, label, huber))
     return tuple(models)
 

@@ -210,10 +210,18 @@ class GraspWrench:
         """
         sensed = sensed_dofs(experiment)
         own = dofs_of(grasp.nodes)
-        held = np.isin(own, grasp.dofs).astype(np.float64)
-        places = np.searchsorted(sensed, own)
-        where = nuisance, 3 * len(experiment.body.nodes_m), sensed, places, held
-        return cls(number, grasp, frame, point_m, grid, *where)
+        return cls(
+            number,
+            grasp,
+            frame=frame,
+            point_m=point_m,
+            on=grid,
+            nuisance=nuisance,
+            dofs=3 * len(experiment.body.nodes_m),
+            sensed=sensed,
+            places=np.searchsorted(sensed, own),
+            held=np.isin(own, grasp.dofs).astype(np.float64),
+        )
 
     @property
     def clock_limit_s(self) -> float:
@@ -229,8 +237,8 @@ class GraspWrench:
         turns, shifts = self.poses_at(self.grid)
         if self.frame == "grasp":
             return turns, shifts + turns @ self.point_m
-        shape = (self.count, 1)
-        return np.tile(np.eye(3), (*shape, 1)), np.tile(self.point_m, shape)
+        axes = np.tile(np.eye(3), (self.count, 1, 1))
+        return axes, np.tile(self.point_m, (self.count, 1))
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
         """Return rotations (k, 3, 3) and translations (k, 3) [m] of the grasp at grid rows (k,)."""
@@ -319,12 +327,11 @@ class GraspWrench:
         poses = self.grasp.poses
         if len(poses.t_s) < 3 or self.on.static:
             return np.zeros((count, 3, 3)), np.zeros((count, 3))
-        range_s = poses.t_s[0] + step_s, poses.t_s[-1] - step_s
-        middle = np.clip(self.t_s[:count], *range_s)
+        middle = np.clip(self.t_s[:count], poses.t_s[0] + step_s, poses.t_s[-1] - step_s)
         before, now, after = (poses.at(middle + way * step_s) for way in (-1, 0, 1))
         pairs = zip(before, now, after, strict=True)
-        turn, shift = ((b - 2 * n + a) / step_s**2 for b, n, a in pairs)
-        return turn, shift
+        rotation_rates, translation_rates = ((b - 2 * n + a) / step_s**2 for b, n, a in pairs)
+        return rotation_rates, translation_rates
 
     def on_grid(self, forced: Forced, phi: Array) -> Array:
         """Return the wrench W (n, 6) including the tool, before the low-pass [N, N m]."""

@@ -129,9 +129,17 @@ class WrenchRows(Carried):
         if len(lag := channel.lag_phi):
             places = self.places.variable + numbers
             by_phi = self.phi_columns[lag][:, None, None]
-            read, seen = (Numbers(places[k : k + 1], self._unit) for k in (1, 0))
-            at = LOW_PASS, channel.low_pass_data[..., None], read, seen, Numbers(by_phi)
-            terms.append(Pattern.of_recursion(*at, Numbers(numbers[1:], self._row_unit)))
+            unfiltered, filtered = (Numbers(places[k : k + 1], self._unit) for k in (0, 1))
+            terms.append(
+                Pattern.of_recursion(
+                    LOW_PASS,
+                    channel.low_pass_data[..., None],
+                    states=filtered,
+                    looked=unfiltered,
+                    constants=Numbers(by_phi),
+                    rows=Numbers(numbers[1:], self._row_unit),
+                )
+            )
         return tuple(terms)
 
     @property

@@ -1,1 +1,22 @@
-"""What the data say of the parameters: error bars, identifiability, residuals."""
+"""Statistics of a fit: error bars, systematic effects, identifiability, residuals and the verdict.
+
+Basis
+    `linearised` computes residuals and derivatives at the answer, which all other modules use.
+    `distributions` has quantiles and tails of common distributions.
+Error bars
+    `uncertainty` computes the statistical intervals, from the noise (`noise`), correlated errors
+    (`autocorrelation`, `spatial`), noise of the poses (`pose_noise`) and differences between
+    recordings (`scatter`); `estimates` expresses them in the user's parameters. `profile` computes
+    profile-likelihood intervals. `fields` and `phases` treat spatially varying constants.
+Combined intervals
+    `numerical` is the discretisation error. `assumptions` lists the systematic effects (type B),
+    with `shape_error` and `size_effect`; `considered` propagates them to the residuals (consider
+    analysis), `budget` to the estimates, and `combined` computes the intervals to publish.
+    `remedies` says what to measure.
+Checks
+    `identifiability` and `scale` describe what the data determine. `diagnostics` analyses the
+    residuals of each marker. `relaxation`, `routine_probes` and `probes` relax assumptions and
+    refit parts of the data. `hypothesis`, `plausible`, `modal`, `cameras` and `causes` test
+    hypotheses of misspecification. `trust` combines everything into a verdict with the messages of
+    `concern`.
+"""

@@ -1,9 +1,11 @@
-"""What is assumed about a recording without being estimated, and what it would do if it were wrong.
+"""Systematic effects (type B): assumptions that are not estimated, and what changes if they are
+wrong.
 
-An assumption is a row of `ASSUMPTIONS`: how far off it may be, and what that changes in the
-equations of motion, c = Σ w F − M a, or in the goals of grasped dofs; `considered` finds what that
-does to the residuals. What changes only what cameras and clocks say is a nuisance parameter, see
-`recording.nuisance`, and has its slopes from there.
+An assumption is a row of `ASSUMPTIONS`: its standard deviation, and its effect on the equations of
+motion, c = Σ w F − M a, or on the prescribed displacements; `considered` propagates effects to the
+residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance parameters,
+see `recording.nuisance`. `Assumptions` is the table of the problem file in which users state
+standard deviations.
 """
 
 from __future__ import annotations
@@ -63,18 +65,18 @@ CORRELATION_KEY = "surface_correlation"
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """What an assumption changes, if it is off by one deviation.
+    """Change of the equations of motion if an assumption is off by one unit.
 
     Attributes
     ----------
-    force_n : (N, 3n), optional
-        Forces at the evaluations.
-    mass_kg : (3n,), optional
-        What moves with every dof and is not in `force_n`: its inertia alone.
+    force_n : (N, 3n) array or None
+        Change of the forces at the evaluations [N]; None means no change.
+    mass_kg : (3n,) array or None
+        Change of the inertial masses, whose weight is not in `force_n` [kg]; None means no change.
     stretched : float
-        By how much times are longer, of one, as inertia sees it.
-    moved_m : (N, g), optional
-        The goals of grasped dofs.
+        Relative change of the times in the inertia.
+    moved_m : (N, g) array or None
+        Change of the prescribed positions of the grasped dofs [m]; None means no change.
     """
 
     force_n: Array | None = None
@@ -85,7 +87,17 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """One experiment at the answer, as assumptions look at it."""
+    """One experiment at the answer, as the effects of assumptions need it.
+
+    Attributes
+    ----------
+    part : Part
+        The experiment at the answer.
+    parameters : Parameters
+        Shared parameters.
+    surface_correlation : float
+        Correlation length of the surface's error over the longest extent of the body.
+    """
 
     part: Part
     parameters: Parameters
@@ -93,42 +105,46 @@ class Fitted:
 
     @property
     def body(self) -> Body:
-        """What moves."""
+        """Body of the experiment."""
         return self.part.segment.body
 
     @property
     def dynamics(self) -> Dynamics:
-        """Its equations of motion."""
+        """Equations of motion at the answer."""
         return self.part.setting.dynamics
 
     @property
     def theta(self) -> Array:
-        """(k,)"""
+        """Constants θ of the body (k,)."""
         return self.dynamics.theta
 
     @property
     def gravity(self) -> Array:
-        """(3n,)"""
+        """Gravity at each dof (3n,) [m/s²]."""
         return self.dynamics.forces.weight.gravity
 
     @cached_property
     def own_mass_kg(self) -> Array:
-        """(3n,) of the body, without what is tied to it."""
+        """Masses (3n,) of the body without point masses [kg]."""
         return self.body.mass_of_dofs(self.theta)
 
     @cached_property
     def acceleration(self) -> Array:
-        """(N, 3n) of the rows."""
+        """Accelerations (N, 3n) of the rows [m/s²]."""
         return self.dynamics.acceleration(self.part.x)
 
     @cached_property
     def states(self) -> tuple[Array, Array]:
-        """ξ and ν (N, 3n) at the evaluations."""
+        """States ξ [m] and velocities ν [m/s] at the evaluations, each (N, 3n); zero before
+        the first.
+        """
         xi, nu = self.dynamics.evaluation_states(self.part.x)
         return self.of_rows(xi), self.of_rows(nu)
 
     def of_rows(self, evaluated: Array) -> Array:
-        """Rows (N, 3n) of those that are evaluated, zero before."""
+        """Return values (N, 3n) of all rows from those of the evaluations, zero before the
+        first.
+        """
         return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
 
     def internal_n(
@@ -138,38 +154,50 @@ class Fitted:
         theta: Array | None = None,
         body: Body | None = None,
     ) -> Array:
-        """Return forces (N, 3n) of the material where space or time is scaled, without γ_m.
+        """Return the material's forces (N, 3n) at scaled lengths or times, without γ_m [N].
 
-        Of a body with another stress-free shape where that is given.
+        Parameters
+        ----------
+        scale : float
+            Factor of lengths: positions and velocities are divided by it.
+        slower : float
+            Factor of times: velocities are divided by it.
+        theta : (k,) array, optional
+            Constants of the body; those of the answer by default.
+        body : Body, optional
+            Body with another stress-free shape.
         """
-        still = (self.theta if theta is None else theta).copy()
-        still[list(self.body.tied_shares)] = 0.0
-        dynamics = self.dynamics.with_theta(still)
-        carried = dynamics.forces_along(dynamics.histories(self.part.x)).past
+        undamped = (self.theta if theta is None else theta).copy()
+        undamped[list(self.body.tied_shares)] = 0.0
+        dynamics = self.dynamics.with_theta(undamped)
+        histories = dynamics.forces_along(dynamics.histories(self.part.x)).past
         xi, nu = dynamics.evaluation_states(self.part.x)
         evaluated = self.body if body is None else body
         return self.of_rows(
-            evaluated.force(xi / scale, nu / (scale * slower), still, carried=carried)
+            evaluated.force(xi / scale, nu / (scale * slower), undamped, carried=histories)
         )
 
     @cached_property
     def internal_force_n(self) -> Array:
-        """Forces (N, 3n) of the material, without γ_m."""
+        """Forces (N, 3n) of the material at the answer, without γ_m [N]."""
         return self.internal_n(body=self.body.with_stress_free(self.stress_free_m))
 
     @cached_property
     def stress_free_m(self) -> Array:
-        """Stress-free positions (n, 3) of the nodes, without frames of obstacles."""
+        """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]."""
         body = self.body
         return body.nodes.points_m if body.inverse is None else self._inverse.positions_m
 
     @cached_property
     def _inverse(self) -> RestShape:
+        """Stress-free shape that follows from a mesh made under gravity."""
         assert self.body.inverse is not None
         return self.body.inverse.shape(self.theta)
 
     def of_reference(self, moved_m: Array) -> Array:
-        """Return the first-order change (N, 3n) of the material's forces by one (n, 3) of X."""
+        """Return the first-order change (N, 3n) of the material's forces if the stress-free
+        positions change by (n, 3) [m].
+        """
         largest = float(np.abs(moved_m).max(initial=0.0))
         if not largest:
             return np.zeros_like(self.part.x)
@@ -179,27 +207,33 @@ class Fitted:
         return (self.internal_n(body=other) - self.internal_force_n) / step
 
     def of_heavier_scan(self) -> Array:
-        """Return the change (N, 3n) of forces per relative change of the weight during the scan."""
+        """Return the change (N, 3n) of forces per relative change of the weight during the
+        scan; zero unless the mesh was made under gravity.
+        """
         if self.body.inverse is None:
             return np.zeros_like(self.part.x)
         return self.of_reference(self.body.inverse.weight_slope(self.theta))
 
     @cached_property
     def surface_modes_m(self) -> Array:
-        """Displacements (modes, n, 3) where the surface is off by its thickness, mode by mode."""
+        """Displacements (modes, n, 3) of the nodes if the surface is off by the thickness
+        of the body, for each mode [m].
+        """
         segment = self.part.segment
         gaps_m = on_surface(segment.experiment, self.theta, self.part.x)[0]
         nearest = np.fmin.reduce(gaps_m, axis=0)
-        touched = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
-        known = np.unique(self.body.mesh.surface[touched])
+        is_touched = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
+        known = np.unique(self.body.mesh.surface[is_touched])
         modes = surface_modes(self.body, known, self.surface_correlation)
         return thickness_m(self.body) * modes
 
     @cached_property
     def likely_held(self) -> Index:
-        """Dofs held while the mesh was made: those of the recording, or those the body stood on."""
-        held = self.part.setting.held.dofs
-        own = held[held < self.body.nodes.points_m.size]
+        """Dofs that were probably supported while the mesh was made: those prescribed in
+        the recording, or else the lowest nodes.
+        """
+        prescribed = self.part.setting.held.dofs
+        own = prescribed[prescribed < self.body.nodes.points_m.size]
         points_m = self.body.nodes.points_m
         if len(free_motions(points_m, _held_mask(own, len(points_m)))):
             gravity = self.part.segment.experiment.gravity_m_s2
@@ -208,23 +242,23 @@ class Fitted:
         return own
 
     def weight_of(self, mass_kg: Array) -> Array:
-        """(N, 3n) what gravity and γ_m do to mass (3n,)."""
+        """Return weight and γ_m damping (N, 3n) of masses (3n,) [N]."""
         return mass_kg * (self.gravity - self.body.tied_drag(self.theta) * self.states[1])
 
     @property
     def buoyancy_n(self) -> Array:
-        """(N, 3n) buoyancy in the model; zero in a vacuum."""
+        """Buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
         lifted = -self.dynamics.mass.displaced_kg * self.gravity
         return np.broadcast_to(lifted, self.part.x.shape)
 
     @property
     def added_mass_kg(self) -> Array:
-        """(3n,) air in the model that moves with the body; zero in a vacuum."""
+        """Added mass (3n,) of the air in the model [kg]; zero in a vacuum."""
         return self.dynamics.mass.added_kg
 
     @cached_property
     def air_drag_n(self) -> Array:
-        """(N, 3n) drag of the air in the model; zero in a vacuum and where nothing moves."""
+        """Drag of the air (N, 3n) in the model [N]; zero in a vacuum and where nothing moves."""
         term = self.dynamics.forces.air_drag
         if term is None:
             return np.zeros_like(self.states[1])
@@ -234,17 +268,17 @@ class Fitted:
 
     @cached_property
     def grasp_force_n(self) -> Array:
-        """(N, g) what the grasps give the grasped dofs."""
+        """Reaction forces (N, g) on the grasped dofs [N]; zero while they are not prescribed."""
         dofs = self.part.setting.held.dofs
         x = self.part.x
         force = forces_on(self.dynamics, x, dofs)
         mass = self.dynamics.mass.kg[:, dofs]
-        given = reactions(self.dynamics, mass, force, self.acceleration[:, dofs])
-        return np.where(np.isnan(self.part.setting.held.positions_m), 0.0, given)
+        reaction_n = reactions(self.dynamics, mass, force, self.acceleration[:, dofs])
+        return np.where(np.isnan(self.part.setting.held.positions_m), 0.0, reaction_n)
 
     @cached_property
     def contacts(self) -> dict[int, Contact]:
-        """Contact by an energy, by its number among the further forces."""
+        """Contact forces derived from an energy, by their index among the further forces."""
         further = enumerate(self.dynamics.forces.further)
         return {k: each for k, each in further if isinstance(each, Contact) and not each.relaxed}
 
@@ -257,7 +291,9 @@ class Fitted:
 
     @cached_property
     def proportional_s(self) -> Array:
-        """(E,) γ_r of elements whose damping is γ_r K(x) v, zero of others."""
+        """Damping times γ_r (E,) of elements with Rayleigh damping γ_r K(x) v [s], zero of
+        others.
+        """
         gamma_r_s = np.zeros(len(self.body.cells))
         for part, start in zip(self.body.parts, self.body.starts, strict=False):
             if GAMMA_R in part.damping.constants and part.damping.stress is None:
@@ -266,36 +302,37 @@ class Fitted:
 
     @cached_property
     def young_pa(self) -> float:
-        """Of the softest part, at small strain."""
+        """Young's modulus of the softest part at small strain [Pa]."""
         return min(engineering(*moduli)[0] for moduli in self.body.lame(self.theta).values())
 
 
 def _held_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
-    """Return which coordinates (n, 3) of the nodes are among the dofs."""
-    held = np.zeros(3 * nodes, dtype=bool)
-    held[dofs] = True
-    return held.reshape(nodes, 3)
+    """Return the mask (n, 3) of the coordinates of n nodes that are among the dofs."""
+    mask = np.zeros(3 * nodes, dtype=bool)
+    mask[dofs] = True
+    return mask.reshape(nodes, 3)
 
 
 @dataclass(frozen=True)
 class Assumption:
-    """Something that is taken as it is stated.
+    """Quantity that is taken as stated instead of being estimated.
 
     Attributes
     ----------
     name : str
+        Name, as in problem files and budgets.
     unit : str
-        Of its deviation.
-    sigma : float, optional
-        The deviation, as a careful laboratory has it; None for what counts only where a problem
-        states its deviation.
+        Unit of its deviation.
+    sigma : float or None
+        Default standard deviation, as in a careful laboratory; None if the effect counts only where
+        a problem states its deviation.
     said : str
-        What it is.
+        Description.
     effect : callable
-        Of an experiment at the answer and the number of its axis: what it changes, if it is off by
-        one of its unit; None where there is no such thing.
+        Returns the effect of one unit, from an experiment at the answer and the index of the
+        component; None if there is no effect in this experiment.
     axes : str
-        Names of its components, which are off independently; one without.
+        Names of components with independent errors, separated by spaces; empty if there is one.
     """
 
     name: str
@@ -307,7 +344,7 @@ class Assumption:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """Names with their axes."""
+        """Names of the components, each after that of the assumption."""
         return tuple(f"{self.name} {a}" for a in self.axes.split()) or (self.name,)
 
 
@@ -334,28 +371,30 @@ def _size(at: Fitted, _: int) -> Effect:
         force += (2.0 if stated else 1.0) * at.contact_n(number)
     segment = at.part.segment
     turns: Array = np.nan_to_num(segment.grasping.poses[0])
-    off = segment.grasping.places(at.part.phi)[0] - segment.nuisance.grasp_pivot_m
-    moved = np.einsum("tgj,gj->tg", turns, off)
+    arms_m = segment.grasping.places(at.part.phi)[0] - segment.nuisance.grasp_pivot_m
+    displacement_m = np.einsum("tgj,gj->tg", turns, arms_m)
     for obstacle, shift_m in obstacle_shifts_m(at.part):
-        along = np.searchsorted(segment.grasping.dofs, obstacle.dofs)
-        moved[:, along] = np.tile(shift_m, len(obstacle.nodes))
+        obstacle_dofs = np.searchsorted(segment.grasping.dofs, obstacle.dofs)
+        displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
     air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
     return Effect(
         force + heavier + at.weight_of(mass) + air,
         mass + 3.0 * at.added_mass_kg,
-        moved_m=moved,
+        moved_m=displacement_m,
     )
 
 
 def _mass(at: Fitted, _: int) -> Effect | None:
-    """All of the body is heavier by a share."""
+    """Effect of a body that is heavier by a share; None if a density is estimated."""
     if any(part.free_density for part in at.body.parts):
         return None
     return Effect(at.weight_of(at.own_mass_kg) + at.of_heavier_scan(), at.own_mass_kg)
 
 
 def _density_gradient(at: Fitted, axis: int) -> Effect:
-    """Heavier at one end of the body, lighter at the other, by a share of its density."""
+    """Effect of a density that is higher at one end of the body and lower at the other, by
+    a share.
+    """
     place = at.body.nodes_m[:, axis]
     middle = np.average(place, weights=at.own_mass_kg[::3])
     mass = at.own_mass_kg * np.repeat((place - middle) / np.abs(place - middle).max(), 3)
@@ -363,9 +402,10 @@ def _density_gradient(at: Fitted, axis: int) -> Effect:
 
 
 def _anisotropy(at: Fitted, axis: int) -> Effect:
-    """Stiffer along one axis by a share of E: the energy ½ E e² of the strain e along it.
+    """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
+    strain e along it.
 
-    Damping that is K(x) v has its slope by time.
+    Rayleigh damping K(x) v follows by its time derivative.
     """
     body = at.body
     xi, nu = at.states
@@ -388,14 +428,16 @@ def _anisotropy(at: Fitted, axis: int) -> Effect:
 
 
 def _drift(at: Fitted, _: int) -> Effect:
-    """Stiffer at the end than at the beginning, by a share."""
+    """Effect of a stiffness that is higher at the end than at the beginning, by a share."""
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
 
 
 def _pace(at: Fitted, _: int) -> Effect | None:
-    """All clocks are fast by a share: less time passes than they say."""
+    """Effect of clocks that are fast by a share, so that less time passes than they show;
+    None for a static experiment.
+    """
     if at.part.segment.experiment.static:
         return None
     slower = at.internal_n(slower=1 + SMALL)
@@ -406,7 +448,7 @@ def _pace(at: Fitted, _: int) -> Effect | None:
 
 
 def _poisson(at: Fitted, _: int) -> Effect | None:
-    """Poisson's ratio is larger where it is stated, not estimated."""
+    """Effect of a larger Poisson's ratio where it is stated; None where it is estimated."""
     items = {item.name: item for item in at.parameters.items}
     stated = {
         name
@@ -424,53 +466,60 @@ def _poisson(at: Fitted, _: int) -> Effect | None:
 
 
 def _grip(at: Fitted, _: int) -> Effect | None:
-    """Grip and what it touches give way like so much more of the body, in its thickness.
+    """Effect of a compliant layer of the body's own material in the grips; None without a grip.
 
-    What holds along some axes only is a platen or a plane of symmetry, and no grip.
+    A grasp that prescribes some axes only is a platen or a plane of symmetry, not a grip.
     """
-    held = at.part.setting.held
+    prescribed = at.part.setting.held
     holding = at.part.segment.experiment.gripping
     gripped = [grasp.dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
     if not gripped:
         return None
-    area_m2 = at.body.dof_volume_m3[held.dofs] ** (2 / 3)
-    here = np.isin(held.dofs, np.concatenate(gripped))
-    moved = np.zeros_like(at.grasp_force_n)
-    moved[:, here] = -at.grasp_force_n[:, here] / (at.young_pa * area_m2[here])
-    return Effect(moved_m=moved)
+    area_m2 = at.body.dof_volume_m3[prescribed.dofs] ** (2 / 3)
+    is_gripped = np.isin(prescribed.dofs, np.concatenate(gripped))
+    displacement_m = np.zeros_like(at.grasp_force_n)
+    displacement_m[:, is_gripped] = -at.grasp_force_n[:, is_gripped] / (
+        at.young_pa * area_m2[is_gripped]
+    )
+    return Effect(moved_m=displacement_m)
 
 
 def _driven(at: Fitted) -> NDArray[np.bool_]:
-    """(g,) grasped dofs that a bench moves."""
+    """Return the mask (g,) of grasped dofs whose prescribed position changes."""
     goals = at.part.setting.held.positions_m
     return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
 
 
 def _machine(at: Fitted, _: int) -> Effect | None:
-    """A test bench gives way: the displacement of what it moves is measured behind its frame."""
+    """Effect of the compliance of a test bench: displacements are measured behind its
+    frame. None for dynamic experiments.
+    """
     experiment = at.part.segment.experiment
-    held = at.part.setting.held
+    prescribed = at.part.setting.held
     if not experiment.static or not (driven := _driven(at)).any():
         return None
-    moved = np.zeros_like(at.grasp_force_n)
+    displacement_m = np.zeros_like(at.grasp_force_n)
     for grasp in experiment.grasps:
         for axis in range(3):
-            here = np.flatnonzero(np.isin(held.dofs, grasp.dofs) & (held.dofs % 3 == axis))
+            here = np.flatnonzero(
+                np.isin(prescribed.dofs, grasp.dofs) & (prescribed.dofs % 3 == axis)
+            )
             if driven[here].any():
-                moved[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
-    return Effect(moved_m=moved)
+                displacement_m[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
+    return Effect(moved_m=displacement_m)
 
 
 def _platen_friction(at: Fitted, _: int) -> Effect | None:
-    """Friction against the way that nodes slide along platens, across the axis these are moved on.
+    """Effect of friction on nodes that slide along platens, perpendicular to the loading axis; None
+    without platens.
 
-    Planes of symmetry have none: nothing presses along their axes.
+    Planes of symmetry have no normal force in the loading direction, and no friction.
     """
     experiment = at.part.segment.experiment
-    held = at.part.setting.held
+    prescribed = at.part.setting.held
     if not experiment.static:
         return None
-    pressed = {_AXES[k] for k in np.unique(held.dofs[_driven(at)] % 3)}
+    pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_driven(at)] % 3)}
     platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
     force = np.zeros_like(at.part.x)
     x = at.part.x
@@ -478,7 +527,7 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
     for grasp in platens:
         across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
         for node in grasp.nodes:
-            normal = np.isin(held.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
+            normal = np.isin(prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
             press = np.linalg.norm(at.grasp_force_n[:, normal], axis=1)
             dofs = [3 * node + k for k in across]
             way = x[:, dofs] - start[dofs]
@@ -518,10 +567,10 @@ def _air_drag(at: Fitted, _: int) -> Effect | None:
 
 
 def _other_damping(at: Fitted, law: str) -> Effect | None:
-    """The damping force of another law with the same γ_r, less that of the stated one.
+    """Effect of replacing the stated damping law by another with the same γ_r.
 
-    Parts with a law that has no name keep it, and so does what is linear, which all laws damp
-    alike. None where that leaves no difference.
+    Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
+    None if there is no difference, or the experiment is static.
     """
     body = at.body
     names = body.constants.items()
@@ -539,27 +588,27 @@ def _other_damping(at: Fitted, law: str) -> Effect | None:
     if all(own.damping is other.damping for own, other in zip(body.parts, parts, strict=True)):
         return None
     xi, nu = at.dynamics.evaluation_states(at.part.x)
-    carried = at.dynamics.forces_along(at.dynamics.histories(at.part.x)).past
+    histories = at.dynamics.forces_along(at.dynamics.histories(at.part.x)).past
     forces_n = (
-        each.force(xi, nu, at.theta, carried=carried) for each in (body.with_parts(parts), body)
+        each.force(xi, nu, at.theta, carried=histories) for each in (body.with_parts(parts), body)
     )
     return Effect(at.of_rows(next(forces_n) - next(forces_n)))
 
 
 def _objective_damping(at: Fitted, number: int) -> Effect | None:
-    """The body obeys another objective law of damping than the stated one."""
+    """Effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`."""
     return _other_damping(at, OBJECTIVE_DAMPINGS[number])
 
 
 def _rayleigh_damping(at: Fitted, _: int) -> Effect | None:
-    """The body obeys Rayleigh's law of damping, which is not objective."""
+    """Effect of Rayleigh damping, which is not objective, instead of the stated law."""
     return _other_damping(at, "rayleigh")
 
 
 def _rest_shape(at: Fitted, axis: int) -> Effect | None:
-    """The mesh is the shape under the body's own weight along one of its axes, not the stress-free.
+    """Effect of a mesh that was made under the body's own weight along one of its axes.
 
-    Meshes that are made of a shape, and those of which the stress-free shape is stated, are not.
+    None if the problem states the stress-free shape.
     """
     if at.body.rest_shape is not None:
         return None
@@ -567,12 +616,12 @@ def _rest_shape(at: Fitted, axis: int) -> Effect | None:
 
 
 def _surface(at: Fitted, mode: int) -> Effect:
-    """The surface is off along its normal, by a mode of a smooth error of the thickness."""
+    """Effect of an error of the surface along its normal, by one mode of a smooth random field."""
     moved_m = at.surface_modes_m[mode]
     grasping = at.part.segment.grasping
     turns: Array = np.nan_to_num(grasping.poses[0])
-    off = moved_m.ravel()[3 * (at.part.setting.held.dofs // 3)[:, None] + np.arange(3)]
-    return Effect(at.of_reference(moved_m), moved_m=np.einsum("tgj,gj->tg", turns, off))
+    offsets_m = moved_m.ravel()[3 * (at.part.setting.held.dofs // 3)[:, None] + np.arange(3)]
+    return Effect(at.of_reference(moved_m), moved_m=np.einsum("tgj,gj->tg", turns, offsets_m))
 
 
 # fmt: off
@@ -616,12 +665,12 @@ ASSUMPTIONS = (
 
 
 class KnownEffect(Section):
-    """An effect of known sign and size, for which estimates are corrected to first order.
+    """Systematic effect of known sign and size, for which estimates are corrected to first order.
 
     Attributes
     ----------
     mean : float
-        Its size, as measured.
+        Its size.
     deviation : float
         Standard deviation of its size.
     """
@@ -647,26 +696,26 @@ _FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in RO
 
 
 class _Stated(Options):
-    """What `Assumptions` does with its fields."""
+    """Methods of the table of standard deviations."""
 
     @classmethod
     def exact(cls) -> Assumptions:
-        """Return assumptions of which each is exactly true, as of a simulated recording."""
+        """Return the table with all assumptions exactly true, as for a simulated recording."""
         exact: dict[str, Literal["none"]] = dict.fromkeys(vars(Assumptions()), "none")
         return Assumptions(**exact)
 
     @property
     def deviations(self) -> dict[str, float | None]:
-        """By name; None of what is known exactly."""
-        found: dict[str, float | None] = {}
+        """Standard deviations by name; None for what is exact."""
+        by_name: dict[str, float | None] = {}
         for name, stated in vars(self).items():
             known = stated.deviation if isinstance(stated, KnownEffect) else stated
-            found[name] = None if known == "none" else known
-        return found
+            by_name[name] = None if known == "none" else known
+        return by_name
 
     @property
     def means(self) -> dict[str, float]:
-        """Sizes of the known effects by name, each over its standard deviation."""
+        """Known effects by name, each over its standard deviation."""
         return {
             name: stated.mean / stated.deviation
             for name, stated in vars(self).items()
@@ -678,7 +727,9 @@ if TYPE_CHECKING:
 
     @dataclass(frozen=True, init=False)
     class Assumptions(_Stated):
-        """Made from the tables."""
+        """Standard deviations of all assumptions and nuisance parameters, one field per row
+        of `ASSUMPTIONS` and of `recording.nuisance.ROWS`.
+        """
 
         def __init__(
             self, **deviations: float | Literal["none"] | KnownEffect | Mapping[str, float]

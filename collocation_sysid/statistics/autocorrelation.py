@@ -1,28 +1,27 @@
-"""Errors that persist from sample to sample and are shared among markers.
+"""Correlated errors: persistence from sample to sample, and errors that markers have in common.
 
-Noise of a camera is nearly white; what a model misses is not. Least squares still finds the
-parameters, but their covariance is the sandwich A⁻¹ B A⁻¹ with B the covariance of the score Sᵀe,
-and B depends on how the errors e hang together. Here, in every experiment on its own,
+Noise of a camera is nearly white; model errors are not. Least squares remains consistent, but the
+covariance of the parameters is the sandwich A⁻¹ B A⁻¹ with B the covariance of the score Sᵀe, which
+depends on the correlation of the errors e. In every experiment separately,
 
     Cov(e_{t,c}, e_{s,d}) = Σ_{c,d} ρ_{|t−s|}
 
-with ρ of one autoregressive process and Σ among the channels (marker and axis). The residuals of
-a fit are smaller and less persistent than the errors, which is corrected for. The
-order minimises Schwarz's criterion. Σ is that of the innovations, which are nearly independent in
-time.
+with the autocorrelation ρ of one autoregressive process and the covariance Σ among the channels
+(marker and axis). The residuals of a fit are smaller and less persistent than the errors, which is
+corrected for. The order minimises Schwarz's criterion. Σ is estimated from the innovations, which
+are nearly independent in time.
 
-Compared with it on simulated fits (tests/test_error_coverage.py), a kernel estimate of B from
-the scores of each time (Andrews 1991, prewhitened) covers 83–90 % where 95 % is meant, and one
+Compared with it on simulated fits (tests/test_error_coverage.py), a kernel estimate of B from the
+scores of each time (Andrews 1991, prewhitened) covers 83–90 % where 95 % is nominal, and one
 without the correction of the residuals or without Σ fails for short records and shared errors.
 
-Autocovariances are found from the lagged products of the residuals, which are r = M e with M = I −
-S A⁻¹ Sᵀ = I − D Dᵀ (see `linearised`): smaller than the errors e. Their lagged products r D_k r
-have the expectations Σ_l γ_l tr(D_k M D_l M), linear in the autocovariances γ (Worsley et al. 2002,
-"A general statistical analysis for fMRI data", NeuroImage 15, there for one series), with D_k the
-matrix that has ones on both k-th diagonals of each channel, marker and axis. A few lags are solved
-for. Those beyond have no place in the equations but in the products: a marker's offset takes the
-mean of its errors away, to which all lags contribute. They follow from an autoregression on the
-lags found, in a few rounds.
+Autocovariances are estimated from lagged products of the residuals r = M e with M = I − S A⁻¹ Sᵀ =
+I − D Dᵀ (see `linearised`). The lagged products r D_k r have the expectations Σ_l γ_l tr(D_k M D_l
+M), linear in the autocovariances γ (Worsley et al. 2002, "A general statistical analysis for fMRI
+data", NeuroImage 15, there for one series); D_k has ones on both k-th diagonals of each channel. A
+few lags are solved for. Longer lags do not enter these equations but contribute to the products,
+because a marker's offset absorbs the mean of its errors; they follow from the autoregression, in a
+few iterations.
 """
 
 from __future__ import annotations
@@ -42,20 +41,24 @@ from .spatial import spatial_errors
 
 Mask = NDArray[np.bool_]
 
-# Partial autocorrelations beyond this belong to a process that never forgets.
+# Largest partial autocorrelation, so that the process is stationary.
 LARGEST_PARTIAL = 0.99
 
 
 @dataclass(frozen=True, eq=False)
 class LaggedProducts:
-    """Lags 0 … `lags` of each experiment, one experiment after another.
+    """Lagged products of the residuals for lags 0 … `lags`, one experiment after another.
 
     Attributes
     ----------
-    lags : (experiments,) last lag of each
-    products : (K,) r D_k r
-    expected : (K, K) tr(D_k M D_l M)
-    shifted : (K, r, r) Dᵀ D_k D
+    lags : (experiments,) tuple of int
+        Last lag of each experiment.
+    products : (K,) array
+        r D_k r.
+    expected : (K, K) array
+        tr(D_k M D_l M).
+    shifted : (K, r, r) array
+        Dᵀ D_k D.
     """
 
     lags: tuple[int, ...]
@@ -64,19 +67,34 @@ class LaggedProducts:
     shifted: Array
 
     def split(self, values: Array) -> list[Array]:
-        """The values (K,) of each experiment."""
+        """Split values (K,) by experiment."""
         ends = np.cumsum([last + 1 for last in self.lags])
         return np.split(values, ends[:-1])
 
     def autocovariances(self, beyond: Array | float = 0.0) -> list[Array]:
-        """γ_0 … of each experiment, (lag + 1,), less what the lags beyond put into the products."""
-        found = np.linalg.lstsq(self.expected, self.products - beyond)[0]
-        return self.split(found.astype(np.float64))
+        """Return the autocovariances γ_0 … of each experiment, (lag + 1,).
+
+        Parameters
+        ----------
+        beyond : (K,) array or 0
+            Contribution of longer lags to the products, which is subtracted.
+        """
+        solution = np.linalg.lstsq(self.expected, self.products - beyond)[0]
+        return self.split(solution.astype(np.float64))
 
     def beyond(self, fit: LinearisedFit, information: Information, tails: Sequence[Array]) -> Array:
-        """(K,) what autocovariances of the lags beyond, (T,) each, put into the products.
+        """Return the contribution (K,) of autocovariances at longer lags to the products.
 
-        tr(D_k M C M) with their Toeplitz matrix C, whose k-th diagonals are zero.
+        It is tr(D_k M C M) with their Toeplitz matrix C, whose k-th diagonals are zero.
+
+        Parameters
+        ----------
+        fit : LinearisedFit
+            The fit.
+        information : Information
+            Its information.
+        tails : sequence of (T,) arrays
+            Autocovariances of each experiment, zero at the lags in `lags`.
         """
         if not any(tail.any() for tail in tails):
             return np.zeros_like(self.products)
@@ -99,63 +117,82 @@ class LaggedProducts:
 def lagged_products(
     fit: LinearisedFit, information: Information, lags: Sequence[int]
 ) -> LaggedProducts:
-    """The products of each experiment's residuals up to a lag, and what they are expected to be."""
+    """Return the lagged products of each experiment's residuals, and their expectations.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The fit.
+    information : Information
+        Its information.
+    lags : sequence of int
+        Last lag of each experiment.
+    """
     products = []
     shifted = []
-    own = []
+    diagonal_counts = []
     overlaps = []
     for block, slope, last in zip(fit.blocks, information.slopes, lags, strict=True):
         residual, _, present = block.channels
         width = slope.shape[2]
-        here = np.zeros((last + 1, width, width))
+        within = np.zeros((last + 1, width, width))
         overlap = np.zeros((last + 1, last + 1))
         for channel in range(residual.shape[1]):  # one at a time: all lags at once are large
-            seen = present[:, channel]
-            lagged = [_lagged(slope[:, channel], seen, k) for k in range(last + 1)]
+            is_present = present[:, channel]
+            lagged = [_lagged(slope[:, channel], is_present, k) for k in range(last + 1)]
             stacked = np.stack([each.ravel() for each in lagged])
             overlap += stacked @ stacked.T
             for k, each in enumerate(lagged):
-                here[k] += slope[:, channel].T @ each
+                within[k] += slope[:, channel].T @ each
         for k in range(last + 1):
             twice = 1 if k == 0 else 2
             ahead = slice(k, None)
             behind = slice(None, len(residual) - k)
             products.append(twice * np.sum(residual[ahead] * residual[behind]))
-            own.append(twice * np.sum(present[ahead] & present[behind]))
-        shifted.append(here)
+            diagonal_counts.append(twice * np.sum(present[ahead] & present[behind]))
+        shifted.append(within)
         overlaps.append(overlap)
     shifted = np.concatenate(shifted)
     rows = shifted.reshape(len(shifted), -1)
-    expected = rows @ rows.T + np.diag(np.array(own, dtype=float))
+    expected = rows @ rows.T + np.diag(np.array(diagonal_counts, dtype=float))
     first = 0
     for overlap in overlaps:
-        here = slice(first, first := first + len(overlap))
-        expected[here, here] -= 2 * overlap
+        within = slice(first, first := first + len(overlap))
+        expected[within, within] -= 2 * overlap
     return LaggedProducts(tuple(lags), np.array(products), expected, shifted)
 
 
 def along_time(autocorrelation: Array, values: Array) -> Array:
-    """The Toeplitz matrix of an autocorrelation (T,) times (T, …)."""
+    """Return the product of the Toeplitz matrix of an autocorrelation (T,) with values (T, …)."""
     columns = values.reshape(len(values), -1)
-    found = np.asarray(matmul_toeplitz(autocorrelation, columns), dtype=np.float64)
-    return found.reshape(values.shape)
+    product = np.asarray(matmul_toeplitz(autocorrelation, columns), dtype=np.float64)
+    return product.reshape(values.shape)
 
 
 def _lagged(columns: Array, seen: Mask, lag: int) -> Array:
-    """D_k times the columns (T, r) of one channel, at its present samples."""
+    """Return D_k times the columns (T, r) of one channel, at its present samples."""
     if lag == 0:
         return columns
-    found = np.zeros_like(columns)
-    found[lag:] += columns[:-lag]
-    found[:-lag] += columns[lag:]
-    return found * seen[:, None]
+    shifted = np.zeros_like(columns)
+    shifted[lag:] += columns[:-lag]
+    shifted[:-lag] += columns[lag:]
+    return shifted * seen[:, None]
 
 
 # Autoregression -----------------------------------------------------------------------------
 
 
 def autoregression(autocovariance: Array, samples: float) -> Array:
-    """Coefficients of the order with the least Schwarz criterion, by Levinson's recursion."""
+    """Return the coefficients of the autoregression with the least Schwarz criterion, by Levinson's
+    recursion.
+
+    Parameters
+    ----------
+    autocovariance : (lags + 1,) array
+        Autocovariances; the largest order is `lags`.
+    samples : float
+        Number of independent samples.
+    """
     coefficients = np.zeros(0)
     innovation = autocovariance[0]
     if not innovation > 0:
@@ -175,49 +212,53 @@ def autoregression(autocovariance: Array, samples: float) -> Array:
 
 
 def autocorrelation(coefficients: Array, samples: int) -> Array:
-    """(samples,) of the autoregressive process, from its Yule–Walker equations."""
+    """Return the autocorrelation (samples,) of an autoregressive process, from its
+    Yule–Walker equations.
+    """
     order = len(coefficients)
-    found = np.zeros(samples + order)
-    found[0] = 1.0
+    correlation = np.zeros(samples + order)
+    correlation[0] = 1.0
     if order:
         equations = np.eye(order)
         for k in range(1, order + 1):
             for j, coefficient in enumerate(coefficients, start=1):
                 if k != j:
                     equations[k - 1, abs(k - j) - 1] -= coefficient
-        found[1 : order + 1] = np.linalg.solve(equations, coefficients)
+        correlation[1 : order + 1] = np.linalg.solve(equations, coefficients)
         for k in range(order + 1, samples):
-            found[k] = coefficients @ found[k - order : k][::-1]
-    return found[:samples]
+            correlation[k] = coefficients @ correlation[k - order : k][::-1]
+    return correlation[:samples]
 
 
+# Largest order of the autoregression.
 MAX_ORDER = 4
-# So many samples per coefficient of the autoregression.
+# Samples per coefficient of the autoregression.
 SAMPLES_PER_ORDER = 10
-# Of finding the autocovariances at the lags beyond from the few, and the few without those.
-# They end when nothing changes by more than a share that no error bar shows.
+# Iterations between the autocovariances at few and at longer lags.
 ROUNDS = 4
+# Relative change that ends these iterations; smaller ones do not show in error bars.
 SETTLED = 0.01
+# Level of the tests for correlation.
 SIGNIFICANCE = 0.01
-# A smaller autocorrelation changes no error bar by more than 5 %, significant or not.
+# Autocorrelation that changes error bars by less than 5 %, significant or not.
 NOTICEABLE = 0.05
 
 
 @dataclass(frozen=True)
 class Dependence:
-    """Whether the errors of a fit look independent.
+    """Tests of the errors of a fit for correlation.
 
     Attributes
     ----------
     lag1 : float
-        Autocorrelation of consecutive samples, pooled over all channels, corrected for what the
-        fit has taken out of the residuals.
+        Autocorrelation of consecutive samples, pooled over all channels and corrected for the
+        effect of the fit on the residuals.
     lag1_deviation : float
-        Its standard deviation if the errors are independent; infinite where it cannot be told.
+        Its standard deviation for independent errors; infinite if it is unknown.
     shared_p : float
-        Probability of correlations among channels as large as found, if they are independent.
+        p-value of the correlations among channels, for independent errors.
     space_p : float
-        The same of neighbours on the surface.
+        p-value of the correlations of neighbours on the surface.
     """
 
     lag1: float
@@ -227,40 +268,42 @@ class Dependence:
 
     @property
     def in_time(self) -> bool:
-        """The errors persist, significantly and noticeably."""
+        """Whether the errors persist, significantly and noticeably."""
         limit = float(normal_isf(SIGNIFICANCE / 2)) * self.lag1_deviation
         return abs(self.lag1) > max(limit, NOTICEABLE)
 
     @property
     def among_channels(self) -> bool:
-        """Markers or axes have errors in common."""
+        """Whether markers or axes have errors in common, significantly."""
         return self.shared_p < SIGNIFICANCE
 
     @property
     def in_space(self) -> bool:
-        """Errors that are near each other on the surface are alike."""
+        """Whether errors of neighbours on the surface are correlated, significantly."""
         return self.space_p < SIGNIFICANCE
 
     @property
     def found(self) -> bool:
-        """The errors are not independent."""
+        """Whether the errors are correlated in any of these ways."""
         return self.in_time or self.among_channels or self.in_space
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorProcess:
-    """How the errors of one experiment hang together, in units of σ.
+    """Correlation model of the errors of one experiment, in units of σ.
 
     Attributes
     ----------
-    along_time : (T,) autocorrelation by lag, the first is one
-    among_channels : (3M, 3M) covariance at one time
+    along_time : (T,) array
+        Autocorrelation by lag; the first is one.
+    among_channels : (3M, 3M) array
+        Covariance at one time.
     order : int
-        Of the autoregression.
+        Order of the autoregression.
     samples : float
-        Number of independent samples in time that `among_channels` rests on.
+        Number of independent samples in time that `among_channels` is estimated from.
     degrees_of_freedom : float
-        Of the mean variance.
+        Degrees of freedom of the mean variance.
     """
 
     along_time: Array
@@ -271,18 +314,18 @@ class ErrorProcess:
 
 
 def dependence(fit: LinearisedFit, information: Information) -> Dependence:
-    """Test the residuals for correlation, in time and among channels."""
+    """Test the residuals for correlation in time, among channels and in space."""
     if fit.chi_squared <= ROUNDING**2 * fit.measurements:
         return Dependence(0.0, np.inf, 1.0)
     pairs = zip(fit.blocks, information.slopes, strict=True)
     tested = (each for each in pairs if not each[0].noise_at_least_stated)
-    over_space = [found for each in tested if (found := spatial_errors(*each))]
-    space_p = min((len(over_space) * found.p for found in over_space), default=1.0)
-    found = lagged_products(fit, information, [1] * len(fit.blocks))
+    over_space = [moments for each in tested if (moments := spatial_errors(*each))]
+    space_p = min((len(over_space) * moments.p for moments in over_space), default=1.0)
+    moments = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
-    products = pool @ found.products
-    expected = pool @ found.expected @ pool.T
+    products = pool @ moments.products
+    expected = pool @ moments.expected @ pool.T
     if not expected[1, 1] > 0:  # nothing follows on anything
         return Dependence(0.0, np.inf, _shared_p(fit), space_p)
     variance = products[0] / expected[0, 0]
@@ -296,7 +339,9 @@ def dependence(fit: LinearisedFit, information: Information) -> Dependence:
 
 
 def _shared_p(fit: LinearisedFit) -> float:
-    """Lagrange-multiplier test of Breusch and Pagan (1980) on all pairs of channels."""
+    """Return the p-value of the Lagrange-multiplier test of Breusch and Pagan (1980) on all
+    pairs of channels; 1 without pairs.
+    """
     statistic = 0.0
     pairs = 0
     for block in fit.blocks:
@@ -312,28 +357,33 @@ def _shared_p(fit: LinearisedFit) -> float:
 
 
 def error_processes(fit: LinearisedFit, information: Information) -> tuple[ErrorProcess, ...]:
-    """The error process of each experiment."""
+    """Estimate the error process of each experiment."""
     orders = [min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER) for block in fit.blocks]
     moments = lagged_products(fit, information, [max(1, order) for order in orders])
-    found = moments.autocovariances()
+    autocovariances = moments.autocovariances()
     for _ in range(ROUNDS):
         tails = [
             _tail(block, gamma, order)
-            for block, gamma, order in zip(fit.blocks, found, orders, strict=True)
+            for block, gamma, order in zip(fit.blocks, autocovariances, orders, strict=True)
         ]
-        before, found = found, moments.autocovariances(moments.beyond(fit, information, tails))
-        if np.allclose(np.concatenate(found), np.concatenate(before), rtol=SETTLED, atol=0):
+        before, autocovariances = (
+            autocovariances,
+            moments.autocovariances(moments.beyond(fit, information, tails)),
+        )
+        if np.allclose(
+            np.concatenate(autocovariances), np.concatenate(before), rtol=SETTLED, atol=0
+        ):
             break
     return tuple(
         _error_process(block, slope, gamma[: order + 1])
         for block, slope, gamma, order in zip(
-            fit.blocks, information.slopes, found, orders, strict=True
+            fit.blocks, information.slopes, autocovariances, orders, strict=True
         )
     )
 
 
 def _tail(block: FitBlock, autocovariance: Array, order: int) -> Array:
-    """(T,) autocovariances at the lags beyond those given, zero up to there."""
+    """Return the autocovariances (T,) at lags beyond those given, and zero up to there."""
     coefficients = _coefficients(block, autocovariance[: order + 1])
     tail = max(0.0, autocovariance[0]) * autocorrelation(coefficients, len(block.t_s))
     tail[: len(autocovariance)] = 0.0
@@ -341,18 +391,19 @@ def _tail(block: FitBlock, autocovariance: Array, order: int) -> Array:
 
 
 def _coefficients(block: FitBlock, autocovariance: Array) -> Array:
-    """Of the autoregression of the errors."""
+    """Return the coefficients of the autoregression of a block's errors."""
     residual, _, present = block.channels
     channels = _effective_channels(_among_channels(residual, present))
     return autoregression(autocovariance, _samples(present) * channels)
 
 
 def _samples(present: NDArray[np.bool_]) -> float:
-    """Mean number of samples of the channels that have any."""
+    """Return the mean number of samples of the channels that have any."""
     return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 
 def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
+    """Estimate the error process of one block from autocovariances of its errors."""
     residual, _, present = block.channels
     over_space = spatial_errors(block, slope)
     measured = present.any(axis=0)
@@ -376,8 +427,13 @@ def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> Erro
         if block.noise_at_least_stated and np.trace(covariance) < len(covariance):
             covariance = np.eye(len(covariance))
             freedom = np.inf
-        samples = np.inf, freedom
-        return ErrorProcess(along, covariance, len(coefficients), *samples)
+        return ErrorProcess(
+            along_time=along,
+            among_channels=covariance,
+            order=len(coefficients),
+            samples=np.inf,
+            degrees_of_freedom=freedom,
+        )
     fitted = float(np.sum(slope**2))
     memory = 1 + 2 * float(np.sum(along[1:] ** 2))
     independent = _samples(present) * _effective_channels(channels)
@@ -391,7 +447,9 @@ def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> Erro
 
 
 def _effective_channels(covariance: Array) -> float:
-    """Number of equal independent channels whose mean variance is known as well."""
+    """Return the number of equal independent channels whose mean variance would be known as
+    precisely.
+    """
     squares = float(np.sum(covariance**2))
     return float(np.trace(covariance)) ** 2 / squares if squares > 0 else 1.0
 
@@ -399,13 +457,26 @@ def _effective_channels(covariance: Array) -> float:
 def score_covariance(
     information: Information, processes: tuple[ErrorProcess, ...], shared: int
 ) -> tuple[Array, Array]:
-    """LᵀB L (r, r), and the degrees of freedom of the shared parameters' variances (shared,).
+    """Return the covariance of the score for correlated errors.
 
-    The latter after Satterthwaite (1946), with a Wishart matrix for Σ; priors are exact.
+    Parameters
+    ----------
+    information : Information
+        Information of the fit.
+    processes : tuple of ErrorProcess
+        Error process of each block.
+    shared : int
+        Number of shared parameters.
+
+    Returns
+    -------
+    ((r, r) array, (shared,) array)
+        LᵀB L, and degrees of freedom of the variances of shared parameters after Satterthwaite
+        (1946), with a Wishart distribution for Σ and exact priors.
     """
     directions = information.fit.root[:shared].T
     total = information.prior.copy()
-    doubt = np.zeros(directions.shape[1])
+    variance_of_variance = np.zeros(directions.shape[1])
     for slope, process in zip(information.slopes, processes, strict=True):
         shape = slope.shape[0] * slope.shape[1], slope.shape[2]
         smoothed = along_time(process.along_time, slope)
@@ -419,33 +490,37 @@ def score_covariance(
             spread = np.sum(share * share.T)
             if spread > 0:
                 freedom = process.samples * variance**2 / spread
-                doubt[k] += variance**2 / min(freedom, process.degrees_of_freedom)
+                variance_of_variance[k] += variance**2 / min(freedom, process.degrees_of_freedom)
     variances = np.sum((directions.T @ total) * directions.T, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = np.where(doubt > 0, variances**2 / doubt, np.inf)
+        freedom = np.where(variance_of_variance > 0, variances**2 / variance_of_variance, np.inf)
     return total, np.maximum(freedom, 1.0)
 
 
 def _innovations(
     residual: Array, present: NDArray[np.bool_], coefficients: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """What the past does not predict, (T − order, 3M), zero where a sample it needs is missing."""
+    """Return the part of the residuals that earlier samples do not predict, (T − order,
+    3M), and a mask of where it is known.
+    """
     order = len(coefficients)
     innovation = residual[order:].copy()
-    known = present[order:].copy()
+    is_known = present[order:].copy()
     for k, coefficient in enumerate(coefficients, start=1):
         past = slice(order - k, len(residual) - k)
         innovation -= coefficient * residual[past]
-        known &= present[past]
-    return innovation * known, known
+        is_known &= present[past]
+    return innovation * is_known, is_known
 
 
 def _among_channels(residual: Array, present: NDArray[np.bool_]) -> Array:
-    """Covariance of channels (3M, 3M) over the samples both have."""
+    """Return the covariance (3M, 3M) of channels over samples that both have, made positive
+    semidefinite.
+    """
     counts = present.T.astype(float) @ present
-    found = residual.T @ residual / np.maximum(counts, 1)
+    covariance = residual.T @ residual / np.maximum(counts, 1)
     if present.all():
-        return found
+        return covariance
     # Pairs with different gaps can give a matrix that is no covariance.
-    values, vectors = np.linalg.eigh(found)
+    values, vectors = np.linalg.eigh(covariance)
     return (vectors * np.maximum(values, 0)) @ vectors.T

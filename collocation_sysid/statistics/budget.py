@@ -1,11 +1,12 @@
-"""What each estimate's variance comes from: noise, nuisances, step and mesh, and what is assumed.
+"""Uncertainty budget: share of each source in the variance of each estimate.
 
-With A the information of a fit, J its slopes and J_c how its residuals change where an assumption
-is off by its deviation, estimates of parameters p follow by S = −(JᵀJ)⁻¹ Jᵀ J_c, and have the
-covariance P + S Sᵀ: that of the fit and that of what it assumes (considered parameters: Schmidt,
-NASA TN D-1235, 1962; type B evaluation: JCGM 100:2008, 4.3). That one value holds for all
-recordings is assumed too; by how much it does not is seen from them, see `scatter`, and where that
-decides intervals are Student's with their degrees of freedom (Welch & Satterthwaite: ibid., G.4).
+Sources are noise, nuisance parameters, discretisation, differences between recordings, and
+systematic effects. With J the derivatives of a fit's residuals and J_c their changes if an
+assumption is off by its standard deviation, the estimates change by C = −(JᵀJ)⁻¹ Jᵀ J_c and have
+the covariance P + C Cᵀ, P being that of the fit (considered parameters: Schmidt, NASA TN D-1235,
+1962; type B evaluation: JCGM 100:2008, 4.3). Differences of parameters between recordings are
+estimated from the recordings, see `scatter`; where they dominate, intervals are Student's with
+their degrees of freedom (Welch & Satterthwaite: ibid., G.4).
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ BETWEEN = "between recordings"
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """The variance of one estimate by source.
+    """Uncertainty budget of one estimate.
 
     Attributes
     ----------
     value : float
-        The estimate, corrected for the discretisation error.
-    shares : mapping of source to its share of the variance, largest first; they sum to one
+        The estimate, corrected for the discretisation error and known effects.
+    shares : mapping of str to float
+        Share of each source in the variance, largest first; they sum to one.
     combined95 : (lower, upper)
         95 % interval due to all sources.
     combined_std_error : float
@@ -48,7 +50,7 @@ class BudgetLine:
         Standard deviation of the systematic effects and of the differences between recordings, in
         the coordinate of the estimate, see `Coordinate`.
     known_effect : float
-        Correction for the known effects, in the same coordinate; `value` contains it.
+        Correction for known effects in the same coordinate, contained in `value`.
     """
 
     value: float
@@ -59,11 +61,21 @@ class BudgetLine:
     known_effect: float = 0.0
 
     def widened(self, source: str, deviation: float, at: Coordinate) -> BudgetLine:
-        """Add a source with a standard deviation in the coordinate `at` of the estimate."""
+        """Return the budget with one more source of variance.
+
+        Parameters
+        ----------
+        source : str
+            Name of the source.
+        deviation : float
+            Its standard deviation in the coordinate of the estimate.
+        at : Coordinate
+            That coordinate.
+        """
         low, high = map(at.at, self.combined95)
-        known = ((high - low) / 2 / NORMAL_95) ** 2
-        total = known + deviation**2
-        shares = {name: share * known / total for name, share in self.shares.items()}
+        known_variance = ((high - low) / 2 / NORMAL_95) ** 2
+        total = known_variance + deviation**2
+        shares = {name: share * known_variance / total for name, share in self.shares.items()}
         shares[source] = deviation**2 / total
         least, most = widened((low, high), at.at(self.value), deviation)
         return BudgetLine(
@@ -78,21 +90,29 @@ class BudgetLine:
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """What moves the estimates of a fit, beside its noise.
+    """Covariances and sensitivities from which budgets are computed.
 
     Attributes
     ----------
-    names : (a,) of what is assumed, with its components
-    moved : (nq, a) how the shared parameters q follow, each off by its deviation
-    free, known : (nq, nq) covariances of q for noise as given, with nuisance parameters free, and
-        with these known
-    by_q : mapping of estimate to (nq,), its derivative
-    wider : (nq,) by how much intervals are wider than noise makes them, as recordings disagree
-    between : (nq, b) how q follows what parameters differ by between recordings
+    names : (a,) tuple of str
+        Names of the assumptions with their components.
+    moved : (nq, a) array
+        Changes of the shared parameters q if each is off by its standard deviation.
+    free : (nq, nq) array
+        Covariance of q for the stated noise, with free nuisance parameters.
+    known : (nq, nq) array
+        Covariance of q for the stated noise, with known nuisance parameters.
+    by_q : mapping of str to (nq,) array
+        Derivatives of each estimate.
+    wider : (nq,) array
+        Factor by which intervals are widened because recordings disagree.
+    between : (nq, b) array
+        Changes of q with the differences of parameters between recordings, in their standard
+        deviations.
     freedom : int
-        How many recordings tell that, less one.
-    means : mapping of assumption to the size of a known effect over its deviation
-        Estimates are to be corrected for these effects.
+        Degrees of freedom of these deviations: recordings less one.
+    means : mapping of str to float
+        Known effects over their standard deviations, for which estimates are corrected.
     """
 
     names: tuple[str, ...]
@@ -115,7 +135,23 @@ class Sources:
         uncertainty: Uncertainty,
         means: Mapping[str, float] | None = None,
     ) -> Sources:
-        """Those of a fit near its answer q (nq,), with known effects `means` if there are any."""
+        """Compute the sources of a fit.
+
+        Parameters
+        ----------
+        fit : LinearisedFit
+            The fit at its answer.
+        assumed : Changes
+            Changes of its residuals by the assumptions.
+        parameters : Parameters
+            Shared parameters.
+        q : (nq,) array
+            Estimates in the solver's coordinates.
+        uncertainty : Uncertainty
+            Statistical uncertainty of the fit.
+        means : mapping of str to float, optional
+            Known effects over their standard deviations; None if there are none.
+        """
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared]
         all_free, known = (np.zeros((fit.shared, fit.shared)) for _ in range(2))
@@ -138,21 +174,39 @@ class Sources:
         )
 
     def of_noise(self, by_q: Array) -> tuple[float, float]:
-        """Of a variance by noise, the shares if nuisances were known and recordings agreed."""
+        """Return shares of the statistical variance of an estimate with the derivative `by_q`
+        (nq,).
+
+        Returns
+        -------
+        (float, float)
+            Share that would remain with known nuisance parameters; and share that would remain if
+            recordings agreed.
+        """
         widened = self.wider * by_q
-        known, whole, all_of_it = (
+        known, all_free, all_widened = (
             float(g @ of_q @ g)
             for g, of_q in ((by_q, self.known), (by_q, self.free), (widened, self.free))
         )
-        if not whole > 0:
+        if not all_free > 0:
             return 1.0, 1.0
-        agreed = 1.0 if (self.wider == 1).all() else whole / all_of_it
-        return float(np.clip(known / whole, 0.0, 1.0)), agreed
+        agreed = 1.0 if (self.wider == 1).all() else all_free / all_widened
+        return float(np.clip(known / all_free, 0.0, 1.0)), agreed
 
     def of_recordings(self, by_q: Array, others: float, told: float) -> float:
-        """A variance by what parameters differ by between recordings, beyond what is told of it.
+        """Return the variance due to differences of parameters between recordings, beyond what is
+        counted already.
 
-        It is as large as its interval is beside that of all others.
+        It is enlarged such that a normal interval is as wide as Student's interval of the sum.
+
+        Parameters
+        ----------
+        by_q : (nq,) array
+            Derivatives of the estimate.
+        others : float
+            Variance of all other sources.
+        told : float
+            Variance between recordings that is counted already.
         """
         more = max(0.0, float(np.sum((by_q @ self.between) ** 2)) - told)
         if not more:
@@ -161,12 +215,16 @@ class Sources:
         return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
 
     def known_effect(self, by_q: Array) -> float:
-        """Return the correction for known effects of what has the derivative `by_q` (nq,)."""
+        """Return the correction for known effects of an estimate with the derivative `by_q`
+        (nq,).
+        """
         sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
         return float(by_q @ self.moved @ sizes)
 
     def of_assumed(self, by_q: Array) -> dict[str, float]:
-        """Variances by each assumption, of what has this derivative."""
+        """Return the variance by each assumption, its components summed, of an estimate
+        with the derivative `by_q` (nq,).
+        """
         variances: dict[str, float] = {}
         for name, way in zip(self.names, by_q @ self.moved, strict=True):
             row = name.partition(" ")[0]
@@ -266,7 +324,7 @@ def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
 
 
 def _slopes(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
-    """(nq,) derivatives of each estimate by q."""
+    """Return the derivatives (nq,) of each estimate by q, by name."""
     values = parameters.values(q)
     slopes = {name: np.zeros(len(q)) for name in values}
     for k, item in enumerate(parameters.free):
@@ -278,7 +336,16 @@ def _slopes(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, A
 
 
 def largest_first(shares: Mapping[str, Mapping[str, float]], least: float) -> list[str]:
-    """The sources that have at least a share of some estimate's variance, the largest first."""
+    """Return the sources with at least a share `least` in the variance of some estimate, the
+    largest first.
+
+    Parameters
+    ----------
+    shares : mapping of str to mapping of str to float
+        Shares by estimate and source.
+    least : float
+        Smallest share of interest.
+    """
     largest: dict[str, float] = {}
     for source, share in (each for line in shares.values() for each in line.items()):
         largest[source] = max(share, largest.get(source, 0.0))
@@ -286,6 +353,6 @@ def largest_first(shares: Mapping[str, Mapping[str, float]], least: float) -> li
 
 
 def worded(source: str) -> str:
-    """A source as people read it."""
+    """Return the name of a source as text, without unit suffix."""
     unit = next((u for u in ("_m_n", "_1_m2", "_rad", "_m", "_s") if source.endswith(u)), "")
     return source.removesuffix(unit).replace("_", " ")

@@ -1,7 +1,8 @@
-"""Depth cameras that see hardly anything of the body: what is likely wrong with their description.
+"""Misspecification of depth cameras: hypotheses about pose, frame and units of a camera that sees
+hardly anything of the body.
 
-Where points may belong to the body, its surface as grasps carry it has points nearby. Where hardly
-any of it has, the usual mistakes are undone, one and then two at a time.
+The surface of the body in its grasps should have measured points nearby. If hardly any of it has,
+common mistakes are corrected, first one and then two at a time, to find which would explain that.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ from ..recording.depth import Depth, points_of
 from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
-# Of the surface, how much has points nearby where it is hardly seen, and where it is.
+# Share of the surface with points nearby below which the body is hardly visible.
 HARDLY = 0.1
+# Share from which on it is well visible.
 WELL = 0.5
-# Descriptions by which a share less of the surface has them cannot be told from the best.
+# Descriptions whose share is smaller than the best by less than this are not distinguishable.
 ALIKE = 0.1
 # The axes of a camera in frames of other conventions: right, down and ahead in columns.
 FRAMES = {
@@ -37,22 +39,25 @@ FRAMES = {
 }
 EXPECTED = "state that of one with x to the right, y down, z forward"
 MILLI = 1e-3
-# Units that are wrong by powers of ten up to this one are looked for.
+# Largest power of ten of wrong units that are tried.
 LARGEST_POWER = 4
-# A cloud of fewer points is all within a few of the cubes that it was thinned by, as where its unit
-# is too small.
+# Clouds with fewer points are too small to cover the body, for instance because thinning in the
+# wrong unit left few.
 COLLAPSED = 50
 
 
 @dataclass(frozen=True)
 class Seeing:
-    """How a camera is described.
+    """Pose and units of a camera.
 
     Attributes
     ----------
-    carrier, pose : (4, 4) motions of what carries it, and of its frame on that
+    carrier : (4, 4) array
+        Motion of what carries the camera, to the world.
+    pose : (4, 4) array
+        Motion of the camera's frame on its carrier.
     factor : float
-        Of the points that it sees.
+        Factor of the measured points.
     """
 
     carrier: Array
@@ -61,18 +66,21 @@ class Seeing:
 
 
 def _scaled(seeing: Seeing, by: float) -> Seeing:
+    """Return the description with the translation of the pose scaled."""
     pose = seeing.pose.copy()
     pose[:3, 3] *= by
     return replace(seeing, pose=pose)
 
 
 def _turned(seeing: Seeing, turn: list[list[int]]) -> Seeing:
+    """Return the description with the camera's frame rotated by a matrix (3, 3)."""
     pose = seeing.pose.copy()
     pose[:3, :3] = pose[:3, :3] @ np.array(turn, dtype=float)
     return replace(seeing, pose=pose)
 
 
 def _with_factor(seeing: Seeing, factor: float) -> Seeing:
+    """Return the description with another factor of the points."""
     return replace(seeing, factor=factor)
 
 
@@ -116,13 +124,10 @@ POWERS: dict[str, Undo] = {
 
 
 def require_depth_units(experiment: Experiment) -> None:
-    """Refuse depth whose unit is wrong by a power of ten: no point would be near the body.
+    """Raise InputError if the unit of a depth camera's points is wrong by a power of ten.
 
-    Raises
-    ------
-    InputError
-        Where hardly any of the body has points of a camera nearby, and most of it would have if all
-        distances were a power of ten times as large.
+    That is the case if hardly any of the body has points nearby, and most of it would have if all
+    distances were a power of ten larger or smaller.
     """
     for depth in experiment.depths:
         view = _OneCamera(experiment, depth)
@@ -145,7 +150,7 @@ def require_depth_units(experiment: Experiment) -> None:
 
 
 def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """That depth cameras are described wrongly which see hardly anything of the body."""
+    """Yield hypotheses for depth cameras that see hardly anything of the body."""
     for depth in experiment.depths:
         view = _OneCamera(experiment, depth)
         here = view.share(view.stated)
@@ -163,15 +168,16 @@ def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 class _OneCamera:
-    """How much of the body a camera sees with another description.
+    """Test of other descriptions of one camera.
 
     Attributes
     ----------
     stated : Seeing
+        Description as stated.
     within_m : float
-        So near to the undeformed body points may be of it.
+        Points within this distance of the undeformed body may belong to it [m].
     points_m, body_m : float
-        Median distances of its points and of the undeformed body from the camera [m].
+        Median distances of the points and of the undeformed body from the camera [m].
     collapsed : bool
         Whether too few points are left to be near much of the body.
     """
@@ -205,22 +211,26 @@ class _OneCamera:
         self.body_m = float(np.median(np.linalg.norm(self.shape_m - eye_m, axis=1)))
 
     def share(self, seeing: Seeing) -> float:
-        """Of the surface that is turned to the camera what has points nearby."""
+        """Return the share of the surface facing the camera that has points nearby, for a
+        description.
+        """
         motion = seeing.carrier @ seeing.pose
         turn = motion[:3, :3]
         eye_m = motion[:3, 3]
-        turned = self.skin.facing(self.shape_m, eye_m if self.pinhole else None)
-        if not turned.any():
+        is_facing = self.skin.facing(self.shape_m, eye_m if self.pinhole else None)
+        if not is_facing.any():
             return 0.0
-        middles_m = self.shape_m[self.skin.flat[turned]].mean(axis=1)
-        own = (middles_m - eye_m) @ turn / seeing.factor
-        nearest, _ = self.tree.query(own, distance_upper_bound=self.within_m / seeing.factor)
+        middles_m = self.shape_m[self.skin.flat[is_facing]].mean(axis=1)
+        in_camera = (middles_m - eye_m) @ turn / seeing.factor
+        nearest, _ = self.tree.query(in_camera, distance_upper_bound=self.within_m / seeing.factor)
         return float(np.isfinite(nearest).mean())
 
     def likeliest(self) -> list[tuple[str, ...]]:
-        """One mistake without which it sees the body, or else two; all that do as well, best first.
+        """Return the combinations of one mistake, or else of two, whose correction makes the body
+        visible, best first.
 
-        A body that looks alike from two sides does not tell which of two it is.
+        All combinations that do nearly as well are returned, because a body that looks alike from
+        two sides does not distinguish them. Empty if none does.
         """
         for count in (1, 2):
             alone = (POWERS,) if count == 1 else ()
@@ -235,5 +245,6 @@ class _OneCamera:
         return []
 
     def _without(self, mistakes: tuple[str, ...]) -> Seeing:
+        """Return the stated description with some mistakes corrected."""
         undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
         return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.stated)

@@ -1,12 +1,12 @@
-"""Why a fit misses its data: what is tried, refitted, and fits far better is the likely cause.
+"""Misspecification hypotheses for a fit that misses its data: refits without a mistake, ranked by
+misfit.
 
-Doubts about the description (`modal`) come for little. The others are changes of one experiment,
-the one that fits worst: it is fitted again without each mistake, and the factor by which its misfit
-falls is the cause's strength. Of gravity's directions the body's modes choose the one that is
-tried.
+The tests of `modal` cost little. The others change the experiment that fits worst: it is fitted
+again with each mistake corrected, and the factor by which its misfit decreases is the strength of
+the hypothesis. Of the directions of gravity, the natural modes choose the one that is refitted.
 
-A measured wrench is compared with the one that a fit to the markers alone has, which a wrong wrench
-has not bent. Tares are allowed for by their priors.
+A measured wrench is compared with the prediction of a fit to the markers alone, which a wrong
+wrench has not distorted. Tares are allowed for by their priors.
 """
 
 from __future__ import annotations
@@ -33,71 +33,82 @@ from .hypothesis import Hypothesis, Trial, clock, ranked
 from .modal import ModalComparison, doubts, gravity_mistakes
 from .plausible import against_the_load
 
-# Residuals up to so many standard deviations are noise: they need no cause.
+# RMS residual in standard deviations up to which there is nothing to explain.
 NOISE = 1.15
-# A refit is far better if its misfit is smaller by this factor, or if it leaves noise only.
+# Factor by which the misfit of a refit must decrease, unless only noise remains.
 BETTER = 1.5
-# A marker slips if two means, before and after, explain its residuals so much better than one.
+# Factor by which two means, before and after, must explain residuals better than one.
 SLIP = 2.0
+# Largest number of samples of a refit.
 MOST_SAMPLES = 100
+# Largest number of refits for the lag of a clock.
 CLOCK_REFITS = 4
-# A refit may take as many sweeps as the fit took iterations, within these, and all refits together
-# so many times the work of the fit; its last step of a parameter's logarithm may be so long.
+# Fewest sweeps of one refit.
 FEWEST_SWEEPS = 15
+# Most sweeps of one refit; within these limits, as many as the fit took iterations.
 MOST_SWEEPS = 40
+# Work of all refits over that of the fit.
 EFFORT = 3
+# Most sweeps of all refits.
 BUDGET = 150
+# Length of the last step of a parameter's logarithm.
 TOLERANCE = 1e-2
-# A cause without which the misfit falls so much is certain: no other is looked for.
+# Factor of the misfit from which on no other hypothesis is tested.
 CERTAIN = 4.0
+# Change of the lag that ends the search [s].
 SAME_LAG_S = 5e-4
-# Samples before and after a slip at least.
+# Fewest samples before and after a slip.
 SHORTEST = 4
 
 
 def likely_causes(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
-    """What is likely described wrongly, likeliest first; empty where the residuals are noise.
+    """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
+    are noise.
 
     Parameters
     ----------
     solution : Solution
+        The fit.
     budget : int, optional
-        Sweeps over the recording's first samples that all refits together may take; by default
-        three times the work of the fit, 150 at most.
+        Largest number of sweeps over the first samples for all refits together; by default three
+        times the work of the fit, at most 150.
 
     Returns
     -------
     tuple of Hypothesis
-        Their `strength` is the factor by which the misfit falls without the mistake.
+        `strength` is the factor by which the misfit decreases without the mistake.
     """
     fitted = [segment.experiment for segment in solution.collocation.segments]
     misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
-    found = [*wrench_causes(solution), *(cause for e in fitted for cause in against_the_load(e))]
+    hypotheses = [
+        *wrench_causes(solution),
+        *(cause for e in fitted for cause in against_the_load(e)),
+    ]
     if max(misfits) > NOISE:
         worst = fitted[int(np.argmax(misfits))]
-        found += doubts(worst, solution.parameters, solution.collocation.huber)
-        if max((each.strength for each in found), default=0.0) < CERTAIN:
-            found += _refitted(solution, worst, budget)
-    return ranked(found)
+        hypotheses += doubts(worst, solution.parameters, solution.collocation.huber)
+        if max((each.strength for each in hypotheses), default=0.0) < CERTAIN:
+            hypotheses += _refitted(solution, worst, budget)
+    return ranked(hypotheses)
 
 
 def _refitted(solution: Solution, experiment: Experiment, budget: int | None) -> list[Hypothesis]:
-    """What the experiment fits far better without."""
+    """Return the hypotheses without which the experiment fits far better."""
     given = first_samples(experiment, MOST_SAMPLES)
     alone = _Alone(solution, given, budget)
-    read = alone.fit(given)
-    if read is None:
+    fitted_m = alone.fit(given)
+    if fitted_m is None:
         return []
-    trial = Trial(_misfit(given, read), alone.left, BETTER, least=1.0, noise=NOISE)
+    trial = Trial(_misfit(given, fitted_m), alone.left, BETTER, least=1.0, noise=NOISE)
     of = f"'{experiment.name}'"
-    lags = [] if given.static else _best_lag(alone, given, read, of)
+    lags = [] if given.static else _best_lag(alone, given, fitted_m, of)
     comparison = ModalComparison.of(given, solution.parameters)
     turned = [] if comparison is None else _other_gravity(given, comparison)
-    return [*trial.of([*lags, *_slip(given, read, of), *turned, *_other_layers(given, of)])]
+    return [*trial.of([*lags, *_slip(given, fitted_m, of), *turned, *_other_layers(given, of)])]
 
 
 def _other_gravity(given: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
-    """Of gravity's directions the one that suits the body's modes best."""
+    """Yield the direction of gravity that suits the natural modes best, as a hypothesis."""
     others = gravity_mistakes(comparison.given)
     nearest = min(others, key=lambda each: comparison.misfit_m(each.without), default=None)
     if nearest is not None:
@@ -106,13 +117,16 @@ def _other_gravity(given: Experiment, comparison: ModalComparison) -> Iterator[H
 
 
 def _other_layers(given: Experiment, of: str) -> Iterator[Hypothesis]:
+    """Yield hypotheses of grasps one layer of elements deeper or less deep."""
     for deeper, deep in ((True, "deeper"), (False, "less deep")):
         if (layered := _one_layer(given, deeper)) is not None:
             yield Hypothesis("grasp-layer", of, {"deep": deep}, layered)
 
 
 def _slip(given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
-    """The experiment without the marker whose residuals step most, if one does."""
+    """Yield the hypothesis that one marker slipped, if its residuals change abruptly; the
+    experiment is then refitted without it.
+    """
     residual = _residual(given, read)
     described = Described.of(given)
     if described is not None:
@@ -129,11 +143,13 @@ def _slip(given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
 
 
 def _step(residual: Array) -> tuple[float, int]:
-    """How much better two means explain residuals (T, 3) than one, and from which sample on."""
-    there = np.flatnonzero(np.isfinite(residual[:, 0]))
-    if len(there) < 2 * SHORTEST:
+    """Return by what factor two means explain residuals (T, 3) better than one, and the
+    sample at which the second begins.
+    """
+    present = np.flatnonzero(np.isfinite(residual[:, 0]))
+    if len(present) < 2 * SHORTEST:
         return 1.0, 0
-    x = residual[there]
+    x = residual[present]
     total = np.cumsum(x, axis=0)[:-1]
     count = np.arange(1, len(x))[:, None]
     before = total / count
@@ -142,13 +158,12 @@ def _step(residual: Array) -> tuple[float, int]:
     k = SHORTEST - 1 + int(np.argmax(gain[SHORTEST - 1 : len(x) - SHORTEST]))
     one = np.sum((x - x.mean(axis=0)) ** 2)
     two = np.sum(x**2) - gain[k]
-    return float(np.sqrt(one / max(two, 1e-30))), int(there[k + 1])
+    return float(np.sqrt(one / max(two, 1e-30))), int(present[k + 1])
 
 
 class _Alone:
-    """Fits of one experiment at a time, from the problem's guess, as long as sweeps are left.
-
-    What the fit itself took bounds them: a mistake undone is no harder to fit than made.
+    """Fits of one experiment at a time from the problem's guess, with a limited number of
+    sweeps.
     """
 
     def __init__(self, solution: Solution, given: Experiment, sweeps: int | None) -> None:
@@ -163,32 +178,33 @@ class _Alone:
             self.known[given] = solution.readings_m[0]
 
     def fit(self, experiment: Experiment) -> Array | None:
-        """Fitted markers (T, M, 3); None where there is no fit."""
+        """Return the fitted markers (T, M, 3) [m]; None if there is no fit. Results are cached."""
         if experiment not in self.known:
             self.known[experiment] = self._fit(experiment)
         return self.known[experiment]
 
     def left(self, experiment: Experiment) -> float | None:
-        """Misfit of the fit; None where there is none."""
-        read = self.fit(experiment)
-        return None if read is None else _misfit(experiment, read)
+        """Return the misfit after a refit; None if there is no fit."""
+        fitted_m = self.fit(experiment)
+        return None if fitted_m is None else _misfit(experiment, fitted_m)
 
     def _fit(self, experiment: Experiment) -> Array | None:
+        """Fit one experiment and count the sweeps."""
         if self.sweeps <= 0:
             return None
         method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
         try:
-            found = method(replace(self.collocation, experiments=(experiment,)))
+            solution = method(replace(self.collocation, experiments=(experiment,)))
         except (InputError, SimulationError):
             return None
-        self.sweeps -= found.iterations
-        found.unless_interrupted()
-        ended = found.status.converged or found.status is Status.ITERATION_LIMIT
-        return found.readings_m[0] if ended else None
+        self.sweeps -= solution.iterations
+        solution.unless_interrupted()
+        ended = solution.status.converged or solution.status is Status.ITERATION_LIMIT
+        return solution.readings_m[0] if ended else None
 
 
 def _best_lag(alone: _Alone, given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
-    """The lag by which residuals and velocities agree, refitted a few times."""
+    """Yield the clock lag for which residuals and velocities agree best, after a few refits."""
     least = _misfit(given, read)
     lag_s = 0.0
     shifted = given
@@ -212,24 +228,27 @@ def _best_lag(alone: _Alone, given: Experiment, read: Array, of: str) -> Iterato
 
 
 def with_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
-    """The experiment with its poses `lag_s` later; None if too little is left of it."""
+    """Return the experiment with its poses `lag_s` later [s]; None if too few samples remain."""
     t_s = experiment.t_s
-    kept = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
-    if kept.sum() < 3:
+    is_covered = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
+    if is_covered.sum() < 3:
         return None
     markers = experiment.markers
     try:
         return replace(
             experiment,
-            t_s=t_s[kept],
+            t_s=t_s[is_covered],
             grasps=[replace(g, poses=_later(g, t_s, lag_s)) for g in experiment.grasps],
-            markers=replace(markers, t_s=t_s[kept], positions_m=markers.positions_m[kept]),
+            markers=replace(
+                markers, t_s=t_s[is_covered], positions_m=markers.positions_m[is_covered]
+            ),
         )
     except InputError:
         return None
 
 
 def _later(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
+    """Return the poses of a grasp, `lag_s` later [s]."""
     poses = grasp.poses
     if len(poses.t_s) < 2:
         return poses
@@ -247,7 +266,9 @@ def _later(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
 
 
 def _lag_s(experiment: Experiment, read: Array) -> float:
-    """By how much the markers lag behind the fit: Σ r·v / Σ v·v of residuals and velocities."""
+    """Return by how much the markers lag behind the fit [s]: Σ r·v / Σ v·v of residuals and
+    velocities.
+    """
     v = np.gradient(read, experiment.timestep_s, axis=0)
     residual = np.where(
         np.isfinite(experiment.markers.positions_m), _residual(experiment, read), 0.0
@@ -257,17 +278,19 @@ def _lag_s(experiment: Experiment, read: Array) -> float:
 
 
 def _one_layer(experiment: Experiment, deeper: bool) -> Experiment | None:
-    """With every grasp one layer of elements deeper or less deep; None where that is none."""
+    """Return the experiment with every grasp one layer of elements deeper or less deep;
+    None if that is impossible.
+    """
     cells = experiment.body.cells
     n = len(experiment.body.nodes_m)
     grasps = []
     for grasp in experiment.grasps:
-        held = np.isin(np.arange(n), grasp.nodes)
+        is_grasped = np.isin(np.arange(n), grasp.nodes)
         # The layer that touches what is held, or of what is held that which touches the rest.
-        touched = held if deeper else ~held
+        touched = is_grasped if deeper else ~is_grasped
         grown = np.zeros(n, dtype=bool)
         grown[cells[touched[cells].any(axis=1)]] = True
-        nodes = np.flatnonzero(grown if deeper else held & ~grown)
+        nodes = np.flatnonzero(grown if deeper else is_grasped & ~grown)
         if len(nodes) < 3 or len(nodes) > n - 1:
             return None
         grasps.append(replace(grasp, nodes=nodes))
@@ -278,23 +301,26 @@ def _one_layer(experiment: Experiment, deeper: bool) -> Experiment | None:
 
 
 def _residual(experiment: Experiment, read: Array) -> Array:
+    """Return fitted less measured markers (T, M, 3) [m], NaN where missing."""
     return np.where(
         experiment.markers.present[..., None], read - experiment.markers.positions_m, np.nan
     )
 
 
 def _misfit(experiment: Experiment, read: Array) -> float:
-    """Root mean square of the residuals in standard deviations."""
+    """Return the root mean square of the residuals in standard deviations."""
     scaled = _residual(experiment, read) / experiment.markers.sigma_m[:, None]
     return root_mean(scaled[experiment.markers.present] ** 2)
 
 
-# Residuals up to so many standard deviations need no cause; what is right leaves so much less.
+# RMS residual of a wrench in standard deviations that needs an explanation; a correct description
+# must leave less.
 MISFIT = 1.3
-# Clocks may be off by this share of a recording.
+# Largest clock shift that is tried, over the length of the recording.
 LATEST = 0.25
+# Number of intervals of the clock shifts that are tried.
 SHIFTS = 60
-# What forces, and torques, are written in by mistake.
+# Wrong units of forces and of torques that are tried, with their factors.
 UNITS = (
     (
         "forces",
@@ -306,18 +332,19 @@ UNITS = (
 
 
 def wrench_causes(solution: Solution) -> list[Hypothesis]:
-    """What is likely described wrongly of the wrenches; empty where they fit."""
+    """Return hypotheses about wrongly described wrenches; empty if they fit."""
     if not any(map(_missed, solution.parts)):
         return []
-    found = []
+    hypotheses = []
     for part in _from_markers(solution.collocation):
         forced = part.motion.forced
         for sensor in part.segment.sensors:
-            found += _of_sensor(part, sensor, forced)
-    return found
+            hypotheses += _of_sensor(part, sensor, forced)
+    return hypotheses
 
 
 def _missed(part: Part) -> bool:
+    """Whether the residuals of a wrench exceed the noise."""
     # They are behind the markers.
     pairs = zip(part.segment.sensors, part.looked[1:], strict=False)
     return any(
@@ -327,25 +354,27 @@ def _missed(part: Part) -> bool:
 
 
 def _from_markers(collocation: Collocation) -> list[Part]:
-    """Every experiment with markers where these alone have it; none where that cannot be found."""
-    seen = [s for s in collocation.segments if s.experiment.markers.samples]
-    if not seen:
+    """Return every experiment with markers, fitted without wrenches; empty if the fit fails."""
+    with_markers = [s for s in collocation.segments if s.experiment.markers.samples]
+    if not with_markers:
         return []
-    blind = [without_sensors(segment.experiment) for segment in seen]
+    without_wrenches = [without_sensors(segment.experiment) for segment in with_markers]
     try:
-        alone = replace(collocation, experiments=blind)
+        alone = replace(collocation, experiments=without_wrenches)
         solution = ReducedSpace(max_iterations=MOST_SWEEPS)(alone)
     except (InputError, SimulationError):
         return []
-    found = []
-    for segment, part in zip(seen, solution.parts, strict=True):
+    parts = []
+    for segment, part in zip(with_markers, solution.parts, strict=True):
         known = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
         phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
-        found.append(Part(segment, part.q, phi, part.x))
-    return found
+        parts.append(Part(segment, part.q, phi, part.x))
+    return parts
 
 
 def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> Iterator[Hypothesis]:
+    """Yield the hypotheses for one wrench sensor that decrease its misfit."""
+
     def left(without: tuple[Wrench, float]) -> float:
         return _wrench_misfit(part, sensor.told(without[0]), forced, without[1])
 
@@ -359,29 +388,33 @@ def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> Iterator[Hy
 
 
 def _weighs(part: Part) -> bool:
-    """Whether markers alone tell how large forces are: by densities, or loads, that are known."""
+    """Whether markers alone determine forces, because densities or loads are known."""
     segment = part.segment
     return not segment.body.mass_slopes or without_sensors(segment.experiment).knows_a_force
 
 
 def _wrench_misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: float) -> float:
-    """RMS of the residuals in standard deviations, tares of so many sigmas allowed for."""
+    """Return the RMS of a wrench's residuals in standard deviations, allowing for tares
+    with a prior of `tare` sigmas.
+    """
     nuisance = part.segment.nuisance
-    read = sensor.of_forced(forced, np.zeros(nuisance.size))
+    predicted = sensor.of_forced(forced, np.zeros(nuisance.size))
     # Sigmas are those of what is measured, whatever a trial makes of it.
-    apart = (read - sensor.wrench.values) / sensor.wrench.sigmas
-    there = np.isfinite(apart)
-    if not there.any():
+    deviations = (predicted - sensor.wrench.values) / sensor.wrench.sigmas
+    is_measured = np.isfinite(deviations)
+    if not is_measured.any():
         return np.inf
-    counts = there.sum(axis=0)
-    sums = np.nansum(apart, axis=0)
-    held = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
-    offsets = sums / np.maximum(counts + held, 1e-12)
-    return float(np.sqrt(np.nanmean((apart - offsets) ** 2)))
+    counts = is_measured.sum(axis=0)
+    sums = np.nansum(deviations, axis=0)
+    prior_weight = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
+    offsets = sums / np.maximum(counts + prior_weight, 1e-12)
+    return float(np.sqrt(np.nanmean((deviations - offsets) ** 2)))
 
 
 def _wrench_mistakes(of: str, wrench: Wrench, tare: float, weighs: bool) -> Iterator[Hypothesis]:
-    """Each undone: the wrench, and how many sigmas its tare may have."""
+    """Yield hypotheses of a wrong wrench; `without` is the corrected wrench and the prior
+    of its tare in sigmas.
+    """
     opposite = replace(wrench, values=-wrench.values)
     yield Hypothesis("wrench-sign", of, without=(opposite, tare))
     other: Frame = "grasp" if wrench.frame == "world" else "world"
@@ -400,7 +433,7 @@ def _wrench_mistakes(of: str, wrench: Wrench, tare: float, weighs: bool) -> Iter
 
 
 def _scaled(wrench: Wrench, columns: slice, factor: float) -> Wrench:
-    """With components in another unit, and their noise, which is no smaller than stated."""
+    """Return the wrench with some components in another unit; its noise is not decreased."""
     values: Array = np.array(wrench.values)
     values[:, columns] *= factor
     sigma = "sigma_n" if columns.start == 0 else "sigma_nm"

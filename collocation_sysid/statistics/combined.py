@@ -88,7 +88,7 @@ def combine(
     if estimate.at_bound:
         return CombinedEstimate(estimate.value, None, None)
     is_corrected = error is not None or known_effect != 0.0
-    known = (estimate.value, *(estimate.statistical95 or ()))
+    known = [estimate.value, *(estimate.statistical95 or ())]
     corrections = () if error is None else (error.extrapolated, *(error.interval95 or ()))
     at = Coordinate.of(name, (*known, *corrections), linear)
     optimum = at.at(estimate.value)
@@ -137,9 +137,11 @@ def widened(ends: Interval, centre: float, deviation: float) -> Interval:
 
 
 def _within(bounds: Interval, value: float) -> float:
+    """Return a value clipped to bounds."""
     low, high = bounds
     return float(min(max(value, low), high))
 
 
 def _interval(at: Coordinate, low: float, high: float, bounds: Interval) -> Interval:
+    """Return the interval between two coordinates as values clipped to bounds."""
     return _within(bounds, at.value(low)), _within(bounds, at.value(high))

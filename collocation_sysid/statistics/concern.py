@@ -1,7 +1,7 @@
-"""What may give concern: by its code the sentence, and by the code's topic what to do about it.
+"""Warnings: message by code, remedy by topic.
 
 A concern has a code, a grade and data. The first part of the code is the topic: "noise/larger" is
-about the noise. Codes stay where words change.
+about the noise. Codes stay the same when messages are reworded.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ Grade = Literal["check", "doubtful"]
 
 @dataclass(frozen=True)
 class Topic:
-    """What concerns are about, and how they are cured.
+    """Subject of several concerns, and its remedy.
 
     Attributes
     ----------
     about : str
-        Its title.
+        Title.
     page : str
-        The page of `docs/howto` that says more.
+        Page of `docs/howto` with more information.
     cure : str
-        What to do, in a sentence or two.
-    said : mapping
-        By the rest of the code what is said, with places for the data.
+        Remedy, in a sentence or two.
+    said : mapping of str to str
+        Message for the rest of the code, with placeholders for the data.
     """
 
     about: str
@@ -50,7 +50,8 @@ TOPICS: Mapping[str, Topic] = {
     "scale": Topic(
         "The scale",
         "forces",
-        "Measure a force, tie on a known mass, or fix a density: motion alone tells ratios only.",
+        "Measure a force, attach a known mass, or fix a density: motion alone determines only "
+        "ratios.",
         {
             "unknown": "only the ratios of {names} can be told (E/ρ): no known force or mass sets "
             "their scale; fix a density, give a known mass, or measure a wrench",
@@ -60,7 +61,7 @@ TOPICS: Mapping[str, Topic] = {
         "The description",
         "wrong_description",
         "Compare units, frames, labels and clocks of the problem file with the laboratory's notes; "
-        "check looks for mistakes in the recordings before any solve.",
+        "check tests the recordings for mistakes before any solve.",
         {
             "poses-inverted": "the markers move as if the poses were inverted: invert them, they "
             "are to map the undeformed body to where it is",
@@ -78,10 +79,10 @@ TOPICS: Mapping[str, Topic] = {
             "check object.density_kg_m3 or mass_kg",
             "gravity": "the markers hang as if gravity were along {axis}: set gravity_m_s2 = "
             "[{vector}]",
-            "gripper-frame": "the markers move with the poses, but the body is elsewhere in them: "
-            "the poses are of the gripper's own frame, or the mesh is in another one; multiply "
-            "every pose on the right by the transform from the mesh's frame to the gripper's, or "
-            "fit the poses by grasp.markers",
+            "gripper-frame": "the markers move with the poses, but at another place relative to "
+            "them: the poses are of the gripper's own frame, or the mesh is in another one; "
+            "multiply every pose on the right by the transform from the mesh's frame to the "
+            "gripper's, or fit the poses by grasp.markers",
             "camera-frame": "the markers fit if all are moved rigidly: cameras and robot have "
             "different frames; set markers.template_m and template_window_s",
             "clock": "the markers' clock is {when} by about {by_ms:.3g} ms against the poses': "
@@ -114,7 +115,7 @@ TOPICS: Mapping[str, Topic] = {
             "clock is not that of the poses",
             "camera": "only {percent:.0f} % of the surface have points within {within_mm:.3g} mm: "
             "check camera.pose, that it is of a frame with x to the right, y down, z forward, and "
-            "the unit of the depth; look at the picture that check draws",
+            "the unit of the depth; see the picture that check draws",
             "camera/likely": "hardly any points are near the body; they would be if {mistakes}",
             "wrench-tare": "it seems zeroed with the body in hand: zero it before, or widen "
             "nuisance.tare",
@@ -141,10 +142,10 @@ TOPICS: Mapping[str, Topic] = {
         "trust",
         "Look at the residuals over time: a constant part means a wrong place or offset, a large "
         "beginning a wrong time of release, an oscillation a wrong stiffness or damping. "
-        "compare --materials tells whether another model predicts better.",
+        "compare --materials tests whether another model predicts better.",
         {
             "outline": "at {percent:.0f} % of its points the outline of the body is more than "
-            "{pixels:.0f} pixels off the edge of what {camera} shows of it: the body may be held "
+            "{pixels:.0f} pixels off its edge in the images of {camera}: the body may be grasped "
             "or hidden elsewhere, or have another stiffness; where depths are missing on the body "
             'itself, state background = "unknown"',
             "outlier": f"{SAMPLE}leave it out, or set solver.huber",
@@ -152,7 +153,7 @@ TOPICS: Mapping[str, Topic] = {
             "begin before the load does, or leave the sample out",
             "persist": "the residuals are not noise: they persist from sample to sample "
             "(autocorrelation {autocorrelation:.2f})",
-            "shared": "the residuals are not noise: markers or axes share them",
+            "shared": "the residuals are not noise: they are correlated among markers or axes",
             "recordings": "the recordings disagree on {names}: model error decides, not noise",
             "wild": "{percent:.0f} % of the samples are beyond Huber's threshold",
             "far": "{percent:.0f} % of the markers' samples lie far from where they can be",
@@ -186,8 +187,8 @@ TOPICS: Mapping[str, Topic] = {
             "at-bound": "{name} is at a bound",
             "not-yet": "{name} is not known yet: {reason}",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
-            "still": f"nothing moves in {{names}}: {NO_DAMPING}, and of the stiffness only what "
-            f"the sag tells; {FIX_DAMPING}",
+            "still": f"nothing moves in {{names}}: {NO_DAMPING}, and information on stiffness only "
+            f"from the sag; {FIX_DAMPING}",
             "rate": f"{MODE} has only {{samples:.1f}} samples a period, too few to see it: record "
             "at {needed_hz:.2g} Hz or more",
             "short": f"one period of {MODE} is longer than the {{duration_s:.3g}} s recorded, "
@@ -197,13 +198,13 @@ TOPICS: Mapping[str, Topic] = {
     "markers": Topic(
         "The markers",
         "motion_capture",
-        "Look at the markers' labels, unit, frame and places, and at when each is seen.",
+        "Check the markers' labels, unit, frame and places, and when each is visible.",
         {
             "off": "marker '{marker}' of '{experiment}' lies {by_mm:.3g} mm from its place on the "
             "body and is extrapolated: give its reference_m, or check the frame and unit",
-            "unseen": "marker '{marker}' of '{experiment}' is never seen: leave it out of names",
+            "unseen": "marker '{marker}' of '{experiment}' is never visible: leave it out of names",
             "missing": "marker '{marker}' of '{experiment}' is missing in {missing} of {frames} "
-            "samples: shorten window_s to where it is seen, or leave it out of names",
+            "samples: shorten window_s to where it is visible, or leave it out of names",
             "astray": "marker '{marker}' of '{experiment}' is first seen {by_mm:.3g} mm from where "
             "the guess has it: check length_unit, the frame of the poses, reference_m, and whether "
             "the guess is far too soft",
@@ -212,8 +213,8 @@ TOPICS: Mapping[str, Topic] = {
     "nuisance": Topic(
         "What is not known of a recording",
         "motion_capture",
-        "Ask whether it can be true: are gravity, clock, grasp and places as the file describes "
-        "them? If the value can be true, widen its prior in [experiment.nuisance].",
+        "Check whether the value is possible: are gravity, clock, grasp and places as the file "
+        "describes them? If it is possible, widen its prior in [experiment.nuisance].",
         {
             "limit": "{name} ended at the largest value allowed",
             "far": "{name} is {deviations:.1f} deviations of its prior away from zero",
@@ -243,14 +244,14 @@ TOPICS: Mapping[str, Topic] = {
             "coarse": f"{MODE} has only {{steps:.1f}} steps a period and is slowed down by "
             "{error:.0%}: {remedy}",
             "turn": TURN,
-            "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Steps go along "
-            "the chord of a turn, which spoils the estimates, damping most of all: {remedy}",
+            "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Steps follow "
+            "the chord of a rotation, which biases the estimates, damping most of all: {remedy}",
         },
     ),
     "stability": Topic(
         "States that are not stable",
         "material",
-        "Does the body buckle there? If not, the damping feeds energy in: take damping = "
+        "Does the body buckle there? If not, the damping law generates energy: use damping = "
         '"kelvin-voigt", which cannot, and make sure that moduli and densities are plausible.',
         {
             "grows": "'{experiment}' is not stable at {time_s:.3g} s: disturbances grow by "
@@ -260,16 +261,16 @@ TOPICS: Mapping[str, Topic] = {
     "contact": Topic(
         "Contact",
         "contact",
-        "Look at the place, the normal and the motion of the obstacle, and at the mesh where it "
-        "touches.",
+        "Check the place, the normal and the motion of the obstacle, and the mesh in the contact "
+        "area.",
         {
-            "never": "'{experiment}'{more} never touches {obstacle}{guess}, but comes as near as "
-            "{mm:.3g} mm: its force and friction say nothing",
+            "never": "'{experiment}'{more} never touches {obstacle}{guess}; the smallest gap is "
+            "{mm:.3g} mm: its force and friction carry no information",
             "coarse": "in '{experiment}'{more} only {faces:.2g} faces, {face_mm:.2g} mm large, "
-            "touch {obstacle} at a time{guess}: how wide the contact is follows from the mesh; "
-            "make it finer there",
+            "touch {obstacle} at a time{guess}: the width of the contact is that of the mesh; "
+            "refine it there",
             "pressed": "in '{experiment}'{more} {obstacle} touches already at the first "
-            "sample{guess}: where it began is not seen; let the recording begin before",
+            "sample{guess}: the first contact is not recorded; start the recording earlier",
             "lost": "in '{experiment}'{more} {obstacle} is touched no more at t = "
             "{t_s:.4g} s{guess}: if it was, check its motion and the guess, or let window_s end "
             "before",
@@ -298,7 +299,7 @@ TOPICS: Mapping[str, Topic] = {
         "The forward simulation",
         "trust",
         "If the fit is good and the simulation is not, the step is too long. If a recording is "
-        "predicted badly, the model lacks something that this recording shows.",
+        "predicted badly, the model lacks an effect that this recording contains.",
         {
             "failed": "the forward simulation of '{experiment}' failed: {why}",
             "misses": "the forward simulation of '{experiment}' misses by {rms_mm:.2g} mm, the fit "
@@ -311,7 +312,7 @@ TOPICS: Mapping[str, Topic] = {
         "The prediction",
         "trust",
         "The parameters are stated, not estimated: make sure that they belong to this body, and "
-        "that sigma is the sensor's noise. Then look for what the model lacks, or estimate a "
+        "that sigma is the sensor's noise. Then check which effects the model lacks, or estimate a "
         "parameter.",
         {
             "misses": "the prediction of '{experiment}' misses {what} by {size}{sigmas:.2g} times "
@@ -332,8 +333,8 @@ TOPICS: Mapping[str, Topic] = {
     "field": Topic(
         "The field",
         "field",
-        "Give the amplitude or lengths that the data want, or tell apart by regions what is known "
-        "to differ: a prior that is too tight makes intervals too narrow.",
+        "State the amplitude or lengths that the data suggest, or use regions where constants are "
+        "known to differ: a prior that is too tight makes intervals too narrow.",
         {
             "amplitude": "{name} differs more from place to place than its field allows for: the "
             "data want an amplitude of about {likely:.2g}, not {stated:.2g}",
@@ -349,10 +350,10 @@ TOPICS: Mapping[str, Topic] = {
             "negative": "{name} is not above zero in {below} of {elements} elements, down to "
             "{least:.3g}: lower the amplitude of its field, {stated:.2g}, or raise its length_m",
             "shapes": "the {modes} shapes of the field of {name} have only {share:.0%} of its "
-            "variance with a length of {length_m:.2g} m: what is finer than {detail_m:.2g} m is "
-            "left to the intervals; raise modes or length_m",
-            "length": "{name} changes over less than the length of its field: the data want about "
-            "{likely:.2g} m, not {stated:.2g} m; give length_m several to choose from",
+            "variance with a length of {length_m:.2g} m: variations finer than {detail_m:.2g} m "
+            "are covered by the intervals only; raise modes or length_m",
+            "length": "{name} changes over less than the length of its field: the data suggest "
+            "about {likely:.2g} m, not {stated:.2g} m; give length_m several to choose from",
         },
     ),
     "solve": Topic(
@@ -364,20 +365,24 @@ TOPICS: Mapping[str, Topic] = {
             "no-start": "there is no start yet: the first frame needs a pose",
             "not-simulable": "the body cannot be simulated with these parameters",
             "grasp-lost": "the grasp is lost",
-            "seeking": "a start is still sought",
+            "seeking": "the start is still being searched",
             "acceptable": "the solve converged to the acceptable tolerance only",
             "no-error-bars": "no error bars could be found",
             "interrupted": "interrupted: {left_out}",
             "moves": "the estimate still moves: it is farther than its error bar from where it was "
             "simulated",
-            "anew": "restarted {times}, as if the body had been at rest there",
+            "anew": "restarted {times}, assuming that the body was at rest there",
         },
     ),
 }
 
 
 def sentence_of(code: str, data: Mapping[str, Any]) -> str:
-    """What is said of a code with its data; what it is `of` stands in front where that is told."""
+    """Return the message of a code with its data.
+
+    If the data contain "of", the message begins with that subject; if they contain "nearer", the
+    factor by which the misfit decreases is appended.
+    """
     topic, _, rest = code.partition("/")
     shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
     said = TOPICS[topic].said[rest].format(**shown)
@@ -387,15 +392,16 @@ def sentence_of(code: str, data: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Concern:
-    """One thing that gives concern.
+    """One reason for concern.
 
     Attributes
     ----------
     code : str
-        Topic and what it is, such as "noise/larger"; stays the same where words change.
+        Topic and kind, such as "noise/larger"; stable when messages are reworded.
     grade : {"check", "doubtful"}
-    data : mapping
-        What its sentence holds.
+        Severity.
+    data : mapping of str to value
+        Values of the placeholders in the message.
     """
 
     code: str
@@ -404,20 +410,22 @@ class Concern:
 
     @property
     def topic(self) -> str:
-        """What it is about, by which it is cured."""
+        """Topic of the concern, a key of `TOPICS`."""
         return self.code.partition("/")[0]
 
     @property
     def sentence(self) -> str:
-        """The same for people."""
+        """Message of the concern for the user."""
         return sentence_of(self.code, self.data)
 
 
 def concerned(found: bool, gross: bool, code: str, **data: Any) -> list[Concern]:
-    """A concern where there is one, doubtful where it is gross."""
+    """Return a list with a concern if `found`, graded "doubtful" if `gross` and else
+    "check"; otherwise an empty list.
+    """
     return [Concern(code, "doubtful" if gross else "check", data)] if found else []
 
 
 def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:
-    """What several concerns are about, each topic once."""
+    """Return the topics of several concerns by key, each once."""
     return {concern.topic: TOPICS[concern.topic] for concern in concerns}

@@ -1,9 +1,9 @@
-"""How the residuals of a fit change where what it assumes is off.
+"""Consider analysis (Schmidt): changes of the residuals if assumptions are wrong.
 
-Trajectories follow the changes of forces, masses and goals by one sweep forward with a column for
-each assumption, and residuals from these, so that all together cost about as much as one
-linearisation of the fit. Nuisance parameters that are considered have their slopes as estimated
-ones do, of the same program with them among its parameters.
+Effects on forces, masses and prescribed displacements are propagated to trajectories by one forward
+sweep with a column for each assumption, and from these to residuals, at about the cost of one
+linearisation of the fit. Nuisance parameters that are not estimated are linearised like estimated
+ones, in the same program with them among its parameters.
 """
 
 from __future__ import annotations
@@ -34,7 +34,15 @@ UNWEIGHTED = 1e9
 
 @dataclass(frozen=True, eq=False)
 class _Changed(Columns):
-    """Columns by changes of forces and of rows."""
+    """Right-hand sides of a forward substitution by changes of forces and of equations.
+
+    Attributes
+    ----------
+    forces_n : (N, 3n, c) array
+        Changes of the forces at the evaluations [N].
+    rows_n : (N, 3n, c) array
+        Changes of the equations of motion [N].
+    """
 
     forces_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
     rows_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
@@ -47,38 +55,46 @@ class _Changed(Columns):
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
+        """Return R (k, free, c) and F_R (k, 3n, c), see `Columns.sides`."""
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
 
 class Changes(NamedTuple):
-    """How the residuals of a fit change where what is assumed is off by its deviation.
+    """Changes of the residuals of a fit if assumptions are off by their standard deviations.
 
     Attributes
     ----------
-    names : (a,) of assumptions, with their components
-    blocks : of each block of `LinearisedFit` (T, M, 3, a) in standard deviations
+    names : (a,) tuple of str
+        Names of the assumptions with their components.
+    blocks : list of (T, M, 3, a) arrays
+        Changes for each block of `LinearisedFit`, in units of σ.
     """
 
     names: tuple[str, ...]
     blocks: list[Array]
 
     def without(self, assumptions: Iterable[str]) -> Changes:
-        """Return the changes by all others than some assumptions, each with all its components."""
-        left_out = set(assumptions)
-        kept = [k for k, name in enumerate(self.names) if name.partition(" ")[0] not in left_out]
-        names = tuple(self.names[k] for k in kept)
-        return Changes(names, [block[..., kept] for block in self.blocks])
+        """Return the changes without some assumptions, each with all its components."""
+        excluded = set(assumptions)
+        remaining = [
+            k for k, name in enumerate(self.names) if name.partition(" ")[0] not in excluded
+        ]
+        names = tuple(self.names[k] for k in remaining)
+        return Changes(names, [block[..., remaining] for block in self.blocks])
 
 
 def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float | None]) -> Changes:
-    """The changes by all that a fit assumes.
+    """Return the changes of the residuals by all assumptions of a fit.
 
     Parameters
     ----------
     collocation : Collocation
-    z : (variables,) a point that satisfies the equations of motion
-    deviations : mapping of the name of an assumption, or nuisance parameter, to its deviation
-        In place of those of the tables; None for what is known exactly.
+        The program.
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+    deviations : mapping of str to float or None
+        Standard deviations of assumptions and nuisance parameters by name, in place of those of the
+        tables; None for what is exact.
     """
     rows = [(row, deviations.get(row.name, row.sigma)) for row in ASSUMPTIONS]
     stated = [(row, s) for row, s in rows if s is not None]
@@ -93,7 +109,9 @@ def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float |
 def considered(
     collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
 ) -> Changes:
-    """Those by nuisance parameters that are not estimated, see `assumed`."""
+    """Return the changes of the residuals by nuisance parameters that are not estimated;
+    arguments as in `assumed`.
+    """
 
     def widened(experiment: Experiment) -> Experiment:
         nuisance = experiment.nuisance
@@ -104,9 +122,9 @@ def considered(
     wider = [widened(experiment) for experiment in collocation.experiments]
     wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
     p, positions = collocation.unpack(z)
-    known = dict(zip(collocation.names, p.tolist(), strict=True))
-    at = wide.pack(np.array([known.get(name, 0.0) for name in wide.names]), positions)
-    new = np.array([k for k, name in enumerate(wide.names) if name not in known], dtype=np.int64)
+    values = dict(zip(collocation.names, p.tolist(), strict=True))
+    at = wide.pack(np.array([values.get(name, 0.0) for name in wide.names]), positions)
+    new = np.array([k for k, name in enumerate(wide.names) if name not in values], dtype=np.int64)
     names: dict[int, str] = {}
     for segment in wide.segments:
         own = zip(segment.places[wide.nq :], segment.nuisance.entries, strict=True)
@@ -123,7 +141,19 @@ def changed_residuals(
     *,
     surface_correlation: float = CORRELATION,
 ) -> Changes:
-    """Return the changes by assumptions, each with its deviation, see `assumed`."""
+    """Return the changes of the residuals by some assumptions.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        The program.
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+    assumptions : sequence of (Assumption, float)
+        Assumptions with their standard deviations.
+    surface_correlation : float
+        Correlation length of the surface's error over the longest extent of the body.
+    """
     names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
     for part in collocation.parts(z):
@@ -138,14 +168,17 @@ def changed_residuals(
 
 
 def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iterator[Array]:
+    """Yield the changes (T, M, 3, a) of the residuals of each measurement by effects, each
+    with its standard deviation; None has no effect.
+    """
     part = at.part
     count = len(effects)
     segment = part.segment
-    held = part.setting.held
+    prescribed = part.setting.held
     x = part.x
     forces = np.zeros((*x.shape, count))
     rows = np.zeros((*x.shape, count))
-    moved = np.zeros((*held.positions_m.shape, count))
+    displacements_m = np.zeros((*prescribed.positions_m.shape, count))
     for k, (effect, sigma) in enumerate(effects):
         if effect is None:
             continue
@@ -157,14 +190,16 @@ def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iter
             mass = at.dynamics.mass.kg
             rows[..., k] += 2 * sigma * effect.stretched * mass * at.acceleration
         if effect.moved_m is not None:
-            moved[..., k] = sigma * np.where(np.isnan(held.positions_m), 0.0, effect.moved_m)
+            displacements_m[..., k] = sigma * np.where(
+                np.isnan(prescribed.positions_m), 0.0, effect.moved_m
+            )
     forces[: at.dynamics.first_row] = rows[: at.dynamics.first_row] = 0.0
     solver = Sweep(segment)
     columns = _Changed(
         part.setting,
         count,
         by_p=False,
-        grasped=GraspMotion.along(solver, held.dofs, moved),
+        grasped=GraspMotion.along(solver, prescribed.dofs, displacements_m),
         forces_n=forces,
         rows_n=rows,
     )
@@ -175,12 +210,22 @@ def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iter
 def followed(
     part: Part, solver: Sweep, columns: Columns, inertia_n: Array | float = 0.0
 ) -> Iterator[tuple[Reading, Motion, Array, Array]]:
-    """Each reading along columns that are no parameters: its motion, what it looks at, and by them.
+    """Propagate columns of a forward substitution to the observables.
+
+    Yields, for each measurement: the measurement model, its motion, the values of its observable,
+    and their changes by the columns.
 
     Parameters
     ----------
-    inertia_n : (N, g, c), optional
-        What the rows of sensed dofs change by themselves: reactions are what they lack.
+    part : Part
+        The experiment at the answer.
+    solver : Sweep
+        Factorised time steps.
+    columns : Columns
+        Right-hand sides, not by parameters.
+    inertia_n : (N, g, c) array or 0
+        Changes of the equations of motion of the sensed dofs, which reaction forces do not contain
+        [N].
     """
     segment = part.segment
     x = part.x
@@ -192,11 +237,13 @@ def followed(
     motions = part.sensing.moving(x, response, by_p=False)
     for reading, motion in zip(segment.readings, motions, strict=True):
         motion = _with_inertia(motion, inertia_n)
-        looked, slopes = reading.channel.linearised(motion, phi, numbers, size)
-        yield reading, motion, looked, slopes.by[..., : columns.count]
+        values, slopes = reading.channel.linearised(motion, phi, numbers, size)
+        yield reading, motion, values, slopes.by[..., : columns.count]
 
 
 def _with_inertia(motion: Motion, inertia_n: Array | float) -> Motion:
+    """Return the motion with `inertia_n` subtracted from the changes of its reaction forces."""
+
     def forced() -> Forced:
         lacking = motion.forced
         assert lacking.reaction_by is not None  # along columns

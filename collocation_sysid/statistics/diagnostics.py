@@ -1,14 +1,13 @@
-"""What the residuals of each marker look like, and what that suggests.
+"""Diagnosis of the residuals of each marker: outliers, offsets, oscillations and drifts.
 
 A single sample may have more of the residuals' power than all others of its marker together. It
-spoils what the residuals tell: beside it all others look like white noise, however
-much they hang together. It is named, and tests of correlation look at the others, as the fit has
-left them.
+then hides the correlation of the others. Such samples are reported as outliers, and tests of
+correlation use the others, as the fit has left them.
 
 Of n independent normal samples in k coordinates the share of one in the power is a Beta variable
-with the parameters k/2 and (n − 1) k/2; the largest of n exceeds a share with n times the
-probability of one at most (Cochran 1941, Grubbs 1950). Samples are set apart one by one as long as
-one of the others spoils the rest.
+with the parameters k/2 and (n − 1) k/2; the largest of n exceeds a share with at most n times the
+probability of one (Cochran 1941, Grubbs 1950). Outliers are removed one by one as long as one of
+the others dominates the rest.
 """
 
 from __future__ import annotations
@@ -25,49 +24,58 @@ from .distributions import beta_sf, chi2_isf, normal_isf
 from .linearised import FitBlock, LinearisedFit, Mask, information
 from .noise import NoiseLevel, noise_level
 
+# Level of the tests for patterns.
 SIGNIFICANCE = 0.01
-# A pattern with this share of the residuals' power is worth naming.
+# Share of the residuals' power from which on a pattern is reported.
 DOMINANT = 0.5
+# Share of the time that counts as the beginning.
 EARLY_TIME = 0.1
 # Bins of the periodogram on both sides of its peak that belong to a damped oscillation.
 PEAK_BINS = 2
 # Fewer periods than this within the record are a drift.
 FEWEST_PERIODS = 3
+# Relative difference of frequencies that are taken as equal.
 SAME_FREQUENCY = 0.2
+# RMS residual that is rounding [m].
 ROUNDING_M = 1e-9
 # Share of the samples beyond Huber's threshold that noise alone may explain.
 MOST_WILD = 0.05
-# White residuals within this factor of σ are as they should be.
+# Factor within which uncorrelated residuals agree with σ.
 AS_STATED = 1.25
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerDiagnosis:
-    """The residuals h(x) − ŷ of one marker in one experiment.
+    """Residuals h(x) − ŷ of one marker in one experiment, and their likely cause.
 
     Shares are of the residuals' power, the sum of their squares over axes and present samples.
 
     Attributes
     ----------
     experiment, marker : str
+        Names.
     samples : int
+        Number of samples.
     wild : int
-        Samples beyond Huber's threshold.
+        Number of samples beyond Huber's threshold.
     rms_m : float
-        Of the distance between fitted and measured marker, wild samples included.
+        Root mean square distance between fitted and measured marker, including those samples [m].
     noise_factor : float
-        How many times σ its errors are, allowing for what the fit takes out of the residuals.
-    offset_m : (3,) mean of h(x) − ŷ
+        Size of its errors over σ, corrected for the effect of the fit on the residuals.
+    offset_m : (3,) array
+        Mean of h(x) − ŷ [m].
     constant_share : float
-        Power of the mean.
+        Share of the mean in the power.
     lag1 : float
         Autocorrelation of consecutive present samples about the mean, pooled over the axes.
-    frequency_hz, oscillating_share : float
-        Largest peak of the periodogram, and the power in it.
+    frequency_hz : float
+        Frequency of the largest peak of the periodogram; 0 without one.
+    oscillating_share : float
+        Share of this peak in the power.
     early_share : float
-        Power within the first tenth of the time.
+        Share of the first tenth of the time in the power.
     sentence : str
-        What this suggests.
+        Message with the likely cause.
     """
 
     experiment: str
@@ -86,7 +94,7 @@ class MarkerDiagnosis:
 
 
 def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
-    """Diagnose every marker that was seen, experiment by experiment."""
+    """Diagnose every marker that was measured, experiment by experiment."""
     level = noise_level(fit, information(fit))
     alone = {outlier.series: outlier for outlier in reversed(set_apart(fit)[1])}
     return tuple(
@@ -98,7 +106,7 @@ def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
 
 
 def _estimated(fit: LinearisedFit, block: FitBlock) -> tuple[bool, bool]:
-    """Whether marker offsets and a time shift of the experiment are estimated already."""
+    """Return whether marker offsets, and a time shift, of the experiment are estimated."""
     kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared :]]
     return any(k.startswith("offset") for k in kinds), any(k.startswith("time") for k in kinds)
 
@@ -111,6 +119,7 @@ def _diagnose(
     level: NoiseLevel,
     alone: Mapping[str, Outlier],
 ) -> MarkerDiagnosis:
+    """Diagnose one marker of a block."""
     present = block.present[:, marker]
     name = f"{block.name}/{block.marker_names[marker]}"
     residual = block.residual[:, marker] * block.sigma_m[marker]
@@ -125,7 +134,7 @@ def _diagnose(
     if not block.static:
         frequency, peak = _largest_peak(varying, block.t_s)
         early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
-    found = MarkerDiagnosis(
+    diagnosis = MarkerDiagnosis(
         experiment=block.name,
         marker=block.marker_names[marker],
         samples=samples,
@@ -141,26 +150,32 @@ def _diagnose(
         sentence="",
     )
     if name in alone:
-        said = alone[name].concern.sentence.removeprefix(f"{name}: ")
-        return replace(found, sentence=f"{name}: {1e3 * found.rms_m:.2g} mm RMS; {said}")
+        message = alone[name].concern.sentence.removeprefix(f"{name}: ")
+        return replace(diagnosis, sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}")
     pairs = int(np.sum(present[1:] & present[:-1]))
     motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
-    said = _suggestion(found, pairs, block, motion, estimated)
-    if found.wild > MOST_WILD * samples:
-        said += (
-            f"; {found.wild} samples are beyond Huber's threshold: exchanged labels, or "
+    message = _suggestion(diagnosis, pairs, block, motion, estimated)
+    if diagnosis.wild > MOST_WILD * samples:
+        message += (
+            f"; {diagnosis.wild} samples are beyond Huber's threshold: exchanged labels, or "
             "reflections taken for the marker"
         )
-    return replace(found, sentence=said)
+    return replace(diagnosis, sentence=message)
 
 
 def _rms_m(block: FitBlock, marker: int) -> float:
+    """Return the root mean square distance of a marker from its measurements [m], including
+    outliers.
+    """
     misfit = block.residual if block.misfit is None else block.misfit
     squares = np.sum(misfit[:, marker] ** 2) / block.present[:, marker].sum()
     return float(block.sigma_m[marker] * np.sqrt(squares))
 
 
 def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
+    """Return the autocorrelation of consecutive present samples of residuals (T, 3) about
+    their mean; 0 without pairs.
+    """
     pairs = np.sum(present[1:] & present[:-1])
     samples = present.sum()
     power = np.sum(varying**2)
@@ -170,7 +185,9 @@ def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
 
 
 def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
-    """Frequency [Hz] of the largest peak, zero if none, and its share of the power."""
+    """Return frequency [Hz] and share of the power of the largest peak of the periodogram;
+    zeros if there is none.
+    """
     if len(t_s) < 4:
         return 0.0, 0.0
     # Gaps count as zeros: they spread some power, but move no peak.
@@ -180,9 +197,9 @@ def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
     if not total > 0:
         return 0.0, 0.0
     peak = 1 + int(np.argmax(spectrum[1:]))
-    around = slice(max(1, peak - PEAK_BINS), peak + PEAK_BINS + 1)
-    weights = spectrum[around]
-    bins = np.arange(len(spectrum))[around]
+    window = slice(max(1, peak - PEAK_BINS), peak + PEAK_BINS + 1)
+    weights = spectrum[window]
+    bins = np.arange(len(spectrum))[window]
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     centre = float(weights @ bins / weights.sum())
     return centre / record_s, float(weights.sum() / total)
@@ -191,6 +208,7 @@ def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
 def _suggestion(
     found: MarkerDiagnosis, pairs: int, block: FitBlock, motion: Array, estimated: tuple[bool, bool]
 ) -> str:
+    """Return the message for a marker without outlier."""
     t_s = block.t_s
     name = f"{found.experiment}/{found.marker}"
     size = f"{1e3 * found.rms_m:.2g} mm RMS"
@@ -202,33 +220,36 @@ def _suggestion(
         return f"{name}: {size}, {_white(found)}"
     if found.constant_share > DOMINANT:
         offset = 1e3 * np.linalg.norm(found.offset_m)
-        said = (
+        cause = (
             f"{100 * found.constant_share:.0f} % of its power is constant: its place on the body "
             f"is off by {offset:.2g} mm; {'widen the prior of' if estimated[0] else 'estimate'} "
             "marker_offsets"
         )
     elif found.early_share > DOMINANT:
         end_s = EARLY_TIME * (t_s[-1] - t_s[0])
-        said = (
+        cause = (
             f"{100 * found.early_share:.0f} % of its power is in the first {end_s:.2g} s: the "
             "start state or the release time is off"
         )
-        said += "" if estimated[1] else "; estimate time_shift"
+        cause += "" if estimated[1] else "; estimate time_shift"
     elif found.oscillating_share > DOMINANT:
-        said = _oscillation(found, t_s, motion)
+        cause = _oscillation(found, t_s, motion)
     elif persistent and found.lag1 > DOMINANT:
-        said = "it wanders slowly: creep of the material, or a grasp that gives, is not modelled"
+        cause = "it drifts slowly: creep of the material, or slip in the grasp, is not modelled"
         if block.static:
-            said = (
-                "it changes with the load: the material's law, or how the grasps hold, is another"
+            cause = (
+                "it changes with the load: the material law or the boundary conditions at the "
+                "grasps are wrong"
             )
     else:
-        said = "a mixture, little of which is white noise"
-    return f"{name}: {size}; {said}"
+        cause = "a mixture, little of which is white noise"
+    return f"{name}: {size}; {cause}"
 
 
 def _white(found: MarkerDiagnosis) -> str:
-    """White residuals, by their size; a few samples may differ from σ by chance."""
+    """Return the description of white residuals by their size; a few samples may differ
+    from σ by chance.
+    """
     factor = found.noise_factor
     chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * found.samples)
     if factor > max(AS_STATED, 1 + chance):
@@ -239,45 +260,51 @@ def _white(found: MarkerDiagnosis) -> str:
 
 
 def _oscillation(found: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
+    """Return the description of oscillating residuals, compared with the frequency of the
+    motion.
+    """
     share = f"{100 * found.oscillating_share:.0f} % of its power"
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     if found.frequency_hz * record_s < FEWEST_PERIODS:
         return (
-            f"{share} is a slow drift: creep of the material, or a grasp that gives, is not in "
+            f"{share} is a slow drift: creep of the material, or slip in the grasp, is not in "
             "the model"
         )
-    said = f"{share} oscillates at {found.frequency_hz:.3g} Hz"
+    message = f"{share} oscillates at {found.frequency_hz:.3g} Hz"
     of_motion, _ = _largest_peak(motion - motion.mean(axis=0), t_s)
     if abs(found.frequency_hz - of_motion) <= SAME_FREQUENCY * of_motion:
-        return f"{said}, with the motion: the model's stiffness, damping or mass differ"
-    return f"{said}, unlike the motion: a vibration or a mode that the model lacks"
+        return f"{message}, with the motion: the model's stiffness, damping or mass differ"
+    return f"{message}, unlike the motion: a vibration or a mode that the model lacks"
 
 
-# Probability that a sample of noise is named, of all of them.
+# Probability of reporting any sample of noise as an outlier.
 RARE = 1e-4
-# Share of its marker's power that a sample has at least.
+# Smallest share of an outlier in its marker's power.
 MOST = 0.5
-# More of a marker's samples than this share are no exceptions; of few samples none stands out.
+# Largest share of a marker's samples that are outliers.
 EXCEPTIONS = 0.1
+# Fewest samples of a marker with outliers.
 FEWEST_SAMPLES = 4
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """One sample that spoils the rest.
+    """Single sample that dominates the residuals of its marker.
 
     Attributes
     ----------
     series : str
-        "swing/tip", the marker, or "press/force".
+        Experiment and marker, such as "swing/tip", or "press/force".
     sample : int
+        Index of the sample.
     t_s : float
+        Its time [s].
     share : float
-        Of the power of its marker's residuals.
+        Its share in the power of its marker's residuals.
     deviations : float
         Its residual over σ.
     first_relaxed : bool
-        The first sample of a body with memory, which counts as relaxed there.
+        Whether it is the first sample of a body with memory, which is assumed relaxed there.
     """
 
     series: str
@@ -289,29 +316,29 @@ class Outlier:
 
     @property
     def concern(self) -> Concern:
-        """What it does, and the remedy."""
+        """Concern about this sample, with the remedy."""
         code = "residuals/first" if self.first_relaxed else "residuals/outlier"
         data = {"t_s": self.t_s, "deviations": self.deviations, "percent": 100 * self.share}
         return Concern(code, data={"of": self.series, **data})
 
 
 def set_apart(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
-    """The fit without the samples that spoil the rest, and these; the same fit where none does."""
+    """Return the fit without its outliers, and the outliers; the same fit if there are none."""
     blocks = []
-    found = []
+    outliers = []
     for block in fit.blocks:
         for marker in np.flatnonzero(block.present.any(axis=0)).tolist():
             allowed = max(1, int(EXCEPTIONS * block.present[:, marker].sum()))
             while allowed and (outlier := _outlier(block, marker, RARE / len(fit.blocks))):
-                found.append(outlier)
+                outliers.append(outlier)
                 block = _without(block, marker, outlier.sample)
                 allowed = allowed - 1
         blocks.append(block)
-    return (replace(fit, blocks=tuple(blocks)), tuple(found)) if found else (fit, ())
+    return (replace(fit, blocks=tuple(blocks)), tuple(outliers)) if outliers else (fit, ())
 
 
 def _outlier(block: FitBlock, marker: int, rare: float) -> Outlier | None:
-    """The sample of a marker that spoils the rest; None where none does."""
+    """Return the sample that dominates a marker's residuals; None if none does."""
     power = np.sum(block.residual[:, marker] ** 2, axis=1)
     count = int(block.present[:, marker].sum())
     sample = int(power.argmax())
@@ -331,12 +358,13 @@ def _outlier(block: FitBlock, marker: int, rare: float) -> Outlier | None:
 
 
 def _without(block: FitBlock, marker: int, sample: int) -> FitBlock:
-    kept: Mask = np.ones(block.present.shape, dtype=bool)
-    kept[sample, marker] = False
-    each = kept[..., None]
+    """Return the block without one sample of a marker."""
+    is_kept: Mask = np.ones(block.present.shape, dtype=bool)
+    is_kept[sample, marker] = False
+    each = is_kept[..., None]
     return replace(
         block,
-        present=block.present & kept,
+        present=block.present & is_kept,
         residual=block.residual * each,
         slope=block.slope * each[..., None],
         misfit=None if block.misfit is None else block.misfit * each,

@@ -1,6 +1,7 @@
-"""Quantiles and tails of normal, χ², Student's and Beta distribution.
+"""Quantiles and tail probabilities of the normal, χ², Student's and Beta distributions.
 
-`scipy.stats` has them as well, and takes as long to import as all else of scipy together.
+`scipy.stats` has them too, but takes as long to import as all other parts of SciPy together.
+Arguments may be arrays.
 """
 
 from __future__ import annotations
@@ -12,30 +13,34 @@ from scipy.special import betaincc, chdtr, chdtrc, chdtri, ndtri, stdtrit
 
 
 def normal_isf(tail: ArrayLike) -> Any:
-    """What a standard normal number exceeds with probability `tail`."""
+    """Return the value that a standard normal variable exceeds with probability `tail`."""
     return -ndtri(tail)
 
 
 def chi2_cdf(value: ArrayLike, freedom: ArrayLike) -> Any:
-    """Probability of a χ² up to `value`."""
+    """Return the probability of a χ² up to `value` with `freedom` degrees of freedom."""
     return chdtr(freedom, value)
 
 
 def chi2_sf(value: ArrayLike, freedom: ArrayLike) -> Any:
-    """Probability of a χ² beyond `value`."""
+    """Return the probability of a χ² beyond `value` with `freedom` degrees of freedom."""
     return chdtrc(freedom, value)
 
 
 def chi2_isf(tail: ArrayLike, freedom: ArrayLike) -> Any:
-    """What a χ² exceeds with probability `tail`."""
+    """Return the value that a χ² with `freedom` degrees of freedom exceeds with probability
+    `tail`.
+    """
     return chdtri(freedom, tail)
 
 
 def student_ppf(share: ArrayLike, freedom: ArrayLike) -> Any:
-    """What Student's t stays below with probability `share`."""
+    """Return the value below which Student's t with `freedom` degrees of freedom stays with
+    probability `share`.
+    """
     return stdtrit(freedom, share)
 
 
 def beta_sf(value: ArrayLike, a: ArrayLike, b: ArrayLike) -> Any:
-    """Probability of a Beta variable with parameters a, b beyond `value`."""
+    """Return the probability of a Beta variable with parameters a, b beyond `value`."""
     return betaincc(a, b, value)

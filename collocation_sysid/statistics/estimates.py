@@ -1,11 +1,10 @@
-"""Values with error bars, in the user's parameters and in the other elastic convention.
+"""Estimates with error bars, in the user's parameters and in the other elastic convention.
 
-The logarithm of a positive parameter is taken as normal (or Student's t), for Poisson's ratio
-ln ν/(½ − ν) = ln λ/μ is: intervals stay within what is physically possible. A parameter that may
-be negative is taken as normal itself. A number after ± is
-given only where it tells something; else the estimate has a reason instead.
-
-What error bars do not tell by themselves, notes do, in sentences that end with the remedy.
+The logarithm of a positive parameter is taken as normal (or Student's t); for Poisson's ratio ln
+ν/(½ − ν) = ln λ/μ is, so that intervals stay within what is physically possible. A parameter that
+may be negative is taken as normal itself. A standard error is reported only where it is meaningful;
+otherwise the estimate states a reason. Notes explain what error bars do not show, in sentences that
+end with the remedy.
 """
 
 from __future__ import annotations
@@ -38,11 +37,12 @@ CONFOUNDED_DEVIATION = 0.1
 
 @dataclass(frozen=True)
 class Estimate:
-    """One value with its error bar.
+    """One value with its statistical uncertainty.
 
     Attributes
     ----------
     value : float
+        Estimate, or the stated value if it was not estimated.
     statistical_std_error : float or None
         Standard error due to noise and nuisance parameters. None for what was not estimated, is at
         a bound, or is not identified by the data.
@@ -50,9 +50,9 @@ class Estimate:
         95 % interval due to noise and nuisance parameters, within what is physically possible. It
         may exist, and be wide, where there is no `statistical_std_error`.
     at_bound : bool
-        The value, or one it follows from, ended at a bound.
+        Whether the value, or one it follows from, ended at a bound.
     reason : str or None
-        Why something that was estimated has no `statistical_std_error`.
+        Why an estimated value has no `statistical_std_error`.
     """
 
     value: float
@@ -64,39 +64,51 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Coordinate:
-    """In which an interval is symmetric: a logarithm, ln ν/(½ − ν), or the value itself."""
+    """Coordinate in which an interval is symmetric: the logarithm, ln ν/(½ − ν) (`odds`),
+    or the value itself (`linear`).
+    """
 
     odds: bool
     linear: bool
 
     @classmethod
     def of(cls, name: str, values: Iterable[float], linear: bool) -> Coordinate:
-        """That of an estimate, of these values and ends of intervals."""
+        """Return the coordinate for an estimate.
+
+        Parameters
+        ----------
+        name : str
+            Name of the parameter or modulus.
+        values : iterable of float
+            Value and ends of its intervals; if any is not positive, the coordinate is linear.
+        linear : bool
+            Whether the parameter is its own coordinate.
+        """
         lowest = min(values)
         return cls(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
 
     def slope(self, value: float) -> float:
-        """Its derivative by the value."""
+        """Return the derivative of the coordinate by the value."""
         if self.odds:
             return 0.5 / (value * (0.5 - value))
         return 1.0 if self.linear else 1 / value
 
     def at(self, value: float) -> float:
-        """Where it is."""
+        """Return the coordinate of a value."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.odds:
                 return float(np.log(value / (0.5 - value)))
             return value if self.linear else float(np.log(value))
 
     def value(self, x: float) -> float:
-        """The value there."""
+        """Return the value of a coordinate."""
         if self.odds:
             return float(0.5 / (1 + np.exp(-x)))
         return x if self.linear else float(np.exp(x))
 
 
 def correlation_of(covariance: Array) -> Array:
-    """Correlations; NaN where a variance is not finite."""
+    """Return the correlations (n, n); NaN where a variance is zero or not finite."""
     deviation = np.sqrt(np.diag(covariance))
     deviation[~np.isfinite(deviation) | (deviation == 0)] = np.nan
     return covariance / np.outer(deviation, deviation)
@@ -105,25 +117,33 @@ def correlation_of(covariance: Array) -> Array:
 def user_estimates(
     parameters: Parameters, q: Array, of_q: Array, bounded: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
-    """Estimates of the user's parameters, by name, but the shares of a field.
+    """Return the estimates of the user's parameters by name, except the mode coefficients of
+    fields.
 
     Parameters
     ----------
-    of_q : (nq, nq) covariance of q
-    bounded : (nq,) which of q are at a bound
-    quantiles : (nq,) half widths of the 95 % intervals, in deviations
+    parameters : Parameters
+        Shared parameters.
+    q : (nq,) array
+        Estimates in the solver's coordinates.
+    of_q : (nq, nq) array
+        Covariance of q.
+    bounded : (nq,) array of bool
+        Whether each is at a bound.
+    quantiles : (nq,) array
+        Half widths of the 95 % intervals in standard deviations.
     """
     values = parameters.values(q).items()
-    found = {name: Estimate(value) for name, value in values if not is_mode(name)}
+    estimates = {name: Estimate(value) for name, value in values if not is_mode(name)}
     partners = np.abs(np.nan_to_num(correlation_of(of_q)))
     np.fill_diagonal(partners, 0.0)
     partners[:, [is_mode(item.name) for item in parameters.free]] = 0.0
     for k, item in enumerate(parameters.free):
-        if item.name not in found:
+        if item.name not in estimates:
             continue
         value = item.value(float(q[k]))
         if bounded[k]:
-            found[item.name] = _at_bound(value)
+            estimates[item.name] = _at_bound(value)
             continue
         deviation = float(np.sqrt(of_q[k, k]))
         estimate = _of_parameter(item, value, deviation, float(quantiles[k]))
@@ -140,17 +160,16 @@ def user_estimates(
                 f"(correlation {correlation_of(of_q)[k, other]:.3f})"
             )
             estimate = Estimate(value, None, estimate.statistical95, reason=reason)
-        found[item.name] = estimate
+        estimates[item.name] = estimate
     for item in parameters.items:
         if item.tied is not None:
-            found[item.name] = _multiplied(found[item.tied.to], item.tied.ratio)
-    return found
+            estimates[item.name] = _multiplied(estimates[item.tied.to], item.tied.ratio)
+    return estimates
 
 
 def relative_slopes(parameters: Parameters, q: Array) -> Array:
-    """(nq,) derivative of each parameter by its q over its size: one for a logarithm.
-
-    One also for a share of a field, which is added to one.
+    """Return the derivative (nq,) of each parameter by its q over its size: 1 for a
+    logarithm and for a field's mode coefficient.
     """
     slopes = []
     for item, coordinate in zip(parameters.free, q, strict=True):
@@ -163,24 +182,24 @@ def relative_slopes(parameters: Parameters, q: Array) -> Array:
 def derived_estimates(
     derived: Derived, of_q: Array, bounded: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
-    """Estimates of the moduli that follow from the parameters, by the delta method."""
-    found = {}
+    """Return the estimates of the moduli that follow from the parameters, by the delta method."""
+    estimates = {}
     for name, value in derived.values.items():
         gradient = derived.by_q[name]
         used = np.flatnonzero(gradient)
         if bounded[used].any():
-            found[name] = _at_bound(value)
+            estimates[name] = _at_bound(value)
         elif not len(used) or not value > 0:
-            found[name] = Estimate(value)
+            estimates[name] = Estimate(value)
         else:
             variance = gradient[used] @ of_q[np.ix_(used, used)] @ gradient[used]
             deviation = float(np.sqrt(variance)) / value
-            found[name] = _estimate(name, value, deviation, float(quantiles[used].max()))
-    return found
+            estimates[name] = _estimate(name, value, deviation, float(quantiles[used].max()))
+    return estimates
 
 
 def _of_parameter(item: Parameter, value: float, deviation: float, quantile: float) -> Estimate:
-    """An estimate whose q has this standard deviation."""
+    """Return the estimate of a parameter whose q has the standard deviation `deviation`."""
     if item.scale == "log":
         return _estimate(item.name, value, deviation, quantile)
     if bare(item.name) == "poisson" and value > 0:
@@ -195,7 +214,7 @@ def _of_parameter(item: Parameter, value: float, deviation: float, quantile: flo
 
 
 def _multiplied(estimate: Estimate, ratio: float) -> Estimate:
-    """The estimate of a multiple."""
+    """Return the estimate multiplied by a number."""
     ends = estimate.statistical95 and sorted(
         (ratio * estimate.statistical95[0], ratio * estimate.statistical95[1])
     )
@@ -211,13 +230,14 @@ def _multiplied(estimate: Estimate, ratio: float) -> Estimate:
 
 
 def _at_bound(value: float) -> Estimate:
+    """Return the estimate of a value at a bound, without error bars."""
     return Estimate(
         value, at_bound=True, reason="it ended at a bound, or follows from one that did"
     )
 
 
 def _estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
-    """An estimate whose logarithm has this standard deviation."""
+    """Return the estimate of a value whose logarithm has the standard deviation `deviation`."""
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
     at = Coordinate.of(name, [value], linear=False)
@@ -238,37 +258,39 @@ NOTEWORTHY = 1.1
 
 
 def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -> list[str]:
-    """Parameters at a bound, not determined, or not identifiable."""
+    """Return notes on parameters at a bound, not determined, or not identifiable."""
     notes = []
     reasons = {}
     for item in (each for each in parameters.free if each.name in estimates):
         name = item.name
-        found = estimates[item.name]
-        if found.at_bound:
+        estimate = estimates[item.name]
+        if estimate.at_bound:
             nearer = min(
-                ("lower", "upper"), key=lambda side: abs(getattr(item, side) - found.value)
+                ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
             )
             notes.append(
                 f"{name} ended at its {nearer} bound {getattr(item, nearer):g}: it has no error "
                 "bar, and the others' allow for other values of it; widen the bound, or fix it "
                 "if it is known"
             )
-        elif found.statistical95 is None:
+        elif estimate.statistical95 is None:
             damping = is_damping(name)
             by = ": no information on damping in these data" if damping else " by these data"
             notes.append(
                 f"{name} is not determined{by}; fix it, give it a prior, or move the body"
                 f"{'' if damping else ' differently'}"
             )
-        elif found.statistical_std_error is None:
-            reasons[name] = str(found.reason)
+        elif estimate.statistical_std_error is None:
+            reasons[name] = str(estimate.reason)
     return [*notes, *_unidentifiable(reasons)]
 
 
 def _unidentifiable(reasons: Mapping[str, str]) -> list[str]:
-    """One sentence a parameter, and one for two that are confounded with each other."""
+    """Return one note for each parameter that is not identifiable, and one for two
+    confounded with each other.
+    """
     notes = []
-    told = set()
+    mentioned = set()
     for name, reason in reasons.items():
         because = reason
         other = reason.removeprefix("confounded with ").split(" ")[0]
@@ -278,17 +300,19 @@ def _unidentifiable(reasons: Mapping[str, str]) -> list[str]:
             which = f"{name} and {other} are"
             pronoun = "one of them"
             because = reason.replace(other, "each other", 1)
-        if other not in told:
+        if other not in mentioned:
             notes.append(
                 f"{which} not identifiable from these data: {because}; fix {pronoun}, give it a "
                 "prior, or move the body differently"
             )
-        told.add(name)
+        mentioned.add(name)
     return notes
 
 
 def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[str]:
-    """Branches of a memory that were not found, and those slower than the longest recording."""
+    """Return notes on memory branches that were not found, and on those slower than the
+    longest recording [s].
+    """
     notes = []
     for name, share in estimates.items():
         if bare(name) != SHARE.name:
@@ -308,20 +332,26 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
         elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
                 f"{branch} relaxes within {tau.value:.2g} s, slower than the longest recording of "
-                f"{longest_s:.2g} s: its share and long-term moduli rest on how it begins; record "
-                "for longer"
+                f"{longest_s:.2g} s: its share and long-term moduli follow from its beginning "
+                "only; record for longer"
             )
     return notes
 
 
 def size_notes(asked: str, kind: Noise, level: NoiseLevel, errors: str) -> list[str]:
-    """Residuals larger or smaller than σ as stated, and what error bars make of that.
+    """Return notes on residuals larger or smaller than the stated σ, and how the error bars account
+    for that.
 
     Parameters
     ----------
-    asked, kind : what the errors' size was to be taken from, and what it is taken from
+    asked : str
+        Requested source of the noise, see `ErrorModel`.
+    kind : str
+        Source that is used, see `ErrorBasis`.
     level : NoiseLevel
+        Size of the residuals.
     errors : {"independent", "autocorrelated"}
+        Correlation of the errors.
     """
     if asked == "estimated" or level.kind == "given":
         return []
@@ -352,7 +382,7 @@ def size_notes(asked: str, kind: Noise, level: NoiseLevel, errors: str) -> list[
 
 
 def correlation_notes(asked: str, errors: str, found: Dependence) -> list[str]:
-    """Residuals that hang together, and what error bars make of that."""
+    """Return notes on correlated residuals, and how the error bars account for that."""
     if not found.found or (errors != "autocorrelated" and asked != "independent"):
         return []
     pattern = "have parts that markers or axes share"
@@ -372,7 +402,7 @@ def correlation_notes(asked: str, errors: str, found: Dependence) -> list[str]:
 
 
 def scatter_notes(fit: LinearisedFit, scatter: Scatter | None) -> list[str]:
-    """Recordings that disagree."""
+    """Return notes on parameters on which the recordings disagree."""
     if scatter is None:
         return []
     return [
@@ -384,5 +414,7 @@ def scatter_notes(fit: LinearisedFit, scatter: Scatter | None) -> list[str]:
 
 
 def told_of(name: str) -> str:
-    """What an estimated parameter is called where it is told of: a share is its field."""
+    """Return the name of an estimated parameter for messages; a mode coefficient is
+    described by its field.
+    """
     return f"the {MODE.name} (share {name})" if is_mode(name) else name

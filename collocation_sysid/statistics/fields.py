@@ -1,16 +1,16 @@
-"""Constants that differ from place to place: value and interval in every element, and how likely.
+"""Spatially varying constants: value and interval in every element, and evidence for other priors.
 
-"The logarithm" is that of the constant or, of a density, the density over the one that is stated.
+"The logarithm" below is that of the constant or, for a density, the density over the stated one.
 
-With the posterior covariance C of the shares a and of all else that is estimated, the logarithm in
-an element has the variance gᵀC g + d², where g are the element's shapes and the slopes of the mean,
-and d is the deviation that finer shapes would add. The prior of the shares is N(0, I). So what the
-data say of them by themselves has the information H = C_a⁻¹ − I, and with a prior N(0, D), as of
-another length or amplitude, the data would be more likely, to first order, by
+With the posterior covariance C of the mode coefficients a and of all other estimates, the logarithm
+in an element has the variance gᵀC g + d², where g are the element's modes and the derivatives of
+the mean, and d is the standard deviation due to finer modes that are left out. The prior of the
+coefficients is N(0, I), so the data alone have the information H = C_a⁻¹ − I about them. With a
+prior N(0, D), for another length or amplitude, the data would be more likely, to first order, by
 
     ln Z(D) − ln Z(I),   ln Z(D) = −½ ln |I + H D| + ½ bᵀ D (I + H D)⁻¹ b,   b = C_a⁻¹ a
 
-(Laplace's approximation, with all others as they are).
+(Laplace's approximation, with all other estimates fixed).
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ from .estimates import relative_slopes
 from .linearised import information, linearised_fit
 from .uncertainty import Uncertainty
 
-# The data tell an element whose interval is less than this share of the prior's.
+# The data determine an element if its interval is less than this share of the prior's.
 TOLD = 0.5
-# Another amplitude, or length, is worth a word where it is likelier by this factor's logarithm.
+# Log-evidence from which on another amplitude or length is reported.
 LIKELIER = 3.0
-# Of error bars' variance over the prior's: more is not told by data and prior.
+# Variance over that of the prior above which error bars contain model error, and no evidence is
+# computed.
 WIDER = 1.1
 # By this factor χ² per measurement of two phases is above that of a smooth field, or of noise,
 # where two phases do not describe the body: chance moves it by a few per cent.
@@ -50,56 +51,63 @@ WORSE = 1.1
 FEWEST_ELEMENTS = 50
 # Ends of a 95 % interval, as quantiles.
 ENDS = (0.025, 0.975)
+# Factors of the amplitude that are tried.
 AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
 def phase_concerns(phases: PhaseFinding, name: str) -> list[Concern]:
-    """Return what speaks against two phases: no contrast, few elements, or a bad fit.
+    """Return concerns about a two-phase field: no contrast, few elements, or a bad fit.
 
     Parameters
     ----------
     phases : PhaseFinding
+        Result of the two-phase field.
     name : str
-        The constant, with its region in front.
+        Name of the constant, with its region in front.
     """
-    found: list[Concern] = []
+    concerns: list[Concern] = []
     lower, median, upper = phases.contrast
     if lower <= 1 <= upper:
         ends = {"name": name, "lower": lower, "median": median, "upper": upper}
-        found.append(Concern("field/one-phase", data=ends))
+        concerns.append(Concern("field/one-phase", data=ends))
     if phases.elements < FEWEST_ELEMENTS:
         few = {"name": name, "elements": phases.elements, "fewest": FEWEST_ELEMENTS}
-        found.append(Concern("field/few", data=few))
+        concerns.append(Concern("field/few", data=few))
     if phases.misfit > WORSE * max(1.0, phases.smooth_misfit):
         both = {"name": name, "misfit": phases.misfit, "smooth": phases.smooth_misfit}
-        found.append(Concern("field/phases", data=both))
-    return found
+        concerns.append(Concern("field/phases", data=both))
+    return concerns
 
 
 @dataclass(frozen=True, eq=False)
 class FieldEstimate:
-    """What was found of a field.
+    """Estimate of a spatially varying constant.
 
     Attributes
     ----------
     name : str
-        The constant, with its region in front.
+        Name of the constant, with its region in front.
     modes : FieldModes
-    cells : (k,) numbers of the elements
-    value : (k,) the constant in each
-    deviation : (k,) standard deviation of its logarithm, of a density over the one stated; NaN
-        without error bars
-    stated : float or None
-        A density as stated, which the deviation is a share of.
-    ends : (lower, upper) or None
-        Ends (k,) of the 95 % intervals where they follow from samples; None where they follow from
-        the deviation.
-    phases : PhaseFinding or None
-        Of a two-phase field; None of a smooth one.
+        Modes of the field.
+    cells : (k,) array
+        Indices of the elements.
+    value : (k,) array
+        Constant in each element.
+    deviation : (k,) array
+        Standard deviation of its logarithm (of a density: over the stated one); NaN without error
+        bars.
     quantile : float
-        Half width of the 95 % intervals, in deviations.
-    shares : (m,) a
-    covariance : (m, m) of these
+        Half width of the 95 % intervals in standard deviations.
+    shares : (m,) array
+        Mode coefficients a.
+    covariance : (m, m) array
+        Their covariance.
+    stated : float or None
+        Stated density that the deviation refers to [kg/m³]; None for other constants.
+    ends : (lower, upper) or None
+        Ends (k,) of the 95 % intervals from samples; None if they follow from the deviation.
+    phases : PhaseFinding or None
+        Result of a two-phase field; None for a smooth field.
     """
 
     name: str
@@ -116,40 +124,44 @@ class FieldEstimate:
 
     @property
     def ci95(self) -> tuple[Array, Array]:
-        """(k,) lower and upper ends of the 95 % intervals."""
+        """Lower and upper ends (k,) of the 95 % intervals."""
         if self.ends is not None:
             return self.ends
         if self.stated is not None:
-            away = self.quantile * self.deviation * self.stated
-            return self.value - away, self.value + away
+            half_width = self.quantile * self.deviation * self.stated
+            return self.value - half_width, self.value + half_width
         factor = np.exp(self.quantile * self.deviation)
         return self.value / factor, self.value * factor
 
     @property
     def over_prior(self) -> Array:
-        """(k,) deviation over that of the prior about the mean."""
+        """Standard deviation (k,) over that of the prior about the mean."""
         prior = self.modes.field.deviation if self.phases is None else self.phases.deviation
         return self.deviation / prior
 
     @property
     def told(self) -> NDArray[np.bool_]:
-        """(k,) bool, which elements the data tell."""
+        """Mask (k,) of the elements that the data determine better than the prior."""
         return self.over_prior < TOLD
 
     @property
     def identified(self) -> int:
-        """How many independent shapes the data tell better than the prior does, by half."""
+        """Number of independent modes whose variance the data halve at least, compared with
+        the prior.
+        """
         known = np.linalg.eigvalsh(np.nan_to_num(self.covariance, nan=1.0))
         return int((known < TOLD).sum())
 
     @property
     def by_element(self) -> Array:
-        """(k, 4) value, ends of its interval, and its deviation over the prior's."""
+        """Table (k, 4): value, ends of its interval, and its standard deviation over that
+        of the prior.
+        """
         return np.column_stack([self.value, *self.ci95, self.over_prior])
 
     @cached_property
     def _of_data(self) -> tuple[Array, Array]:
-        """H and b."""
+        """Information H of the data alone, and the score b, see the module's documentation."""
         values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
         # Rounding, or error bars that are wider than the fit's: no less than nothing.
         values = np.clip(values, 1e-12, 1.0)
@@ -158,15 +170,25 @@ class FieldEstimate:
 
     @cached_property
     def _beyond_prior(self) -> bool:
-        """Whether the model misses by so much more than noise that bars are wider than the prior.
-
-        The answer then weighs data and prior by other errors than these, and tells no evidence.
+        """Whether error bars exceed the prior, because residuals are much larger than the
+        noise; then there is no valid evidence.
         """
         known = self.covariance
         return not np.isfinite(known).all() or np.linalg.eigvalsh(known)[-1] > WIDER
 
     def likelier(self, length_m: float | None = None, factor: float = 1.0) -> float:
-        """Ln Z(D) − ln Z(I) with another length, or with the amplitude times a factor."""
+        """Return ln Z(D) − ln Z(I) for another correlation length [m], or for the amplitude times a
+        factor.
+
+        0 for two-phase fields, and where error bars exceed the prior.
+
+        Parameters
+        ----------
+        length_m : float, optional
+            Correlation length; None means the present one.
+        factor : float
+            Factor of the amplitude.
+        """
         if self.phases is not None or self._beyond_prior or length_m == self.modes.length_m:
             return 0.0
         size = len(self.shares)
@@ -177,25 +199,30 @@ class FieldEstimate:
         return self._evidence(prior) - self._evidence(np.eye(size))
 
     def _evidence(self, prior: Array) -> float:
-        alone, pulled = self._of_data
+        """Return ln Z(D) for a prior covariance D (m, m)."""
+        alone, score = self._of_data
         both = np.eye(len(alone)) + alone @ prior
-        return (
-            float(pulled @ prior @ np.linalg.solve(both, pulled) - np.linalg.slogdet(both)[1]) / 2
-        )
+        return float(score @ prior @ np.linalg.solve(both, score) - np.linalg.slogdet(both)[1]) / 2
 
     @property
     def concerns(self) -> list[Concern]:
-        """A density that none has; an amplitude too small, or a length too long, by the data."""
+        """Concerns: negative densities, or an amplitude or length that the data contradict."""
         if self.phases is not None:
             return phase_concerns(self.phases, self.name)
         amplitude = self.modes.field.deviation
-        said = dict[str, dict[str, float]]()
+        contradicted = dict[str, dict[str, float]]()
         best = max(AMPLITUDES, key=lambda factor: self.likelier(factor=factor))
         if best > 1 and self.likelier(factor=best) > LIKELIER:
-            said["amplitude"] = {"stated": amplitude, "likely": best * amplitude}
+            contradicted["amplitude"] = {"stated": amplitude, "likely": best * amplitude}
         if self.likelier(self.modes.length_m / 2) > LIKELIER:
-            said["length"] = {"stated": self.modes.length_m, "likely": self.modes.length_m / 2}
-        told = [Concern(f"field/{what}", data={"name": self.name, **v}) for what, v in said.items()]
+            contradicted["length"] = {
+                "stated": self.modes.length_m,
+                "likely": self.modes.length_m / 2,
+            }
+        told = [
+            Concern(f"field/{what}", data={"name": self.name, **v})
+            for what, v in contradicted.items()
+        ]
         if below := int((self.value <= 0).sum()):
             counts = {"name": self.name, "below": below, "elements": len(self.value)}
             least = {"least": float(self.value.min()), "stated": amplitude}
@@ -206,7 +233,19 @@ class FieldEstimate:
 def fields_of(
     body: Body, parameters: Parameters, q: Array, known: Uncertainty | Array | None
 ) -> list[FieldEstimate]:
-    """The fields of a body at q, with error bars or the covariance (nq, nq) where there is one."""
+    """Return the estimates of all fields of a body.
+
+    Parameters
+    ----------
+    body : Body
+        The body.
+    parameters : Parameters
+        Shared parameters.
+    q : (nq,) array
+        Estimates in the solver's coordinates.
+    known : Uncertainty, (nq, nq) array or None
+        Error bars, or covariance of q; None gives no error bars.
+    """
     size = len(q)
     names = [item.name for item in parameters.free]
     covariance = np.full((size, size), np.nan)
@@ -218,26 +257,26 @@ def fields_of(
     elif known is not None:
         covariance = known
         quantile = 1.96
-    found = []
+    estimates = []
     constants = ThetaMap(parameters, body)
     theta = constants.theta(q)
     by_q = constants.slopes(q)
     for number, part in enumerate(body.parts):
         if (modes := part.field) is None:
             continue
-        here = body.mode_places[number]
+        coefficients = body.mode_places[number]
         mean, slopes = _mean(constants, number, modes).slopes(q, NOTHING)
-        local = mean[0] + modes.logarithms(theta[here])
+        local = mean[0] + modes.logarithms(theta[coefficients])
         stated = None
         if part.stress_field is None:
             stated = part.density_kg_m3
-        gradient = slopes + modes.slopes(theta[here]) @ by_q[here]
+        gradient = slopes + modes.slopes(theta[coefficients]) @ by_q[coefficients]
         # What is at a bound has no variance: it is taken for known.
         used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
         own = gradient[:, used]
         variance = np.einsum("ei,ij,ej->e", own, covariance[np.ix_(used, used)], own)
         deviation = np.sqrt(variance + modes.left_out**2)
-        free = [names.index(name) for name in [*body.constants][here] if name in names]
+        free = [names.index(name) for name in [*body.constants][coefficients] if name in names]
         values = np.exp(local) if stated is None else stated * local
         estimate = FieldEstimate(
             name=part.field_name,
@@ -246,27 +285,32 @@ def fields_of(
             value=values,
             deviation=deviation if known is not None else np.full_like(deviation, np.nan),
             quantile=quantile,
-            shares=theta[here],
+            shares=theta[coefficients],
             covariance=covariance[np.ix_(free, free)],
             stated=stated,
         )
         if isinstance(modes, TwoPhaseModes):
-            contrast = theta[here.stop - 1]
+            contrast = theta[coefficients.stop - 1]
             estimate = _with_phases(estimate, modes, float(contrast))
-        found.append(estimate)
-    return found
+        estimates.append(estimate)
+    return estimates
 
 
 def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float) -> FieldEstimate:
-    """Return the estimate of a two-phase field with the intervals of its samples.
+    """Return the estimate of a two-phase field with intervals from its samples.
 
-    Quantiles of the samples, so that an element at the boundary has an interval from one phase to
-    the other. Without samples the phases count as known.
+    Intervals are quantiles of the samples, so that an element at the boundary has an interval from
+    one phase to the other. Without samples the phases count as known, and the estimate is returned
+    unchanged.
 
     Parameters
     ----------
+    estimate : FieldEstimate
+        Estimate with known phases.
+    modes : TwoPhaseModes
+        Modes with their samples.
     contrast : float
-        The contrast of the answer.
+        Contrast of the answer.
     """
     samples = modes.samples
     if samples is None or not np.isfinite(estimate.deviation).all():
@@ -297,31 +341,36 @@ def _quantiles(values: Array) -> tuple[float, float, float]:
 
 
 def fields_by_information(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
-    """Those of a solution, by name, with the covariance for independent errors of the σ stated."""
+    """Return the field estimates at a solution by name, with the covariance for independent
+    errors of the stated σ.
+    """
     covariance = information(linearised_fit(collocation, z)).fit.covariance()
     nq = collocation.nq
-    found = dict[str, FieldEstimate]()
+    estimates = dict[str, FieldEstimate]()
     for body in dict.fromkeys(segment.body for segment in collocation.segments):
         known = covariance[:nq, :nq]
         for field in fields_of(body, collocation.parameters, z[:nq], known):
-            found.setdefault(field.name, field)
-    return found
+            estimates.setdefault(field.name, field)
+    return estimates
 
 
 def mean_logarithm(
     body: Body, parameters: Parameters, q: Array, *, number: int, names: Sequence[str]
 ) -> tuple[float, Array]:
-    """Return the logarithm of the mean of a part's field, and its slopes by some parameters.
+    """Return the logarithm of the mean of a part's field, and its derivatives by some parameters.
 
     Parameters
     ----------
     body : Body
+        The body.
     parameters : Parameters
-    q : (nq,)
+        Shared parameters.
+    q : (nq,) array
+        Estimates in the solver's coordinates.
     number : int
-        Index of the part.
+        Index of the part, which must have a field.
     names : sequence of str
-        Names of the estimated parameters by which the slopes are, in their order.
+        Names of the estimated parameters of the derivatives, in their order.
     """
     modes = body.parts[number].field
     assert modes is not None
@@ -331,7 +380,9 @@ def mean_logarithm(
 
 
 def _mean(constants: ThetaMap, number: int, modes: FieldModes) -> Generated:
-    """The logarithm of the mean of a part's field, by q; a density's over the one stated."""
+    """Return the generated logarithm of the mean of a part's field as a function of q; of a
+    density, the density over the stated one.
+    """
     body = constants.body
     part = constants.body.parts[number]
 

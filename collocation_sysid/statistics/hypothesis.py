@@ -1,10 +1,9 @@
-"""What may be described wrongly: the description without a mistake, how it is tried, what is said.
+"""Misspecification hypotheses: what may be described wrongly, how it is tested, and its message.
 
-A hypothesis is tried by what is left of the misfit if it holds: by the modes of bodies of many
-stiffnesses (`modal`), by another fit, or by the wrench that a fit to the markers alone has
-(`causes`). What jumps or contradicts itself needs no trial (`plausible`). All are ranked by the
-factor by which the misfit falls. One that is believed gives concern: its code begins with the
-cause, and the sentence is looked up by it among those of descriptions.
+A hypothesis is tested by the misfit with the mistake corrected: by natural modes for many
+stiffnesses (`modal`), by another fit, or by the wrench of a fit to the markers alone (`causes`).
+Contradictions and jumps need no test (`plausible`). All are ranked by the factor by which the
+misfit decreases. An accepted hypothesis becomes a concern of the topic "description".
 """
 
 from __future__ import annotations
@@ -18,23 +17,23 @@ from .concern import Concern, Grade
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One thing of a description that may be wrong.
+    """One possible mistake in the description of a problem.
 
     Attributes
     ----------
     code : str
-        The cause and how it shows, such as "marker-slip/alone".
+        Cause and how it shows, such as "marker-slip/alone".
     of : str
-        What is described, as sentences begin with it; may be empty.
-    data : mapping
-        What its sentence holds.
-    without : optional
-        The description without the mistake, of whatever kind its trial takes; None where what is
-        given tells it.
+        What is described, as the beginning of the message; may be empty.
+    data : mapping of str to value
+        Values of the placeholders in the message.
+    without : Any
+        Description with the mistake corrected, of the type that its test expects; None if no test
+        is needed.
     handicap : float
-        What has numbers to fit has to fit so many times better than what has none.
+        Factor by which a hypothesis with fitted numbers must fit better than one without.
     strength : float
-        Factor by which the misfit falls if this is assumed, zero until it is tried.
+        Factor by which the misfit decreases if the hypothesis is true; 0 until it is tested.
     """
 
     code: str
@@ -46,41 +45,41 @@ class Hypothesis:
 
     @property
     def cause(self) -> str:
-        """Short name of what is wrong, such as "poses-inverted"."""
+        """Short name of the mistake, such as "poses-inverted"."""
         return self.code.partition("/")[0]
 
     @property
     def sentence(self) -> str:
-        """What is likely wrong, and the remedy."""
+        """Message with the likely mistake and the remedy."""
         return self.concern().sentence
 
     def concern(self, grade: Grade = "check") -> Concern:
-        """The same with its numbers, as what gives concern."""
+        """Return the hypothesis as a concern of a given grade."""
         tried = {} if self.without is None else {"nearer": self.strength}
         of = {"of": self.of} if self.of else {}
         return Concern(f"description/{self.code}", grade, {**of, **self.data, **tried})
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON and tables."""
+        """Return cause, message and strength for JSON and tables."""
         return {"cause": self.cause, "sentence": self.sentence, "strength": self.strength}
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A way to try hypotheses.
+    """Test of hypotheses by the misfit that remains.
 
     Attributes
     ----------
     misfit : float
-        Of the description as given.
+        Misfit of the description as stated.
     left : callable
-        What is left of it with another description; None where that cannot be told.
+        Returns the misfit of a corrected description; None if it is unknown.
     better : float
-        The factor by which the misfit has to fall.
+        Factor by which the misfit must decrease.
     least : float
-        A smaller misfit tells nothing.
+        Smallest meaningful misfit; smaller ones count as this.
     noise : float
-        From a misfit above this to one below any factor will do.
+        If the misfit decreases from above this level to below it, any factor suffices.
     """
 
     misfit: float
@@ -90,24 +89,26 @@ class Trial:
     noise: float = 0.0
 
     def of(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
-        """Those that fit far better, with their strength."""
+        """Iterate over the hypotheses that fit far better, with their strength."""
         for each in hypotheses:
-            if (left := self.left(each.without)) is None:
+            if (misfit := self.left(each.without)) is None:
                 continue
-            strength = self.misfit / max(self.least, left) / each.handicap
-            if strength > self.better or left < self.noise < self.misfit:
+            strength = self.misfit / max(self.least, misfit) / each.handicap
+            if strength > self.better or misfit < self.noise < self.misfit:
                 yield replace(each, strength=strength)
 
 
 def clock(of: str, lag_s: float, without: Any, handicap: float = 1.0) -> Hypothesis:
-    """That the markers' clock is late by `lag_s` against the poses'."""
+    """Return the hypothesis that the markers' clock is late by `lag_s` [s] (negative:
+    early) compared with the poses.
+    """
     when, do = ("late", "add") if lag_s > 0 else ("early", "subtract")
     data = {"when": when, "by_ms": 1e3 * abs(lag_s), "do": do}
     return Hypothesis("clock", of, data, without, handicap)
 
 
 def ranked(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Each cause once, likeliest first."""
+    """Return each cause once, with its strongest hypothesis, strongest first."""
     strongest: dict[str, Hypothesis] = {}
     for each in sorted(hypotheses, key=lambda each: -each.strength):
         strongest.setdefault(each.cause, each)

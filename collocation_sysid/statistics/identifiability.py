@@ -1,8 +1,8 @@
-"""What the data determine, and what they leave open, in words.
+"""Identifiability: what the data determine and what they do not, as sentences.
 
-Directions are those of the marginal covariance of the parameters' logarithms. Scaled to unit
-variances it is the correlation matrix; an eigenvalue ε ≪ 1 belongs to a combination Σ w_k q_k, that
-is a product of powers of the parameters, which is known √ε times better than each of them alone.
+Directions are those of the marginal covariance of the parameters' logarithms, scaled to unit
+variances (correlation matrix). An eigenvalue ε ≪ 1 belongs to a combination Σ w_k q_k, a product of
+powers of the parameters, which is known √ε times better than each of them alone.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from ..fem.moduli import ELASTIC
 from .estimates import CONFOUNDED, Estimate
 from .uncertainty import Uncertainty
 
-# An interval within this factor fixes a parameter; a wider one does so "only".
+# Interval as a factor up to which a parameter is well determined.
 WELL_FIXED = 1.25
-# Share of the largest part from which on a parameter belongs to a combination.
+# Share of the largest component from which on a parameter belongs to a combination.
 MEMBER = 0.2
-# Above this factor an interval tells nothing.
+# Interval as a factor above which it is useless.
 HOPELESS = 1e4
 
 
 def verdicts(uncertainty: Uncertainty) -> tuple[str, ...]:
-    """Sentences on what the data say about each parameter and about combinations of them.
+    """Return sentences about each parameter and about combinations of parameters, with 95 %
+    intervals.
 
-    The intervals meant are those of 95 %. Sentences on parameters at a bound or not identifiable
-    are the same as in the notes.
+    Sentences on parameters at a bound or not identifiable are the same as in the notes.
     """
     open_ends = [note for note in uncertainty.notes if note.split()[0] in uncertainty.names]
     combined = _combinations(uncertainty)
@@ -40,6 +40,7 @@ def verdicts(uncertainty: Uncertainty) -> tuple[str, ...]:
 
 
 def _one_by_one(uncertainty: Uncertainty) -> list[str]:
+    """Return the sentence about the parameters that are determined, with their precision."""
     factors = {
         name: factor
         for name in uncertainty.names
@@ -53,6 +54,9 @@ def _one_by_one(uncertainty: Uncertainty) -> list[str]:
 
 
 def _combinations(uncertainty: Uncertainty) -> list[str]:
+    """Return sentences about confounded parameters, one for each eigenvector with a small
+    eigenvalue.
+    """
     deviations = np.sqrt(np.diag(uncertainty.covariance))
     modes = np.array([is_mode(name) for name in uncertainty.names], dtype=bool)
     known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0) & ~modes)
@@ -77,6 +81,7 @@ def _combinations(uncertainty: Uncertainty) -> list[str]:
 def _combination(
     uncertainty: Uncertainty, members: NDArray[np.intp], eigenvalue: float, vector: Array
 ) -> str:
+    """Return the sentence about one combination of confounded parameters (members are indices)."""
     names = [uncertainty.names[k] for k in members]
     deviations = np.sqrt(np.diag(uncertainty.covariance))[members]
     quantiles = uncertainty.quantiles[members]
@@ -95,6 +100,9 @@ def _combination(
 
 
 def _other_convention(uncertainty: Uncertainty) -> list[str]:
+    """Return the sentence about the moduli of the other elastic convention; none if no
+    elastic constant is estimated.
+    """
     if not set(ELASTIC) & {bare(name) for name in uncertainty.names}:
         return []
     parts = []
@@ -106,7 +114,9 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
 
 
 def _factor(estimate: Estimate) -> float | None:
-    """Half width of the interval as a factor."""
+    """Return the half width of the interval as a factor; None without one, or if it is too
+    wide to be useful.
+    """
     if estimate.statistical95 is None or not estimate.statistical95[0] > 0:
         return None
     factor = float(np.sqrt(estimate.statistical95[1] / estimate.statistical95[0]))
@@ -114,12 +124,14 @@ def _factor(estimate: Estimate) -> float | None:
 
 
 def _spread(factor: float) -> str:
+    """Return an interval's half width, given as a factor, as text."""
     if factor < 1.5:
         return f"±{100 * (factor - 1):.2g} %"
     return f"within a factor of {factor:.2g}" if factor < HOPELESS else "no useful range"
 
 
 def _product(names: Sequence[str], powers: Array) -> str:
+    """Return a product of powers of parameters as text."""
     parts = []
     for name, power in zip(names, powers, strict=True):
         parts.append(name if abs(power - 1) < 5e-3 else f"{name}^{power:.2g}")

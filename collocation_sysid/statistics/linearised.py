@@ -1,16 +1,16 @@
-"""The fit near its answer: residuals of all samples and their slopes along the motion equations.
+"""Linearised fit at its answer: residuals of all samples and their derivatives along the equations
+of motion.
 
-Everything the statistics need to know of a fit. Estimated are the shared parameters, q, and
-possibly nuisance parameters of single experiments, such as the offset of a marker on the body.
+The basis of all statistics. Estimated are the shared parameters q and nuisance parameters φ of
+single experiments, such as the offset of a marker.
 
-How the trajectory follows the parameters, Z = dx/dp with the equations of motion kept, is found
-from the linearised constraints c_x Z + c_p = 0, solved forward in time by `program.sweep`; p are
-the shared parameters q and those φ of an experiment that move its body, see `Segment.moving`.
+The sensitivities of the trajectory, Z = dx/dp along the equations of motion, follow from the
+linearised constraints c_x Z + c_p = 0, solved forward in time by `program.sweep`; p are q and those
+φ of an experiment that change its motion, see `Segment.moving`.
 
-The information is factored, in coordinates where the statistics are simple. With S the slopes of
-all residuals and P the priors' slopes, the information is A = SᵀS + PᵀP. The root L with A⁻¹ = L Lᵀ
-turns S into D = S L, for which DᵀD + LᵀPᵀP L = I: a covariance B of the score Sᵀe becomes L (LᵀB L)
-Lᵀ for the parameters, without any further inverse.
+The information is factorised. With S the derivatives of all residuals and P those of the priors,
+the information is A = SᵀS + PᵀP. With a root L, A⁻¹ = L Lᵀ, and D = S L, DᵀD + LᵀPᵀP L = I: a
+covariance B of the score Sᵀe becomes L (LᵀB L) Lᵀ for the parameters, without any further inverse.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from ..program.sweep import Sweep
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """dx/dp of each experiment, (N, 3n, m) in metres per unit of p.
+    """Return the sensitivities dx/dp of each experiment, (N, 3n, m) [m per unit of p].
 
-    Held dofs have zeros, and so has x_0 unless it is found in equilibrium.
+    Prescribed dofs have zeros, and so has x_0 unless it follows as an equilibrium.
 
     Raises
     ------
     SimulationError
-        Where the equations of a step are singular.
+        If the equations of a step are singular.
     """
     return [
         np.stack(list(Sweep(part.segment).sensitivities(part.x, part.setting)))
@@ -52,66 +52,80 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 
 @one_blas_thread()
 def responses(collocation: Collocation, z: Array) -> list[Response]:
-    """The response of each experiment; needs no more memory than the result.
+    """Return the changes of the observables of each experiment with its parameters, computed in
+    parallel.
 
     Raises
     ------
     SimulationError
-        Where the equations of a step are singular.
+        If the equations of a step are singular.
     """
 
     def of(part: Part) -> Response:
         segment = part.segment
-        held = HeldForces.nothing(len(part.x), len(segment.sensed_dofs), len(segment.moving))
-        rows = Sweep(segment).sensitivities(part.x, part.setting, held)
-        return part.sensing.read_along(rows, held)
+        grasp_forces = HeldForces.nothing(
+            len(part.x), len(segment.sensed_dofs), len(segment.moving)
+        )
+        rows = Sweep(segment).sensitivities(part.x, part.setting, grasp_forces)
+        return part.sensing.read_along(rows, grasp_forces)
 
     return side_by_side(of, collocation.parts(z), collocation.threads)
 
 
 def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """d(markers)/dp of each experiment at its samples, (T, 3M, m), see `Response`."""
+    """Return the derivatives d(markers)/dp of each experiment at its samples, (T, 3M, m),
+    see `Response`.
+    """
     return [response.looked[0] for response in responses(collocation, z)]
 
 
 Mask = NDArray[np.bool_]
 
-# A parameter this near a bound, in its logarithm, is at it: interior-point methods stay inside.
+# A parameter within this distance of a bound, in its logarithm, is at it: interior-point methods
+# stay inside.
 AT_BOUND = 1e-3
+# Largest step of parameters at a bound; exactly zero would leave no interval.
 NO_STEP = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class FitBlock:
-    """Residuals of one of an experiment's readings, and slopes at the answer.
+    """Residuals of one measurement of an experiment, with derivatives at the answer.
 
-    A sensor of a wrench has two "markers", its force and its torque, in newtons and newton metres;
-    a reading of one's own has one for each three numbers.
+    Markers are the entities of the measurement; a wrench sensor has two, force and torque [N, N m],
+    and a custom sensor one for each three numbers.
 
     Attributes
     ----------
     name : str
-        Of the experiment.
-    t_s : (T,) sample times, equally spaced unless static
-    marker_names : (M,)
-    present : (T, M) bool
-    residual : (T, M, 3) (h(x) − ŷ) / σ, zero where missing
-    slope : (T, M, 3, p) derivative of the residual by all p parameters, zero where missing
-    sigma_m : (M,) standard deviations given
-    misfit : (T, M, 3), optional
-        Residuals as they are, where Huber's loss has shortened those in `residual`.
-    components : (T, M, 3) bool, optional
-        Coordinates that are there, where not all three of a sample need be.
+        Name of the experiment.
+    t_s : (T,) array
+        Times of the samples [s], equally spaced unless static.
+    marker_names : (M,) tuple of str
+        Names of the markers.
+    present : (T, M) array of bool
+        Samples that are compared.
+    residual : (T, M, 3) array
+        Residuals (h(x) − ŷ) / σ, zero where missing.
+    slope : (T, M, 3, p) array
+        Derivatives of the residuals by all p parameters, zero where missing.
+    sigma_m : (M,) array
+        Stated standard deviations.
+    misfit : (T, M, 3) array or None
+        Original residuals where Huber's loss has shortened those in `residual`; None if they are
+        the same.
+    components : (T, M, 3) array of bool or None
+        Coordinates that exist; None if all three of a present sample do.
     stated : str
-        What states σ in the problem: "sigma_m" of places.
+        Key of σ in the problem: "sigma_m" for positions.
     static : bool
-        Whether samples are equilibria, of which no frequency can be told.
+        Whether samples are equilibria, which have no frequency.
     relaxed_first : bool
-        Whether a memory counts as relaxed at the first sample.
-    places_m : (3M, 3), optional
-        Where channels are on the undeformed body.
-    disturbances : (K, T, M, 3), optional
-        Samples of what the residuals have besides their noise, in units of σ.
+        Whether a memory is assumed relaxed at the first sample.
+    places_m : (3M, 3) array or None
+        Places of the channels on the undeformed body [m]; None if they have none.
+    disturbances : (K, T, M, 3) array or None
+        Samples of known errors of the residuals besides their noise, in units of σ.
     noise_at_least_stated : bool
         See `Reading`.
     """
@@ -134,21 +148,23 @@ class FitBlock:
 
     @cached_property
     def seen(self) -> Mask:
-        """(T, M, 3) coordinates that are there."""
+        """Mask (T, M, 3) of the coordinates that exist."""
         if self.components is not None:
             return self.components
         return np.repeat(self.present[..., None], 3, axis=2)
 
     @property
     def wild(self) -> Mask:
-        """(T, M) samples beyond Huber's threshold."""
+        """Mask (T, M) of the samples beyond Huber's threshold."""
         if self.misfit is None:
             return np.zeros(self.present.shape, dtype=bool)
         return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
 
     @property
     def weight(self) -> Array:
-        """(T, M, 1) root of Huber's weights, which residuals and slopes have already."""
+        """Square root (T, M, 1) of Huber's weights, which residuals and derivatives contain
+        already.
+        """
         if self.misfit is None:
             return np.ones((*self.present.shape, 1))
         long, short = (np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual))
@@ -157,12 +173,12 @@ class FitBlock:
 
     @property
     def measurements(self) -> int:
-        """Scalar measurements that are present."""
+        """Number of scalar measurements that are present."""
         return int(self.seen.sum())
 
     @cached_property
     def channels(self) -> tuple[Array, Array, Mask]:
-        """Residuals (T, 3M), slopes (T, 3M, p) and presence (T, 3M); column 3 m + axis."""
+        """Residuals (T, 3M), derivatives (T, 3M, p) and presence (T, 3M); column 3 m + axis."""
         samples, markers = self.present.shape
         return (
             self.residual.reshape(samples, 3 * markers),
@@ -177,8 +193,10 @@ class Derived:
 
     Attributes
     ----------
-    values : by name
-    by_q : by name, (shared,) derivatives
+    values : mapping of str to float
+        Moduli by name.
+    by_q : mapping of str to (shared,) array
+        Their derivatives by q.
     """
 
     values: Mapping[str, float]
@@ -186,42 +204,43 @@ class Derived:
 
     @classmethod
     def of(cls, constants: Iterable[ThetaMap], q: Array) -> Derived:
-        """Those of several bodies."""
+        """Compute the moduli of several bodies at q."""
         values: dict[str, float] = {}
         by_q: dict[str, Array] = {}
         for each in constants:
-            found, slopes = each.derived(q)
-            values |= dict(zip(each.derived_names, found.tolist(), strict=True))
+            moduli, slopes = each.derived(q)
+            values |= dict(zip(each.derived_names, moduli.tolist(), strict=True))
             by_q |= dict(zip(each.derived_names, slopes, strict=True))
         return cls(values, by_q)
 
 
 def values_of(collocation: Collocation, q: Array) -> dict[str, float]:
-    """Moduli that follow from the parameters, and the parameters, by name."""
+    """Return derived moduli and parameters by name, at q."""
     constants = (segment.constants for segment in collocation.segments)
     return {**Derived.of(constants, q).values, **collocation.parameters.values(q)}
 
 
 @dataclass(frozen=True, eq=False)
 class LinearisedFit:
-    """The least-squares problem at its answer.
+    """Linearised least-squares problem at its answer.
 
     Attributes
     ----------
     blocks : tuple of FitBlock
-        Of each fitted experiment that of its markers, then those of its other readings.
-    names : (p,) the shared parameters first, which are q; then φ, with their unit in
-        brackets: ``"gravity/offset Tip1 x [m]"``
+        For each fitted experiment its markers, then its other measurements.
+    names : (p,) tuple of str
+        Shared parameters q, then φ with their unit in brackets: ``"gravity/offset Tip1 x [m]"``.
     shared : int
         Number of shared parameters.
-    prior_residual, prior_slope : (p,) in units of the prior's deviation, zero without a prior
-    at_bound : (p,) bool
+    prior_residual, prior_slope : (p,) arrays
+        Residuals of the priors and their derivatives, in standard deviations; zero without a prior.
+    at_bound : (p,) array of bool
         Parameters that ended at a bound.
     derived : Derived
-        What follows from the shared parameters.
-    of_phases : (shared, shared) or None
-        Covariance that unknown phases of a two-phase field add to that of the shared parameters,
-        in the solver's coordinates; None without such a field.
+        Moduli that follow from the shared parameters.
+    of_phases : (shared, shared) array or None
+        Covariance of q due to unknown phases of a two-phase field, in the solver's coordinates;
+        None without such a field.
     """
 
     blocks: tuple[FitBlock, ...]
@@ -235,38 +254,42 @@ class LinearisedFit:
 
     @property
     def measurements(self) -> int:
-        """Scalar measurements that are present."""
+        """Number of scalar measurements that are present."""
         return sum(block.measurements for block in self.blocks)
 
     def disturbed(self, samples: Iterable[Array | None]) -> LinearisedFit:
-        """The same with what is known of each block's residuals besides their noise."""
+        """Return the fit with samples of known errors of the residuals for each block; None
+        where there are none.
+        """
         pairs = zip(self.blocks, samples, strict=True)
         return replace(self, blocks=tuple(replace(b, disturbances=each) for b, each in pairs))
 
     def after(self, step: Array) -> LinearisedFit:
-        """The same after a step (p,) of all parameters, to first order."""
-        moved = (replace(b, residual=b.residual + b.slope @ step) for b in self.blocks)
+        """Return the fit after a step (p,) of all parameters, to first order."""
+        blocks_after = (replace(b, residual=b.residual + b.slope @ step) for b in self.blocks)
         at_best = self.prior_residual + self.prior_slope * step
-        return replace(self, blocks=tuple(moved), prior_residual=at_best)
+        return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
     @property
     def chi_squared(self) -> float:
-        """Σ residual² of markers and wrenches, without priors."""
+        """Sum of squared residuals of all measurements, without priors."""
         return float(sum(np.sum(block.residual**2) for block in self.blocks))
 
 
 def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
-    """The fit near a solution.
+    """Linearise a fit at a solution.
 
     Parameters
     ----------
     collocation : Collocation
-    z : (variables,) a point that satisfies the equations of motion, the optimum
+        The program.
+    z : (variables,) array
+        The optimum, which satisfies the equations of motion.
 
     Raises
     ------
     SimulationError
-        Where the equations of motion are singular.
+        If the equations of motion are singular.
     """
     p = collocation.parameters_of(z)
     blocks = []
@@ -274,8 +297,8 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         segment = part.segment
         experiment = part.segment.experiment
         relaxed = segment.body.remembers and bool(np.isinf(experiment.loaded_since_s))
-        found = part.sensing.linearised(part.x, response)
-        for reading, (misfit, by_own) in zip(segment.readings, found, strict=True):
+        linearised = part.sensing.linearised(part.x, response)
+        for reading, (misfit, by_own) in zip(segment.readings, linearised, strict=True):
             residual, by_own = as_weights(misfit, by_own, reading.huber)
             residual, misfit, by_own = map(reading.pooled, (residual, misfit, by_own))
             slope = np.zeros((*residual.shape, len(p)))
@@ -313,31 +336,36 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
 
 
 def _covariance_by_phases(collocation: Collocation) -> Array | None:
-    """Return what unknown phases add to the covariance (nq, nq) of q; None if there are none."""
+    """Return the covariance (nq, nq) of q due to unknown phases; None if there is no
+    two-phase field.
+    """
     names = [item.name for item in collocation.parameters.free]
-    found: Array | None = None
+    covariance: Array | None = None
     for body in dict.fromkeys(segment.body for segment in collocation.segments):
         for samples in body.phase_samples:
             places = [k for k, name in enumerate(samples.names) if name in names]
             own = [names.index(samples.names[k]) for k in places]
-            found = np.zeros((len(names), len(names))) if found is None else found
-            found[np.ix_(own, own)] += samples.deviations[np.ix_(places, places)]
-    return found
+            covariance = np.zeros((len(names), len(names))) if covariance is None else covariance
+            covariance[np.ix_(own, own)] += samples.deviations[np.ix_(places, places)]
+    return covariance
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What residuals and priors say of all parameters, by the r directions that are determined.
+    """Information of residuals and priors about all parameters, in the r directions that are
+    determined.
 
-    Those that ended at a bound are free here like the others: had the noise been another, they
-    would not have, and what they can take from the others belongs to these others' error.
+    Parameters at a bound are free here: with other noise they would not have ended there, and their
+    correlation with the other parameters is part of those parameters' error.
 
     Attributes
     ----------
     fit : LeastSquares
-        Its root is L.
-    slopes : of each experiment (T, 3M, r), D = S L; zero where missing
-    prior : (r, r) Lᵀ PᵀP L
+        Triangle of all rows; its root is L.
+    slopes : tuple of (T, 3M, r) arrays
+        D = S L of each block; zero where missing.
+    prior : (r, r) array
+        Lᵀ PᵀP L.
     """
 
     fit: LeastSquares
@@ -346,12 +374,14 @@ class Information:
 
     @property
     def fitted(self) -> float:
-        """Number of parameters the data determine; one that a prior determines counts in part."""
+        """Number of parameters that the data determine; one that a prior determines counts
+        in part.
+        """
         return float(sum(np.sum(slope**2) for slope in self.slopes))
 
 
 def information(fit: LinearisedFit) -> Information:
-    """Factor the information of a fit."""
+    """Factorise the information of a fit."""
     all_rows = least_squares(fit)
     slopes = tuple(block.channels[1] @ all_rows.root for block in fit.blocks)
     prior = all_rows.root * fit.prior_slope[:, None]
@@ -359,21 +389,23 @@ def information(fit: LinearisedFit) -> Information:
 
 
 def least_squares(fit: LinearisedFit) -> LeastSquares:
-    """Residuals and priors by a step of all parameters."""
+    """Return residuals and priors as a least-squares problem in a step of all parameters."""
     of_all = rows_of(fit, range(len(fit.blocks)))
     return of_all.add(fit.prior_residual, np.diag(fit.prior_slope))
 
 
 def rows_of(fit: LinearisedFit, numbers: Iterable[int]) -> LeastSquares:
-    """Residuals of some blocks, without priors."""
-    found = LeastSquares.none(len(fit.names))
+    """Return the residuals of some blocks (indices) as a least-squares problem, without priors."""
+    problem = LeastSquares.none(len(fit.names))
     for k in numbers:
         residual, slope, _ = fit.blocks[k].channels
-        found = found.add(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
-    return found
+        problem = problem.add(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
+    return problem
 
 
 def best_step(fit: LinearisedFit) -> Array:
-    """(p,) step of the parameters to the least squares of what is linearised; at a bound none."""
+    """Return the step (p,) to the least squares of the linearised fit; parameters at a
+    bound do not change.
+    """
     free = np.where(fit.at_bound, NO_STEP, np.inf)
     return least_squares(fit).best(-free, free)

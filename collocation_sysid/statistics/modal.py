@@ -1,8 +1,8 @@
-"""Does the description of a recording fit its tracks? Told before solving, for any stiffness.
+"""Misspecification hypotheses tested before any solve, by natural modes for many stiffnesses.
 
-The markers of bodies of many stiffnesses (`program.any_stiffness`) are compared with the tracks:
-for the description as given, and without each of the mistakes that people make. What fits far
-better is named.
+The markers of bodies of many stiffnesses (`program.any_stiffness`) are compared with the measured
+tracks, for the description as stated and with each common mistake corrected. A correction that fits
+far better is reported.
 """
 
 from __future__ import annotations
@@ -22,32 +22,35 @@ from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis, Trial, clock, ranked
 from .plausible import against_the_load, exchanges, steps
 
-# The misfit falls by this factor at least before a cause is named.
+# Factor by which the misfit must decrease.
 FAR_BETTER = 2.0
-# What has numbers to fit has to fit better still than what has none.
+# Additional factor for hypotheses with fitted numbers.
 FITTED = 1.5
-# Small strains and a few modes predict no better than to this part of the body's size.
+# Accuracy of small strains and a few modes, over the size of the body.
 ROUGHLY = 0.005
-# Samples beyond this share may be anything: exchanged labels, reflections.
+# Share of the samples that are used, the best ones; others may be exchanged labels or reflections.
 USED = 0.9
+# Clock lags that are tried [s].
 LAGS_S = np.concatenate([-np.arange(15, 0, -1), np.arange(1, 16)]) * 0.01
-# Of the recording: a lag leaves most of it.
+# Longest lag over the length of the recording.
 LONGEST_LAG = 0.3
+# Alternations between the best stiffness and the best rigid motion.
 REFITS = 3
 
 
 def doubts(
     experiment: Experiment, constants: Mapping[str, float], huber: float | None = None
 ) -> tuple[Hypothesis, ...]:
-    """What is likely wrong with a recording's description, likeliest first; mostly nothing.
+    """Return hypotheses about a recording's description, likeliest first; mostly empty.
 
     Parameters
     ----------
     experiment : Experiment
-    constants : mapping of name to value
-        Of the body, any that keep the ratios of stiffness within it.
+        The recording.
+    constants : mapping of str to float
+        Constants of the body; only ratios of stiffness within it matter.
     huber : float, optional
-        Of the loss, where it is Huber's.
+        Threshold of Huber's loss; None means a quadratic loss.
     """
     if experiment.static or not experiment.markers.names:
         return ranked(against_the_load(experiment))
@@ -58,15 +61,18 @@ def doubts(
 
 @dataclass(frozen=True, eq=False)
 class ModalComparison:
-    """Descriptions of one experiment against its tracks.
+    """Comparison of descriptions of one experiment with its tracks.
 
     Attributes
     ----------
     given : Described
-    names : (M,) of the markers
+        Description as stated.
+    names : (M,) tuple of str
+        Names of the markers.
     sway : Sway
+        Natural modes at the markers.
     floor_m : float
-        Misfit that is to be expected at least.
+        Smallest misfit that can be expected [m].
     """
 
     given: Described
@@ -76,9 +82,10 @@ class ModalComparison:
 
     @classmethod
     def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> ModalComparison | None:
-        """That of an experiment, see `doubts`; None where the body has no modes to tell by.
+        """Build the comparison for an experiment, see `doubts`.
 
-        Nor where tendons or pressures drive it, which is beyond a sway under gravity.
+        None if the body has no modes, no single grasp carries it, there are too few tracks, or
+        tendons or pressures drive it.
         """
         given = None if experiment.actuators else Described.of(experiment)
         if given is None or np.isfinite(given.tracks_m[..., 0]).sum() < 3:
@@ -92,22 +99,24 @@ class ModalComparison:
         return cls(given, markers.names, sway, float(np.hypot(noise_m, ROUGHLY * sway.size_m)))
 
     def misfit_m(self, described: Described) -> float:
-        """Misfit of the stiffness that suits best."""
+        """Return the misfit of the best stiffness [m]."""
         return float(self._misfits_m(described, self.sway.predicted(described)).min())
 
     def best(self, described: Described) -> Array:
-        """(T, M, 3) markers for the stiffness that suits best."""
+        """Return the markers (T, M, 3) of the best stiffness [m]."""
         predicted = self.sway.predicted(described)
         return predicted[int(self._misfits_m(described, predicted).argmin())]
 
     def doubts(self) -> Iterator[Hypothesis]:
-        """All that fits far better than what is given."""
+        """Iterate over the hypotheses that fit far better than the description as stated."""
         trial = Trial(self.misfit_m(self.given), self.misfit_m, FAR_BETTER)
         yield from trial.of([*mistakes(self.given), *self._other_frames(), *self._other_clock()])
         yield from self._other_names()
 
     def _misfits_m(self, described: Described, predicted: Array) -> Array:
-        """(S,) root mean square distance of most samples, and what is to be expected at least."""
+        """Return the misfit (S,) of each prediction: root mean square distance of the best
+        90 % of the samples, and the floor [m].
+        """
         present = np.isfinite(described.tracks_m[..., 0]) & np.isfinite(predicted[0, ..., 0])
         distance = np.linalg.norm(predicted - described.tracks_m, axis=3)[:, present]
         squares = np.sort(distance**2, axis=1)
@@ -115,63 +124,70 @@ class ModalComparison:
         return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
 
     def _other_frames(self) -> Iterator[Hypothesis]:
-        """The rigid motions before the poses, and of the tracks, that suit best."""
+        """Yield hypotheses of a rigid motion before the poses, and of a rigid motion of the
+        tracks.
+        """
         given = self.given
         places_m = self.sway.places_m
         if not _fixes_rotation(places_m):
             return
-        own = seen = given
+        moved_poses = moved_tracks = given
         for k in range(REFITS):
             best = (
-                own.pulled_back(self.best(own))
+                moved_poses.pulled_back(self.best(moved_poses))
                 if k
                 else np.broadcast_to(places_m, given.tracks_m.shape)
             )
-            own = own.after(*_rigid(best, own.pulled_back(own.tracks_m)))
-            turn, shift_m = _rigid(seen.tracks_m, self.best(seen))
-            seen = replace(seen, tracks_m=seen.tracks_m @ turn.T + shift_m)
-        yield Hypothesis("gripper-frame", given.name, without=own, handicap=FITTED)
-        yield Hypothesis("camera-frame", given.name, without=seen, handicap=FITTED)
+            moved_poses = moved_poses.after(
+                *_rigid(best, moved_poses.pulled_back(moved_poses.tracks_m))
+            )
+            turn, shift_m = _rigid(moved_tracks.tracks_m, self.best(moved_tracks))
+            moved_tracks = replace(moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m)
+        yield Hypothesis("gripper-frame", given.name, without=moved_poses, handicap=FITTED)
+        yield Hypothesis("camera-frame", given.name, without=moved_tracks, handicap=FITTED)
 
     def _other_clock(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis of the clock lag that fits best."""
         given = self.given
         predicted = self.sway.predicted(given)
         allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(given.t_s)].tolist()
-        seen = (later(predicted, given.t_s, lag_s) for lag_s in allowed)
-        misfits = [self._misfits_m(given, each).min() for each in seen]
+        delayed = (later(predicted, given.t_s, lag_s) for lag_s in allowed)
+        misfits = [self._misfits_m(given, each).min() for each in delayed]
         if misfits:
             lag_s = allowed[int(np.argmin(misfits))]
             yield clock(given.name, lag_s, replace(given, lag_s=lag_s), FITTED)
 
     def _other_names(self) -> Iterator[Hypothesis]:
-        """Markers that have each other's name, tried on these."""
+        """Yield the hypothesis that markers have each other's names, tested on these markers."""
         given = self.given
         squares = np.sum((given.tracks_m[:, :, None] - self.best(given)[:, None]) ** 2, axis=3)
-        there = np.isfinite(squares).any(axis=0).all()
-        if not there or len(self.names) < 2:
+        is_complete = np.isfinite(squares).any(axis=0).all()
+        if not is_complete or len(self.names) < 2:
             return
         _, chosen = linear_sum_assignment(np.nanmean(squares, axis=0))
-        moved = np.flatnonzero(chosen != np.arange(len(chosen)))
-        if not len(moved):
+        exchanged = np.flatnonzero(chosen != np.arange(len(chosen)))
+        if not len(exchanged):
             return
         few, renamed = (
-            _with_markers(given, given.tracks_m[:, order], moved)
+            _with_markers(given, given.tracks_m[:, order], exchanged)
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
-        listed = ", ".join(f"{self.names[k]} is {self.names[chosen[k]]}" for k in moved)
-        found = Hypothesis("markers-exchanged", given.name, {"names": listed}, renamed)
-        yield from Trial(self.misfit_m(few), self.misfit_m, FAR_BETTER).of([found])
+        listed = ", ".join(f"{self.names[k]} is {self.names[chosen[k]]}" for k in exchanged)
+        hypothesis = Hypothesis("markers-exchanged", given.name, {"names": listed}, renamed)
+        yield from Trial(self.misfit_m(few), self.misfit_m, FAR_BETTER).of([hypothesis])
 
 
 def _with_markers(given: Described, tracks_m: Array, markers: Index) -> Described:
-    """With the tracks of some markers only."""
+    """Return the description with the tracks of some markers only."""
     few_m = np.full_like(tracks_m, np.nan)
     few_m[:, markers] = tracks_m[:, markers]
     return replace(given, tracks_m=few_m)
 
 
 def _rigid(from_m: Array, to_m: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and translation (3,) that bring points to others, both (T, M, 3)."""
+    """Return rotation (3, 3) and translation (3,) that map points to others, both (T, M,
+    3), by least squares.
+    """
     both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
     a = from_m[both]
     b = to_m[both]
@@ -180,20 +196,21 @@ def _rigid(from_m: Array, to_m: Array) -> tuple[Array, Array]:
 
 
 def _fixes_rotation(places_m: Array) -> bool:
+    """Whether places (M, 3) are not collinear, so that they determine a rotation."""
     if len(places_m) < 3:
         return False
     extents = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
     return bool(extents[1] > 0.1 * extents[0])
 
 
-# How many times as large what is given in another unit should be, and the key's value.
+# Factors of lengths in a wrong unit, with the unit to state; empty where none is certain.
 UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "in", 1e3: "", 1e2: ""}
-# A direction within about 20 degrees of the one that is given is none of another axis.
+# Cosine of some 20 degrees, above which a direction is not another axis.
 SAME_DIRECTION = 0.94
 
 
 def mistakes(given: Described) -> Iterator[Hypothesis]:
-    """The mistakes that need no fit, each undone."""
+    """Iterate over the hypotheses without fitted numbers, each with the mistake corrected."""
     moving = np.ptp(given.rotations, axis=0).any() or np.ptp(given.translations_m, axis=0).any()
     if moving or np.abs(given.translations_m).any():
         yield from _poses(given)
@@ -204,6 +221,7 @@ def mistakes(given: Described) -> Iterator[Hypothesis]:
 
 
 def _poses(given: Described) -> Iterator[Hypothesis]:
+    """Yield hypotheses of inverted poses, inverted rotations and other quaternion orders."""
     inverse = given.rotations.transpose(0, 2, 1)
     shift = -np.einsum("tij,tj->ti", inverse, given.translations_m)
     inverted = replace(given, rotations=inverse, translations_m=shift)
@@ -220,6 +238,19 @@ def _poses(given: Described) -> Iterator[Hypothesis]:
 
 
 def _lengths(given: Described, what: str, who: str, section: str) -> Iterator[Hypothesis]:
+    """Yield hypotheses that an attribute of the description is in another unit of length.
+
+    Parameters
+    ----------
+    given : Described
+        Description as stated.
+    what : str
+        Attribute of the description.
+    who : str
+        Beginning of the message.
+    section : str
+        Section of the problem file.
+    """
     key = f"{section}.length_unit"
     for factor, unit in UNITS.items():
         remedy = f'set {key} = "{unit}"' if unit else f"check {key}"
@@ -229,7 +260,7 @@ def _lengths(given: Described, what: str, who: str, section: str) -> Iterator[Hy
 
 
 def gravity_mistakes(given: Described) -> Iterator[Hypothesis]:
-    """Gravity along the other axes, and with the other sign."""
+    """Iterate over the hypotheses of gravity along the other axes, and with the other sign."""
     size = float(np.linalg.norm(given.gravity_m_s2))
     for axis, name in enumerate("xyz"):
         for sign, plus in ((1.0, "+"), (-1.0, "−")):

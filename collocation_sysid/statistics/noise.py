@@ -1,13 +1,14 @@
-"""How large the errors are against the σ given, marker by marker; forces and torques count as such.
+"""Size of the errors compared with the stated σ, for each marker; forces and torques count as
+markers.
 
 The residuals are r = M e + D Lᵀ Pᵀ e_P with M = I − D Dᵀ (see `linearised`) and e_P the errors of
-the priors. If the errors of marker m have s_m² times the variance given, its residuals have
+the priors. If the errors of marker m have s_m² times the stated variance, its residuals have
 
-    E Σ r_m² = Σ_n s_n² tr(M_mn M_nm) + tr(G_m LᵀPᵀP L) + what is expected besides,
+    E Σ r_m² = Σ_n s_n² tr(M_mn M_nm) + tr(G_m LᵀPᵀP L) + expectation of other known errors,
 
-with G_m = D_mᵀ D_m, which is solved for the s_n². Whether they differ is Bartlett's test; whether
-all of them are one is that of χ². What is known to add to the residuals besides the noise may be
-given by samples of it, such as those of `pose_noise`.
+with G_m = D_mᵀ D_m, which is solved for the s_n². Bartlett's test decides whether they differ, a χ²
+test whether all of them are one. Other known errors are given by samples, such as those of
+`pose_noise`.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ Noise = Literal["given", "estimated", "by-marker"]
 
 # Residuals this small, in units of σ, are rounding.
 ROUNDING = 1e-6
-# Levels of the tests that residuals are larger, smaller, and different among markers.
+# Level of the test that residuals are larger than σ.
 LARGER = 0.05
+# Level of the test that residuals are smaller than σ.
 SMALLER = 0.01
+# Level of the test that markers differ.
 UNEQUAL = 0.01
 # A variance found below this share of the mean square of the residuals is chance.
 LEAST_SHARE = 0.5
@@ -41,22 +44,26 @@ class NoiseLevel:
 
     Attributes
     ----------
-    names : (G,) "swing/tip", the markers that were seen
-    by_marker : (G,) s_m²
-    freedoms : (G,) degrees of freedom of each
+    names : (G,) tuple of str
+        Markers that were measured, such as "swing/tip".
+    by_marker : (G,) array
+        Variance s_m² of each.
+    freedoms : (G,) array
+        Degrees of freedom of each.
     pooled : float
-        s² if all are equal.
+        Variance s² if all are equal.
     freedom : float
         Degrees of freedom of all residuals.
     larger_p, smaller_p : float
-        Probability of residuals as large, or as small, if σ is right.
+        p-values of residuals as large, or as small, if σ is right.
     unequal_p : float
-        Probability of markers as different, if all are alike.
-    shares : (G, r, r) G_m
-    extra : (r, r)
-        What is expected besides adds to the covariance of the score.
+        p-value of markers as different, if all are equal.
+    shares : (G, r, r) array
+        Matrices G_m.
+    extra : (r, r) array
+        Covariance of the score due to other known errors.
     stated : str
-        What states σ in the problem.
+        Key of σ in the problem.
     """
 
     names: tuple[str, ...]
@@ -73,29 +80,31 @@ class NoiseLevel:
 
     @property
     def smaller(self) -> bool:
-        """The residuals are clearly smaller than σ says."""
+        """Whether the residuals are significantly smaller than σ."""
         return self.smaller_p < SMALLER
 
     @property
     def unequal(self) -> bool:
-        """Markers differ more than by chance."""
+        """Whether markers differ more than by chance."""
         return self.unequal_p < UNEQUAL
 
     @property
     def kind(self) -> Noise:
-        """What the residuals ask for."""
+        """Source of the variance that the residuals suggest."""
         if self.unequal:
             return "by-marker"
         return "estimated" if self.larger_p < LARGER or self.smaller else "given"
 
     @cached_property
     def factors(self) -> dict[str, float]:
-        """How many times σ the errors of each marker are."""
+        """Size of the errors of each marker over σ."""
         return dict(zip(self.names, np.sqrt(self.by_marker).tolist(), strict=True))
 
     @property
     def unevenness(self) -> float:
-        """By how much markers that differ widen a mean over all of them: one if they do not."""
+        """Factor by which unequal markers increase the standard deviation of a mean over
+        all of them; 1 if they are equal.
+        """
         if not self.unequal:
             return 1.0
         weights = self.by_marker * self.freedoms
@@ -105,9 +114,22 @@ class NoiseLevel:
     def score_covariance(
         self, kind: Noise, information: Information, shared: int
     ) -> tuple[Array, Array]:
-        """LᵀB L (r, r), and the degrees of freedom of the shared parameters' variances (shared,).
+        """Return the covariance of the score.
 
-        The latter after Satterthwaite (1946); σ as given and priors are exact.
+        Parameters
+        ----------
+        kind : {"given", "estimated", "by-marker"}
+            Source of the variance.
+        information : Information
+            Information of the fit.
+        shared : int
+            Number of shared parameters.
+
+        Returns
+        -------
+        ((r, r) array, (shared,) array)
+            LᵀB L, and degrees of freedom of the variances of shared parameters after Satterthwaite
+            (1946); stated σ and priors are exact.
         """
         exact = information.prior + self.extra
         if kind == "given":
@@ -118,21 +140,24 @@ class NoiseLevel:
         total = exact + np.tensordot(self.by_marker, self.shares, 1)
         directions = information.fit.root[:shared]
         parts = np.einsum("kr,grs,ks->kg", directions, self.shares, directions) * self.by_marker
-        doubt = np.sum(parts**2 / np.maximum(self.freedoms, 1.0), axis=1)
+        variance_of_variance = np.sum(parts**2 / np.maximum(self.freedoms, 1.0), axis=1)
         variances = np.einsum("kr,rs,ks->k", directions, total, directions)
         with np.errstate(divide="ignore", invalid="ignore"):
-            freedom = np.where(doubt > 0, variances**2 / doubt, np.inf)
+            freedom = np.where(
+                variance_of_variance > 0, variances**2 / variance_of_variance, np.inf
+            )
         return total, np.maximum(freedom, 1.0)
 
 
 def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
-    """Compare the residuals with the σ given.
+    """Compare the residuals of a fit with the stated σ.
 
     Parameters
     ----------
     fit : LinearisedFit
+        The fit.
     information : Information
-        Of the fit.
+        Its information.
     """
     names = []
     squares = []
@@ -160,21 +185,22 @@ def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
         information.prior + stated,
         of_score + stated,
     )
-    said = [b.stated for b in fit.blocks if b.present.any() and not b.noise_at_least_stated]
+    sigma_keys = [b.stated for b in fit.blocks if b.present.any() and not b.noise_at_least_stated]
     # That of places stands for all.
-    return replace(level, stated=min(said, key="sigma_m".__ne__, default="sigma_m"))
+    return replace(level, stated=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"))
 
 
 def _stated_noise(block: FitBlock, slope: Array) -> Array:
-    """Return the covariance (r, r) of the score by the noise of a block that is known as stated.
+    """Return the covariance (r, r) of the score due to a block whose noise is at least as stated.
 
-    Residuals that are larger than stated make it larger.
+    Residuals larger than stated increase it.
 
     Parameters
     ----------
     block : FitBlock
+        The block.
     slope : (T, 3M, r) array
-        In units of what is known.
+        Its D = S L.
     """
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
@@ -184,35 +210,56 @@ def _stated_noise(block: FitBlock, slope: Array) -> Array:
 
 
 def drawn(fit: LinearisedFit) -> list[Array]:
-    """Samples (K, T, M, 3) of every block, zero where it has none and where samples are missing."""
+    """Return samples (K, T, M, 3) of known errors for every block; zero where there are
+    none and where measurements are missing.
+    """
     of_blocks = [block.disturbances for block in fit.blocks]
     count = next((len(each) for each in of_blocks if each is not None), 0)
-    found = []
+    samples_of_blocks = []
     for block, each in zip(fit.blocks, of_blocks, strict=True):
         samples = np.zeros((count, *block.residual.shape)) if each is None else each
-        found.append(samples[:count] * block.seen)
-    return found
+        samples_of_blocks.append(samples[:count] * block.seen)
+    return samples_of_blocks
 
 
 def projected(information: Information, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
-    """Scores (K, r), and residuals (K, T, M, 3) by block, that errors of that shape leave."""
+    """Return the effect of samples of errors on the fit.
+
+    Parameters
+    ----------
+    information : Information
+        Information of the fit.
+    errors : sequence of (K, T, M, 3) arrays
+        Samples for each block.
+
+    Returns
+    -------
+    ((K, r) array, list of (K, T, M, 3) arrays)
+        Scores, and the residuals that remain after the fit.
+    """
     flat = [each.reshape(len(each), each.shape[1], -1) for each in errors]
     pairs = [*zip(flat, information.slopes, strict=True)]
     scores = np.sum([np.einsum("ktc,tcr->kr", e, slope) for e, slope in pairs], axis=0)
-    left = [e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs]
-    return scores, [each.reshape(given.shape) for each, given in zip(left, errors, strict=True)]
+    remaining = [e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs]
+    return scores, [
+        each.reshape(given.shape) for each, given in zip(remaining, errors, strict=True)
+    ]
 
 
 def _besides(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
-    """Covariance (r, r) of the score, and (G, K) sums of squares of each marker."""
-    seen = [block.present.any(axis=0) & (not block.noise_at_least_stated) for block in fit.blocks]
+    """Return the covariance (r, r) of the score, and sums of squares (G, K) of each marker,
+    due to known errors.
+    """
+    is_used = [
+        block.present.any(axis=0) & (not block.noise_at_least_stated) for block in fit.blocks
+    ]
     if not len((samples := drawn(fit))[0]):
-        return np.zeros_like(information.prior), np.zeros((int(np.concatenate(seen).sum()), 1))
-    scores, left = projected(information, samples)
+        return np.zeros_like(information.prior), np.zeros((int(np.concatenate(is_used).sum()), 1))
+    scores, remaining = projected(information, samples)
     present = [block.seen for block in fit.blocks]
     sums = [
         np.sum((each * there) ** 2, axis=(1, 3))[:, used].T
-        for each, there, used in zip(left, present, seen, strict=True)
+        for each, there, used in zip(remaining, present, is_used, strict=True)
     ]
     return scores.T @ scores / len(scores), np.concatenate(sums)
 
@@ -226,26 +273,27 @@ def _level(
     prior: Array,
     of_score: Array,
 ) -> NoiseLevel:
+    """Solve for the variances of the markers and test them."""
     fitted = np.trace(shares, axis1=1, axis2=2)
-    left = np.maximum(counts - fitted, 0.0)
+    own_freedoms = np.maximum(counts - fitted, 0.0)
     # Sums of squares with these means and twice these "spreads" as variances are tested as χ² of
     # the same mean and variance.
-    more = besides.mean(axis=1)
-    means = left + more
-    spreads = left + 2 * more + besides.var(axis=1) / 2
+    known_means = besides.mean(axis=1)
+    means = own_freedoms + known_means
+    spreads = own_freedoms + 2 * known_means + besides.var(axis=1) / 2
     freedoms = means**2 / np.maximum(spreads, 1e-300)
-    spread = left.sum() + 2 * more.sum() + besides.sum(axis=0).var() / 2
+    spread = own_freedoms.sum() + 2 * known_means.sum() + besides.sum(axis=0).var() / 2
     freedom = float(means.sum() ** 2 / max(spread, 1e-300))
     of_prior = np.einsum("grs,sr->g", shares, prior)
     overlap = np.einsum("grs,hsr->gh", shares, shares)
     expected = np.diag(counts - 2 * fitted) + overlap
-    own = squares - of_prior - more
-    raw = np.maximum(squares - more, 0.0)
+    own = squares - of_prior - known_means
+    raw = np.maximum(squares - known_means, 0.0)
     least = np.maximum(LEAST_SHARE * raw / np.maximum(counts, 1.0), ROUNDING**2)
     by_marker = np.maximum(np.linalg.lstsq(expected, own)[0], least)
     pooled = max(own.sum() / max(1.0, expected.sum()), counts @ least / max(1.0, counts.sum()))
     exact = squares.sum() <= ROUNDING**2 * counts.sum()
-    tested = not exact and left.sum() >= 1
+    tested = not exact and own_freedoms.sum() >= 1
     statistic = float(squares.sum()) * freedom / max(float(means.sum()), 1e-300)
     return NoiseLevel(
         names=names,
@@ -264,7 +312,7 @@ def _level(
 
 
 def _bartlett(squares: Array, freedoms: Array) -> float:
-    """Probability of mean squares as different, if the variances are equal."""
+    """Return the p-value of Bartlett's test of equal variances."""
     used = (freedoms >= 1) & (squares > 0)
     count = int(used.sum())
     each = freedoms[used]
@@ -278,9 +326,10 @@ def _bartlett(squares: Array, freedoms: Array) -> float:
 
 
 def shortened(block: FitBlock) -> float:
-    """Share of white noise's power that Huber's loss leaves in the residuals; one without it.
+    """Return the share of white noise's power that remains in residuals shortened by Huber's loss;
+    1 without outliers.
 
-    E min(χ², k²) / E χ² of three axes, with the threshold k.
+    It is E min(χ², k²) / E χ² for three axes and the threshold k.
     """
     if not block.wild.any():
         return 1.0

@@ -1,28 +1,28 @@
-"""Numerical error of the estimates: what the step and the mesh do to them.
+"""Discretisation error of the estimates, due to time step and mesh.
 
-In the coordinate in which an interval is symmetric (the logarithm; ln ν/(½ − ν) of Poisson's
-ratio; a linear parameter itself) let x be an estimate, and δ its change with half the step, or with
-half the edge lengths. An error of order p leaves
+In the coordinate in which an interval is symmetric (the logarithm; ln ν/(½ − ν) of Poisson's ratio;
+a linear parameter itself) let x be an estimate, and δ its change with half the step, or with half
+the edge lengths. An error of order p leaves
 
     Δ = δ 2^p / (2^p − 1)
 
-in x (Richardson). With two levels p is assumed, 2 as a rule, and what Δ may be wrong by is what
-lower orders would leave: half of p for the step, whose order is known; ½ for the mesh, since
-elements that are too stiff, and the edge of a grasp, converge slowly at first. On the other side
-twice δ / (2^p − 1) is enough. With three levels p is observed, from the ratio of both changes, and
-1.25 times what is left of the finest is enough (Roache 1994), unless the changes do not shrink as
-they should: then the largest of them is taken. The ends of the interval of 95 % are
+in x (Richardson). With two levels p is assumed, 2 as a rule, and the uncertainty of Δ is what lower
+orders would leave: half of p for the step, whose order is known; ½ for the mesh, since elements
+that are too stiff, and the edge of a grasp, converge slowly at first. On the other side twice δ /
+(2^p − 1) is enough. With three levels p is observed, from the ratio of both changes, and 1.25 times
+the remaining error of the finest is enough (Roache 1994), unless the changes do not shrink as they
+should: then the largest of them is taken. The ends of the 95 % interval are
 
     x + Δ_step + Δ_mesh ± √(n² + (u_step + u_mesh)²),
 
-n being the half width for the noise and u what each Δ may be wrong by on that side.
+n being the half width for the noise and u the uncertainty of each Δ on that side.
 
-Cheaper is a Gauss–Newton step towards a finer simulation with the answer's parameters, d being what
-half the step changes of the residuals: −A⁻¹ Sᵀ d, see `linearised`, to first order. That takes the
-place of the change with half the step.
+A cheaper estimate is a Gauss–Newton step towards a finer simulation with the answer's parameters:
+−A⁻¹ Sᵀ d to first order, see `linearised`, d being the change of the residuals with half the step.
+It replaces the change with half the step.
 
-From what one step a sample leaves follows how many leave little enough: an error of order p falls
-with the p-th power of their number.
+The number of steps that leaves a small enough error follows from the error with one step a sample,
+because an error of order p decreases with the p-th power of their number.
 """
 
 from __future__ import annotations
@@ -40,30 +40,31 @@ from .linearised import LinearisedFit
 
 # Roache's factor of safety for an observed order.
 OBSERVED = 1.25
-# Errors of smooth solutions fall with the square of linear elements' edges, and faster for
-# quadratic ones; where elements are too stiff or the body leaves its grasp they do not.
+# Order of the mesh for smooth solutions with linear elements; quadratic ones converge faster.
 MESH_ORDER = 2.0
+# Lowest order of the mesh, where elements are too stiff or at the edge of a grasp.
 LEAST_ORDER = 0.5
-# Standard errors that the step may move an estimate where its number is chosen, and how many steps
-# a sample are chosen at most.
+# Largest change of an estimate due to the step, in standard errors, where the number of steps is
+# chosen.
 LITTLE = 0.5
+# Largest number of steps per sample that is chosen.
 MOST_SUBSTEPS = 8
 
 
 @dataclass(frozen=True)
 class NumericalError:
-    """What discretisation does to one estimate.
+    """Discretisation error of one estimate.
 
     Attributes
     ----------
     step, mesh : float or None
         Change of the value with half the step, and with half the edge lengths; None if unknown.
     step_order, mesh_order : float or None
-        Observed orders; None where there were two levels, or the changes did not shrink.
+        Observed orders; None with two levels, or if the changes did not shrink.
     extrapolated : float
-        The value without discretisation, by Richardson's extrapolation.
+        Value without discretisation error, by Richardson's extrapolation.
     interval95 : (lower, upper) or None
-        95 % interval due to noise and discretisation; None if that due to noise is not known.
+        95 % interval due to noise and discretisation; None if that due to noise is unknown.
     """
 
     step: float | None
@@ -75,7 +76,7 @@ class NumericalError:
 
 
 def known_kinds(errors: Iterable[NumericalError]) -> tuple[str, ...]:
-    """Return which discretisation errors are known of some estimate: "step", "mesh"."""
+    """Return which discretisation errors are known for some estimate: "step", "mesh"."""
     known = tuple(errors)
     of_step = any(error.step is not None for error in known)
     of_mesh = any(error.mesh is not None for error in known)
@@ -84,18 +85,22 @@ def known_kinds(errors: Iterable[NumericalError]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Level:
-    """A finer answer.
+    """One solution on a finer discretisation.
 
     Attributes
     ----------
     halved : {"step", "mesh"}
+        What was refined.
     times : int
-        How often.
+        How often it was halved.
     timesteps, nodes : int
-        Rows of the grid, and nodes of the bodies.
+        Number of grid times, and of nodes of the bodies.
     iterations : int
+        Iterations of the solve.
     time_s : float
-    values : mapping of parameter or derived modulus to value
+        Computing time [s].
+    values : mapping of str to float
+        Parameters and derived moduli by name.
     """
 
     halved: str
@@ -109,14 +114,14 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """What finer discretisations do to the estimates.
+    """Discretisation errors of all estimates.
 
     Attributes
     ----------
-    errors : mapping of parameter or derived modulus to NumericalError
+    errors : mapping of str to NumericalError
+        Errors by parameter or derived modulus.
     levels : tuple of Level
-        Empty where the step's error was estimated from a finer simulation, and nothing solved
-        again.
+        Refined solutions; empty if the error of the step was estimated from a finer simulation.
     """
 
     errors: Mapping[str, NumericalError]
@@ -124,7 +129,9 @@ class Refinement:
 
     @property
     def holds(self) -> tuple[str, ...]:
-        """What its intervals hold: the noise, and of "step" and "mesh" what is known."""
+        """Contributions that its intervals contain: "noise", and of "step" and "mesh" what
+        is known.
+        """
         return ("noise", *known_kinds(self.errors.values()))
 
     def worst(
@@ -132,13 +139,14 @@ class Refinement:
         estimates: Mapping[str, Estimate],
         std_errors: Mapping[str, float | None] | None = None,
     ) -> tuple[str, float]:
-        """Return the estimate that is moved by most of its standard errors, and by how many.
+        """Return the estimate with the largest correction in standard errors, and that ratio; ("",
+        0.0) if there is none.
 
         Parameters
         ----------
-        estimates : mapping of name to Estimate
-            Before the correction of the discretisation error.
-        std_errors : mapping of name to float or None, optional
+        estimates : mapping of str to Estimate
+            Estimates before the correction of the discretisation error.
+        std_errors : mapping of str to float or None, optional
             Standard errors to compare with; the statistical ones of `estimates` by default.
             Estimates without one are left out.
         """
@@ -153,14 +161,34 @@ class Refinement:
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
     def substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
-        """How many steps keep every move small, if these are of one; not more than the most."""
+        """Return the number of steps per sample that makes every correction small, if the errors
+        belong to one step; at most `MOST_SUBSTEPS`.
+
+        Parameters
+        ----------
+        estimates : mapping of str to Estimate
+            Estimates before the correction.
+        order : float
+            Order of the scheme.
+        """
         many = self.worst(estimates)[1]
         return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
 
 
 @dataclass(frozen=True)
 class _Limit:
-    """Way from the first of several values to their limit, and what it may lack on both sides."""
+    """Extrapolation from the first of several values to their limit, with its uncertainty on both
+    sides.
+
+    Attributes
+    ----------
+    way : float
+        Limit less the first value.
+    below, above : float
+        Uncertainty below and above the limit.
+    order : float or None
+        Observed order; None if it was assumed.
+    """
 
     way: float = 0.0
     below: float = 0.0
@@ -169,25 +197,36 @@ class _Limit:
 
     @classmethod
     def of(cls, x: Sequence[float], order: float, least: float) -> _Limit:
-        """Of values at steps or edge lengths halved again and again, or one value alone."""
+        """Extrapolate values at steps or edge lengths halved repeatedly; a single value has no
+        change.
+
+        Parameters
+        ----------
+        x : sequence of float
+            Values in the coordinate of the estimate.
+        order : float
+            Theoretical order.
+        least : float
+            Lowest order that is considered.
+        """
         changes = np.diff(x)
         if not len(changes):
             return cls()
         last = float(changes[-1])
         if len(changes) == 1:
-            left = last / (2**order - 1)
-            further = last / (2**least - 1) - left
-            sides = sorted((-2 * left, further))
-            return cls(last + left, -sides[0], sides[1])
+            remaining = last / (2**order - 1)
+            slow_remaining = last / (2**least - 1) - remaining
+            sides = sorted((-2 * remaining, slow_remaining))
+            return cls(last + remaining, -sides[0], sides[1])
         ratio = float(changes[-2] / last) if last else np.inf
         if not ratio > 2**LEAST_ORDER:
             largest = float(np.abs(changes).max())
             return cls(float(changes.sum()), largest, largest)
         # No faster than in theory: a change that vanishes by chance promises nothing.
-        found = float(np.log2(ratio))
-        left = last / (2 ** min(found, order) - 1)
-        doubt = OBSERVED * abs(left)
-        return cls(float(changes.sum()) + left, doubt, doubt, found)
+        observed_order = float(np.log2(ratio))
+        remaining = last / (2 ** min(observed_order, order) - 1)
+        uncertainty = OBSERVED * abs(remaining)
+        return cls(float(changes.sum()) + remaining, uncertainty, uncertainty, observed_order)
 
 
 def numerical_error(
@@ -198,18 +237,18 @@ def numerical_error(
     step_order: float = 2.0,
     linear: bool = False,
 ) -> NumericalError:
-    """Numerical error from the values that finer steps and meshes give.
+    """Compute the discretisation error from the values with finer steps and meshes.
 
     Parameters
     ----------
     name : str
-        Of a parameter or derived modulus.
+        Name of the parameter or derived modulus.
     estimate : Estimate
-        The answer, whose interval is that of the noise.
+        The answer with its statistical interval.
     by_step, by_mesh : sequences of float
-        The values with the step, or the edge lengths, halved once, twice and so on; may be empty.
+        Values with the step, or the edge lengths, halved once, twice and so on; may be empty.
     step_order : float
-        Of the scheme.
+        Order of the scheme.
     linear : bool
         Whether the parameter is its own coordinate.
     """
@@ -242,54 +281,66 @@ def numerical_errors(
     step_order: float,
     linear: Container[str],
 ) -> dict[str, NumericalError]:
-    """Those of all estimates that change; what is fixed, or at its bound, stays.
+    """Return the discretisation errors of all estimates that change; fixed values and those at a
+    bound are left out.
 
     Parameters
     ----------
-    estimates : mapping of name to Estimate
-    by_step, by_mesh : sequences of mappings of name to value, see `numerical_error`
+    estimates : mapping of str to Estimate
+        Answers.
+    by_step, by_mesh : sequences of mappings of str to float
+        Values by name, see `numerical_error`.
     step_order : float
-    linear : names of the parameters that are their own coordinates
+        Order of the scheme.
+    linear : container of str
+        Names of the parameters that are their own coordinates.
     """
-    found = {}
+    errors = {}
     for name, estimate in estimates.items():
         steps, meshes = ([values[name] for values in level] for level in (by_step, by_mesh))
         if any(value != estimate.value for value in (*steps, *meshes)):
-            found[name] = numerical_error(name, estimate, steps, meshes, step_order, name in linear)
-    return found
+            errors[name] = numerical_error(
+                name, estimate, steps, meshes, step_order, name in linear
+            )
+    return errors
 
 
 def changes_towards(fit: LinearisedFit, apart: Sequence[Array]) -> Array:
-    """(p,) change of the parameters towards readings that are apart from those fitted.
+    """Return the change (p,) of the parameters if the predictions change by given residuals.
 
     Parameters
     ----------
     fit : LinearisedFit
-    apart : of each block (T, M, 3), in units of σ
+        The fit.
+    apart : sequence of (T, M, 3) arrays
+        Changes of the residuals of each block, in units of σ.
     """
     return shifts(fit, [each[..., None] for each in apart])[:, 0]
 
 
 def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
-    """(p, a) how the estimates follow changes of the residuals; those at a bound stay.
+    """Return the changes (p, a) of the estimates with changes of the residuals; estimates at a
+    bound do not change.
 
     Parameters
     ----------
     fit : LinearisedFit
-    changes : of each block (T, M, 3, a), in units of σ
+        The fit.
+    changes : sequence of (T, M, 3, a) arrays
+        Changes of the residuals of each block, in units of σ.
     """
     free = np.flatnonzero(~fit.at_bound)
     count = changes[0].shape[-1] if changes else 0
     if not free.size:
         return np.zeros((len(fit.names), count))
-    known = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
+    problem = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
     score = np.zeros((len(free), count))
     for block, change in zip(fit.blocks, changes, strict=True):
         slope = block.slope[..., free]
         slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
-        known = known.add(np.zeros(len(slope)), slope)
-        apart = change * block.weight[..., None] * block.seen[..., None]
-        score += slope.T @ apart.reshape(len(slope), count)
-    found = np.zeros((len(fit.names), count))
-    found[free] = -known.root @ (known.root.T @ score)
-    return found
+        problem = problem.add(np.zeros(len(slope)), slope)
+        weighted_change = change * block.weight[..., None] * block.seen[..., None]
+        score += slope.T @ weighted_change.reshape(len(slope), count)
+    estimates = np.zeros((len(fit.names), count))
+    estimates[free] = -problem.root @ (problem.root.T @ score)
+    return estimates

@@ -1,4 +1,4 @@
-"""Which elements are of an inclusion: a two-phase posterior by linearised measurements.
+"""Two-phase fields: posterior of which elements belong to an inclusion, by linearised measurements.
 
 With the residuals linear in parameters p and in the logarithm z_e of a constant in every element,
 and z_e = s h_e for phases h ∈ {0, 1}ᴱ and the logarithm s of the contrast, the posterior is
@@ -7,9 +7,9 @@ and z_e = s h_e for phases h ∈ {0, 1}ᴱ and the logarithm s of the contrast, 
 
 The last sum is over the faces f between two elements, w_f is the face's area over the mean area and
 |Δh|_f is one where the phases differ: the prior of Ising and Potts, a total variation of h. T is
-the lack of fit, at least one: by how much χ² is above that of the smooth field, per shape that the
-smooth field determines. One is expected where two phases describe the body and the right ones are
-found; what they miss, and what the linearisation misses, widens intervals.
+the lack of fit, at least one: by how much χ² exceeds that of the smooth field, per mode that the
+smooth field determines. It is one if two phases describe the body and the right ones are found;
+otherwise, and where the linearisation is inaccurate, it widens intervals.
 
 Phases start at a total-variation estimate of z, divided into two classes (Otsu 1979), and are drawn
 one element at a time by locally balanced proposals (Zanella 2020); given h, s and δp are normal and
@@ -37,19 +37,19 @@ class SamplerSettings:
     Attributes
     ----------
     face_nats : float
-        J. On twins with an inclusion of factor 3 of some 80 elements, 2 and 3 gave the same
-        contrast, 1 let single elements flicker and the contrast come out 6 % lower.
+        Strength J of the prior. On twins with an inclusion of factor 3 of some 80 elements, 2 and 3
+        gave the same contrast; with 1 single elements flickered and the contrast was 6 % lower.
     steps_per_element : int
-        Proposals per element and chain; the first quarter is left out.
+        Proposals per element and chain; the first quarter is discarded.
     least_steps : int
-        Proposals of a chain at least.
+        Fewest proposals of a chain.
     chains : int
-        Chains with random numbers of their own. Their samples count alike, so that an interval
-        has the optima that chains end in.
+        Chains with independent random numbers. Their samples count equally, so that an interval
+        contains the optima that chains end in.
     steps_per_draw : int
         Proposals between draws of s and δp.
     steps_per_sample : int
-        Proposals between samples that are kept.
+        Proposals between stored samples.
     total_variation : float
         Weight of the total variation of z per face at the start, in units of −2 ln π.
     smallest_jump : float
@@ -81,8 +81,10 @@ class Faces:
 
     Attributes
     ----------
-    pairs : (F, 2) the elements on both sides
-    weights : (F,) area over the mean area
+    pairs : (F, 2) array
+        Indices of the elements on both sides.
+    weights : (F,) array
+        Area over the mean area.
     count : int
         Number E of elements.
     """
@@ -93,7 +95,7 @@ class Faces:
 
     @classmethod
     def of(cls, mesh: TetMesh, cells: Index) -> Faces:
-        """Return those between elements of a mesh, numbered in the order of `cells`."""
+        """Find the faces between some elements of a mesh, numbered in the order of `cells`."""
         corners = mesh.tetrahedra[cells]
         triples = np.sort(corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
         owner = np.repeat(np.arange(len(cells)), 4)
@@ -108,14 +110,14 @@ class Faces:
 
     @property
     def neighbours(self) -> sp.csr_array:
-        """(E, E) weights of the faces between elements."""
+        """Sparse matrix (E, E) of the weights of the faces between elements."""
         i, j = self.pairs.T
         both = (np.r_[self.weights, self.weights], (np.r_[i, j], np.r_[j, i]))
         return sp.csr_array(both, shape=(self.count, self.count))
 
     @property
     def differences(self) -> sp.csr_array:
-        """(F, E) jump across each face from values in elements."""
+        """Sparse matrix (F, E) from values in elements to their jump across each face."""
         faces = np.arange(len(self.pairs))
         ends = np.r_[faces, faces], self.pairs.T.ravel()
         signs = np.repeat([1.0, -1.0], len(faces))
@@ -128,14 +130,20 @@ class ElementInformation:
 
     Attributes
     ----------
-    of_p : (p, p) S_pᵀS_p and the priors, over T where they are measurements
-    mixed : (E, p) S_zᵀS_p / T
-    of_z : (E, E) S_zᵀS_z / T
-    score_p : (p,) S_pᵀr / T and that of the priors
-    score_z : (E,) S_zᵀr / T
-    base : (E,) z₀
+    of_p : (p, p) array
+        S_pᵀS_p / T and the information of the priors.
+    mixed : (E, p) array
+        S_zᵀS_p / T.
+    of_z : (E, E) array
+        S_zᵀS_z / T.
+    score_p : (p,) array
+        S_pᵀr / T and the score of the priors.
+    score_z : (E,) array
+        S_zᵀr / T.
+    base : (E,) array
+        Expansion point z₀.
     deviation : float
-        A, prior standard deviation of s.
+        Prior standard deviation A of s.
     """
 
     of_p: Array
@@ -149,17 +157,22 @@ class ElementInformation:
 
 @dataclass(frozen=True, eq=False)
 class PhaseDraws:
-    """Samples of a chain.
+    """Samples of one or several chains.
 
     Attributes
     ----------
-    phases : (K, E) of 0 and 1
-    contrasts : (K,) s
-    changes : (K, p) δp
-    means : (K, p + 1) of δp and s given the phases
-    probability : (E,) of an inclusion, mean over the samples
+    phases : (K, E) array
+        Phases, 0 or 1.
+    contrasts : (K,) array
+        Logarithms s of the contrast.
+    changes : (K, p) array
+        Changes δp of the parameters.
+    means : (K, p + 1) array
+        Means of δp and s given the phases.
+    probability : (E,) array
+        Probability of phase 1 in each element.
     accepted : float
-        Share of the proposals.
+        Share of accepted proposals.
     """
 
     phases: NDArray[np.int8]
@@ -173,9 +186,21 @@ class PhaseDraws:
 def start_phases(
     data: ElementInformation, faces: Faces, volumes_m3: Array, settings: SamplerSettings = USUAL
 ) -> Array:
-    """Return phases (E,) by the total-variation estimate of z, divided into two classes.
+    """Return initial phases (E,) of 0 and 1 from the total-variation estimate of z, divided into
+    two classes.
 
-    The class of less volume is the inclusion.
+    The class of smaller volume is the inclusion, phase 1.
+
+    Parameters
+    ----------
+    data : ElementInformation
+        Normal equations.
+    faces : Faces
+        Faces between elements.
+    volumes_m3 : (E,) array
+        Volumes of the elements [m³].
+    settings : SamplerSettings
+        Constants of the algorithm.
     """
     inverse = np.linalg.pinv(data.of_p, hermitian=True)
     normal = data.of_z - data.mixed @ inverse @ data.mixed.T
@@ -194,7 +219,7 @@ def start_phases(
 
 
 def _two_classes(values: Array, weights: Array) -> float:
-    """Return the threshold between two classes of the least variance within (Otsu)."""
+    """Return the threshold between two classes with the least weighted variance within (Otsu)."""
     order = np.argsort(values)
     sorted_values = values[order]
     weight = np.cumsum(weights[order])
@@ -214,9 +239,13 @@ def draw_phases(
     Parameters
     ----------
     data : ElementInformation
+        Normal equations.
     faces : Faces
-    start : (E,) phases with which the chains start, 0 or 1
+        Faces between elements.
+    start : (E,) array
+        Initial phases, 0 or 1.
     settings : SamplerSettings
+        Constants of the sampler.
     """
     chains = [_chain(data, faces, start, seed, settings) for seed in range(settings.chains)]
     phases = np.concatenate([chain.phases for chain in chains])
@@ -238,11 +267,15 @@ def _chain(
     Parameters
     ----------
     data : ElementInformation
+        Normal equations.
     faces : Faces
-    start : (E,) phases with which the chain starts, 0 or 1
+        Faces between elements.
+    start : (E,) array
+        Initial phases, 0 or 1.
     seed : int
-        Of the random numbers.
+        Seed of the random numbers.
     settings : SamplerSettings
+        Constants of the sampler.
     """
     rng = np.random.default_rng(seed)
     count = len(start)
@@ -255,13 +288,15 @@ def _chain(
     of_p = data.score_p - data.mixed.T @ data.base
 
     phase = start.copy()
-    pulled = data.of_z @ phase
-    beside = neighbours @ phase
+    of_z_phase = data.of_z @ phase
+    neighbour_sums = neighbours @ phase
 
     def conditional() -> tuple[Array, Array]:
-        """Mean of (δp, s) given the phases, and the factor L of their information L Lᵀ."""
+        """Return the mean of (δp, s) given the phases, and the factor L of their
+        information L Lᵀ.
+        """
         coupling = data.mixed.T @ phase
-        own = phase @ pulled + 1 / data.deviation**2
+        own = phase @ of_z_phase + 1 / data.deviation**2
         information = np.block([[data.of_p, coupling[:, None]], [coupling, np.array([[own]])]])
         information[np.diag_indices_from(information)] *= 1 + 1e-12
         factor = np.linalg.cholesky(information)
@@ -271,20 +306,20 @@ def _chain(
         return mean, np.asarray(factor, dtype=float)
 
     def drawn() -> tuple[Array, Array]:
-        """Mean and a draw of (δp, s)."""
+        """Return the mean and a draw of (δp, s)."""
         mean, factor = conditional()
         noise = rng.normal(size=len(mean))
         return mean, mean + np.asarray(solve_triangular(factor.T, noise))
 
     def change(signs: Array) -> Array:
-        """−ln of the posterior's ratio (E,) if each phase flips."""
-        force = constant + data.mixed @ both[:-1] + both[-1] * pulled
+        """Return −ln of the ratio of posteriors (E,) if each phase flips."""
+        force = constant + data.mixed @ both[:-1] + both[-1] * of_z_phase
         own = signs * both[-1] * force + both[-1] ** 2 * diagonal / 2
-        return own + settings.face_nats * signs * (degrees - 2 * beside)
+        return own + settings.face_nats * signs * (degrees - 2 * neighbour_sums)
 
     mean, both = drawn()
     energy = change(1 - 2 * phase)
-    kept: list[tuple[NDArray[np.int8], Array, Array]] = []
+    samples: list[tuple[NDArray[np.int8], Array, Array]] = []
     accepted = 0
     for step in range(steps):
         if step % settings.steps_per_draw == 0:
@@ -293,11 +328,11 @@ def _chain(
         weights = np.cumsum(np.exp(np.clip(-energy / 2, -limit, limit)))
         chosen = min(int(np.searchsorted(weights, rng.random() * weights[-1])), count - 1)
         sign = 1 - 2 * phase[chosen]
-        before = pulled, beside, energy
+        before = of_z_phase, neighbour_sums, energy
         row = slice(neighbours.indptr[chosen], neighbours.indptr[chosen + 1])
-        pulled = pulled + sign * data.of_z[chosen]
-        beside = beside.copy()
-        beside[neighbours.indices[row]] += sign * neighbours.data[row]
+        of_z_phase = of_z_phase + sign * data.of_z[chosen]
+        neighbour_sums = neighbour_sums.copy()
+        neighbour_sums[neighbours.indices[row]] += sign * neighbours.data[row]
         phase[chosen] += sign
         energy = change(1 - 2 * phase)
         back = np.exp(np.clip(-energy / 2, -limit, limit)).sum()
@@ -305,16 +340,16 @@ def _chain(
             accepted += 1
         else:
             phase[chosen] -= sign
-            pulled, beside, energy = before
+            of_z_phase, neighbour_sums, energy = before
         if step >= steps // 4 and step % settings.steps_per_sample == 0:
-            kept.append((phase.astype(np.int8), both, mean))
-    phases = np.array([each[0] for each in kept])
-    values = np.array([each[1] for each in kept])
+            samples.append((phase.astype(np.int8), both, mean))
+    phases = np.array([each[0] for each in samples])
+    values = np.array([each[1] for each in samples])
     return PhaseDraws(
         phases=phases,
         contrasts=values[:, -1],
         changes=values[:, :-1],
-        means=np.array([each[2] for each in kept]),
+        means=np.array([each[2] for each in samples]),
         probability=phases.mean(axis=0),
         accepted=accepted / steps,
     )

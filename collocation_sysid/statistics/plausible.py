@@ -1,14 +1,15 @@
-"""What contradicts itself or what is known of soft bodies: told by the description and data alone.
+"""Plausibility of a description: contradictions and impossible values, found without any
+simulation.
 
-- Sizes and densities that soft objects can have: a unit mistaken shows here first.
-- A body that is deformed takes work: loads that fall as their grasp goes on have a wrong sign.
-- Sudden lasting steps, of a pose that the markers do not follow, or of one marker alone. A step of
-  h between two samples shows in the second differences as h followed by −h; a motion that starts or
-  stops suddenly shows one of them only.
-- Markers that take each other's names at some sample, as trackers do after an occlusion. Seen from
-  the grasp a marker is, from one sample to the next, nearly where it was: where the names suit far
-  better in another order, they have been exchanged. The first order is taken for right, unless
-  another lasts more than twice as long.
+- Sizes and densities that soft objects cannot have, which indicate a wrong unit.
+- Deforming a body takes work: loads that fall as their grasp advances have a wrong sign.
+- Sudden lasting steps of a pose that the markers do not follow, or of one marker alone. A step of h
+between two samples shows in the second differences as h followed by −h; a motion that starts or
+stops suddenly shows one of them only.
+- Markers that exchange names at some sample, as trackers do after an occlusion. In the frame of the
+grasp a marker hardly moves from one sample to the next; if names fit far better in another order,
+they have been exchanged. The first order is assumed right, unless another lasts more than twice as
+long.
 """
 
 from __future__ import annotations
@@ -26,24 +27,27 @@ from ..program.any_stiffness import carrying
 from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
+# Densities of soft objects [kg/m³].
 DENSITIES_KG_M3 = (10.0, 25_000.0)
+# Diagonals of soft objects [m].
 SIZES_M = (1e-4, 10.0)
-# What is as dense as this is metal or full of it, and no metal is softer than this.
+# Densities from which on a body contains metal [kg/m³].
 METAL_KG_M3 = 5e3
+# Smallest Young's modulus of a metal [Pa].
 SOFTEST_METAL_PA = 1e9
-# So many times outside these ranges nothing can be meant.
+# Factor outside these ranges from which on a value is rejected.
 IMPOSSIBLE = 100.0
 
 
 def oddities(body: Body) -> tuple[Hypothesis, ...]:
-    """What is odd about a body's size and density; mostly nothing.
+    """Return hypotheses about an implausible size or density of a body; mostly empty.
 
-    Their strength is how many times they are outside what there is.
+    Their strength is the factor by which the value is outside the plausible range.
 
     Raises
     ------
     InputError
-        If one of them is more than a hundred times outside what there is.
+        If a value is outside by more than a factor of a hundred.
     """
     size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
     density_kg_m3 = body.mass_kg / body.mesh.volume_m3
@@ -74,9 +78,10 @@ def oddities(body: Body) -> tuple[Hypothesis, ...]:
 
 
 def odd_material(body: Body, theta: Array) -> Hypothesis | None:
-    """That no material is as dense and as soft as a body with constants θ; None where one may be.
+    """Return the hypothesis that no material is as dense and as soft as a body with constants θ;
+    None if one may be.
 
-    Tracks and poses tell the stiffness over the density, so a wrong density leaves no other trace.
+    Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
     density_kg_m3 = float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
     young_pa = max(float(engineering(*lame)[0]) for lame in body.lame(theta).values())
@@ -86,18 +91,22 @@ def odd_material(body: Body, theta: Array) -> Hypothesis | None:
 
 
 def _outside(value: float, limits: tuple[float, float]) -> float:
+    """Return the factor by which a value is outside limits; below 1 inside."""
     return max(limits[0] / value, value / limits[1])
 
 
-# Of load and displacement; noise and hysteresis leave it above zero.
+# Correlation of load and displacement below which a sign is wrong; noise and hysteresis leave it
+# positive.
 AGAINST = -0.8
+# Fewest samples for this correlation.
 FEWEST_SAMPLES = 3
 
 
 def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Displacements of a static experiment whose own load goes the other way.
+    """Yield hypotheses of a wrong sign, where displacement and load of a static experiment are
+    anticorrelated.
 
-    What moves may be pushed against its displacement, by its inertia.
+    Dynamic experiments are not tested, because of inertia.
     """
     for k, grasp in enumerate(experiment.grasps if experiment.static else (), start=1):
         if grasp.wrench is None:
@@ -105,29 +114,30 @@ def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
         for axis in grasp.zero:
             along = "xyz".index(axis)
-            moved_m = shifts_m[:, along]
+            displacement_m = shifts_m[:, along]
             load_n = grasp.wrench.values[:, along]
-            there = np.isfinite(load_n)
-            if there.sum() < FEWEST_SAMPLES or not (
-                np.ptp(moved_m[there]) and np.ptp(load_n[there])
+            is_measured = np.isfinite(load_n)
+            if is_measured.sum() < FEWEST_SAMPLES or not (
+                np.ptp(displacement_m[is_measured]) and np.ptp(load_n[is_measured])
             ):
                 continue
-            together = float(np.corrcoef(moved_m[there], load_n[there])[0, 1])
-            if together < AGAINST:
-                data = {"axis": axis, "grasp": k, "correlation": together}
-                strength = 1 / (1 + together + 1e-3)
+            correlation = float(np.corrcoef(displacement_m[is_measured], load_n[is_measured])[0, 1])
+            if correlation < AGAINST:
+                data = {"axis": axis, "grasp": k, "correlation": correlation}
+                strength = 1 / (1 + correlation + 1e-3)
                 yield Hypothesis("sign", f"'{experiment.name}'", data, strength=strength)
 
 
-# A step is so many times what else happens between samples.
+# Size of a step over usual changes between samples.
 SUDDEN = 4.0
-# Of all samples, the liveliest tenth tells what else happens.
+# Quantile of the changes that counts as usual.
 LIVELY = 0.9
+# Fewest samples in which steps are searched.
 FEWEST = 8
 
 
 def steps(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Poses that jump and markers that slip."""
+    """Yield hypotheses of poses that jump and of markers that slip."""
     if len(experiment.markers.positions_m) < FEWEST:
         return
     if (grasp := carrying(experiment)) is not None:
@@ -136,19 +146,26 @@ def steps(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _corners(experiment: Experiment) -> Array:
-    """Corners of the markers' places on the undeformed body, which poses carry."""
+    """Return two corners (2, 3) of the bounding box of the markers' places on the
+    undeformed body [m].
+    """
     places = experiment.markers.observe(experiment.body.nodes_m)
     return np.vstack([places.min(axis=0), places.max(axis=0)])
 
 
 def step_sizes(x: Array) -> Array:
-    """(T − 3, M) size of a step between samples k + 1 and k + 2 of x (T, M, 3); NaN in gaps."""
+    """Return the size (T − 3, M) of a step between samples k + 1 and k + 2 of tracks x (T,
+    M, 3); NaN in gaps.
+    """
     second = x[2:] - 2 * x[1:-1] + x[:-2]
     opposite = -np.sum(second[:-1] * second[1:], axis=2)
     return np.sqrt(np.maximum(opposite, 0.0))
 
 
 def _jump(experiment: Experiment, carried: Array) -> Iterator[Hypothesis]:
+    """Yield the hypothesis of the largest jump of points (T, m, 3) carried by the poses, if
+    the markers do not follow it.
+    """
     sizes = step_sizes(carried).max(axis=1)
     k = int(sizes.argmax())
     markers = step_sizes(experiment.markers.positions_m)[k]
@@ -160,6 +177,7 @@ def _jump(experiment: Experiment, carried: Array) -> Iterator[Hypothesis]:
 
 
 def _slips(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield a hypothesis for each marker that steps alone and stays displaced."""
     markers = experiment.markers
     sizes = step_sizes(markers.positions_m)
     for m, name in enumerate(markers.names):
@@ -177,14 +195,16 @@ def _slips(experiment: Experiment) -> Iterator[Hypothesis]:
 def _sudden(
     code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
 ) -> Iterator[Hypothesis]:
-    """A step between samples k + 1 and k + 2, if it is far larger than what is usual."""
+    """Yield the hypothesis of a step between samples k + 1 and k + 2, if it is far larger
+    than usual.
+    """
     data = {"marker": marker, "by_mm": 1e3 * size_m, "t_s": experiment.t_s[k + 2]}
     if size_m >= SUDDEN * usual_m:
         yield Hypothesis(code, f"'{experiment.name}'", data, strength=size_m / usual_m)
 
 
 def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
-    """Whether the marker's distances from the others stay changed."""
+    """Whether the marker's distances from the others remain changed after a sample."""
     to_others = np.linalg.norm(tracks - tracks[:, marker : marker + 1], axis=2)
     others = np.delete(to_others, marker, axis=1)
     if not others.shape[1]:
@@ -197,25 +217,26 @@ def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
 
 
 def _lively(sizes: Array) -> float:
-    """What else happens: the liveliest tenth of all samples but the largest three."""
+    """Return the 90 % quantile of changes without the largest three; 0 if there are no others."""
     rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
     return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
 
 
-# Another order of the names suits so many times better before it is believed.
+# Factor by which exchanged names must fit better.
 CLEARLY = 2.5
-# With Huber's loss fewer of a marker's samples than this share are no matter: they count as wild.
+# With Huber's loss, exchanges of a smaller share of the samples are tolerated as outliers.
 TAMED = 0.2
 
 
 def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypothesis, ...]:
-    """Markers whose names are exchanged for a part of the recording.
+    """Return hypotheses that names of markers are exchanged for a part of the recording.
 
     Parameters
     ----------
     experiment : Experiment
+        The recording.
     huber : float, optional
-        Of the loss, where it is Huber's.
+        Threshold of Huber's loss, which tolerates short exchanges; None means a quadratic loss.
     """
     order, strength = _orders(experiment)
     kinds, counts = np.unique(order, axis=0, return_counts=True)
@@ -224,8 +245,8 @@ def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypot
     share = float(wrong.mean(axis=0).max(initial=0.0))
     if not share or (huber is not None and share < TAMED):
         return ()
-    at = np.flatnonzero(wrong.any(axis=1))
-    first = int(at[0])
+    affected = np.flatnonzero(wrong.any(axis=1))
+    first = int(affected[0])
     t_s = experiment.t_s
     names = experiment.markers.names
     same = (order[first:] == order[first]).all(axis=1)
@@ -235,44 +256,48 @@ def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypot
     )
     real = np.argsort(right)[order[first]]
     listed = ", ".join(f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first]))
-    also = ", and at other times" if at[-1] >= end else ""
+    also = ", and at other times" if affected[-1] >= end else ""
     data = {"when": f"{when}{also}", "names": listed}
     return (Hypothesis("markers-exchanged/later", f"'{experiment.name}'", data, strength=strength),)
 
 
 def _orders(experiment: Experiment) -> tuple[Index, float]:
-    """(T, M) which marker of the first samples each one is, and how clearly it changes."""
+    """Return the identity (T, M) of each marker among those of the first samples, and the
+    factor by which exchanged names fit better.
+    """
     markers = experiment.markers
     grasp = carrying(experiment)
-    seen_m = np.array(markers.positions_m)
+    in_grasp_m = np.array(markers.positions_m)
     if grasp is not None:
         rotations, translations_m = grasp.poses.at(experiment.t_s)
-        seen_m = np.einsum("tji,tmj->tmi", rotations, seen_m - translations_m[:, None])
-    order = np.tile(np.arange(len(markers.names)), (len(seen_m), 1))
+        in_grasp_m = np.einsum("tji,tmj->tmi", rotations, in_grasp_m - translations_m[:, None])
+    order = np.tile(np.arange(len(markers.names)), (len(in_grasp_m), 1))
     strength = 0.0
-    last_m = np.full(seen_m.shape[1:], np.nan)
-    for k, now_m in enumerate(seen_m):
-        there = np.isfinite(now_m[:, 0])
-        known = np.flatnonzero(there & np.isfinite(last_m[:, 0]))
+    last_m = np.full(in_grasp_m.shape[1:], np.nan)
+    for k, now_m in enumerate(in_grasp_m):
+        is_present = np.isfinite(now_m[:, 0])
+        known = np.flatnonzero(is_present & np.isfinite(last_m[:, 0]))
         chosen, clearly = _chosen(last_m[known], now_m[known], markers.sigma_m[known])
         if clearly > CLEARLY:
             order[k:, known] = order[k, known[chosen]]
             strength = max(strength, clearly)
-        last_m[there] = now_m[there]
+        last_m[is_present] = now_m[is_present]
     return order, strength
 
 
 def _chosen(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Index, float]:
-    """Which of the markers before each one is now, and how many times nearer it is so."""
+    """Return the assignment of markers to those of the sample before, and the factor by
+    which it is nearer than no exchange.
+    """
     same = np.arange(len(now_m))
     if len(now_m) < 2:
         return same, 1.0
-    apart_m = (now_m - now_m.mean(axis=0))[:, None] - (before_m - before_m.mean(axis=0))
-    cost = np.sum(apart_m**2, axis=2)
+    differences_m = (now_m - now_m.mean(axis=0))[:, None] - (before_m - before_m.mean(axis=0))
+    cost = np.sum(differences_m**2, axis=2)
     if (cost.argmin(axis=1) == same).all():
         return same, 1.0
     _, chosen = linear_sum_assignment(cost)
-    moved = np.flatnonzero(chosen != same)
-    noise = 6 * float(np.sum(sigma_m[moved] ** 2))
-    left = max(float(cost[moved, chosen[moved]].sum()), noise, 1e-300)
-    return chosen, float(np.sqrt(cost[moved, moved].sum() / left))
+    exchanged = np.flatnonzero(chosen != same)
+    noise = 6 * float(np.sum(sigma_m[exchanged] ** 2))
+    remaining = max(float(cost[exchanged, chosen[exchanged]].sum()), noise, 1e-300)
+    return chosen, float(np.sqrt(cost[exchanged, exchanged].sum() / remaining))

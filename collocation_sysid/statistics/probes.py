@@ -1,12 +1,11 @@
-"""Where to look harder: what parts of the data say alone, and what a freed assumption changes.
+"""Deeper checks of a fit: refits of parts of the data, and with assumptions relaxed.
 
 Windows of time and recordings are fitted alone by one Gauss–Newton step from the answer, as for
-`scatter`: parts that agree are near it, and of parts that do not the first order tells which way.
-An assumption that is freed joins the linearised fit as one more nuisance parameter, its prior the
-deviation that it is considered with and its slope what that changes of the residuals, see
-`considered`. Where the data tell it, its effect is found again where that step leads, simulated
-without it, and a step is taken from there, until parameters settle: what is left out is of second
-order in its own size. Error bars are those of any fit.
+`scatter`. An assumption that is relaxed joins the linearised fit as one more nuisance parameter,
+with the deviation of the budget as its prior and the changes of the residuals as its derivative,
+see `considered`. Where its amplitude is significant, the effect is computed again at the parameters
+that the step leads to, and a step is taken from there, until parameters settle; the remaining error
+is of second order in the amplitude. Error bars are those of any fit.
 """
 
 from __future__ import annotations
@@ -44,39 +43,39 @@ SETTLED = 0.02
 
 
 def probes_of_every_solve(at: Answered) -> tuple[Probe, ...]:
-    """Relax the routine assumptions by one linear step, and follow the one that gives concern.
+    """Relax the routine assumptions by one linear step, and iterate the one that gives concern.
 
     A linear step suffices to find that an assumption is wrong, but not for estimates that change by
-    much of their value. So the most significant assumption that gives concern, if there is one,
-    takes a few steps more, each a simulation.
+    much of their value. The most significant assumption that gives concern therefore takes a few
+    further steps, each with a simulation.
     """
-    found = routine_probes(at)
-    alarming = [probe for probe in found if is_alarming(probe)]
+    probes_found = routine_probes(at)
+    alarming = [probe for probe in probes_found if is_alarming(probe)]
     if not alarming:
-        return found
+        return probes_found
     worst = max(alarming, key=lambda probe: probe.chi_squared)
     followed = replace(_released(at, worst, significance(at.changes)), routine=True)
-    return tuple(followed if probe is worst else probe for probe in found)
+    return tuple(followed if probe is worst else probe for probe in probes_found)
 
 
 def probes(at: Answered) -> tuple[Probe, ...]:
     """Refit windows of time, recordings where there are several, and with assumptions relaxed.
 
-    Assumptions that every solve probes have the same prior and level of significance as there.
+    Routine assumptions have the same prior and level of significance as in `routine_probes`.
     """
     parts = [*_windows(at), *_recordings(at)]
-    freed = [*_freed(at)]
-    tests = sum(len(probe.moves) for probe in parts) + len(freed)
+    relaxed = [*_freed(at)]
+    tests = sum(len(probe.moves) for probe in parts) + len(relaxed)
     limit = float(normal_isf(CHANCE / 2 / max(1, tests)))
     limits = dict.fromkeys(ROUTINE, significance(at.changes))
     return (
         *(_elsewhere(each, limit) for each in parts),
-        *(_released(at, probe, limits.get(probe.name, limit)) for probe in freed),
+        *(_released(at, probe, limits.get(probe.name, limit)) for probe in relaxed),
     )
 
 
 def _windows(at: Answered) -> Iterator[Probe]:
-    """A third of every recording's time at a time."""
+    """Yield the refits of a third of every recording's time."""
     for k, name in enumerate(WINDOWS):
         cuts = [_third(block, k) for block in at.fit.blocks]
         blocks = [_cut(block, cut) for block, cut in zip(at.fit.blocks, cuts, strict=True)]
@@ -85,12 +84,13 @@ def _windows(at: Answered) -> Iterator[Probe]:
 
 
 def _third(block: FitBlock, k: int) -> slice:
+    """Return the slice of the samples in third k (an index) of a block's time."""
     ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(int)
     return slice(int(ends[k]), int(ends[k + 1]))
 
 
 def _cut(block: FitBlock, cut: slice) -> FitBlock:
-    """The same of some samples."""
+    """Return the block with some samples only."""
     own = ("t_s", "present", "residual", "slope", "misfit", "components")
     there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
     shaken = block.disturbances
@@ -98,6 +98,7 @@ def _cut(block: FitBlock, cut: slice) -> FitBlock:
 
 
 def _recordings(at: Answered) -> Iterator[Probe]:
+    """Yield the refits of single recordings; none if there is only one."""
     if len(recordings_of(at.fit)) < 2:
         return
     for alone, step in single_fits(at.fit):
@@ -107,22 +108,24 @@ def _recordings(at: Answered) -> Iterator[Probe]:
 def _part(
     at: Answered, kind: Kind, name: str, alone: LinearisedFit, step: Array
 ) -> Iterator[Probe]:
-    """What a part of the data says alone, of what it tells at all."""
+    """Yield the probe of a part of the data, unless it has fewer measurements than parameters."""
     if alone.measurements <= len(alone.names):
         return
-    found = at.found(alone, at.p[: alone.shared] + step[: alone.shared])
-    left = least_squares(alone)
-    falls = left.loss(-step) - left.loss(np.zeros(len(step)))
-    yield Probe(kind, name, falls, at.moves(found))
+    uncertainty = at.found(alone, at.p[: alone.shared] + step[: alone.shared])
+    remaining = least_squares(alone)
+    falls = remaining.loss(-step) - remaining.loss(np.zeros(len(step)))
+    yield Probe(kind, name, falls, at.moves(uncertainty))
 
 
 def _elsewhere(probe: Probe, limit: float) -> Probe:
-    """Told are estimates that are farther away than by chance.
+    """Return the probe with the estimates in `told` that differ more than by chance.
 
-    A part scatters about the whole by less than its own error bar (Hausman 1978).
+    A part differs from the whole with less than its own error bar (Hausman 1978).
     """
-    far = (n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error)
-    return replace(probe, told=tuple(far))
+    significant = (
+        n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error
+    )
+    return replace(probe, told=tuple(significant))
 
 
 # Freed assumptions --------------------------------------------------------------------------------
@@ -137,32 +140,34 @@ def _freed(at: Answered) -> Iterator[Probe]:
 
 
 def _released(at: Answered, probe: Probe, limit: float) -> Probe:
-    """Return a probe that is significant after further steps, from where its first step leads.
+    """Iterate a significant probe by further steps, from where its first step leads.
 
     Parameters
     ----------
     at : Answered
+        The fit.
     probe : Probe
-        Of an assumption, after one linear step; one that is not significant is returned as it is.
+        Probe of an assumption after one linear step; it is returned unchanged if it is not
+        significant.
     limit : float
-        The least significant size, in its standard errors.
+        Least significant size, in its standard errors.
     """
     if not probe.is_beyond(limit):
         return probe
     first = len(at.fit.names)
     collocation = at.collocation
-    kept = assumption_of(probe.name), CORRELATION_KEY
-    alone = {name: size if name in kept else None for name, size in at.deviations.items()}
+    kept_names = assumption_of(probe.name), CORRELATION_KEY
+    alone = {name: size if name in kept_names else None for name, size in at.deviations.items()}
     wide = with_freedom(at.fit, at.changes, probe.name, _widening(probe.name))
     p = at.p
-    _, near = collocation.unpack(at.z)
+    _, positions = collocation.unpack(at.z)
     for _ in range(STEPS):
         step = best_step(wide)[:first]
         p = p + step
-        near, failure = marched(collocation, p, near=near)
+        positions, failure = marched(collocation, p, near=positions)
         if failure is not None:
             break
-        z = collocation.pack(p, near)
+        z = collocation.pack(p, positions)
         changes = probed_changes(collocation, z, alone)
         there = linearised_fit(collocation, z).disturbed(b.disturbances for b in at.fit.blocks)
         wide = with_freedom(there, changes, probe.name, _widening(probe.name))

@@ -1,8 +1,8 @@
-"""Profile likelihood: how far one parameter can go before the loss notices.
+"""Profile likelihood of one parameter: its 95 % interval from refits with the parameter fixed.
 
-The loss, minimised over everything else, rises by 3.84 (the 95 % quantile of χ² with one degree
-of freedom) at the ends of the interval. Unlike a standard error this follows a bent or one-sided
-loss; where it never rises so far, the interval is open.
+The loss, minimised over everything else, rises by 3.84 (the 95 % quantile of χ² with one degree of
+freedom) at the ends of the interval. Unlike a standard error this follows a curved or one-sided
+loss; where the loss never rises so far, the interval is open.
 """
 
 from __future__ import annotations
@@ -25,27 +25,33 @@ from .uncertainty import Uncertainty
 
 SolveFixed = Callable[[str, float], float]
 
+# Increase of the loss at the ends of a 95 % interval.
 THRESHOLD = float(chi2_isf(0.05, 1))
-# The ends are found to this share of their distance from the best value, in the logarithm.
+# Relative precision of the ends, in the logarithm.
 PRECISION = 0.02
+# Largest number of doublings of the first step.
 MOST_DOUBLINGS = 20
-# No rise counts for more thresholds than this, not even one to no solution at all.
+# Largest rise over the threshold; infinite losses count as this.
 HIGHEST = 16.0
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """The loss along one parameter, everything else fitted.
+    """Loss as a function of one parameter, with everything else fitted.
 
     Attributes
     ----------
     parameter : str
-    values, losses : (n,) ascending values and the losses there; infinite where it has no solution
+        Name.
+    values, losses : (n,) arrays
+        Ascending values and the losses there; infinite where there is no solution.
     threshold : float
-        Loss above the smallest at which the interval ends.
+        Increase of the loss at which the interval ends.
     interval : (lower or None, upper or None)
-        95 % interval; None where it is open: the loss does not rise so far up to the last value.
+        95 % interval; None where it is open, because the loss does not rise so far up to the last
+        value.
     sentence : str
+        Message for the user.
     """
 
     parameter: str
@@ -69,12 +75,14 @@ def profile(
     Parameters
     ----------
     solve_fixed : callable (parameter, value) -> loss
-        Σ ((ŷ − h(x)) / σ)² with priors, minimised with the parameter held at the value; a
+        Returns Σ ((ŷ − h(x)) / σ)² with priors, minimised with the parameter fixed; a
         `SimulationError` counts as an infinite loss.
     parameter : str
-    best : (value, loss) at the optimum
-    bounds : (lower, upper) of the parameter
-        The search does not leave them.
+        Name.
+    best : (value, loss)
+        The optimum.
+    bounds : (lower, upper)
+        Positive bounds of the parameter, which the search does not leave.
     deviation : float
         Expected standard deviation of the logarithm: the first step is two of them.
     noise_scale : float
@@ -92,18 +100,22 @@ def profile(
             f"best value {value:g} of {parameter} is not within its bounds "
             f"[{bounds[0]:g}, {bounds[1]:g}]"
         )
-    known = {value: loss}
+    losses_by_value = {value: loss}
     threshold = THRESHOLD * noise_scale
 
     def rise(way: float) -> float:
-        """By how much the root of the loss rises, over what it may; this is nearly straight."""
-        at = float(np.clip(value * np.exp(way), *bounds))
-        if at not in known:
+        """Return the square root of the loss's rise over the threshold, less one; nearly
+        linear in `way`, the change of the logarithm.
+        """
+        trial = float(np.clip(value * np.exp(way), *bounds))
+        if trial not in losses_by_value:
             try:
-                known[at] = solve_fixed(parameter, at)
+                losses_by_value[trial] = solve_fixed(parameter, trial)
             except SimulationError:
-                known[at] = np.inf
-        above = float(np.sqrt(np.clip((known[at] - loss) / threshold, 0.0, HIGHEST))) - 1.0
+                losses_by_value[trial] = np.inf
+        above = (
+            float(np.sqrt(np.clip((losses_by_value[trial] - loss) / threshold, 0.0, HIGHEST))) - 1.0
+        )
         return above if abs(above) > PRECISION / 2 else 0.0
 
     step = 2 * deviation if np.isfinite(deviation) and deviation > 0 else 0.1
@@ -113,17 +125,17 @@ def profile(
         else float(value * np.exp(way))
         for side, bound in zip((-1, 1), bounds, strict=True)
     )
-    values = np.array(sorted(known))
-    losses = np.array([known[at] for at in values.tolist()])
-    said = _sentence(parameter, (lower, upper), bounds)
+    values = np.array(sorted(losses_by_value))
+    losses = np.array([losses_by_value[at] for at in values.tolist()])
+    message = _sentence(parameter, (lower, upper), bounds)
     if losses.min() < loss - 1e-3 * max(1.0, abs(loss)):
         better = values[int(np.argmin(losses))]
-        said += f"; at {better:.4g} the loss is lower than at the answer: solve again from there"
-    return Profile(parameter, values, losses, threshold, (lower, upper), said)
+        message += f"; at {better:.4g} the loss is lower than at the answer: solve again from there"
+    return Profile(parameter, values, losses, threshold, (lower, upper), message)
 
 
 def _end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
-    """Where the loss has risen enough, on one side; None if it has not at the bound."""
+    """Return where the loss has risen enough, on one side; None if it has not at the bound."""
     inside = 0.0
     nearer = min if step > 0 else max
     for _ in range(MOST_DOUBLINGS):
@@ -143,6 +155,7 @@ def _sentence(
     interval: tuple[float | None, float | None],
     bounds: tuple[float, float],
 ) -> str:
+    """Return the message for an interval."""
     lower, upper = interval
     how = "(95 %, profile likelihood)"
     if lower is not None and upper is not None:
@@ -163,7 +176,7 @@ def _sentence(
 def profile_of(
     solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, name: str
 ) -> Profile:
-    """Profile likelihood of an estimated parameter.
+    """Compute the profile likelihood of an estimated parameter of a solution.
 
     Raises
     ------
@@ -196,28 +209,31 @@ def profile_of(
 
 
 def _loss(solution: Solution) -> float:
+    """Return the loss of a solution, with priors."""
     return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
 
 
 def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
-    """Smallest loss with one parameter at a value, the search starting at the answer."""
+    """Return the smallest loss with one parameter fixed at a value, from the answer;
+    infinite if the solve does not converge.
+    """
     before = solution.collocation
     started = before.parameters.with_guess(solution.parameters)
-    held = started.with_fixed({item.name: value})
-    found = ReducedSpace()(replace(before, parameters=held)).unless_interrupted()
-    if not found.status.converged:
+    fixed = started.with_fixed({item.name: value})
+    refit = ReducedSpace()(replace(before, parameters=fixed)).unless_interrupted()
+    if not refit.status.converged:
         return float("inf")
     prior = 0.0
     if item.prior is not None:
         mean, deviation = item.prior
-        away = np.log(value / mean) if item.scale == "log" else value - mean
-        prior = (away / deviation) ** 2
-    return _loss(found) + float(prior)
+        deviation_from_prior = np.log(value / mean) if item.scale == "log" else value - mean
+        prior = (deviation_from_prior / deviation) ** 2
+    return _loss(refit) + float(prior)
 
 
 def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
-    """Variance of the estimate over what the σ given would make it."""
+    """Return the variance of the estimate over that for the stated σ; 1 if it is not finite."""
     size = relative_slopes(solution.collocation.parameters, solution.q)[k]
-    given = size * least_squares(fit).errors[k]
-    scale = float(uncertainty.covariance[k, k] / given**2)
+    stated_error = size * least_squares(fit).errors[k]
+    scale = float(uncertainty.covariance[k, k] / stated_error**2)
     return scale if np.isfinite(scale) else 1.0

@@ -1,9 +1,10 @@
-"""Fits near an answer with one assumption relaxed, and how far the estimates move in them.
+"""Relaxed assumptions: fits near an answer with one assumption estimated, and the changes of the
+estimates.
 
-An assumption that is relaxed joins the linearised fit as one more nuisance parameter, or several:
-its prior has the deviation of the uncertainty budget, or a multiple of it, and its slope is how the
-residuals change where the assumption is off, see `considered`. Used by `routine_probes` in every
-solve and by `probes` where a deeper check is asked for.
+A relaxed assumption joins the linearised fit as one or several nuisance parameters: its prior has
+the deviation of the uncertainty budget, or a multiple of it, and its derivatives are the changes of
+the residuals if the assumption is wrong, see `considered`. `routine_probes` uses this in every
+solve, `probes` for a deeper check.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ Kind = Literal["window", "recording", "assumption"]
 
 @dataclass(frozen=True)
 class Move:
-    """The change of an estimate in a refit.
+    """Change of an estimate in a refit.
 
     Attributes
     ----------
     value, std_error : float
-        The estimate of the refit, and its standard error.
+        Estimate of the refit, and its standard error.
     change : float
-        From the fit of all data to the refit.
+        Estimate of the refit less that of the fit of all data.
     of_statistical95, of_combined95 : float or None
-        The same over the half widths of the statistical and of the combined interval of the fit;
+        `change` over the half widths of the statistical and of the combined interval of the fit;
         None where there is no such interval.
     """
 
@@ -58,27 +59,29 @@ class Move:
 
 @dataclass(frozen=True)
 class Probe:
-    """One refit.
+    """One refit, of a part of the data or with an assumption relaxed.
 
     Attributes
     ----------
     kind : {"window", "recording", "assumption"}
+        What was refitted.
     name : str
-        The window, the recording, or the assumption with its component.
+        Name of the window, of the recording, or of the assumption with its component.
     chi_squared : float
-        Decrease of χ², with the σ stated and with priors.
-    moves : mapping of estimate to Move
-        Of the estimates that the refit determines.
+        Decrease of χ², with the stated σ and with priors.
+    moves : mapping of str to Move
+        Changes of the estimates that the refit determines.
     size, size_error : float or None
-        Of a relaxed assumption, in its unit: how far it is off, and the standard error of that.
+        Estimated error of a relaxed assumption in its unit, and its standard error; None for parts
+        of the data.
     told : tuple of str
-        What is significant. Of a part of the data: the estimates that differ. Of an assumption: its
+        What is significant: for a part of the data the estimates that differ, for an assumption its
         name.
     routine : bool
         Whether this is one of the probes of every solve, with one linear step.
     relevance : float or None
-        Of an assumption: the largest change of an estimate by it, in half widths of the statistical
-        interval, see `relevance`.
+        For an assumption the largest change of an estimate, in half widths of the statistical
+        interval, see `relevance`; None for parts of the data.
     """
 
     kind: Kind
@@ -92,7 +95,9 @@ class Probe:
     relevance: float | None = None
 
     def is_beyond(self, limit: float) -> bool:
-        """Whether the size of a relaxed assumption exceeds `limit` of its standard errors."""
+        """Whether the size of a relaxed assumption exceeds `limit` of its standard errors;
+        false if there is no size.
+        """
         if self.size is None or not self.size_error:
             return False
         return abs(self.size) > limit * self.size_error
@@ -100,20 +105,26 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class Answered:
-    """A fit at its answer, with what probes need to know of it.
+    """A fit at its answer, with the data that probes need.
 
     Attributes
     ----------
     collocation : Collocation
-    z : (variables,) the answer
+        The program.
+    z : (variables,) array
+        The answer.
     fit : LinearisedFit
+        The linearised fit.
     errors : ErrorModel
-    statistical : mapping of name to Estimate
-        Values of the fit, with intervals for the noise alone.
-    budget : mapping of name to BudgetLine
-    deviations : mapping of all assumptions and nuisance parameters to their deviations
+        Assumptions about the errors.
+    statistical : mapping of str to Estimate
+        Estimates with statistical intervals.
+    budget : mapping of str to BudgetLine
+        Uncertainty budgets.
+    deviations : mapping of str to float or None
+        Standard deviations of all assumptions and nuisance parameters; None if exact.
     changes : Changes
-        Of the residuals by these assumptions, see `probed_changes`.
+        Changes of the residuals by these assumptions, see `probed_changes`.
     """
 
     collocation: Collocation
@@ -126,7 +137,7 @@ class Answered:
     changes: Changes
 
     def found(self, fit: LinearisedFit, p: Array) -> Uncertainty:
-        """Return estimates and error bars of another fit, at its parameters p."""
+        """Return estimates and error bars of another fit at its parameters p (p,)."""
         q = p[: fit.shared]
         constants = (segment.constants for segment in self.collocation.segments)
         fit = replace(fit, derived=Derived.of(constants, q))
@@ -134,7 +145,7 @@ class Answered:
 
     def moves(self, found: Uncertainty) -> dict[str, Move]:
         """Return the changes of the estimates that a refit determines, by name."""
-        went = {}
+        changes = {}
         for name, each in {**found.estimates, **found.derived}.items():
             error = each.statistical_std_error
             joint = self.statistical[name]
@@ -143,12 +154,12 @@ class Answered:
                 combined95 = self.budget[name].combined95 if name in self.budget else None
                 of_statistical = _share(change, joint.statistical95)
                 of_combined = _share(change, combined95)
-                went[name] = Move(each.value, error, change, of_statistical, of_combined)
-        return went
+                changes[name] = Move(each.value, error, change, of_statistical, of_combined)
+        return changes
 
     @property
     def p(self) -> Array:
-        """All parameters at the answer."""
+        """All parameters (p,) at the answer."""
         return self.collocation.parameters_of(self.z)
 
 
@@ -166,19 +177,22 @@ def probed_changes(
     deviations: Mapping[str, float | None],
     changes: Changes | None = None,
 ) -> Changes:
-    """Return how residuals change by each assumption that the data can test.
+    """Return the changes of the residuals by each assumption that the data can test.
 
     In a static recording whose load only rises, or only falls, "stiffer at the end" and "stiffer at
-    large strain" are the same, so that a wrong law of the material would look like a drift: there
-    the column of the drift is zero. Where the load returns, or the recording is dynamic, it stays.
+    large strain" are the same, so that a wrong material law would look like a drift: there the
+    column of the drift is zero.
 
     Parameters
     ----------
     collocation : Collocation
-    z : (variables,) the answer
-    deviations : mapping of assumption or nuisance parameter to its deviation, None if exact
+        The program.
+    z : (variables,) array
+        The answer.
+    deviations : mapping of str to float or None
+        Standard deviation of each assumption or nuisance parameter; None if exact.
     changes : Changes, optional
-        What `assumed` returns for these deviations, if that is known.
+        Result of `assumed` for these deviations, if it is known.
     """
     known = assumed(collocation, z, deviations) if changes is None else changes
     columns = [k for k, name in enumerate(known.names) if name == DRIFT]
@@ -198,7 +212,9 @@ def probed_changes(
 
 
 def has_monotonic_load(part: Part, collocation: Collocation) -> bool:
-    """Whether the internal forces of a static recording only grow, or only shrink, in time."""
+    """Whether the internal forces of a static recording only grow, or only shrink, in time;
+    true for very few samples.
+    """
     load_n = np.linalg.norm(Fitted(part, collocation.parameters).internal_n(), axis=1)
     if len(load_n) < FEWEST_SAMPLES:
         return True
@@ -215,9 +231,12 @@ def with_freedom(
     Parameters
     ----------
     fit : LinearisedFit
+        The fit.
     changes : Changes
-        Each off by its deviation, which is the unit of the new parameters.
+        Changes of its residuals by the assumptions, each off by its standard deviation, which is
+        the unit of the new parameters.
     name : str
+        Name of the assumption with its component.
     widening : float
         Standard deviation of the prior of the new parameters, in these deviations.
     """
@@ -238,16 +257,18 @@ def with_freedom(
 
 
 def relaxed_probe(at: Answered, name: str, wide: LinearisedFit, p: Array) -> Probe:
-    """Return the best of a fit with one assumption relaxed, by one linear step.
+    """Return the optimum of a fit with one assumption relaxed, by one linear step.
 
     Parameters
     ----------
     at : Answered
+        The fit.
     name : str
-        The assumption.
+        The assumption with its component.
     wide : LinearisedFit
-        Of `with_freedom`, linearised at p.
-    p : (p,) all parameters without those of the assumption
+        Result of `with_freedom`, linearised at p.
+    p : (p,) array
+        All parameters without those of the assumption.
 
     Returns
     -------
@@ -258,23 +279,24 @@ def relaxed_probe(at: Answered, name: str, wide: LinearisedFit, p: Array) -> Pro
     step = best_step(wide)
     after = wide.after(step)
     own = step[first:]
-    found = at.found(after, p + step[:first])
+    uncertainty = at.found(after, p + step[:first])
     before = least_squares(at.fit)
-    left = least_squares(after)
-    falls = before.loss(np.zeros(first)) - left.loss(np.zeros(len(step)))
+    remaining = least_squares(after)
+    decrease = before.loss(np.zeros(first)) - remaining.loss(np.zeros(len(step)))
     unit = at.deviations[assumption_of(name)] or 1.0
-    errors = np.array([*found.nuisance.values()][first - wide.shared :])
+    errors = np.array([*uncertainty.nuisance.values()][first - wide.shared :])
     worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
-    probe = Probe("assumption", name, falls, at.moves(found))
+    probe = Probe("assumption", name, decrease, at.moves(uncertainty))
     probe = replace(probe, size=float(unit * own[worst]), size_error=float(unit * errors[worst]))
     return replace(probe, relevance=relevance(at, probe))
 
 
 def relevance(at: Answered, probe: Probe) -> float:
-    """Return the largest change of an estimate, in half widths of its statistical interval.
+    """Return the largest change of an estimate by a probe, in half widths of its statistical
+    interval.
 
-    Of a drift, half of it counts as a change of the moduli too: so far is the stiffness at either
-    end of a recording from the one that is reported for all of it.
+    For a drift, half of it counts as a change of the moduli too: by so much the stiffness at either
+    end of a recording differs from the one that is reported.
     """
     shares = [0.0]
     for name, move in probe.moves.items():

@@ -1,4 +1,4 @@
-"""What to measure in order to reduce a source of the uncertainty budget."""
+"""Remedies: what to measure in order to reduce a source of the uncertainty budget."""
 
 from __future__ import annotations
 

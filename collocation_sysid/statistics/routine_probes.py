@@ -40,12 +40,13 @@ RELEVANT = 0.25
 def probed_deviations(deviations: Mapping[str, float | None]) -> dict[str, float | None]:
     """Return deviations in which none of the routine probes is None.
 
-    That something is stated as exact is a reason to leave it out of the budget, but none to leave
-    it untested: the table's own deviation stands in.
+    A quantity stated as exact is left out of the budget but still tested, with the default
+    deviation of the table.
 
     Parameters
     ----------
-    deviations : mapping of assumption or nuisance parameter to its deviation, None if exact
+    deviations : mapping of str to float or None
+        Standard deviation of each assumption or nuisance parameter; None if exact.
     """
     usual = {row.name: row.sigma for row in ASSUMPTIONS}
     usual[CLOCK_RATE.name] = CLOCK_RATE.considered or 0.0
@@ -59,35 +60,36 @@ def routine_probes(answered: Answered) -> tuple[Probe, ...]:
     Parameters
     ----------
     answered : Answered
-        An assumption that has no column in its `changes`, because it is estimated or changes
-        nothing, is not probed.
+        The fit. An assumption that has no column in its `changes`, because it is estimated or has
+        no effect, is not probed.
 
     Returns
     -------
     tuple of Probe
-        With `routine` set; `told` is empty where the amplitude is not significant.
+        Probes with `routine` set; `told` is empty where the amplitude is not significant.
     """
     limit = significance(answered.changes)
-    found = []
+    probes = []
     for name in ROUTINE:
         wide = with_freedom(answered.fit, answered.changes, name, WIDENING)
         if any(block.slope[..., len(answered.fit.names) :].any() for block in wide.blocks):
             probe = relaxed_probe(answered, name, wide, answered.p)
-            told = (name,) if probe.is_beyond(limit) else ()
-            found.append(replace(probe, routine=True, told=told))
-    return tuple(found)
+            significant = (name,) if probe.is_beyond(limit) else ()
+            probes.append(replace(probe, routine=True, told=significant))
+    return tuple(probes)
 
 
 def significance(changes: Changes) -> float:
     """Return the least significant amplitude of a routine probe, in its standard errors.
 
-    By Bonferroni's bound over all amplitudes: a drift has one, the clock rate one a recording. With
-    both and one recording it is 3.0.
+    Bonferroni's bound over all amplitudes: a drift has one, the clock rate one for each recording.
     """
     amplitudes = sum(name in ROUTINE for name in changes.names)
     return float(normal_isf(FALSE_ALARMS / 2 / max(1, amplitudes)))
 
 
 def is_alarming(probe: Probe) -> bool:
-    """Whether a relaxed assumption is significant, and relevant to what is reported."""
+    """Whether a relaxed assumption is significant, and relevant to the estimates that are
+    reported.
+    """
     return bool(probe.told) and probe.kind == "assumption" and (probe.relevance or 0.0) >= RELEVANT

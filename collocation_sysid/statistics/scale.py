@@ -1,8 +1,8 @@
-"""What no recording tells, whatever its noise: the scale of stiffness and mass, and a damping.
+"""Quantities that no recording can determine, whatever its noise: a common scale of stiffness and
+mass, and damping without motion.
 
-Multiply all moduli and all densities by one number: without a known force or mass on the body the
-equations of motion are the same. Where nothing moves, or only slowly, a stiffness shows and no
-damping.
+If all moduli and all densities are multiplied by one number, the equations of motion are the same
+unless a force or mass is known. Slow or static experiments determine stiffness but no damping.
 """
 
 from __future__ import annotations
@@ -21,32 +21,36 @@ from ..recording.experiment import Experiment
 from .concern import Concern, Grade
 from .distributions import chi2_isf
 
-# What is left over of a change of all constants that parameters cannot bring about.
+# Relative error up to which parameters can multiply all constants by a common factor.
 LEFT = 1e-8
 
 
 def open_scale(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
-    """The parameters of which only ratios can be told, densities among them; mostly none."""
+    """Return the parameters of which only ratios can be determined, densities among them;
+    mostly empty.
+    """
     if not any(is_density(item.name) for item in parameters.free):
         return ()
     return _moved(experiments, parameters, stated=False)
 
 
 def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
-    """The parameters that are known relative to densities as stated."""
+    """Return the parameters that are determined relative to the stated densities only."""
     return _moved(experiments, parameters, stated=True)
 
 
 def scale_concerns(
     experiments: Iterable[Experiment], parameters: Parameters, grade: Grade = "check"
 ) -> list[Concern]:
-    """A scale that is open."""
+    """Return a concern if the scale is not determined."""
     names = open_scale(experiments, parameters)
     return [Concern("scale/unknown", grade, {"names": names})] if names else []
 
 
 def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
-    """What the moduli found rest on, where no force sets the scale."""
+    """Return the note that moduli are relative to the stated density; None if a force sets
+    the scale, or the scale is open.
+    """
     names = relative_moduli(experiments, parameters)
     if not names or open_scale(experiments, parameters):
         return None
@@ -58,14 +62,22 @@ def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters)
 def _moved(
     experiments: Iterable[Experiment], parameters: Parameters, stated: bool
 ) -> tuple[str, ...]:
-    """Free parameters that multiply all moduli and densities; none where data or priors resist.
+    """Return the free parameters that multiply all moduli and densities by a common factor; empty
+    if data or priors determine the factor.
 
-    With `stated`, densities that are not estimated are multiplied along.
+    Parameters
+    ----------
+    experiments : iterable of Experiment
+        Experiments; those for validation are ignored.
+    parameters : Parameters
+        Shared parameters.
+    stated : bool
+        Whether densities that are not estimated count as multiplied too.
     """
     fitted = [experiment for experiment in experiments if not experiment.validation]
     bodies = {id(e.body): e.body for e in fitted}
-    held = {id(e.body) for e in fitted if e.knows_a_force}
-    if len(held) == len(bodies):
+    with_known_force = {id(e.body) for e in fitted if e.knows_a_force}
+    if len(with_known_force) == len(bodies):
         return ()
     usual = usual_parameters(parameters, SOFT_PA)
     slopes = []
@@ -75,25 +87,27 @@ def _moved(
         theta = constants.theta(usual.guess_q)
         slope = constants.slopes(usual.guess_q)
         change = _multiplied(body, theta, slope, stated)
-        if key in held or change is None:
+        if key in with_known_force or change is None:
             change = np.zeros(len(slope))
         size = np.where(theta == 0, 1.0, np.abs(theta))
         slopes.append(slope / size[:, None])
         changes.append(change / size)
     matrix = np.concatenate(slopes)
-    wanted = np.concatenate(changes)
-    if not wanted.any():
+    scaling = np.concatenate(changes)
+    if not scaling.any():
         return ()
-    way = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
-    moves = np.abs(way) > LEFT * np.abs(way).max(initial=0.0)
+    solution = np.linalg.lstsq(matrix, scaling, rcond=None)[0]
+    moves = np.abs(solution) > LEFT * np.abs(solution).max(initial=0.0)
     priors = np.array([item.prior is not None for item in usual.free], dtype=bool)
-    if np.abs(matrix @ way - wanted).max() > LEFT or (moves & priors).any():
+    if np.abs(matrix @ solution - scaling).max() > LEFT or (moves & priors).any():
         return ()
-    return tuple(item.name for item, here in zip(usual.free, moves, strict=True) if here)
+    return tuple(item.name for item, is_moved in zip(usual.free, moves, strict=True) if is_moved)
 
 
 def _multiplied(body: Body, theta: Array, slope: Array, stated: bool) -> Array | None:
-    """How θ changes when all moduli and densities do; None where a density cannot."""
+    """Return the change of θ (k,) if all moduli and densities change by a common factor;
+    None if a density cannot.
+    """
     if not stated and not all(part.free_density for part in body.parts):
         return None
     scaled = [
@@ -103,23 +117,23 @@ def _multiplied(body: Body, theta: Array, slope: Array, stated: bool) -> Array |
     return np.where(scaled, theta, 0.0)
 
 
-# Probability of noise of sigma_m that moves markers more than still ones move.
+# Probability that noise of a motionless marker is taken for motion.
 RARE = 1e-3
-# Held nodes that move less than so many sigma_m do not.
+# Displacement of grasped nodes up to which they count as motionless, over sigma_m.
 HELD = 2.0
 
 
 def motionless(experiment: Experiment) -> bool:
-    """Whether neither grasps and loads nor markers move or change, but for noise."""
+    """Whether neither grasps, loads nor markers change, except for noise."""
     markers = experiment.markers
     t_s = experiment.t_s
     sigma_m = float(np.median(markers.sigma_m)) if markers.names else 0.0
-    held, positions_m = experiment.grasped(t_s)
-    lasting = held.all(axis=0)
-    if (held.any(axis=0) != lasting).any():
+    is_prescribed, positions_m = experiment.grasped(t_s)
+    lasting = is_prescribed.all(axis=0)
+    if (is_prescribed.any(axis=0) != lasting).any():
         return False
-    moved_m = np.ptp(positions_m[:, lasting], axis=0)
-    if moved_m.size and moved_m.max() > HELD * sigma_m:
+    displacement_m = np.ptp(positions_m[:, lasting], axis=0)
+    if displacement_m.size and displacement_m.max() > HELD * sigma_m:
         return False
     if np.ptp(experiment.tied_mass_kg(t_s), axis=0).any():
         return False
@@ -128,14 +142,16 @@ def motionless(experiment: Experiment) -> bool:
     present = markers.present[..., None]
     counts = np.maximum(present.sum(axis=0), 1)
     mean = np.where(present, markers.positions_m, 0.0).sum(axis=0) / counts
-    away = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
+    deviations = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
     # Of a mean of n samples, the deviations have n − 1 degrees of freedom.
     freedom = 3 * float(np.maximum(present.sum(axis=0) - 1, 0).sum())
-    return bool(np.sum(away**2) <= chi2_isf(RARE, max(freedom, 1.0)))
+    return bool(np.sum(deviations**2) <= chi2_isf(RARE, max(freedom, 1.0)))
 
 
 def stillness_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
-    """What no recording can tell, if nothing moves in those that are to be fitted."""
+    """Return a concern if nothing moves in the fitted recordings, so that damping cannot be
+    determined.
+    """
     fitted = [experiment for experiment in experiments if not experiment.validation]
     damping = [item.name for item in parameters.free if is_damping(item.name)]
     if not fitted or not damping or not all(e.static or motionless(e) for e in fitted):

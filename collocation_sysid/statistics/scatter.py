@@ -1,27 +1,27 @@
-"""By how much recordings disagree on the parameters that they share.
+"""Differences between recordings in the parameters that they share.
 
 To first order the estimate from one recording alone is a Gauss–Newton step away from the joint
-answer: with S its slopes by the shared parameters and its own nuisance parameters, and P the
-slopes of the latter's priors, (SᵀS + PᵀP)⁻¹ Sᵀ r. Its covariance is found as that of any fit. For
-each parameter
+answer: with S its derivatives by the shared parameters and its own nuisance parameters, and P the
+derivatives of the latter's priors, (SᵀS + PᵀP)⁻¹ Sᵀ r. Its covariance is that of any fit. For each
+parameter
 
     χ² = Σ (x_e − x̄)² / v_e,   x̄ = Σ x_e / v_e / Σ 1 / v_e,
 
-with one degree of freedom less than there are recordings that tell it. If it is larger than chance
-allows, something but the noise differs among recordings: the model's error. Error bars are then
-√(χ² / f) times as large (Birge 1932), and intervals are Student's. The joint fit may have seen
-that error in its residuals already; not to count it twice, 1 / Σ 1 / v_e widened so is enough.
+has one degree of freedom less than there are recordings that determine it. If it is larger than
+chance allows, model error differs among recordings. Error bars are then √(χ² / f) times as large
+(Birge 1932), and intervals are Student's. The joint fit may contain that error in its residuals
+already; not to count it twice, 1 / Σ 1 / v_e widened so is enough.
 
-A parameter that hardly a recording tells alone may look certain because all together tell it. So
-each parameter k in turn is let be another in every recording, where all others are shared: with W
-what the information of everything leaves for these numbers and s their score, they differ by
+A parameter that hardly any recording determines alone may look certain because all together
+determine it. So each parameter k in turn may differ between recordings, while all others are
+shared: with W the information that remains for these numbers and s their score, they differ by
 
     Q_k = sᵀP s,   P = W⁺ − 11ᵀ / 1ᵀW1,   E Q_k = E_k + Σ_l τ_l² tr M_klᵀ P M_kl,
 
-E_k being what noise makes of it, as many as there are recordings less one, or more where errors
-hang together; and M_kl what parameter l does to s where it differs itself, by the variance τ_l²
-between recordings. All of these follow by moments, none below zero (DerSimonian & Laird 1986, of
-several parameters and with the recordings' own covariance). Estimates follow by −A⁻¹ (SᵀS)_e.
+E_k being the contribution of noise, the number of recordings less one or more for correlated
+errors, and M_kl the change of s if parameter l differs with the variance τ_l² between recordings.
+All τ_l² ≥ 0 follow by moments (DerSimonian & Laird 1986, for several parameters and with the
+recordings' own covariance). Estimates change by −A⁻¹ (SᵀS)_e.
 """
 
 from __future__ import annotations
@@ -37,25 +37,30 @@ from ..arrays import Array, Index
 from .distributions import chi2_sf
 from .linearised import FitBlock, LinearisedFit, best_step, least_squares, rows_of
 
-# Probability that recordings without such an error are said to disagree, for all parameters.
+# Probability that consistent recordings are reported to disagree, for all parameters together.
 SIGNIFICANT = 0.01
-# A recording tells a parameter if the deviation of its q is below this; else a step tells nothing.
+# Standard deviation of q below which a recording determines a parameter; otherwise a linear step is
+# meaningless.
 TELLING = 0.5
-# Nor does all that is left of its information, where that is rounding.
+# Share of the information that is rounding.
 SILENT = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """What single recordings say, in the solver's coordinates.
+    """Comparison of single recordings, in the solver's coordinates.
 
     Attributes
     ----------
-    recordings : (n,) names
-    away : (n, nq) estimates from each less the joint one; NaN where it does not tell
-    deviations : (n, nq) their standard deviations; NaN likewise
-    between : (p, nq n) how the joint estimates follow what each parameter is off by in each
-        recording, by the deviation between recordings that these have
+    recordings : (n,) tuple of str
+        Names.
+    away : (n, nq) array
+        Estimates from each alone less the joint ones; NaN where it does not determine them.
+    deviations : (n, nq) array
+        Their standard deviations; NaN likewise.
+    between : (p, nq n) array
+        Changes of the joint estimates if a parameter differs in one recording by its standard
+        deviation between recordings.
     """
 
     recordings: tuple[str, ...]
@@ -65,7 +70,7 @@ class Scatter:
 
     @property
     def chi_squared(self) -> Array:
-        """(nq,) χ² of the disagreement."""
+        """χ² of the disagreement on each parameter (nq,)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = np.nan_to_num(1 / self.deviations**2)
             mean = np.nansum(weight * self.away, axis=0) / weight.sum(axis=0)
@@ -73,18 +78,18 @@ class Scatter:
 
     @property
     def freedom(self) -> NDArray[np.int64]:
-        """(nq,) its degrees of freedom."""
+        """Degrees of freedom (nq,) of χ²."""
         return np.maximum(np.isfinite(self.deviations).sum(axis=0) - 1, 0)
 
     @property
     def disagreeing(self) -> NDArray[np.bool_]:
-        """(nq,) parameters on which the recordings disagree more than by chance."""
+        """Mask (nq,) of the parameters on which the recordings disagree more than by chance."""
         freedom = self.freedom
         p = chi2_sf(self.chi_squared, np.maximum(freedom, 1))
         return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
 
     def widened(self, variances: Array) -> Array:
-        """(nq,) variances of q of the joint fit, larger where recordings disagree."""
+        """Return variances (nq,) of q of the joint fit, increased where recordings disagree."""
         ratio = self.chi_squared / np.maximum(self.freedom, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
@@ -93,17 +98,16 @@ class Scatter:
 
 
 def recordings_of(fit: LinearisedFit) -> dict[str, list[int]]:
-    """Numbers of the blocks of each recording, by its name."""
-    found: dict[str, list[int]] = {}
+    """Return the indices of the blocks of each recording, by its name."""
+    blocks: dict[str, list[int]] = {}
     for k, block in enumerate(fit.blocks):
-        found.setdefault(block.name, []).append(k)
-    return found
+        blocks.setdefault(block.name, []).append(k)
+    return blocks
 
 
 def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
-    """The fit to each recording alone, and its parameters less the joint ones.
-
-    The numbers are those of its blocks.
+    """Iterate over the fits to each recording alone, each with its parameters less the
+    joint ones.
     """
     for name, numbers in recordings_of(fit).items():
         # What recordings share they have to find alone, too.
@@ -115,9 +119,19 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
 def part_fit(
     fit: LinearisedFit, blocks: Sequence[FitBlock], columns: Index
 ) -> tuple[LinearisedFit, Array]:
-    """The fit of some parameters to some data alone, and these less the joint ones.
+    """Return the fit of some parameters to some data alone, and these parameters less the joint
+    ones.
 
-    Priors of shared parameters are of all the data, and left out.
+    Priors of shared parameters belong to all the data and are left out.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The joint fit.
+    blocks : sequence of FitBlock
+        Data of the part.
+    columns : array
+        Indices of the parameters that are fitted.
     """
     prior_residual, prior_slope = (
         np.where(columns < fit.shared, 0.0, prior[columns])
@@ -136,52 +150,59 @@ def part_fit(
 
 
 def scatter_of(fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]) -> Scatter:
-    """Compare recordings, by name, by what each says alone.
+    """Compare recordings by the result of each alone.
 
-    That are its step (nq,) from the joint answer, and variances (nq,) of q as they are, and as they
-    were if its errors were independent and of the σ given.
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The joint fit.
+    alone : mapping of str to three arrays, each (nq,)
+        For each recording: step from the joint answer, variances of q, and variances of q for
+        independent errors of the stated σ.
     """
     steps, variances, independent = (np.array(each) for each in zip(*alone.values(), strict=True))
     deviations = np.sqrt(variances)
-    told = deviations < TELLING
+    is_determined = deviations < TELLING
     with np.errstate(invalid="ignore"):
         excess = variances / independent
     return Scatter(
         tuple(alone),
-        np.where(told, steps, np.nan),
-        np.where(told, deviations, np.nan),
+        np.where(is_determined, steps, np.nan),
+        np.where(is_determined, deviations, np.nan),
         _between(fit, [*alone], np.where(np.isfinite(excess), excess, 1.0)),
     )
 
 
 def _between(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
-    """See `Scatter`; of parameters at a bound nothing."""
+    """Return `Scatter.between` (p, nq n); zero for parameters at a bound."""
     own = [rows_of(fit, recordings_of(fit)[name]) for name in names]
     each = np.array([o.information for o in own])
     scores = np.array([o.score for o in own])
     together = least_squares(fit)
-    whole = together.information
+    information = together.information
     score = together.score
     free = np.flatnonzero(~fit.at_bound)
-    inverse = np.linalg.pinv(whole[np.ix_(free, free)], hermitian=True)
+    inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
     shared = free[free < fit.shared]
-    unlike = np.zeros(len(shared))
+    excess_scatter = np.zeros(len(shared))
     by_each = np.zeros((len(shared), len(shared)))
     for row, k in enumerate(shared.tolist()):
         others = free[free != k]
-        cross = each[:, k, others] @ np.linalg.pinv(whole[np.ix_(others, others)], hermitian=True)
+        cross = each[:, k, others] @ np.linalg.pinv(
+            information[np.ix_(others, others)], hermitian=True
+        )
         own_s = scores[:, k] - cross @ score[others]
         by_own = [np.diag(each[:, k, l]) - cross @ each[:, others, l].T for l in shared]
-        left = by_own[row]
-        if not left.sum() > SILENT * whole[k, k]:
+        remaining = by_own[row]
+        if not remaining.sum() > SILENT * information[k, k]:
             continue
-        apart = np.linalg.pinv(left, rcond=SILENT, hermitian=True) - 1 / left.sum()
-        noise = left * np.sqrt(np.outer(excess[:, k], excess[:, k]))
-        unlike[row] = own_s @ apart @ own_s - np.trace(apart @ noise)
-        by_each[row] = [np.trace(m.T @ apart @ m) for m in by_own]
+        projection = np.linalg.pinv(remaining, rcond=SILENT, hermitian=True) - 1 / remaining.sum()
+        noise = remaining * np.sqrt(np.outer(excess[:, k], excess[:, k]))
+        excess_scatter[row] = own_s @ projection @ own_s - np.trace(projection @ noise)
+        by_each[row] = [np.trace(m.T @ projection @ m) for m in by_own]
     sizes = np.where(np.diag(by_each) > 0, np.diag(by_each), 1.0)
-    variances = nnls(by_each / np.sqrt(np.outer(sizes, sizes)), unlike / np.sqrt(sizes))[0]
-    moved = np.zeros((len(fit.names), fit.shared, len(names)))
+    variances = nnls(by_each / np.sqrt(np.outer(sizes, sizes)), excess_scatter / np.sqrt(sizes))[0]
+    sensitivities = np.zeros((len(fit.names), fit.shared, len(names)))
     for k, tau in zip(shared, np.sqrt(variances / np.sqrt(sizes)), strict=True):
-        moved[free, k] = -tau * inverse @ each[:, free, k].T
-    return moved.reshape(len(fit.names), -1)
+        sensitivities[free, k] = -tau * inverse @ each[:, free, k].T
+    return sensitivities.reshape(len(fit.names), -1)

@@ -1,9 +1,9 @@
 """Errors of the stress-free shape of a body, as smooth displacements of its nodes.
 
-Two kinds count in the budget of the intervals. The surface of the mesh may be off along its normal
-by a random field with a Gaussian correlation; its strongest modes are the components. And a mesh of
-which nothing is stated may be a shape under the body's own weight, in an unknown pose: to first
-order, the stress-free shape is then off by the static deflection.
+Two kinds enter the uncertainty budget. The surface of the mesh may be off along its normal by a
+random field with a Gaussian correlation; its strongest modes are the components. And a mesh whose
+origin is not stated may be a shape under the body's own weight, in an unknown orientation: to first
+order, the stress-free shape then differs by the static deflection.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ def extents_m(points_m: Array) -> Array:
 
 
 def thickness_m(body: Body) -> float:
-    """Return the thickness of a body [m]: its least extent, or what its volume has per surface.
+    """Return the thickness of a body [m]: its least extent, or six times its volume over its
+    surface if that is less.
 
-    Six times the volume over the surface is the edge of a cube; of what is bent or hollow it is
+    Six times the volume over the surface is the edge of a cube; for bent or hollow bodies it is
     less than the extents.
     """
     a, b, c = np.moveaxis(body.mesh.points_m[body.mesh.surface], 1, 0)
@@ -55,15 +56,18 @@ def thickness_m(body: Body) -> float:
 
 
 def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) -> Array:
-    """Return displacements (modes, n, 3) of the nodes, where the surface's error has deviation 1.
+    """Return displacements (modes, n, 3) of the nodes for unit standard deviation of the surface's
+    error.
 
-    The surface moves along its normals by each mode of its error in turn, scaled by the mode's
+    The surface is displaced along its normals by each mode in turn, scaled by the mode's standard
     deviation; inside, displacements are harmonic on the graph of the mesh.
 
     Parameters
     ----------
     body : Body
-    known : (k,) nodes of the mesh near which the surface is known, such as where obstacles touch it
+        The body.
+    known : (k,) array
+        Nodes of the mesh near which the surface is known, such as contact areas.
     correlation : float
         Correlation length over the longest extent.
     """
@@ -77,14 +81,16 @@ def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) ->
     if known.size:
         away_m = KDTree(corners.points_m[known]).query(corners.points_m)[0]
         fields *= 1 - np.exp(-((away_m / (KNOWN_WITHIN * length_m)) ** 2))[:, None]
-    moved = fields[:, :, None] * normals[:, None, :]
-    harmonic = _harmonic(corners, surface, moved.reshape(len(fields), -1))
+    displacements = fields[:, :, None] * normals[:, None, :]
+    harmonic = _harmonic(corners, surface, displacements.reshape(len(fields), -1))
     of_corners = harmonic.reshape(len(fields), SURFACE_MODES, 3)
     return _of_all_nodes(body, of_corners.transpose(1, 0, 2))
 
 
 def _correlated(points_m: Array, weights: Array, length_m: float) -> Array:
-    """Return the strongest modes (n, SURFACE_MODES or fewer), scaled by their deviations."""
+    """Return the strongest modes (n, SURFACE_MODES or fewer) of a correlated field, scaled
+    by their standard deviations.
+    """
     count = min(len(points_m), MOST_NODES)
     chosen = np.sort(np.random.default_rng(0).permutation(len(points_m))[:count])
 
@@ -103,12 +109,14 @@ def _correlated(points_m: Array, weights: Array, length_m: float) -> Array:
 
 
 def _harmonic(nodes: Nodes, surface: Index, values: Array) -> Array:
-    """Return values (n, m) with those inside solving Laplace's equation on the mesh graph."""
+    """Return values (n, m) with those inside the surface replaced by the solution of
+    Laplace's equation on the mesh graph.
+    """
     count = len(nodes.points_m)
-    found = values.copy()
+    extended = values.copy()
     inside = np.setdiff1d(np.arange(count), surface)
     if not inside.size:
-        return found
+        return extended
     a, b = nodes.mesh.edges.T
     ones = np.ones(2 * len(a))
     rows = np.concatenate([a, b])
@@ -116,23 +124,25 @@ def _harmonic(nodes: Nodes, surface: Index, values: Array) -> Array:
     adjacency = sp.csr_array((ones, (rows, columns)), shape=(count, count))
     laplacian = sp.csc_array(sp.diags_array(adjacency.sum(axis=1)) - adjacency)
     right = -(laplacian[inside][:, surface] @ values[surface])
-    found[inside] = splu(sp.csc_array(laplacian[inside][:, inside])).solve(right)
-    return found
+    extended[inside] = splu(sp.csc_array(laplacian[inside][:, inside])).solve(right)
+    return extended
 
 
 def _of_all_nodes(body: Body, of_corners: Array) -> Array:
-    """Return fields (m, n, 3) at all nodes from those at the corners; frames have zero."""
-    found = np.zeros((len(of_corners), *body.nodes_m.shape))
+    """Return fields (m, n, 3) at all nodes from those at the corners; nodes of obstacle
+    frames have zero.
+    """
+    fields = np.zeros((len(of_corners), *body.nodes_m.shape))
     corners = of_corners.shape[1]
-    found[:, :corners] = of_corners
+    fields[:, :corners] = of_corners
     ends = body.nodes.ends
     if len(ends):
-        found[:, corners : corners + len(ends)] = of_corners[:, ends].mean(axis=2)
-    return found
+        fields[:, corners : corners + len(ends)] = of_corners[:, ends].mean(axis=2)
+    return fields
 
 
 def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
-    """Return the lowest nodes of a body, on which it stands where nothing grips it."""
+    """Return the lowest nodes of a body, on which it stands if nothing grips it."""
     points_m = body.nodes.points_m
     length = float(np.linalg.norm(gravity_m_s2))
     up = -np.asarray(gravity_m_s2) / length if length else np.array([0.0, 0.0, 1.0])
@@ -142,18 +152,22 @@ def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
 
 
 def sag_m(body: Body, theta: Array, held: Index, axis: int) -> Array:
-    """Return how far off the mesh (n, 3) is if it sagged along an axis of the mesh: X − Y [m].
+    """Return the difference (n, 3) of stress-free shape and mesh if the mesh sagged along one of
+    its axes, X − Y [m].
 
-    To first order, the deflection under the body's own weight, with the other sign; at most
-    `MOST_SAG` of the longest extent.
+    To first order, the negative deflection under the body's own weight; limited to `MOST_SAG` of
+    the longest extent. Zero if the supported dofs do not prevent rigid motions.
 
     Parameters
     ----------
     body : Body
-    theta : (k,)
-    held : (k,) dofs that were held
+        The body.
+    theta : (k,) array
+        Constants of the body.
+    held : (k,) array
+        Dofs that were supported.
     axis : int
-        Along which gravity pulled.
+        Index of the axis along which gravity acted.
     """
     own = body.nodes.points_m.size
     x = np.asarray(body.nodes_m, dtype=float)
@@ -162,14 +176,14 @@ def sag_m(body: Body, theta: Array, held: Index, axis: int) -> Array:
     matrix = sp.csc_array(body.pattern.matrix(stiffness)[free][:, free])
     weight_n = np.zeros(own)
     weight_n[axis::3] = GRAVITY_M_S2 * body.mass_of_dofs(theta)[:own][axis::3]
-    found = np.zeros(body.nodes_m.size)
+    difference_m = np.zeros(body.nodes_m.size)
     try:
-        found[free] = -splu(matrix).solve(weight_n[free])
+        difference_m[free] = -splu(matrix).solve(weight_n[free])
     except RuntimeError:
         # A body that could move freely has no deflection: what holds it was not found.
-        return found.reshape(-1, 3)
-    largest = float(np.abs(found).max(initial=0.0))
+        return difference_m.reshape(-1, 3)
+    largest = float(np.abs(difference_m).max(initial=0.0))
     limit_m = MOST_SAG * float(extents_m(body.mesh.points_m)[0])
     if not np.isfinite(largest):
         return np.zeros_like(x)
-    return found.reshape(-1, 3) * min(1.0, limit_m / max(largest, 1e-300))
+    return difference_m.reshape(-1, 3) * min(1.0, limit_m / max(largest, 1e-300))

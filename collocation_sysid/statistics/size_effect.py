@@ -1,9 +1,10 @@
-"""Where obstacles are if the body is larger than its mesh: first contact stays as it is.
+"""Displacements of obstacles if the body is larger than its mesh, such that first contact is
+preserved.
 
 The depth of an indentation counts from first contact, and the prior of an obstacle's offset refers
-to the surface of the body. A body that is larger by a share would reach into obstacles that stay
-where they are, by that share of its distance from the grasps: for an indentation of 1 mm into a
-block of 15 mm, 15 % of the depth for a size that is off by 1 %.
+to the surface of the body. A larger body would penetrate obstacles that do not move, by its
+relative size times its distance from the grasps: for an indentation of 1 mm into a block of 15 mm,
+15 % of the depth for a size error of 1 %.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ ROWS_AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class FirstContact:
-    """Where, and in which row, an obstacle first touches a body, or comes nearest to it.
+    """First contact of an obstacle with a body, or its nearest approach.
 
     Attributes
     ----------
     row : int
         Index of the row in the grid.
-    place_m : (3,)
-        Mean of the points that touch, weighted by their pressure, in the row before.
-    normal : (3,)
-        Of the obstacle there, in the world.
+    place_m : (3,) array
+        Mean of the points in contact, weighted by their pressure, in the row before [m].
+    normal : (3,) array
+        Normal of the obstacle there, in the world.
     """
 
     row: int
@@ -42,7 +43,7 @@ class FirstContact:
 
     @classmethod
     def in_motion(cls, contact: Contact, x: Array) -> FirstContact:
-        """Find first contact in a motion x (N, 3n); the nearest approach where none touches."""
+        """Find first contact in a motion x (N, 3n), or the nearest approach if there is none."""
         law = contact.contact
         nearest_m = np.inf
         row = 0
@@ -50,10 +51,10 @@ class FirstContact:
             gaps_m = law.gaps(contact.points.vectors(x[first : first + ROWS_AT_ONCE]))
             touching = np.flatnonzero((gaps_m < law.widths_m).any(axis=1))
             gaps_m = gaps_m.min(axis=1)
-            here = int(touching[0]) if len(touching) else int(gaps_m.argmin())
-            if gaps_m[here] < nearest_m:
-                nearest_m = float(gaps_m[here])
-                row = first + here
+            row_in_chunk = int(touching[0]) if len(touching) else int(gaps_m.argmin())
+            if gaps_m[row_in_chunk] < nearest_m:
+                nearest_m = float(gaps_m[row_in_chunk])
+                row = first + row_in_chunk
             if len(touching):
                 break
         y = contact.points.vectors(x[row : row + 1])
@@ -72,11 +73,11 @@ class FirstContact:
 
 
 def obstacle_shifts_m(part: Part) -> Iterator[tuple[Obstacle, Array]]:
-    """Return of each obstacle the shift (N, 3) per relative size that keeps first contact.
+    """Yield each obstacle with the shift (N, 3) per relative size that preserves first contact [m].
 
-    The body scales about the middle of its grasps. Along axes that no grasp holds, it scales about
-    the place where the first obstacle touches it, of several the one that moves least: the body
-    rests on that one.
+    The body scales about the middle of its grasps. Along axes that no grasp prescribes, it scales
+    about the place of its first contact; if several obstacles touch it at the same time, about that
+    of the one that moves least.
     """
     experiment = part.segment.experiment
     forces = part.setting.dynamics.forces
@@ -84,16 +85,18 @@ def obstacle_shifts_m(part: Part) -> Iterator[tuple[Obstacle, Array]]:
     contacts = [term for term in forces.further if isinstance(term, Contact)]
     if not contacts:
         return
-    touched = [FirstContact.in_motion(contact, part.x) for contact in contacts]
+    first_contacts = [FirstContact.in_motion(contact, part.x) for contact in contacts]
     travels_m = [np.ptp(part.x[:, c.contact.obstacle.dofs], axis=0).max() for c in contacts]
-    support = min(zip((each.row for each in touched), travels_m, range(len(contacts)), strict=True))
-    held = set("".join(grasp.axes for grasp in experiment.gripping))
-    free = np.array([axis not in held for axis in "xyz"])
-    for contact, each in zip(contacts, touched, strict=True):
+    support = min(
+        zip((each.row for each in first_contacts), travels_m, range(len(contacts)), strict=True)
+    )
+    prescribed_axes = set("".join(grasp.axes for grasp in experiment.gripping))
+    free = np.array([axis not in prescribed_axes for axis in "xyz"])
+    for contact, each in zip(contacts, first_contacts, strict=True):
         obstacle = contact.contact.obstacle
         turn, shift = (values[0] for values in experiment.rigid_motion(t_s[each.row]))
         pivot_m = turn @ part.segment.nuisance.grasp_pivot_m + shift
-        pivot_m = np.where(free, touched[support[-1]].place_m, pivot_m)
+        pivot_m = np.where(free, first_contacts[support[-1]].place_m, pivot_m)
         way_m = each.normal * (each.normal @ (each.place_m - pivot_m))
         turns, _ = obstacle.poses.at(t_s)
         yield obstacle, turns @ (turns[each.row].T @ way_m)

@@ -1,8 +1,8 @@
-"""One word on how far an answer can be trusted, with its reasons.
+"""Verdict on a fit: "good", "check" or "doubtful", with its reasons.
 
-Every function here that ends in "concerns" looks at one thing and returns what gives concern. The
-levels are strict: of answers to faultless data at least 95 % are to be called good, however many
-markers and nuisance parameters there are.
+Each function whose name ends in "concerns" examines one thing and returns a list of concerns, empty
+if there are none. Levels of significance are strict: at least 95 % of fits to faultless data are to
+be "good", however many markers and nuisance parameters there are.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from .uncertainty import Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
 
-# A cause without which the misfit falls by more than this is as good as certain.
+# Factor of the misfit from which on a hypothesis is as good as certain.
 CERTAIN = 2.0
-# Probability of a false alarm, of each test.
+# Probability of a false alarm of each test.
 RARE = 1e-4
 # Residuals over sigma, or sigma over residuals: from here on "check". The noise of
 # cameras is known to about this factor.
@@ -45,55 +45,68 @@ MISFIT = 1.5
 # Residuals over sigma: from here on "doubtful" if they are not white, or are those of a prediction.
 # The only threshold for doubtful residuals; docs/howto/verdict.md states its value.
 GROSS_MISFIT = 3.0
-# One marker alone may differ by more.
+# Factor by which one marker may be noisier than the others.
 MARKER_MISFIT = 2.0
-# Autocorrelation that matters.
+# Autocorrelation from which on errors matter.
 PERSISTENT = 0.2
-# What a forward simulation misses more than the fit, over the fit's own RMS or that of the noise.
+# Additional distance of a forward simulation, over the RMS distance of the fit or of noise:
+# "check".
 ROLLOUT = 0.35
+# The same for "doubtful".
 GROSS_ROLLOUT = 2.0
-# A prediction this many times worse than the fit.
+# Distance of a prediction over that of the fit: "check".
 PREDICTION = 3.0
+# The same for "doubtful".
 GROSS_PREDICTION = 10.0
-# Nuisance parameters this many deviations of their priors away.
+# Nuisance parameters in standard deviations of their priors: "check".
 FAR = 3.0
+# The same for "doubtful".
 ABSURD = 6.0
-# Deviations of its prior that the pose of a depth camera may be off: it trades for the shape.
+# Pose of a depth camera in standard deviations of its prior: "check", because it compensates wrong
+# shapes.
 CAMERA_FAR = 2.0
-# Points of an outline may be so many pixels off the edge in the image, but for this share of them:
-# edges of pixels scatter by 0.3, lenses and wrong depths at edges by one.
+# Distance of outline points from the edge [pixels] that needs an explanation: edges of pixels
+# scatter by 0.3, lenses and wrong depths at edges by one.
 OUTLINE_FAR_PX = 3.0
+# Share of outline points that may be farther.
 OUTLINE_SHARE = 0.1
+# Time shift in standard deviations of its prior: "check".
 LATE = 1.8
-# Share of the samples beyond Huber's threshold, of all.
+# Share of the samples beyond Huber's threshold: "check".
 WILD = MOST_WILD
+# The same for "doubtful".
 HARDLY_TAME = 0.2
-# What a scheme adds to the damping ratio, over it; and by how much it may lengthen a period.
+# Damping ratio that a scheme adds, over that of the mode: "check".
 DAMPING_SHARE = 0.2
+# The same for "doubtful".
 GROSS_DAMPING_SHARE = 1.0
+# Added damping ratio that never matters.
 LITTLE_DAMPING = 0.005
+# Relative change of a period by the scheme: "check".
 PERIOD_ERROR = 0.02
+# The same for "doubtful".
 GROSS_PERIOD_ERROR = 0.1
-# Powers of e by which a disturbance may grow in a recording.
+# Powers of e by which a disturbance may grow in a recording: "check".
 E_FOLDINGS = 1.0
+# The same for "doubtful".
 GROSS_E_FOLDINGS = 7.0
-# A contact of fewer faces is as wide as the mesh makes it.
+# Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
 # Combined standard uncertainties by which step and mesh may change a parameter: the half width of
 # its 95 % interval.
 MOVED = 2.0
-# What is said of the numerical error: estimated, and measured.
+# Codes of the concern about an estimated, and about a measured discretisation error.
 NUMERICAL = "scheme/step", "mesh/refined"
 
 
 @dataclass(frozen=True)
 class Trust:
-    """What gives concern, the gravest first, and the verdict that this brings.
+    """Concerns, the gravest first, and the resulting verdict.
 
     Attributes
     ----------
     concerns : tuple of Concern
-        Empty if the verdict is good.
+        Empty if the verdict is "good".
     """
 
     concerns: tuple[Concern, ...] = ()
@@ -101,33 +114,35 @@ class Trust:
 
     @classmethod
     def of(cls, concerns: Iterable[Concern]) -> Trust:
-        """Each concern once, the gravest first."""
-        found = {concern.sentence: concern for concern in reversed([*concerns])}
-        gravest = sorted(reversed(found.values()), key=lambda each: each.grade == "check")
+        """Build from concerns; duplicates are removed and the gravest come first."""
+        by_message = {concern.sentence: concern for concern in reversed([*concerns])}
+        gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
         return cls(tuple(gravest))
 
     @property
     def verdict(self) -> Verdict:
-        """In one word how far the answer can be trusted.
+        """Verdict in one word.
 
-        "good": nothing speaks against the answer and its error bars. "check": usable, after a
-        look at the reasons. "doubtful": something is wrong with data, model or solve.
+        "good": nothing speaks against the answer and its error bars. "check": usable, after a look
+        at the reasons. "doubtful": something is wrong with data, model or solve.
         """
         return self.concerns[0].grade if self.concerns else "good"
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """The sentences that it rests on."""
+        """Messages of the concerns, in the order of `concerns`."""
         return tuple(concern.sentence for concern in self.concerns)
 
     def joined(self, other: Trust) -> Trust:
-        """The graver of two verdicts, with the reasons of both."""
+        """Return the graver of two verdicts, with the reasons of both."""
         light, grave = sorted((other, self), key=lambda t: get_args(Verdict).index(t.verdict))
         return Trust.of((*grave.concerns, *light.concerns))
 
 
 def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
-    """What is likely described wrongly."""
+    """Return concerns about likely misspecifications, "doubtful" if the misfit decreases by
+    more than a factor of two without one.
+    """
     return [
         replace(cause, of=f"likely: {cause.of}").concern(
             "doubtful" if cause.strength > CERTAIN else "check"
@@ -137,29 +152,31 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
 
 
 def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """The residuals against sigma_m and against white noise."""
+    """Return concerns about the residuals: their size compared with σ, correlation,
+    outliers and disagreement of recordings.
+    """
     level = uncertainty.level
-    found = uncertainty.dependence
+    dependence = uncertainty.dependence
     factor = float(np.sqrt(level.pooled))
-    limit = float(normal_isf(RARE / 2)) * found.lag1_deviation
-    persistent = abs(found.lag1) > max(PERSISTENT, limit)
-    shared = found.shared_p < RARE
-    matters = uncertainty.errors == "autocorrelated" and (persistent or shared)
+    limit = float(normal_isf(RARE / 2)) * dependence.lag1_deviation
+    persistent = abs(dependence.lag1) > max(PERSISTENT, limit)
+    shared = dependence.shared_p < RARE
+    is_used = uncertainty.errors == "autocorrelated" and (persistent or shared)
     larger = factor > MISFIT and level.larger_p < RARE
     # Of single samples nothing tells that it is noise.
-    no_noise = persistent or shared or not np.isfinite(found.lag1_deviation)
+    no_noise = persistent or shared or not np.isfinite(dependence.lag1_deviation)
     # Residuals of exactly zero are those of no measurement at all.
-    smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not matters
+    smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not is_used
     stated = level.stated
     return [
         *(outlier.concern for outlier in uncertainty.outliers),
         *concerned(
-            matters and persistent,
+            is_used and persistent,
             factor > GROSS_MISFIT,
             "residuals/persist",
-            autocorrelation=found.lag1,
+            autocorrelation=dependence.lag1,
         ),
-        *concerned(matters and not persistent, False, "residuals/shared"),
+        *concerned(is_used and not persistent, False, "residuals/shared"),
         *concerned(
             larger, factor > GROSS_MISFIT and no_noise, "noise/larger", factor=factor, stated=stated
         ),
@@ -170,7 +187,7 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Recordings that disagree on what they share."""
+    """Return a concern if recordings disagree on shared parameters."""
     scatter = uncertainty.scatter
     disagreeing = [] if scatter is None else np.flatnonzero(scatter.disagreeing).tolist()
     names = [told_of(uncertainty.names[k]) for k in disagreeing]
@@ -178,7 +195,7 @@ def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
 
 
 def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
-    """Markers that are noisier than the others."""
+    """Return a concern if markers are much noisier than the others."""
     if not level.unequal_p < RARE:
         return []
     usual = float(np.median([*level.factors.values()]))
@@ -192,20 +209,27 @@ def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
 
 
 def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Parameters at their bounds, and those that the data do not tell."""
+    """Return concerns about parameters at their bounds, and about those that the data do
+    not determine.
+    """
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
-    bounded = [name for name, found in estimates.items() if found.at_bound]
-    vague = [
+    bounded = [name for name, estimate in estimates.items() if estimate.at_bound]
+    undetermined = [
         name
-        for name, found in estimates.items()
-        if not found.at_bound and found.statistical_std_error is None
+        for name, estimate in estimates.items()
+        if not estimate.at_bound and estimate.statistical_std_error is None
     ]
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
     return [
         *concerned(bool(bounded), several, code, names=bounded),
-        *concerned(bool(vague), len(vague) == len(estimates), "information/none", names=vague),
+        *concerned(
+            bool(undetermined),
+            len(undetermined) == len(estimates),
+            "information/none",
+            names=undetermined,
+        ),
     ]
 
 
@@ -236,7 +260,7 @@ def numerical_concerns(
     return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
 
 
-# What a relaxed assumption says of a body or a recording, by its name.
+# What is assumed, by the name of the relaxed assumption, for messages.
 RELAXED = {
     "stiffness_drift": "the stiffness is constant during a recording",
     "clock_rate": "the clocks of cameras and robot run at the same rate",
@@ -245,16 +269,18 @@ RELAXED = {
 
 
 def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) -> list[Concern]:
-    """The assumption that the data contradict most, with the estimates without it.
+    """Return a concern about the assumption that the data contradict most, with the estimates
+    without it.
 
-    Other assumptions that would explain the data less well are named in the same concern: relaxing
-    one is mostly a substitute for relaxing another.
+    Other assumptions that would explain the data less well are named in the same concern, because
+    relaxing one is mostly a substitute for relaxing another.
 
     Parameters
     ----------
     probes : iterable of Probe
-    corrections : mapping of parameter to float
-        The estimated parameters, in the order in which they are reported, each with the factor that
+        Relaxed assumptions.
+    corrections : mapping of str to float
+        The estimated parameters in the order in which they are reported, each with the factor that
         corrects its optimum for the known discretisation error.
     """
     alarming = sorted(filter(is_alarming, probes), key=lambda each: -each.chi_squared)
@@ -275,7 +301,7 @@ def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) ->
 
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
-    """Return the estimate of a parameter with an assumption relaxed, in words."""
+    """Return the estimate of a parameter with an assumption relaxed, as text."""
     move = probe.moves.get(name)
     if move is None:
         return f"{symbol_of(name)} not determined"
@@ -284,25 +310,39 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
 
 
 def marker_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
-    """Samples that Huber's loss takes for wild."""
-    found = tuple(diagnoses)
-    share = sum(d.wild for d in found) / max(1, sum(d.samples for d in found))
+    """Return a concern if too many samples are beyond Huber's threshold."""
+    diagnoses_list = tuple(diagnoses)
+    share = sum(d.wild for d in diagnoses_list) / max(1, sum(d.samples for d in diagnoses_list))
     return concerned(share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share)
 
 
 def nuisance_concerns(
     names: Iterable[str], deviations: Iterable[float], low: Iterable[float], high: Iterable[float]
 ) -> list[Concern]:
-    """Nuisance parameters φ in deviations of their priors: far from these, or at their limits."""
+    """Return concerns about nuisance parameters far from their priors or at their limits.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Labels.
+    deviations : iterable of float
+        Estimates φ in standard deviations of their priors.
+    low, high : iterables of float
+        Limits of the estimates, likewise.
+    """
     items = [*zip(names, deviations, low, high, strict=True)]
-    far = max(FAR, float(normal_isf(RARE / 2 / max(1, len(items))))) if items else FAR
+    limit = max(FAR, float(normal_isf(RARE / 2 / max(1, len(items))))) if items else FAR
     concerns: list[Concern] = []
     for name, phi, lowest, highest in items:
-        away = abs(float(phi))
+        deviation = abs(float(phi))
         limited = not lowest + 1e-3 < phi < highest - 1e-3
         concerns += concerned(limited, True, "nuisance/limit", name=name)
         concerns += concerned(
-            away > far and not limited, away > ABSURD, "nuisance/far", name=name, deviations=away
+            deviation > limit and not limited,
+            deviation > ABSURD,
+            "nuisance/far",
+            name=name,
+            deviations=deviation,
         )
     return concerns
 
@@ -310,31 +350,31 @@ def nuisance_concerns(
 def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> list[Concern]:
     """Return a concern if a depth camera is farther from its stated pose than expected.
 
-    A wrong shape of the body often fits with a camera that is turned and shifted to match.
+    A wrong shape of the body often fits with a camera that is rotated and translated to match.
 
     Parameters
     ----------
     names : (k,) sequence of str
-        Of the turns and shifts of one camera.
+        Labels of the rotation and translation errors of one camera.
     deviations : (k,) sequence of float
         Their values in standard deviations of their priors.
     """
     if not len(names):
         return []
     worst = int(np.argmax(np.abs(deviations)))
-    away = abs(float(deviations[worst]))
+    deviation = abs(float(deviations[worst]))
     return concerned(
-        away > CAMERA_FAR, False, "nuisance/camera", name=names[worst], deviations=away
+        deviation > CAMERA_FAR, False, "nuisance/camera", name=names[worst], deviations=deviation
     )
 
 
 def outline_concerns(camera: str, apart_px: Array) -> list[Concern]:
-    """Return a concern if the outline of the body is elsewhere than a camera's images show.
+    """Return a concern if the outline of the body differs from the edges in a camera's images.
 
     Parameters
     ----------
     camera : str
-        Name of the depth camera, and of its experiment.
+        Name of the depth camera and of its experiment, for the message.
     apart_px : (n,) array
         Distances of outline points from the edges in the images [pixels].
     """
@@ -350,7 +390,17 @@ def outline_concerns(camera: str, apart_px: Array) -> list[Concern]:
 
 
 def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
-    """A time shift that is unusual for its prior, though it is estimated and allowed for."""
+    """Return a concern if a time shift is large for its prior, although it is estimated.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    shift_s : float
+        Estimated shift; positive if the markers were measured later than their times state [s].
+    prior_s : float
+        Standard deviation of its prior [s].
+    """
     return concerned(
         abs(shift_s) > LATE * prior_s,
         False,
@@ -364,7 +414,21 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
 def rollout_concerns(
     name: str, rms_m: float, fit_rms_m: float, noise_rms_m: float, fitted: bool
 ) -> list[Concern]:
-    """The forward simulation of an experiment against its fit, or its prediction."""
+    """Return a concern if the forward simulation of an experiment is much worse than the fit.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    rms_m : float
+        Root mean square distance of the simulated markers from the measurements [m].
+    fit_rms_m : float
+        The same distance of the fit, or for a prediction of the fits of other experiments [m].
+    noise_rms_m : float
+        Distance that noise alone would give [m]; without both there is no concern.
+    fitted : bool
+        Whether the experiment was fitted; if not, the simulation is a prediction.
+    """
     yardstick_m = max(fit_rms_m, noise_rms_m)
     if not yardstick_m:  # nothing of the kind is measured
         return []
@@ -394,22 +458,25 @@ def prediction_concerns(
     numbers: int,
     size: str = "",
 ) -> list[Concern]:
-    """Return whether a prediction, of which nothing was fitted, misses the measurements.
+    """Return a concern if a prediction, for which nothing was fitted, differs from the
+    measurements.
 
     Parameters
     ----------
     name : str
-        Of the experiment.
-    what, stated : str
-        What was measured, and what states its σ.
+        Name of the experiment.
+    what : str
+        Name of the measured quantity.
+    stated : str
+        Key of its σ in the problem.
     sigmas : float
-        Root mean square of the differences over σ.
+        Root mean square difference over σ.
     tame_sigmas : float
-        The same without wild samples, by which the prediction is judged.
+        Root mean square difference over σ with outliers shortened, which decides.
     numbers : int
-        How many numbers were measured.
+        Number of measured values.
     size : str
-        The root mean square in a unit, for people.
+        Root mean square difference with its unit, for the message.
     """
     is_chance = float(chi2_sf(numbers * tame_sigmas**2, numbers)) > RARE
     return concerned(
@@ -425,7 +492,7 @@ def prediction_concerns(
 
 
 def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
-    """States of the answer in which disturbances grow."""
+    """Return concerns about states of the answer in which disturbances grow."""
     concerns: list[Concern] = []
     for each in found:
         grows = each.e_foldings > E_FOLDINGS
@@ -435,10 +502,18 @@ def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
 
 
 def contact_concerns(found: Iterable[Touch], guess: str = "") -> list[Concern]:
-    """Obstacles that are never touched, or by too few faces to tell the shape of a contact.
+    """Return concerns about obstacles that are never touched, or by too few faces to resolve the
+    contact.
 
-    Where a guess was simulated, and `guess` says so, also those that are left, or touched already
-    at the first sample. What several experiments share is said once, of the worst.
+    For a simulation at the guess, also about obstacles that lose contact, or are in contact at the
+    first sample. A concern that several experiments share is returned once, for the worst of them.
+
+    Parameters
+    ----------
+    found : iterable of Touch
+        Contact summaries.
+    guess : str
+        Text that refers to the guess, such as " at the guess"; empty for an answer.
     """
     concerns: dict[tuple[str, str], list[Concern]] = {}
     for each in sorted(found, key=lambda touch: touch.faces):
@@ -461,7 +536,7 @@ def contact_concerns(found: Iterable[Touch], guess: str = "") -> list[Concern]:
 def turn_concerns(
     experiment: Experiment, substeps: int, far: float = FAST, code: str = "scheme/turns"
 ) -> list[Concern]:
-    """A grasp that turns farther within a step of the grid than `far` [rad]."""
+    """Return a concern if a grasp rotates by more than `far` [rad] within a step of the grid."""
     turn = fastest_turn(experiment, substeps)
     numbers = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
     return concerned(turn.angle_rad > far, False, code, **vars(turn), **numbers)
@@ -470,7 +545,19 @@ def turn_concerns(
 def scheme_concerns(
     name: str, damping_ratio: float, added_ratio: float, period_error: float
 ) -> list[Concern]:
-    """What the scheme does to the first mode of an experiment, with the answer's parameters."""
+    """Return concerns about the effect of the scheme on the first mode of an experiment.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    damping_ratio : float
+        Damping ratio of the mode at the answer.
+    added_ratio : float
+        Damping ratio that the scheme adds.
+    period_error : float
+        Relative change of the period by the scheme.
+    """
     return [
         *concerned(
             added_ratio > max(DAMPING_SHARE * damping_ratio, LITTLE_DAMPING),
@@ -491,16 +578,18 @@ def scheme_concerns(
 
 
 def noise_rms_m(sigma_m: Array, samples: Array, fitted: float) -> float:
-    """RMS distance of markers that noise alone would leave: √(3 (1 − p/N)) σ, pooled.
+    """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N)) σ, pooled
+    [m].
 
     Parameters
     ----------
-    sigma_m, samples : (M,) of the markers of all experiments
+    sigma_m, samples : (M,) arrays
+        Stated σ and number of samples of the markers of all experiments.
     fitted : float
-        p, the number of parameters that the data determine.
+        Number p of parameters that the data determine, of N = 3 Σ samples measurements.
     """
     if not samples.sum():
         return 0.0
     total = float(samples.sum())
-    left = max(0.0, 1 - fitted / (3 * total))
-    return float(np.sqrt(3 * left * (samples @ sigma_m**2) / total))
+    remaining = max(0.0, 1 - fitted / (3 * total))
+    return float(np.sqrt(3 * remaining * (samples @ sigma_m**2) / total))

@@ -1,18 +1,19 @@
 """Error bars of the estimated parameters, from the information of the fit and from its residuals.
 
-With S the slopes of the residuals (h(x) − ŷ)/σ along the equations of motion and P those of the
-priors, the estimate errs by A⁻¹ Sᵀe, A = SᵀS + PᵀP, and has the covariance
+With S the derivatives of the residuals (h(x) − ŷ)/σ along the equations of motion and P those of
+the priors, the error of the estimate is A⁻¹ Sᵀe, A = SᵀS + PᵀP, with the covariance
 
-    C = A⁻¹ (Sᵀ Cov(e) S + PᵀP) A⁻¹,
+    C = A⁻¹ (Sᵀ Cov(e) S + PᵀP) A⁻¹.
 
-of which the block of the shared parameters q is reported: nuisance parameters of single
-experiments widen it by what they could have explained. For independent errors of the σ given it
-is A⁻¹. If the residuals are larger or smaller than σ says, Cov(e) = s² I with their variance s²,
-and where markers differ each has its own (see `noise`); intervals are Student's then. If a test
-finds the residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The
-output names which of them was used.
+The block of the shared parameters q is reported; nuisance parameters of single experiments widen it
+by what they could have explained. For independent errors of the stated σ, C is A⁻¹. If the
+residuals are larger or smaller than σ, Cov(e) = s² I with their variance s², and where markers
+differ each has its own variance (see `noise`); intervals are then Student's. If a test finds the
+residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The output
+states which was used.
 
-Places of the markers on the undeformed body, where these were found, have error bars likewise.
+Use `covariance` at a solution, or `uncertainty_of` where the linearised fit is known. Estimated
+marker places have error bars too, see `places_of`.
 """
 
 from __future__ import annotations
@@ -54,24 +55,25 @@ from .scatter import Scatter, recordings_of, scatter_of, single_fits
 
 Errors = Literal["independent", "autocorrelated"]
 
-# A damping that ended at its bound is not told at all if it may be this many times the usual.
+# A damping at its bound has no information if it may be this many times its usual value.
 UNINFORMED = 100.0
-# With σ given, correlation that widens no error bar by this factor is of no consequence.
+# With stated σ, correlation that widens error bars by less than this factor is ignored.
 CONSEQUENCE = 1.05
-# Simulations of the residuals that tell how dependent they may be by chance.
+# Simulated residuals that show how correlated they are by chance.
 REPLICAS = 39
 
 
 @dataclass(frozen=True)
 class ErrorModel(Options):
-    """What is assumed of the measurements' errors.
+    """Options: assumptions about the errors of the measurements.
 
     Attributes
     ----------
     noise : {"auto", "given", "estimated"}
-        Trust sigma_m, or scale it by the residuals; auto where they ask for it.
+        Use the stated σ ("given"), scale it by the residuals ("estimated"), or decide by a test of
+        the residuals ("auto").
     errors : {"auto", "independent", "autocorrelated"}
-        What to assume of the errors; auto tests the residuals.
+        Correlation of the errors; "auto" decides by a test of the residuals.
     """
 
     noise: Literal["auto", "given", "estimated"] = "auto"
@@ -83,18 +85,20 @@ AUTO = ErrorModel()
 
 @dataclass(frozen=True, eq=False)
 class ErrorBasis:
-    """What error bars are based on.
+    """Error model that error bars are based on.
 
     Attributes
     ----------
     noise : {"given", "estimated", "by-marker"}
+        Source of the variance: stated σ, one common factor, or one factor for each marker.
     errors : {"independent", "autocorrelated"}
+        Correlation of the errors.
     level : NoiseLevel
-        How large the residuals of each marker are.
+        Size of the residuals of each marker.
     dependence : Dependence
-        The test of the residuals.
+        Tests of the residuals for correlation.
     outliers : tuple of Outlier
-        Samples that spoil what the residuals tell; `dependence` leaves them out.
+        Single samples that dominate the residuals of their marker; `dependence` leaves them out.
     """
 
     noise: Noise
@@ -106,33 +110,41 @@ class ErrorBasis:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty(ErrorBasis):
-    """What the data say, and do not say, about the parameters.
+    """Statistical uncertainty of the estimated parameters.
 
     Attributes
     ----------
-    names : (nq,) estimated parameters, in the order of q
-    covariance : (nq, nq) of the parameters' logarithms, with nuisance parameters free
-        Of a parameter that may be negative, of its deviation over its size.
-        NaN in rows and columns of parameters at a bound, which the others' takes for free;
-        infinite variance where the data do not determine a parameter.
-    correlation : (nq, nq) NaN likewise
-    quantiles : (nq,) half widths of the 95 % intervals, in standard deviations
-        1.96, or Student's for a variance that was estimated.
-    estimates : by name, all parameters of the user but the shares of a field
-    derived : by name, the moduli of the other convention
-    nuisance : by name, standard deviation of each parameter of a single experiment
-        In the unit it is estimated in, that is deviations of its prior; NaN at a bound.
-    nuisance_covariance : (k, k) of these, in their order
+    names : (nq,) tuple of str
+        Estimated parameters, in the order of q.
+    covariance : (nq, nq) array
+        Covariance of the parameters' logarithms with free nuisance parameters; of a parameter that
+        may be negative, of its value over its size. NaN in rows and columns of parameters at a
+        bound (the variances of the others treat those as free); infinite variance where the data do
+        not determine a parameter.
+    correlation : (nq, nq) array
+        Correlations; NaN where a variance is not finite.
+    quantiles : (nq,) array
+        Half widths of the 95 % intervals in standard deviations: 1.96, or Student's for an
+        estimated variance.
+    estimates : mapping of str to Estimate
+        All parameters of the user by name, except the mode coefficients of fields.
+    derived : mapping of str to Estimate
+        Moduli of the other convention by name.
+    nuisance : mapping of str to float
+        Standard deviation of each nuisance parameter, in standard deviations of its prior; NaN at a
+        bound.
+    nuisance_covariance : (k, k) array
+        Covariance of these, in their order.
     chi_squared : float
-        Σ ((ŷ − h(x)) / σ)² of the markers, with the σ given.
+        Σ ((ŷ − h(x)) / σ)² of the measurements, with the stated σ.
     degrees_of_freedom : float
         Measurements less parameters; one that a prior determines counts in part.
     notes : tuple of str
-        What the user should know.
+        Notes for the user.
+    wider : (nq,) array
+        Factor by which intervals are widened because recordings disagree; 1 if they agree.
     scatter : Scatter or None
-        What the recordings say one by one, where there are several.
-    wider : (nq,)
-        By how much intervals are wider because they disagree.
+        Comparison of single recordings; None unless there are several.
     """
 
     names: tuple[str, ...]
@@ -151,25 +163,28 @@ class Uncertainty(ErrorBasis):
 
     @property
     def reduced_chi_squared(self) -> float:
-        """χ² per degree of freedom: one when the residuals are as large as σ."""
+        """χ² per degree of freedom; 1 if the residuals are as large as σ."""
         return self.chi_squared / max(1.0, self.degrees_of_freedom)
 
 
 def covariance(collocation: Collocation, z: Array, errors: ErrorModel = AUTO) -> Uncertainty:
-    """Uncertainty of the parameters at a solution.
+    """Return the uncertainty of the parameters at a solution, including noise of the poses.
 
     Parameters
     ----------
     collocation : Collocation
-    z : (variables,) a point that satisfies the equations of motion, the optimum
+        The program.
+    z : (variables,) array
+        The optimum, which satisfies the equations of motion.
     errors : ErrorModel
+        Assumptions about the errors.
 
     Raises
     ------
     InputError
         If the noise is to be estimated from fewer measurements than parameters.
     SimulationError
-        Where the equations of motion are singular.
+        If the equations of motion are singular.
     """
     fit, _ = with_pose_noise(linearised_fit(collocation, z), collocation, z)
     return uncertainty_of(fit, collocation.parameters, z[: collocation.nq], errors)
@@ -179,20 +194,22 @@ def covariance(collocation: Collocation, z: Array, errors: ErrorModel = AUTO) ->
 def uncertainty_of(
     fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel = AUTO
 ) -> Uncertainty:
-    """Uncertainty of the parameters from the fit near its answer.
+    """Return the uncertainty of the parameters from the linearised fit.
 
     Parameters
     ----------
     fit : LinearisedFit
+        The fit at its answer.
     parameters : Parameters
-    q : (nq,) the estimated parameters in the solver's coordinates at the answer
+        Shared parameters.
+    q : (nq,) array
+        Estimates in the solver's coordinates.
     errors : ErrorModel
-        The noise "given" trusts the markers' σ, "estimated" scales it by the residuals: then only
-        the ratios between markers matter. "auto" tests the residuals: it scales σ where they are
-        larger or clearly smaller, for each marker by itself where markers differ. The size of
-        correlated errors always follows from the residuals, but with σ given it is at least that.
-        Correlated residuals smaller than σ do not lower it: they may be small only where they
-        were fitted.
+        Assumptions about the errors. With noise "estimated" only the ratios of the stated σ matter.
+        With "auto" σ is scaled where residuals are larger or clearly smaller, separately for each
+        marker where markers differ. The size of correlated errors always follows from the
+        residuals, but with noise "given" it is at least the stated σ. Correlated residuals smaller
+        than σ do not lower it, because they may be small only where they were fitted.
 
     Raises
     ------
@@ -242,10 +259,12 @@ def uncertainty_of(
 def _error_bars(
     fit: LinearisedFit, factored: Information, asked: ErrorModel
 ) -> tuple[Array, Array, ErrorBasis]:
-    """Covariance of all parameters, quantiles of the shared ones, and what they are based on."""
+    """Return the covariance of all parameters, the quantiles of the shared ones, and the
+    error model used.
+    """
     level = noise_level(fit, factored)
-    rest, outliers = set_apart(fit)
-    seen, dependent = _dependence(rest)
+    without_outliers, outliers = set_apart(fit)
+    dependence_found, dependent = _dependence(without_outliers)
     correlated = asked.errors == "autocorrelated" or (asked.errors == "auto" and dependent)
     kind: Noise = level.kind if asked.noise == "auto" else asked.noise
     if asked.noise == "auto" and correlated and level.pooled < 1:
@@ -254,43 +273,53 @@ def _error_bars(
     covariance = factored.fit.covariance(of_score)
     used = "independent"
     if correlated:
-        of_score, of_few = _autocorrelated(fit, factored, kind, level)
+        of_score, few_freedom = _autocorrelated(fit, factored, kind, level)
         persistent = factored.fit.covariance(of_score)
         before, after = (np.diag(each)[: fit.shared] for each in (covariance, persistent))
         widens = (after > CONSEQUENCE**2 * before).any()
         if asked.errors == "autocorrelated" or kind != "given" or widens:
             covariance = persistent
-            freedom = of_few
+            freedom = few_freedom
             used = "autocorrelated"
     if fit.of_phases is not None:
         covariance = covariance.copy()
         covariance[: fit.shared, : fit.shared] += fit.of_phases
-    return covariance, student_ppf(0.975, freedom), ErrorBasis(kind, used, level, seen, outliers)
+    return (
+        covariance,
+        student_ppf(0.975, freedom),
+        ErrorBasis(kind, used, level, dependence_found, outliers),
+    )
 
 
 def _known(
     covariance: Array, fit: LinearisedFit, parameters: Parameters, q: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Covariance of all parameters as it is told, and which of the shared ones are at a bound.
+    """Return the covariance of all parameters as it is reported, and a mask (nq,) of shared
+    parameters at a bound.
 
-    It is NaN of those at a bound, and infinite of shared ones that the data do not determine.
+    Rows and columns of parameters at a bound are NaN; shared parameters that the data do not
+    determine have infinite variance.
     """
-    told = covariance.copy()
+    reported = covariance.copy()
     shared = fit.shared
-    silent = _no_information(parameters, q, np.diag(covariance)[:shared])
+    uninformed = _no_information(parameters, q, np.diag(covariance)[:shared])
     at_bound = fit.at_bound.copy()
-    at_bound[:shared] &= ~silent
-    told[at_bound] = told[:, at_bound] = np.nan
-    of_q = told[:shared, :shared]
+    at_bound[:shared] &= ~uninformed
+    reported[at_bound] = reported[:, at_bound] = np.nan
+    of_q = reported[:shared, :shared]
     bounded = at_bound[:shared]
-    lost = np.flatnonzero((np.diag(of_q) > UNDETERMINED**2) | (silent & fit.at_bound[:shared]))
-    of_q[lost] = of_q[:, lost] = np.nan
-    of_q[lost, lost] = np.inf
-    return told, bounded
+    undetermined = np.flatnonzero(
+        (np.diag(of_q) > UNDETERMINED**2) | (uninformed & fit.at_bound[:shared])
+    )
+    of_q[undetermined] = of_q[:, undetermined] = np.nan
+    of_q[undetermined, undetermined] = np.inf
+    return reported, bounded
 
 
 def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Array, Array, Array]:
-    """Covariance and quantiles, larger where recordings disagree, and by what intervals are so."""
+    """Return covariance (nq, nq) and quantiles (nq,), larger where recordings disagree, and
+    the factors (nq,) of the intervals.
+    """
     if scatter is None:
         return of_q, quantiles, np.ones(len(quantiles))
     with np.errstate(invalid="ignore"):
@@ -304,7 +333,9 @@ def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Ar
 def _scatter(
     fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel
 ) -> Scatter | None:
-    """What recordings say one by one, with error bars of their own."""
+    """Return the comparison of single recordings with their own error bars; None if there
+    are fewer than two to compare.
+    """
     if len(recordings_of(fit)) < 2:
         return None
     known = {}
@@ -312,36 +343,42 @@ def _scatter(
     for alone, step in single_fits(fit):
         if alone.measurements <= len(alone.names):
             continue
-        found = uncertainty_of(alone, parameters, q, errors)
+        uncertainty = uncertainty_of(alone, parameters, q, errors)
         independent = least_squares(alone).errors[: fit.shared] ** 2
-        variances = np.diag(found.covariance) / sizes**2
+        variances = np.diag(uncertainty.covariance) / sizes**2
         known[alone.blocks[0].name] = step[: fit.shared], variances, independent
     return scatter_of(fit, known) if len(known) > 1 else None
 
 
 def _no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
-    """(nq,) dampings of which even a hundred times the usual would not show."""
-    found = []
+    """Return the mask (nq,) of dampings that could be a hundred times their usual value
+    without being noticed.
+    """
+    uninformed = []
     for item, at, variance in zip(parameters.free, q, variances, strict=True):
         usual = constant_named(item.name).usual or 0.0
         deviation = np.sqrt(variance) * item.per_value(item.value(float(at)))
-        found.append(is_damping(item.name) and not deviation <= UNINFORMED * usual)
-    return np.array(found, dtype=bool)
+        uninformed.append(is_damping(item.name) and not deviation <= UNINFORMED * usual)
+    return np.array(uninformed, dtype=bool)
 
 
 def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
-    """How the residuals hang together, and whether more than what is known to add to the noise."""
+    """Return the tests of the residuals for correlation, and whether they show more than
+    known disturbances explain.
+    """
     factored = information(fit)
     level = noise_level(fit, factored)
-    found = dependence(fit, factored)
-    found = replace(found, lag1_deviation=found.lag1_deviation * level.unevenness)
-    return found, found.found and not _expected(fit, factored, level, found)
+    tested = dependence(fit, factored)
+    tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.unevenness)
+    return tested, tested.found and not _expected(fit, factored, level, tested)
 
 
 def _expected(
     fit: LinearisedFit, factored: Information, level: NoiseLevel, found: Dependence
 ) -> bool:
-    """Whether what is known to add to the noise makes residuals as dependent as they are."""
+    """Whether known disturbances (such as noise of the poses) explain residuals as
+    correlated as those found.
+    """
     added = drawn(fit)
     if not len(added[0]):
         return False
@@ -351,14 +388,14 @@ def _expected(
         (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.seen
         for each, block in zip(added, fit.blocks, strict=True)
     ]
-    _, left = projected(factored, errors)
+    _, residuals = projected(factored, errors)
     replicas = [
         dependence(
             replace(
                 fit,
                 blocks=tuple(
                     replace(block, residual=each[k] * block.seen)
-                    for block, each in zip(fit.blocks, left, strict=True)
+                    for block, each in zip(fit.blocks, residuals, strict=True)
                 ),
             ),
             factored,
@@ -372,7 +409,9 @@ def _expected(
 def _autocorrelated(
     fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
 ) -> tuple[Array, Array]:
-    """Covariance of the score of correlated errors, and its degrees of freedom."""
+    """Return the covariance (r, r) of the score for correlated errors, and degrees of
+    freedom (shared,).
+    """
     of_score, freedom = score_covariance(factored, error_processes(fit, factored), fit.shared)
     if kind == "given" or level.extra.any():
         # In no direction less than independent errors of the σ given bring, nor than those found
@@ -388,17 +427,18 @@ def _autocorrelated(
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a marker sits.
+    """Place of a marker on the undeformed body.
 
     Attributes
     ----------
-    position_m : (3,) on the undeformed body
-    std_error_m : (3,) or None
-        Standard error of each coordinate, zero for a place that is exact; None without error bars.
+    position_m : (3,) array
+        Estimated or exact place [m].
+    std_error_m : (3,) array or None
+        Standard error of each coordinate [m], zero for an exact place; None without error bars.
     prior_m : float
-        Standard deviation of the prior of each coordinate, zero for a place that is exact.
-    given_m : (3,) or None
-        The place that was given; None where it was not known.
+        Prior standard deviation of each coordinate [m], zero for an exact place.
+    given_m : (3,) array or None
+        Stated place [m]; None if there is none.
     """
 
     position_m: Array
@@ -409,18 +449,20 @@ class Place:
 
     @property
     def given(self) -> bool:
-        """Whether a place was given."""
+        """Whether a place was stated."""
         return self.given_m is not None
 
     @property
     def moved_m(self) -> float | None:
-        """How far it was found from the place given."""
+        """Distance of the estimate from the stated place [m]; None if there is none."""
         given = self.given_m
         return None if given is None else float(np.linalg.norm(self.position_m - given))
 
 
 def places_of(part: Part, uncertainty: Uncertainty | None = None) -> dict[str, Place]:
-    """Places of an experiment's markers at a solution, by name."""
+    """Return the places of an experiment's markers at a solution, by name; without
+    `uncertainty` they have no errors.
+    """
     segment = part.segment
     chart = segment.chart
     markers = segment.experiment.markers
@@ -439,7 +481,9 @@ def places_of(part: Part, uncertainty: Uncertainty | None = None) -> dict[str, P
 
 
 def _std_errors_m(part: Part, uncertainty: Uncertainty | None) -> Array | None:
-    """(M, 3) of the coordinates; on a surface they move together."""
+    """Return the standard errors (M, 3) of the markers' coordinates [m], or None without
+    `uncertainty`.
+    """
     if uncertainty is None:
         return None
     segment = part.segment
@@ -448,8 +492,8 @@ def _std_errors_m(part: Part, uncertainty: Uncertainty | None) -> Array | None:
     at = np.array([row[name] for name in segment.nuisance.names], dtype=np.int64)
     errors = np.zeros(chart.points_m.shape)
     for m in chart.estimated:
-        here = at[segment.markers.place_places[m]]
-        of_phi = uncertainty.nuisance_covariance[np.ix_(here, here)]
-        along = chart.sigma_m[m] * chart.axes[m]
-        errors[m] = np.sqrt(np.einsum("ik,kl,il->i", along, of_phi, along))
+        indices = at[segment.markers.place_places[m]]
+        of_phi = uncertainty.nuisance_covariance[np.ix_(indices, indices)]
+        axes_m = chart.sigma_m[m] * chart.axes[m]
+        errors[m] = np.sqrt(np.einsum("ik,kl,il->i", axes_m, of_phi, axes_m))
     return errors

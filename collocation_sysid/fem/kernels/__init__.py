@@ -1,13 +1,20 @@
-"""Evaluate an element kernel over [timestep × element]: two evaluators, one interface.
+"""Evaluation of element kernels over [time step × element]: two evaluators with one interface.
 
-An `EvaluatorChoice` takes the SIMD evaluator where llvmlite can be imported and knows all of a
-material's operations, and CasADi's ``Function.map`` otherwise; ``COLLOCATION_SYSID_EVALUATOR`` or
-the argument forces either.
+- `batch`: what is evaluated, the interface, and the reference evaluator, CasADi's ``Function.map``.
+- `simd`: the fast evaluator, vector code compiled by LLVM; `instructions`: CasADi operations in
+LLVM. - `jit`: compilation to native code, cached on disk.
+- `instances`: functions of a few numbers at many instances.
+- `combine`: linear combinations of rows into sparse values; `skyline`: factorisation of bands.
+- `threads`: distribution of time steps and experiments over threads.
 
-What is not in the cache is compiled at once, however small the body; of a body of fewer than
-`simd.REPAID` quadrature points as it is written: the kernels of 48 elements, with their curvature,
-then take LLVM 0.5 s of processor time in place of 2.5 s. Of a larger body optimising repays itself:
-1,296 elements at 20 states are linearised in 9 ms in place of 16 ms.
+`EvaluatorChoice` selects the SIMD evaluator if llvmlite can be imported and supports all operations
+of a material, otherwise CasADi's; the environment variable ``COLLOCATION_SYSID_EVALUATOR`` or the
+argument forces one.
+
+Kernels that are not in the cache are compiled at once, however small the body; for a body of fewer
+than `simd.REPAID` quadrature points without optimisation: the kernels of 48 elements, with second
+derivatives, then take LLVM 0.5 s of processor time instead of 2.5 s. For larger bodies optimisation
+is worthwhile: 1,296 elements at 20 states are linearised in 9 ms instead of 16 ms.
 """
 
 from __future__ import annotations
@@ -54,12 +61,13 @@ EVALUATORS = ("auto", "simd", "casadi")
 
 
 def choose_evaluator(choice: str = "auto") -> str:
-    """Settle on "simd" or "casadi".
+    """Return the evaluator to use, "simd" or "casadi".
 
     Parameters
     ----------
     choice : {"auto", "simd", "casadi"}
-        "auto" yields to the environment variable ``COLLOCATION_SYSID_EVALUATOR``.
+        "auto" uses the environment variable ``COLLOCATION_SYSID_EVALUATOR`` if it is set, otherwise
+        "simd" if llvmlite is installed.
 
     Raises
     ------
@@ -74,6 +82,9 @@ def choose_evaluator(choice: str = "auto") -> str:
 
 
 def _asked_for(choice: str) -> str:
+    """Return the choice, or for "auto" that of the environment variable; an `InputError` if
+    unknown.
+    """
     if choice == "auto":
         choice = os.environ.get("COLLOCATION_SYSID_EVALUATOR", "auto")
     if choice not in EVALUATORS:
@@ -82,7 +93,12 @@ def _asked_for(choice: str) -> str:
 
 
 def make_evaluator(batch: Batch, name: str) -> Evaluator:
-    """Build a batch's evaluator, "simd" or "casadi".
+    """Build the evaluator of a batch.
+
+    Parameters
+    ----------
+    batch : Batch
+    name : {"simd", "casadi"}
 
     Raises
     ------
@@ -101,7 +117,7 @@ def make_evaluator(batch: Batch, name: str) -> Evaluator:
 
 
 class EvaluatorChoice:
-    """An evaluator by name, which yields to CasADi's map unless it was asked for.
+    """Choice of an evaluator that falls back to CasADi's unless "simd" was requested by name.
 
     Parameters
     ----------
@@ -111,8 +127,9 @@ class EvaluatorChoice:
     Attributes
     ----------
     name : "simd" or "casadi"
+        Evaluator in use; changes to "casadi" on a fallback.
     notes : tuple of str
-        Why vector code had to yield, if it had.
+        Reasons of a fallback.
     """
 
     def __init__(self, choice: str = "auto") -> None:
@@ -121,12 +138,14 @@ class EvaluatorChoice:
         self._may_yield = _asked_for(choice) == "auto"
 
     def check(self, function: ca.Function) -> None:
-        """Find out, without compiling it, whether the evaluator has a function's operations.
+        """Check, without compiling, whether the evaluator supports all operations of a function.
+
+        If not, fall back to CasADi's evaluator.
 
         Raises
         ------
         VectorCodeError
-            If it has not, and was asked for by name.
+            If an operation is not supported and "simd" was requested by name.
         """
         if self.name == "casadi":
             return
@@ -138,12 +157,12 @@ class EvaluatorChoice:
             self._yield_to_casadi(error)
 
     def make(self, batch: Batch) -> Evaluator:
-        """Build a batch's evaluator.
+        """Build the evaluator of a batch; fall back to CasADi's if the kernel cannot be compiled.
 
         Raises
         ------
         VectorCodeError
-            If the kernel cannot be compiled, and vector code was asked for by name.
+            If the kernel cannot be compiled and "simd" was requested by name.
         """
         try:
             return make_evaluator(batch, self.name)
@@ -152,6 +171,9 @@ class EvaluatorChoice:
             return make_evaluator(batch, self.name)
 
     def _yield_to_casadi(self, error: VectorCodeError) -> None:
+        """Change to CasADi's evaluator with a note, or raise the error if "simd" was requested by
+        name.
+        """
         if not self._may_yield:
             message = f"{error.message}; choose evaluator='casadi' for this material"
             raise VectorCodeError(message) from error
@@ -163,7 +185,14 @@ class EvaluatorChoice:
 
 
 def make_instances(function: ca.Function, compiled: bool) -> Instances:
-    """A function at many instances, compiled where that is asked for and can be."""
+    """Return an evaluator of a function at many instances.
+
+    Parameters
+    ----------
+    function : casadi.Function
+    compiled : bool
+        Whether to compile the function; CasADi's evaluator is used where that is not possible.
+    """
     if compiled and choose_evaluator() == "simd":
         # What llvmlite raises where it cannot compile, and what there is no instruction for.
         with suppress(RuntimeError, VectorCodeError):
@@ -172,7 +201,7 @@ def make_instances(function: ca.Function, compiled: bool) -> Instances:
 
 
 def make_combiner(plan: Plan) -> Combiner:
-    """The loop that fills sparse values from a plan, compiled where llvmlite can."""
+    """Return the loop that fills sparse values according to a plan, compiled if llvmlite can."""
     if find_spec("llvmlite"):
         try:
             return combine_natively(plan)
@@ -182,7 +211,15 @@ def make_combiner(plan: Plan) -> Combiner:
 
 
 def make_skyline(size: int, rows: Index, columns: Index, source: Index) -> Skyline | None:
-    """The compiled factorisation of a skyline, where llvmlite can."""
+    """Return the compiled factorisation of a skyline; None if llvmlite cannot compile it.
+
+    Parameters
+    ----------
+    size : int
+        Number of rows.
+    rows, columns, source : (e,) int
+        See `skyline.Skyline`.
+    """
     if not find_spec("llvmlite"):
         return None
     from .skyline import Skyline

@@ -1,4 +1,4 @@
-"""What is evaluated over all timesteps and elements, and by CasADi's own machine, the reference."""
+"""Batches of element kernels over time steps and elements, and their reference evaluator."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from ..pattern import dofs_of
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """A kernel on a mesh, and where its outputs are added up.
+    """Kernel on a mesh, and the positions at which its outputs are summed.
 
     Attributes
     ----------
     kernel : PointKernel
-    cells : ndarray
-        (E, nodes) node numbers.
-    geometry : ndarray
-        (E, q, 3·nodes + 1), see `elements.reference_geometry`.
-    destinations : ndarray
-        (E, outputs) position of every output entry in the result row of its timestep.
+    cells : (E, nodes)
+        Node indices.
+    geometry : (E, q, 3·nodes + 1)
+        Shape gradients and volumes, see `elements.reference_geometry`.
+    destinations : (E, outputs)
+        Position of every output entry in the result row of its time step.
     width : int
         Length of that row.
-    carried : ndarray, optional
-        (E, q, m) where in a timestep's row of what points carry the numbers of each point are.
+    carried : (E, q, m), optional
+        Columns of the data of each point in the row of data of a time step.
     """
 
     kernel: PointKernel
@@ -44,7 +44,9 @@ class Batch:
 
 
 class Evaluator(Protocol):
-    """Sums a batch's kernel over elements and quadrature points, for each timestep."""
+    """Evaluator of a batch: sums the kernel over elements and quadrature points, for each time
+    step.
+    """
 
     def __call__(
         self,
@@ -55,20 +57,37 @@ class Evaluator(Protocol):
         add: bool = False,
         carried: Array | None = None,
     ) -> None:
-        """Overwrite `out` (T, width), or add to it.
+        """Overwrite `out`, or add to it.
 
-        From `fields`, each (T, 3n), θ (k,) and, for points that carry something, `carried`
-        (T, any), or (1, any) where it is the same at all times.
+        Parameters
+        ----------
+        fields : sequence of (T, 3n)
+            Node fields of the kernel.
+        theta : (k,)
+            Constants.
+        out : (T, width)
+            Result; modified.
+        threads : int
+            Number of threads.
+        add : bool
+            Whether to add to `out`.
+        carried : (T, any) or (1, any), optional
+            Data of the points, (1, any) if they are equal at all times.
         """
         ...
 
 
 class VectorCodeError(InputError):
-    """A kernel that cannot be compiled to vector code."""
+    """Error: a kernel cannot be compiled to vector code."""
 
 
 class CasadiEvaluator:
-    """Evaluate a `Batch` by CasADi's own virtual machine; slower, available everywhere."""
+    """Evaluator of a `Batch` by CasADi's virtual machine: slower, but always available.
+
+    Parameters
+    ----------
+    batch : Batch
+    """
 
     def __init__(self, batch: Batch) -> None:
         count, points, size = batch.geometry.shape
@@ -96,14 +115,14 @@ class CasadiEvaluator:
         add: bool = False,
         carried: Array | None = None,
     ) -> None:
-        """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
+        """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         for t in range(len(out)):
             inputs = [field[t][self._dofs] for field in fields]
             if self._carried is not None and carried is not None:
-                own = [carried[t if len(carried) > 1 else 0][self._carried]]
+                point_data = [carried[t if len(carried) > 1 else 0][self._carried]]
             else:
-                own = []
-            outputs = self._mapped.call([*inputs, self._geometry, theta, *own])
+                point_data = []
+            outputs = self._mapped.call([*inputs, self._geometry, theta, *point_data])
             stacked = np.concatenate([value.full() for value in outputs])
             total = self._sum @ stacked.ravel(order="F")
             out[t] = out[t] + total if add else total

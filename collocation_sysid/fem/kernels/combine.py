@@ -1,4 +1,4 @@
-"""Fill sparse values with linear combinations of gathered rows, natively or with NumPy."""
+"""Linear combinations of gathered rows into sparse values, compiled or with NumPy."""
 
 from __future__ import annotations
 
@@ -13,31 +13,33 @@ from ...arrays import Array, Index
 
 
 class Plan(Protocol):
-    """What to combine, see `program.block_band.CombinePlan`."""
+    """Plan of the combinations, see `program.block_band.CombinePlan`."""
 
     @property
     def first_task(self) -> Index:
-        """(N + 1,) where each column block's tasks begin and end."""
+        """First task of each column block (N + 1,); the last entry is the number of tasks."""
         ...
 
     @property
     def tasks(self) -> Index:
-        """(tasks, 5) out, map start, map length, row, 1 to add or 0 to overwrite."""
+        """Tasks (tasks, 5): offset in the values, map start, map length, row, 1 to add or 0 to
+        overwrite.
+        """
         ...
 
     @property
     def coefficients(self) -> Array:
-        """(tasks, 2) a, b."""
+        """Coefficients a and b of each task (tasks, 2)."""
         ...
 
     @property
     def targets(self) -> NDArray[np.int32]:
-        """Concatenated maps: where to write, from out on."""
+        """Concatenated maps of positions in the values, relative to the offset of the task."""
         ...
 
     @property
     def sources(self) -> NDArray[np.int32]:
-        """Concatenated maps: which entry of the row to read."""
+        """Concatenated maps of the entries of the row to read."""
         ...
 
 
@@ -45,9 +47,12 @@ Combiner = Callable[[int, int, Array, Array, Array], None]
 
 
 def combine_with_numpy(plan: Plan) -> Combiner:
-    """The reference: one fancy-indexed statement a task."""
+    """Return the reference combiner, one indexed NumPy statement for each task."""
 
     def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
+        """Run the tasks of column blocks `start` … `stop` − 1 on rows a and b, writing to
+        `values`.
+        """
         for task in range(plan.first_task[start], plan.first_task[stop]):
             out, first, length, row, add = plan.tasks[task]
             alpha, beta = plan.coefficients[task]
@@ -64,7 +69,7 @@ def combine_with_numpy(plan: Plan) -> Combiner:
 
 
 def combine_natively(plan: Plan) -> Combiner:
-    """The same through a compiled loop."""
+    """Return a compiled combiner with the same arguments and result as `combine_with_numpy`."""
     from .jit import NativeCode, compiled
 
     signature = (*[ctypes.c_int64] * 3, *[ctypes.c_void_p] * 7)
@@ -74,14 +79,27 @@ def combine_natively(plan: Plan) -> Combiner:
     ]
 
     def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
+        """Run the tasks of column blocks `start` … `stop` − 1 on rows a and b, writing to
+        `values`.
+        """
         stride = a.strides[0] // a.itemsize
-        tasks = int(plan.first_task[start]), int(plan.first_task[stop])
-        run(*tasks, stride, *constants, a.ctypes.data, b.ctypes.data, values.ctypes.data)
+        first_task = int(plan.first_task[start])
+        last_task = int(plan.first_task[stop])
+        run(
+            first_task,
+            last_task,
+            stride,
+            *constants,
+            a.ctypes.data,
+            b.ctypes.data,
+            values.ctypes.data,
+        )
 
     return combine
 
 
 def _emit() -> Any:
+    """Return the LLVM module of the compiled loop over tasks."""
     from llvmlite import ir
 
     from .jit import DOUBLES, I32S, I64, counting

@@ -1,6 +1,6 @@
-"""A function of a few numbers at many instances, natively or by CasADi's own machine.
+"""Evaluation of a function of a few numbers at many instances, compiled or by CasADi.
 
-Numbers are (k, instances) arrays, and so are the entries of its dense outputs, column after column.
+Inputs are (k, instances) arrays, and so are the entries of dense outputs, column after column.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ import numpy as np
 
 from ...arrays import Array
 
-# So many are mapped at once, and more of them in blocks: a map takes longer to make than to use.
+# Number of instances of one CasADi map; more instances are evaluated in blocks, because creating a
+# map takes longer than evaluating it.
 BLOCK = 1024
 
 Instances = Callable[[list[Array]], list[Array]]
 
 
 def instances_by_casadi(function: ca.Function) -> Instances:
-    """The reference: mapped over the instances."""
+    """Return the reference evaluator: the function mapped over instances by CasADi."""
     mapped: dict[int, ca.Function] = {}
 
     def evaluate(inputs: list[Array]) -> list[Array]:
@@ -51,39 +52,49 @@ def instances_by_casadi(function: ca.Function) -> Instances:
 
 
 def instances_natively(function: ca.Function) -> Instances:
-    """The same in vector code, whose lanes are instances."""
+    """Return an evaluator in vector code, each lane of which is one instance.
+
+    Raises
+    ------
+    VectorCodeError
+        For operations that vector code does not support.
+    """
     from .instructions import check_operations
     from .jit import NativeCode, address, compiled, vector_lanes
 
     check_operations(function)
-    lanes, arrays = vector_lanes(), function.n_in() + function.n_out()
+    lanes = vector_lanes()
+    arrays = function.n_in() + function.n_out()
     key = f"instances {lanes} {hashlib.sha256(function.serialize().encode()).hexdigest()}"
     signature = (ctypes.c_int64, *[ctypes.c_void_p] * arrays)
     run = compiled(NativeCode("instances", key, signature, lambda: _emit(function, lanes)))
 
     def evaluate(inputs: list[Array]) -> list[Array]:
         count = inputs[0].shape[1]
-        whole = -(-count // lanes) * lanes
-        if whole > count:
+        padded_count = -(-count // lanes) * lanes
+        if padded_count > count:
             # The last lanes repeat the last instance.
-            here = np.minimum(np.arange(whole), count - 1)
-            inputs = [each[:, here] for each in inputs]
+            instance_indices = np.minimum(np.arange(padded_count), count - 1)
+            inputs = [each[:, instance_indices] for each in inputs]
         arguments = [np.ascontiguousarray(each, float) for each in inputs]
-        outputs = [np.empty((function.nnz_out(k), whole)) for k in range(function.n_out())]
-        run(whole, *map(address, [*arguments, *outputs]))
+        outputs = [np.empty((function.nnz_out(k), padded_count)) for k in range(function.n_out())]
+        run(padded_count, *map(address, [*arguments, *outputs]))
         return [each[:, :count] for each in outputs]
 
     return evaluate
 
 
 def _emit(function: ca.Function, lanes: int) -> Any:
-    """Writes ``instances(count, input…, output…)``, for whole blocks of W instances."""
+    """Return the LLVM module of ``instances(count, input…, output…)``, for whole blocks of W
+    instances.
+    """
     from llvmlite import ir
 
     from .instructions import function_values
     from .jit import DOUBLE, DOUBLES, I64, Builder, Value, counting
 
-    module, vector = ir.Module(), ir.VectorType(DOUBLE, lanes)
+    module = ir.Module()
+    vector = ir.VectorType(DOUBLE, lanes)
     arrays = [DOUBLES] * (function.n_in() + function.n_out())
     kind = ir.FunctionType(ir.VoidType(), [I64, *arrays])
     run = ir.Function(module, kind, "instances")

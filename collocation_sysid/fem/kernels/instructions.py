@@ -1,11 +1,11 @@
 """CasADi's SX operations as LLVM instructions on vectors.
 
-Comparisons and logic are numbers, 1 or 0, and any number but 0 is true. What LLVM has no vector
-instruction for calls the C library lane by lane, as CasADi's own virtual machine does.
+Comparisons and logical operations give 1 or 0, and any number except 0 is true. Operations without
+a vector instruction in LLVM call the C library lane by lane, as CasADi's virtual machine does.
 
-The C library has no inverse error function. Here it is in elementary operations: a rational first
-guess and two Newton steps, which are exact but for the rounding of x. CasADi's own is up to 3·10⁻⁶
-off, most of all around |x| = 0.7.
+The C library has no inverse error function. Here it consists of elementary operations: a rational
+initial guess and two Newton steps, which are exact up to the rounding of x. CasADi's function has
+errors of up to 3·10⁻⁶, mostly around |x| = 0.7.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from llvmlite import ir
 from .batch import VectorCodeError
 from .jit import DOUBLE, I32, Builder, Value
 
-# Numerators and denominators, the highest power first.
+# Numerator and denominator of the initial guess of the inverse error function, for |x| < 0.7 and
+# beyond; the highest power first.
 CENTRE = (
     (-0.140543331, 0.914624893, -1.645349621, 0.886226899),
     (0.012229801, -0.329097515, 1.442710462, -2.118377725, 1.0),
@@ -31,6 +32,7 @@ TAIL = (
 
 
 def _inverse_error(x: ca.SX) -> ca.SX:
+    """Return the inverse error function of x as an expression."""
     away_from_zero = _ratio(TAIL, ca.sqrt(-ca.log((1 - ca.fabs(x)) / 2)))
     y = ca.if_else(ca.fabs(x) < 0.7, x * _ratio(CENTRE, x**2), ca.copysign(away_from_zero, x))
     for _ in range(2):
@@ -41,6 +43,7 @@ def _inverse_error(x: ca.SX) -> ca.SX:
 
 
 def _ratio(coefficients: tuple[tuple[float, ...], ...], z: ca.SX) -> ca.SX:
+    """Return the ratio of two polynomials at z, given by their coefficients."""
     numerator, denominator = (ca.polyval(ca.SX(part), z) for part in coefficients)
     return numerator / denominator
 
@@ -65,24 +68,28 @@ def function_values(
     ----------
     builder : llvmlite IRBuilder
     function : casadi.Function
-    vector : type of all values
+    vector : llvmlite type
+        Type of all values.
     read : callable
-        The value of (input, entry).
+        Returns the value of (input, entry).
 
     Yields
     ------
     output, entry : int
-    value : vector value
+        Index of the output, and index of its entry.
+    value : llvmlite value
+        Vector value of the entry.
 
     Raises
     ------
     VectorCodeError
-        For an operation that has no counterpart here.
+        For an operation that vector code does not support.
     """
     check_operations(function)
     work: dict[int, Value] = {}
     for k in range(function.n_instructions()):
-        operation, source = function.instruction_id(k), function.instruction_input(k)
+        operation = function.instruction_id(k)
+        source = function.instruction_input(k)
         target = function.instruction_output(k)
         if operation == ca.OP_INPUT:
             work[target[0]] = read(*source)
@@ -95,23 +102,19 @@ def function_values(
 
 
 def check_operations(function: ca.Function) -> None:
-    """Refuse a function that holds an operation without counterpart here.
-
-    Raises
-    ------
-    VectorCodeError
-        It names the operations.
+    """Raise a `VectorCodeError` with their names if a function has operations without
+    instructions.
     """
     known = {ca.OP_INPUT, ca.OP_CONST, ca.OP_OUTPUT, *OPERATIONS}
-    held = {function.instruction_id(k) for k in range(function.n_instructions())}
-    if missing := sorted(held - known):
+    operations = {function.instruction_id(k) for k in range(function.n_instructions())}
+    if missing := sorted(operations - known):
         raise VectorCodeError(
             f"vector code has no CasADi operation {', '.join(map(operation_name, missing))}"
         )
 
 
 def operation_name(operation: int) -> str:
-    """CasADi's own name, such as "OP_ADD"."""
+    """Return the name of an operation in CasADi, such as "OP_ADD"."""
     names = (name for name, number in vars(ca).items() if number == operation)
     return next((name for name in names if name.startswith("OP_")), str(operation))
 
@@ -120,10 +123,13 @@ def operation_name(operation: int) -> str:
 
 
 def _constant(vector: ir.VectorType, value: float) -> Value:
+    """Return a vector of equal constants."""
     return ir.Constant(vector, [float(value)] * vector.count)
 
 
 def _intrinsic(name: str) -> Emit:
+    """Return the emitter of a vector intrinsic of LLVM."""
+
     def emit(b: Builder, *operands: Value) -> Value:
         vector = operands[0].type
         full_name = f"llvm.{name}.v{vector.count}f64"
@@ -133,7 +139,7 @@ def _intrinsic(name: str) -> Emit:
 
 
 def _library(name: str) -> Emit:
-    """Lane by lane: the C library knows no vectors."""
+    """Return the emitter of a function of the C library, called lane by lane."""
 
     def emit(b: Builder, *operands: Value) -> Value:
         function = _declared(b.module, name, DOUBLE, len(operands))
@@ -149,11 +155,14 @@ def _library(name: str) -> Emit:
 
 
 def _declared(module: ir.Module, name: str, kind: ir.Type, operands: int) -> ir.Function:
-    known = module.globals.get(name)
-    return known or ir.Function(module, ir.FunctionType(kind, [kind] * operands), name)
+    """Return a function of the module, declared if necessary."""
+    declared = module.globals.get(name)
+    return declared or ir.Function(module, ir.FunctionType(kind, [kind] * operands), name)
 
 
 def _compared(sign: str) -> Emit:
+    """Return the emitter of a comparison, with the values 1 and 0."""
+
     def emit(b: Builder, x: Value, y: Value) -> Value:
         return b.uitofp(_comparison(b, sign, x, y), x.type)
 
@@ -162,14 +171,17 @@ def _compared(sign: str) -> Emit:
 
 def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
     # As in C: NaN differs from everything, itself included.
+    """Return a comparison as a vector of booleans."""
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 
 
 def _is_true(b: Builder, x: Value) -> Value:
+    """Return whether values are nonzero, as a vector of booleans."""
     return _comparison(b, "!=", x, _constant(x.type, 0.0))
 
 
 def _sign(b: Builder, x: Value) -> Value:
+    """Emit the sign of x; zeros of either sign and NaN are unchanged."""
     zero, one, minus_one = (_constant(x.type, value) for value in (0.0, 1.0, -1.0))
     # Zeros of either sign and NaN are their own sign.
     positive = b.select(_comparison(b, ">", x, zero), one, x)
@@ -177,6 +189,7 @@ def _sign(b: Builder, x: Value) -> Value:
 
 
 def _erfinv(b: Builder, x: Value) -> Value:
+    """Emit the inverse error function."""
     ((_, _, value),) = function_values(b, ERFINV, x.type, lambda *_: x)
     return value
 

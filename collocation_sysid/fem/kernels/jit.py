@@ -1,9 +1,9 @@
-"""LLVM IR compiled to native code for this CPU, with the object code kept on disk.
+"""LLVM code compiled to native code for this CPU, with the object code cached on disk.
 
-It is keyed by the code's own key, the sources that generate it, the LLVM version, the CPU and its
-features. What is read from disk is executed. So the folder must be the user's own, with nobody else
-able to write in it or to put another in its place, and a file is used only where its digest is that
-of its code for its key: one that was damaged, or made for another key, is compiled anew.
+The cache key consists of the key of the code, the source files that generate it, the LLVM version,
+the CPU and its features. Because cached code is executed, the folder must belong to the user, with
+nobody else able to write in it or to replace it, and a file is used only if it has the digest of
+its code and key: a damaged file, or one for another key, is compiled anew.
 """
 
 from __future__ import annotations
@@ -27,17 +27,20 @@ from llvmlite import ir
 from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
-DOUBLE, I32, I64 = ir.DoubleType(), ir.IntType(32), ir.IntType(64)
-DOUBLES, I32S = DOUBLE.as_pointer(), I32.as_pointer()
+DOUBLE = ir.DoubleType()
+I32 = ir.IntType(32)
+I64 = ir.IntType(64)
+DOUBLES = DOUBLE.as_pointer()
+I32S = I32.as_pointer()
 Builder = Value = Any  # llvmlite is not annotated, and what is inferred of it is wrong
 
-# So many functions stay in memory for further bodies.
+# Number of compiled functions kept in memory for further bodies.
 KEPT = 128
 
 
 @contextmanager
 def counting(builder: Builder, start: Value, stop: Value, name: str) -> Iterator[Value]:
-    """A loop over start ≤ i < stop; yields i."""
+    """Emit a loop over start ≤ i < stop; the context gives i."""
     before = builder.block
     head = builder.append_basic_block(f"{name}.head")
     body = builder.append_basic_block(f"{name}.body")
@@ -64,7 +67,7 @@ LIBM += ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")
 
 @cache
 def _initialise() -> None:
-    """Make LLVM ready and the C library's functions known to it."""
+    """Initialise LLVM and register the functions of the C library."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     library = ctypes.CDLL("ucrtbase" if os.name == "nt" else None)
@@ -73,7 +76,7 @@ def _initialise() -> None:
 
 
 def _target_machine(quickly: bool) -> llvm.TargetMachine:
-    """A code generator for this CPU. An engine owns and frees its own."""
+    """Return a code generator for this CPU; the engine that uses it owns and frees it."""
     _initialise()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(),
@@ -89,7 +92,7 @@ def _target_machine(quickly: bool) -> llvm.TargetMachine:
 
 @cache
 def vector_lanes() -> int:
-    """Doubles in one vector register of this CPU."""
+    """Return the number of doubles in one vector register of this CPU."""
     features = llvm.get_host_cpu_features()
     if features.get("avx512f"):
         return 8
@@ -98,19 +101,21 @@ def vector_lanes() -> int:
 
 @dataclass(frozen=True)
 class NativeCode:
-    """A native function that is wanted.
+    """Native function to compile.
 
     Attributes
     ----------
     name : str
-        The function to look up.
+        Name of the function.
     key : str
-        Identifies the code: while the files of this folder stay, equal keys must mean equal IR.
+        Identifies the code: as long as the files of this folder are unchanged, equal keys must mean
+        equal code.
     signature : tuple of ctypes types
     build : callable
-        Returns the IR module that defines `name`; only called when nothing is cached.
+        Returns the LLVM module that defines `name`; called only if nothing is cached.
     quickly : bool
-        Compile it as it is written, in a fifth of the time; it then runs up to twice as long.
+        Whether to compile without optimisation, in a fifth of the time; the function then takes up
+        to twice as long.
     """
 
     name: str
@@ -122,12 +127,17 @@ class NativeCode:
 
 @lru_cache(KEPT)
 def compiled(code: NativeCode) -> CompiledFunction:
-    """The function, of which one serves all bodies."""
+    """Return the compiled function; the latest 128 are kept and shared by all bodies."""
     return CompiledFunction(code)
 
 
 class CompiledFunction:
-    """A native function, called through ctypes (which releases the interpreter lock)."""
+    """Native function, called through ctypes, which releases the interpreter lock.
+
+    Parameters
+    ----------
+    code : NativeCode
+    """
 
     def __init__(self, code: NativeCode) -> None:
         machine = _target_machine(code.quickly)
@@ -138,12 +148,12 @@ class CompiledFunction:
         self._call = ctypes.CFUNCTYPE(None, *code.signature)(address)
 
     def __call__(self, *arguments: object) -> None:
-        """Run it on integers and addresses, as in the signature."""
+        """Call the function with integers and addresses according to the signature."""
         self._call(*arguments)
 
 
 def address(array: NDArray[Any]) -> int:
-    """Where an array's memory begins; ``array.ctypes.data`` takes three times as long."""
+    """Return the address of an array's memory; ``array.ctypes.data`` takes three times as long."""
     try:
         return ctypes.addressof(ctypes.c_char.from_buffer(array.data))
     except (TypeError, ValueError):  # read-only, empty, or not contiguous
@@ -151,19 +161,22 @@ def address(array: NDArray[Any]) -> int:
 
 
 def _cached_object(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
+    """Return the object code from the cache, or compile and store it."""
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
-    whole_key = f"{host}\n{_generation()}\n{code.key}" + "\nquickly" * code.quickly
-    found = load(whole_key)
-    if found is None:
-        found = _compile(code.build(), machine, code.quickly)
-        store(whole_key, found)
-    return found
+    cache_key = f"{host}\n{_generation()}\n{code.key}" + "\nquickly" * code.quickly
+    code_bytes = load(cache_key)
+    if code_bytes is None:
+        code_bytes = _compile(code.build(), machine, code.quickly)
+        store(cache_key, code_bytes)
+    return code_bytes
 
 
 @cache
 def _generation() -> str:
-    """Identify the code that emits and compiles: once it changes, old kernels must not be used."""
+    """Return a digest of the source files of this folder, so that changes invalidate cached
+    kernels.
+    """
     digest = hashlib.sha256()
     for file in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(file.read_bytes())
@@ -171,6 +184,7 @@ def _generation() -> str:
 
 
 def _compile(module: ir.Module, machine: llvm.TargetMachine, quickly: bool) -> bytes:
+    """Return the object code of an LLVM module."""
     module.triple = machine.triple
     parsed = llvm.parse_assembly(str(module))
     parsed.verify()
@@ -186,13 +200,15 @@ OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def cache_folder() -> Path:
-    """Where compiled kernels are kept: ``COLLOCATION_SYSID_CACHE``, or the user's cache folder."""
+    """Return the folder of compiled kernels: ``COLLOCATION_SYSID_CACHE``, or the user's cache
+    folder.
+    """
     override = os.environ.get("COLLOCATION_SYSID_CACHE")
     return Path(override) if override else user_cache_path("collocation_sysid")
 
 
 def load(key: str) -> bytes | None:
-    """The code that `store` kept for a key; None where there is none to trust."""
+    """Return the code stored for a key; None if there is none that can be trusted."""
     folder = cache_folder()
     if not folder.is_dir() or not _is_trusted(folder):
         return None
@@ -200,44 +216,50 @@ def load(key: str) -> bytes | None:
         content = _read_own(folder / _file_name(key))
     except OSError:
         return None
-    digest, code = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
+    digest = content[:DIGEST_BYTES]
+    code = content[DIGEST_BYTES:]
     return code if digest == _digest(key, code) else None
 
 
 def store(key: str, code: bytes) -> None:
-    """Keep code; a folder that cannot be written costs time, not correctness."""
+    """Store code in the cache; do nothing if the folder cannot be written or trusted."""
     folder = cache_folder()
     with suppress(OSError):
         for missing in [p for p in (folder, *folder.parents) if not p.exists()][::-1]:
             missing.mkdir(mode=0o700, exist_ok=True)
         if not _is_trusted(folder):
             return
-        with tempfile.TemporaryDirectory(dir=folder) as passing:
-            unfinished = Path(passing) / _file_name(key)
+        with tempfile.TemporaryDirectory(dir=folder) as temporary_folder:
+            unfinished = Path(temporary_folder) / _file_name(key)
             unfinished.write_bytes(_digest(key, code) + code)
             unfinished.chmod(0o600)
             unfinished.replace(folder / unfinished.name)
 
 
 def _file_name(key: str) -> str:
+    """Return the file name of a key."""
     return f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.o"
 
 
 def _digest(key: str, code: bytes) -> bytes:
+    """Return the digest of a key and its code."""
     return hashlib.sha256(hashlib.sha256(key.encode()).digest() + code).digest()
 
 
 def _read_own(path: Path) -> bytes:
-    """What a plain file of the user holds; an OSError where it is anything else."""
+    """Return the content of a plain file that belongs to the user alone; an OSError for any
+    other.
+    """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     with os.fdopen(os.open(path, flags | getattr(os, "O_BINARY", 0)), "rb") as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode) or _fault(found):
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode) or _fault(status):
             raise OSError(f"{path} is not a file of this user alone")
         return file.read()
 
 
 def _is_trusted(folder: Path) -> bool:
+    """Return whether nobody else can write in a folder or replace it; warn if somebody can."""
     fault = _folder_fault(folder.resolve())
     if fault is not None:
         _warn(fault)
@@ -246,6 +268,7 @@ def _is_trusted(folder: Path) -> bool:
 
 @cache
 def _warn(fault: str) -> None:
+    """Warn once that compiled kernels are not stored."""
     warnings.warn(
         f"compiled kernels are not kept: {fault}; set COLLOCATION_SYSID_CACHE to a folder of "
         "your own (chmod 700)",
@@ -255,18 +278,26 @@ def _warn(fault: str) -> None:
 
 
 def _folder_fault(folder: Path) -> str | None:
-    """Why others could put code in a folder, or another folder in its place; None if not."""
+    """Return why others could put code in a folder, or replace the folder; None if they cannot."""
     if (fault := _fault(folder.stat())) is not None:
         return f"{folder} {fault}"
     for parent in folder.parents:
-        found = parent.stat()
+        status = parent.stat()
         # In a sticky folder, such as /tmp, nobody can move what is another's.
-        if (fault := _fault(found, or_root=True)) and not found.st_mode & stat.S_ISVTX:
+        if (fault := _fault(status, or_root=True)) and not status.st_mode & stat.S_ISVTX:
             return f"{parent}, which {folder} is in, {fault}"
     return None
 
 
 def _fault(found: os.stat_result, or_root: bool = False) -> str | None:
+    """Return why a file or folder is not the user's alone; None if it is.
+
+    Parameters
+    ----------
+    found : os.stat_result
+    or_root : bool
+        Whether it may belong to root, too.
+    """
     if not hasattr(os, "getuid"):
         return None  # Windows: the profile's access list keeps others out
     owners = {os.getuid(), 0} if or_root else {os.getuid()}

@@ -1,10 +1,10 @@
-"""Vectorised kernels: SX instructions emitted as LLVM IR on ``<W x double>`` vectors.
+"""Vectorised evaluator of element kernels: SX operations as LLVM code on ``<W x double>`` vectors.
 
-Elements are laid out in blocks of W lanes. For every timestep and block the native function
-gathers the node values, runs the kernel at each quadrature point, and adds the block's outputs
-straight into the row of that timestep, so no element output outlives its block. Contractions with
-the shape gradients are loops over nodes, which keeps the code small: it compiles in a fraction of
-the time, and fits the instruction cache.
+Elements are arranged in blocks of W lanes. For every time step and block the native function
+gathers the node values, evaluates the kernel at each quadrature point, and adds the outputs of the
+block to the row of that time step, so no element output is stored. Contractions with the shape
+gradients are loops over nodes, which keeps the code small: it compiles in a fraction of the time,
+and fits the instruction cache.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from functools import reduce
+from functools import partial, reduce
 
 import casadi as ca
 import numpy as np
@@ -38,12 +38,17 @@ from .jit import (
 )
 from .threads import in_slices
 
-# Bodies of fewer quadrature points do not evaluate so often that optimised code repays its making.
+# Number of quadrature points from which optimised code saves more time than its compilation takes.
 REPAID = 200
 
 
 class SimdEvaluator:
-    """Evaluate a `Batch` with native vector code, timesteps shared among threads."""
+    """Evaluator of a `Batch` by native vector code, with time steps distributed over threads.
+
+    Parameters
+    ----------
+    batch : Batch
+    """
 
     def __init__(self, batch: Batch) -> None:
         lanes = vector_lanes()
@@ -56,7 +61,7 @@ class SimdEvaluator:
         geometry[count:, :, -1] = 0.0
         by_block = (blocks, lanes)
         self._geometry = np.ascontiguousarray(
-            np.moveaxis(geometry.reshape(*by_block, *geometry.shape[1:]), 1, -1)
+            np.moveaxis(geometry.reshape(blocks, lanes, *geometry.shape[1:]), 1, -1)
         )
         self._nodes = _block_major(3 * batch.cells[lane_element], by_block)
         self._destinations = _block_major(batch.destinations[lane_element], by_block)
@@ -75,7 +80,8 @@ class SimdEvaluator:
         if kernel.carried:
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         points = self._points
-        build, quickly = lambda: _Emitter(kernel, points, lanes).emit(), count * points < REPAID
+        build = partial(_emit_kernel, kernel, points, lanes)
+        quickly = count * points < REPAID
         self._run = compiled(NativeCode("run", key, tuple(signature), build, quickly))
 
     def __call__(
@@ -87,7 +93,7 @@ class SimdEvaluator:
         add: bool = False,
         carried: Array | None = None,
     ) -> None:
-        """Add up the kernel over elements and points into `out` (T, width); see `Evaluator`."""
+        """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         addresses = [address(field) for field in fields]
         constants = [*self._tables, address(theta), address(out)]
         if self._carried is not None and carried is not None:
@@ -96,20 +102,40 @@ class SimdEvaluator:
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
-            sizes = start, stop, self._blocks, stride, self._width, int(add)
-            self._run(*sizes, *addresses, *constants)
+            self._run(
+                start,
+                stop,
+                self._blocks,
+                stride,
+                self._width,
+                int(add),
+                *addresses,
+                *constants,
+            )
 
         in_slices(run, len(out), threads)
 
 
+def _emit_kernel(kernel: PointKernel, points: int, lanes: int) -> ir.Module:
+    """Return the LLVM module of a kernel; see `_Emitter` for the arguments."""
+    return _Emitter(kernel, points, lanes).emit()
+
+
 def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray[np.int32]:
-    """(blocks · lanes, k) to contiguous (blocks, k, lanes)."""
+    """Return an array (blocks · lanes, k) as contiguous (blocks, k, lanes)."""
     blocked = array.reshape(*by_block, -1)
     return np.ascontiguousarray(np.swapaxes(blocked, 1, 2), dtype=np.int32)
 
 
 class _Layout:
-    """Where the pieces of a phase are kept, and where among the totals its outputs."""
+    """Offsets of the pieces of a phase in their buffer, and of its outputs in the totals.
+
+    Parameters
+    ----------
+    phase : Phase
+    first : int
+        Offset of the outputs of this phase in the totals.
+    """
 
     def __init__(self, phase: Phase, first: int) -> None:
         self.sx = phase.pieces
@@ -125,7 +151,17 @@ class _Layout:
         self.outputs = (first + np.cumsum([0, *outputs])).tolist()
 
     def entries(self, first: int, how: Contraction, step: int) -> list[int]:
-        """Places of what is so contracted, each of `step` entries, from an output on."""
+        """Return the offsets in the totals of outputs with a contraction, in steps of `step`
+        entries.
+
+        Parameters
+        ----------
+        first : int
+            Index of the first output to include.
+        how : {"none", "nodes", "pairs"}
+            Contraction.
+        step : int
+        """
         return [
             place
             for k, mine in enumerate(self.contractions)
@@ -135,9 +171,19 @@ class _Layout:
 
 
 class _Emitter:
-    """Writes ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out, …)``.
+    """Emitter of ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out,
+    …)``.
 
-    What points carry comes last: the length of its row, where its numbers are, and itself.
+    For kernels with data of the points, the last arguments are the length of a row of data, the
+    columns of each point and the data.
+
+    Parameters
+    ----------
+    kernel : PointKernel
+    points : int
+        Quadrature points of an element.
+    lanes : int
+        Number W of elements in a block.
     """
 
     def __init__(self, kernel: PointKernel, points: int, lanes: int) -> None:
@@ -172,13 +218,16 @@ class _Emitter:
         self.builder: Builder = ir.IRBuilder(self.run.append_basic_block("entry"))
 
     def emit(self) -> ir.Module:
-        b, args = self.builder, self.run.args
+        """Return the LLVM module with the function ``run``."""
+        b = self.builder
+        args = self.run.args
         t0, t1, blocks, field_stride, out_stride, add = args[:6]
         field_rows = args[6 : 6 + self.fields]
         geometry, nodes, destinations, theta, out, *memory = args[6 + self.fields :]
         gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
         phases = [*self.earlier, self.last]
-        outputs, total = self.last.outputs[self.own], max(phase.outputs[-1] for phase in phases)
+        outputs = self.last.outputs[self.own]
+        total = max(phase.outputs[-1] for phase in phases)
         totals = self._buffer(total, "totals")
         pieces = self._buffer(max(phase.pieces[-1] for phase in phases), "pieces")
         half = self._buffer(27, "half")
@@ -191,21 +240,23 @@ class _Emitter:
             with b.if_then(b.icmp_signed("==", add, I64(0))):
                 self._clear(out_row, out_stride)
             with counting(b, I64(0), blocks, "block") as block:
-                here = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
-                self._gather(rows, here, gathered)
+                address = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
+                self._gather(rows, address, gathered)
                 with counting(b, I64(0), I64(total), "zero") as k:
                     self._store(self.vector(None), totals, k)
                 first = b.mul(block, I64(self.points))
                 for phase in phases:
                     with counting(b, first, b.add(first, I64(self.points)), "point") as point:
-                        here = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
-                        own = [self._carried(memory, t, point)] if memory else []
-                        self._pieces(phase, [*gathered, here, parameters, *own, totals], pieces)
-                        self._contract(phase, pieces, here, half, totals)
+                        address = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
+                        point_data = [self._carried(memory, t, point)] if memory else []
+                        self._pieces(
+                            phase, [*gathered, address, parameters, *point_data, totals], pieces
+                        )
+                        self._contract(phase, pieces, address, half, totals)
                 if self.coupling:
                     self._couple(self.coupling, totals, combined)
-                here = b.gep(geometry, [b.mul(first, I64(geometry_size * self.lanes))])
-                volume = self._load(here, I64(geometry_size - 1))
+                address = b.gep(geometry, [b.mul(first, I64(geometry_size * self.lanes))])
+                volume = self._load(address, I64(geometry_size - 1))
                 zero = self.vector(None)
                 # Not left to the product with the volume, which makes NaN of what is infinite.
                 is_element = b.fcmp_ordered("!=", volume, zero)
@@ -217,29 +268,37 @@ class _Emitter:
         return self.module
 
     def _buffer(self, count: int, name: str) -> Value:
+        """Allocate aligned memory for `count` vectors."""
         buffer = self.builder.alloca(DOUBLE, size=I64(count * self.lanes), name=name)
         buffer.align = 64
         return buffer
 
     def _clear(self, row: ir.Value, length: ir.Value) -> None:
-        """Zero one timestep's outputs, which then stay in the cache while they are added up."""
-        b, bytes_ = self.builder, ir.IntType(8).as_pointer()
+        """Set the outputs of one time step to zero; they stay in the cache while they are
+        summed.
+        """
+        b = self.builder
+        bytes_ = ir.IntType(8).as_pointer()
         memset = self.module.declare_intrinsic("llvm.memset", (bytes_, I64))
         size = b.mul(length, I64(8))
         b.call(memset, [b.bitcast(row, bytes_), ir.IntType(8)(0), size, ir.IntType(1)(0)])
 
     def _pointer(self, base: Value, entry: Value) -> Value:
+        """Return the pointer to a vector entry of a buffer."""
         b = self.builder
         address = b.gep(base, [b.mul(entry, I64(self.lanes))])
         return b.bitcast(address, self.vector.as_pointer())
 
     def _load(self, base: Value, entry: Value) -> Value:
+        """Load a vector entry of a buffer."""
         return self.builder.load(self._pointer(base, entry), align=8)
 
     def _store(self, value: Value, base: Value, entry: Value) -> None:
+        """Store a vector entry of a buffer."""
         self.builder.store(value, self._pointer(base, entry), align=8)
 
     def _splat(self, scalar: Value) -> Value:
+        """Return a vector of W equal scalars."""
         value: Value = ir.Constant(self.vector, ir.Undefined)
         for lane in range(self.lanes):
             value = self.builder.insert_element(value, scalar, I32(lane))
@@ -263,7 +322,7 @@ class _Emitter:
                     self._store(value, buffer, b.add(b.mul(node, I64(3)), I64(axis)))
 
     def _scatter(self, value: Value, targets: Value, k: Value, row: Value) -> None:
-        """Add the W lanes of one output entry where their elements' destinations are."""
+        """Add the W lanes of one output entry at the destinations of their elements."""
         b = self.builder
         first = b.mul(k, I64(self.lanes))
         for lane in range(self.lanes):
@@ -272,23 +331,23 @@ class _Emitter:
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
     def _carried(self, memory: list, t: Value, point: Value) -> list:
-        """What a quadrature point of W elements carries at timestep t."""
+        """Return the data of a quadrature point of W elements at time step t."""
         b = self.builder
         length, places, rows = memory
         row = b.gep(rows, [b.mul(t, length)])
         first = b.mul(point, I64(self.carried * self.lanes))
-        found = []
+        values = []
         for entry in range(self.carried):
             value: Value = ir.Constant(self.vector, ir.Undefined)
             for lane in range(self.lanes):
-                at = b.gep(places, [b.add(first, I64(entry * self.lanes + lane))])
-                scalar = b.load(b.gep(row, [b.sext(b.load(at), I64)]))
+                position = b.gep(places, [b.add(first, I64(entry * self.lanes + lane))])
+                scalar = b.load(b.gep(row, [b.sext(b.load(position), I64)]))
                 value = b.insert_element(value, scalar, I32(lane))
-            found.append(value)
-        return found
+            values.append(value)
+        return values
 
     def _pieces(self, phase: _Layout, inputs: list, pieces: Value) -> None:
-        """Find the pieces of one quadrature point."""
+        """Evaluate the pieces of one quadrature point and store them."""
 
         def read(slot: int, entry: int) -> Value:
             if isinstance(inputs[slot], list):
@@ -302,32 +361,34 @@ class _Emitter:
     def _contract(
         self, phase: _Layout, pieces: Value, geometry: Value, half: Value, totals: Value
     ) -> None:
-        """Add the pieces of one quadrature point to the totals, as `kernel._contracted`."""
+        """Add the pieces of one quadrature point to the totals, contracted as in
+        `kernel._contracted`.
+        """
         b = self.builder
         for k, how in enumerate(phase.contractions):
-            here = self._at(pieces, phase.pieces[k])
-            there = self._at(totals, phase.outputs[k])
+            piece_base = self._at(pieces, phase.pieces[k])
+            output_base = self._at(totals, phase.outputs[k])
             length = phase.lengths[k]
             if how == "none":
                 with counting(b, I64(0), I64(length), "entry") as entry:
-                    self._add(self._load(here, entry), there, entry)
+                    self._add(self._load(piece_base, entry), output_base, entry)
             elif how == "nodes":
                 with counting(b, I64(0), I64(self.nodes), "node") as node:
-                    values = self._at_node(here, length // 9, self._gradient(geometry, node))
+                    values = self._at_node(piece_base, length // 9, self._gradient(geometry, node))
                     for column, row, value in values:
                         first = I64(column * self.size + row)
-                        self._add(value, there, b.add(b.mul(node, I64(3)), first))
+                        self._add(value, output_base, b.add(b.mul(node, I64(3)), first))
             else:
                 with counting(b, I64(0), I64(self.nodes), "column") as node:
                     gradient = self._gradient(geometry, node)
-                    for column, row, value in self._at_node(here, 9, gradient):
+                    for column, row, value in self._at_node(piece_base, 9, gradient):
                         self._store(value, half, I64(column + 9 * row))
-                    self._block(half, gradient, node, node, there)
+                    self._block(half, gradient, node, node, output_base)
                     with counting(b, b.add(node, I64(1)), I64(self.nodes), "row") as other:
-                        self._block(half, self._gradient(geometry, other), other, node, there)
+                        self._block(half, self._gradient(geometry, other), other, node, output_base)
 
     def _block(self, half: Value, gradient: list, a: Value, node: Value, outputs: Value) -> None:
-        """Add node a's rows of node b's columns, below the diagonal."""
+        """Add the rows of node a to the columns of a node, below the diagonal."""
         b = self.builder
         for column, row, value in self._at_node(half, 3, gradient):
             if a is node and row < column:
@@ -337,17 +398,20 @@ class _Emitter:
             self._add(value, outputs, b.add(self._column_start(c), r))
 
     def _column_start(self, c: Value) -> Value:
-        """Entry (r, c) of a lower triangle is at c (2 size − c − 1) / 2 + r."""
+        """Return c (2 size − c − 1) / 2, the offset of column c in a lower triangle, less its row
+        index.
+        """
         b = self.builder
         return b.lshr(b.mul(c, b.sub(I64(2 * self.size - 1), c)), I64(1))
 
     def _couple(self, coupling: ca.Function, totals: Value, combined: Value) -> None:
-        """Add to the outputs what couples the node vectors, see `kernel`."""
+        """Add the coupling of the node vectors to the outputs, see `kernel`."""
         b = self.builder
         for k, columns in enumerate(self._coefficients(coupling, totals)):
-            how, there = self.last.contractions[k], self._at(totals, self.last.outputs[k])
+            how = self.last.contractions[k]
+            output_base = self._at(totals, self.last.outputs[k])
             if how == "nodes":
-                self._combine(columns, totals, there, self._add)
+                self._combine(columns, totals, output_base, self._add)
             elif how == "pairs":
                 self._combine(columns, totals, combined, self._store)
                 with counting(b, I64(0), I64(self.size), "column") as c:
@@ -355,12 +419,14 @@ class _Emitter:
                         (j * self.size, self._load(self._at(totals, self.vectors[j]), c))
                         for j in columns
                     ]
-                    start = b.gep(there, [b.mul(self._column_start(c), I64(self.lanes))])
+                    start = b.gep(output_base, [b.mul(self._column_start(c), I64(self.lanes))])
                     with counting(b, c, I64(self.size), "row") as r:
                         self._add(self._combination(factors, combined, r), start, r)
 
     def _coefficients(self, coupling: ca.Function, totals: Value) -> list[dict[int, list]]:
-        """For each output, column after column, the node vectors' places and coefficients."""
+        """Return for each output, column by column, offsets of node vectors and their
+        coefficients.
+        """
         outputs = [coupling.sparsity_out(k) for k in range(coupling.n_out())]
         entries = [list(zip(*output.get_triplet(), strict=True)) for output in outputs]
         columns: list[dict[int, list]] = [{} for _ in outputs]
@@ -376,14 +442,23 @@ class _Emitter:
     def _combine(
         self, columns: dict[int, list], totals: Value, out: Value, put: Callable[..., None]
     ) -> None:
-        """Put combinations of node vectors where the columns of a matrix are."""
+        """Write combinations of node vectors to the columns of a matrix."""
         for column, factors in columns.items():
-            here = self._at(out, column * self.size)
+            column_base = self._at(out, column * self.size)
             with counting(self.builder, I64(0), I64(self.size), "entry") as entry:
-                put(self._combination(factors, totals, entry), here, entry)
+                put(self._combination(factors, totals, entry), column_base, entry)
 
     def _combination(self, factors: list, base: Value, entry: Value) -> Value:
-        """One entry of the sum of vectors, which begin at places of `base`, times factors."""
+        """Return one entry of a linear combination of vectors.
+
+        Parameters
+        ----------
+        factors : list of (offset, factor)
+            Offset of each vector in `base`, and its factor.
+        base : Value
+        entry : Value
+            Index of the entry.
+        """
         b = self.builder
         terms = [
             b.fmul(self._load(self._at(base, place), entry), factor, flags=FUSE)
@@ -392,7 +467,7 @@ class _Emitter:
         return reduce(lambda x, y: b.fadd(x, y, flags=FUSE), terms)
 
     def _at_node(self, stress: Value, columns: int, gradient: list) -> Iterator[tuple]:
-        """Columns of (9, k) times one node's shape gradient, by column and row."""
+        """Yield column, row and value of (9, k) times the shape gradient of one node."""
         for column in range(columns):
             for row in range(3):
                 terms = [
@@ -407,11 +482,14 @@ class _Emitter:
                 yield column, row, self.builder.fadd(value, terms[2], flags=FUSE)
 
     def _gradient(self, geometry: Value, node: Value) -> list:
+        """Return the shape gradient of a node."""
         first = self.builder.mul(node, I64(3))
         return [self._load(geometry, self.builder.add(first, I64(axis))) for axis in range(3)]
 
     def _at(self, base: Value, entry: int) -> Value:
+        """Return the pointer to the vector entry with a given offset."""
         return self.builder.gep(base, [I64(entry * self.lanes)])
 
     def _add(self, value: Value, base: Value, entry: Value) -> None:
+        """Add a value to a vector entry of a buffer."""
         self._store(self.builder.fadd(self._load(base, entry), value), base, entry)

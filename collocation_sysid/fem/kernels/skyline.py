@@ -1,8 +1,10 @@
-"""Factorise narrow bands within their skyline natively, without exchanging rows: L D Uᵀ.
+"""Compiled factorisation L D Uᵀ of narrow banded matrices within their skyline, without row
+exchanges.
 
-LAPACK's blocks are as high as the widest row, its LU makes room for exchanges, and it solves
-column by column. Here pivots are taken a few at a time, each acts on the rows that it reaches, and
-one pass over the factors serves all right-hand sides. Bands that outgrow the cache are LAPACK's.
+LAPACK's blocks are as high as the widest row, its LU factorisation reserves space for row
+exchanges, and it solves column by column. Here a few pivots are eliminated at a time, each one acts
+only on the rows within its reach, and one pass over the factors serves all right-hand sides. Use
+LAPACK for bands that exceed the cache.
 """
 
 from __future__ import annotations
@@ -34,45 +36,50 @@ from .jit import (
     vector_lanes,
 )
 
-# Pivots that act on a row at a time: it is then read and written once for all of them.
+# Number of pivots that are eliminated at a time: each row is read and written once for all of them.
 PIVOTS = 4
+# Size of a cache line, to which memory is aligned [bytes].
 LINE_BYTES = 64
-# Integers, arrays of integers and arrays of numbers that each kernel takes.
+# Numbers of integer arguments, integer arrays and floating-point arrays of each compiled function.
 ARGUMENTS = {"fill": (1, 2, 5), "factorise": (2, 1, 4), "solve": (4, 1, 4)}
 
 
 class Skyline:
-    """Factors of matrices of one skyline.
+    """Factorisation of matrices with a common skyline.
 
-    A side holds a triangle: row k that of column k of the lower one, or of row k of the upper one,
-    in whole vectors of the matrix's own places, so that all loads are aligned.
+    A side holds a triangle: row k contains column k of the lower triangle, or row k of the upper
+    one, in whole vectors of matrix positions, so that all loads are aligned.
 
     Parameters
     ----------
     size : int
-        n.
+        Number n of rows.
     rows, columns : (e,) int
-        The entries of one triangle, on either side of the diagonal and on it.
+        Row and column of the entries of one triangle, with the diagonal.
     source : (e,) int
-        Where in given values they are.
+        Positions of the entries in given values.
 
     Attributes
     ----------
-    shape : (n, width) of a side
+    shape : (n, width)
+        Shape of a side.
     """
 
     def __init__(self, size: int, rows: Index, columns: Index, source: Index) -> None:
-        low, high = np.minimum(rows, columns), np.maximum(rows, columns)
+        low = np.minimum(rows, columns)
+        high = np.maximum(rows, columns)
         reach = np.arange(size)
         np.maximum.at(reach, low, high)
         self._reach = np.maximum.accumulate(reach)
-        height, lanes = int((self._reach - np.arange(size)).max(initial=0)), vector_lanes()
+        height = int((self._reach - np.arange(size)).max(initial=0))
+        lanes = vector_lanes()
         # As far as the last of some pivots reaches; an odd number spreads rows over the cache.
         vectors = -(-(height + PIVOTS + lanes) // lanes) | 1
         self.shape = size, vectors * lanes
         places = low * self.shape[1] + high - low // lanes * lanes
         order = np.argsort(places)
-        self._places, self._source = places[order], source[order]
+        self._places = places[order]
+        self._source = source[order]
         on_diagonal = rows == columns
         self._diagonal = source[on_diagonal][np.argsort(rows[on_diagonal])]
         # A skew part's entries have another sign beyond the diagonal.
@@ -83,8 +90,9 @@ class Skyline:
         self._solve = _compiled("solve", 1)
 
     def room(self, sides: int) -> Room:
-        """Memory for the sides of a matrix; a symmetric one needs one."""
-        numbers, (size, width) = sides * math.prod(self.shape), self.shape
+        """Return memory for the sides of a matrix: one for a symmetric matrix, otherwise two."""
+        numbers = sides * math.prod(self.shape)
+        size, width = self.shape
         memory = np.zeros(numbers + LINE_BYTES // 8)
         start = -memory.ctypes.data % LINE_BYTES // 8
         return Room(
@@ -93,20 +101,26 @@ class Skyline:
         )
 
     def factorise(self, room: Room, symmetric: Array, skew: Array) -> tuple[Array, Array]:
-        """Make L and U without their diagonals of ones in a room, of a symmetric matrix only L.
+        """Compute L and U without their unit diagonals in the given memory; for a symmetric matrix
+        only L.
 
         Parameters
         ----------
         room : Room
-        symmetric, skew : values of the matrix's two parts; without a skew one the latter is empty
+            Memory; overwritten.
+        symmetric, skew : array
+            Values of the symmetric and skew parts of the matrix; `skew` is empty if there is none.
 
         Returns
         -------
-        pivots : (n,) D, in the room
-        growth : (n,) Σ_k |L_ik D_k U_ik| / A_ii
-            How many times itself a diagonal entry has changed at most; of a symmetric matrix zero.
+        pivots : (n,)
+            Diagonal D; a view of the memory.
+        growth : (n,)
+            Σ_k |L_ik D_k U_ik| / A_ii: bound of the relative change of each diagonal entry. Zero
+            for a symmetric matrix.
         """
-        (size, width), count = self.shape, 2 if skew.size else 1
+        size, width = self.shape
+        count = 2 if skew.size else 1
         room.sides[:count].fill(0)
         room.results.fill(0)
         fill, factorise = self._kernels[count]
@@ -121,34 +135,51 @@ class Skyline:
         return pivots, growth
 
     def solve(self, first: Array, pivots: Array, second: Array, right: Array) -> Array:
-        """Solve L D Uᵀ x = b for rows b of `right` (columns, n), with L `first` and U `second`."""
+        """Return the solutions of L D Uᵀ x = b for the rows b of `right`, (columns, n).
+
+        Parameters
+        ----------
+        first, second : (n, width)
+            Sides of L and of U; twice the same for a symmetric matrix.
+        pivots : (n,)
+            Diagonal D.
+        right : (columns, n)
+            Right-hand sides.
+        """
         size, width = self.shape
         rows = np.empty((len(right), size + width))
-        rows[:, :size], rows[:, size:] = right, 0.0
-        arrays = first, second, pivots, rows
-        self._solve(size, width, *rows.shape, self._reached, *_addresses(*arrays))
+        rows[:, :size] = right
+        rows[:, size:] = 0.0
+        columns, stride = rows.shape
+        addresses = _addresses(first, second, pivots, rows)
+        self._solve(size, width, columns, stride, self._reached, *addresses)
         return rows[:, :size]
 
 
 class Room:
-    """Memory of one factor.
+    """Memory of one factorisation.
 
     Parameters
     ----------
     sides : (1, n, width) for a symmetric matrix, or (2, n, width)
-    results : (2, n + width) pivots and growth
+    results : (2, n + width)
+        Pivots and growth.
     """
 
     def __init__(self, sides: Array, results: Array) -> None:
-        self.sides, self.results = sides, results
-        self.ends, self.results_at = _addresses(*sides), _addresses(*results)
+        self.sides = sides
+        self.results = results
+        self.ends = _addresses(*sides)
+        self.results_at = _addresses(*results)
 
 
 def _addresses(*arrays: NDArray[Any]) -> list[int]:
+    """Return the addresses of arrays."""
     return [address(array) for array in arrays]
 
 
 def _compiled(name: str, sides: int) -> CompiledFunction:
+    """Return one of the compiled functions "fill", "factorise" and "solve"."""
     emit: Callable[[_Emitter], ir.Module] = getattr(_Emitter, name)
     integers, *arrays = ARGUMENTS[name]
     lanes = vector_lanes()
@@ -158,7 +189,15 @@ def _compiled(name: str, sides: int) -> CompiledFunction:
 
 
 class _Emitter:
-    """Loops over vectors of the matrix's rows, by their numbers."""
+    """Emitter of the loops over vectors of matrix rows.
+
+    Parameters
+    ----------
+    lanes : int
+        Number of doubles of a vector.
+    sides : int
+        1 for a symmetric matrix, otherwise 2.
+    """
 
     def __init__(self, lanes: int, sides: int) -> None:
         self.lanes = lanes
@@ -167,6 +206,7 @@ class _Emitter:
         self.module = ir.Module()
 
     def _begin(self, name: str) -> Sequence[Value]:
+        """Begin a function, and return its arguments."""
         integers, maps, arrays = ARGUMENTS[name]
         kinds = [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), name)
@@ -174,7 +214,9 @@ class _Emitter:
         return function.args
 
     def fill(self) -> Any:
-        """``fill(entries, source, places, signs, symmetric, skew, lower, upper)``."""
+        """Return the module of ``fill(entries, source, places, signs, symmetric, skew, lower,
+        upper)``.
+        """
         count, source, places, signs, symmetric, skew, lower, upper = self._begin("fill")
         b = self.b
         with counting(b, I64(0), count, "entry") as k:
@@ -183,15 +225,16 @@ class _Emitter:
             if self.count == 1:
                 b.store(value, b.gep(lower, [place]))
             else:
-                sign, other = b.load(b.gep(signs, [k])), b.load(b.gep(skew, [origin]))
-                turned = b.fmul(sign, other)
-                b.store(b.fadd(value, turned), b.gep(lower, [place]))
-                b.store(b.fsub(value, turned), b.gep(upper, [place]))
+                sign = b.load(b.gep(signs, [k]))
+                other = b.load(b.gep(skew, [origin]))
+                signed_skew = b.fmul(sign, other)
+                b.store(b.fadd(value, signed_skew), b.gep(lower, [place]))
+                b.store(b.fsub(value, signed_skew), b.gep(upper, [place]))
         b.ret_void()
         return self.module
 
     def factorise(self) -> Any:
-        """``factorise(n, width, reach, lower, upper, pivots, growth)``."""
+        """Return the module of ``factorise(n, width, reach, lower, upper, pivots, growth)``."""
         size, self.width, self.reach, *sides, self.pivots, self.growth = self._begin("factorise")
         self.sides = sides[: self.count]
         kind = ir.FunctionType(self.vector, [self.vector])
@@ -207,18 +250,21 @@ class _Emitter:
         return self.module
 
     def _eliminate(self, pivots: Sequence[Value]) -> None:
+        """Eliminate consecutive pivots from all rows within their reach."""
         b = self.b
         last = b.load(b.gep(self.reach, [pivots[-1]]))
         for p, pivot in enumerate(pivots):
             self._scale(pivot, last)
             for later in pivots[p + 1 :]:
                 self._subtract([pivot], later, last)
-        following = b.add(pivots[-1], I64(1))
-        with counting(b, following, b.add(last, I64(1)), "row") as row:
+        next_row = b.add(pivots[-1], I64(1))
+        with counting(b, next_row, b.add(last, I64(1)), "row") as row:
             self._subtract(pivots, row, last)
 
     def _scale(self, pivot: Value, last: Value) -> None:
-        """Divide what is below and right of a pivot by it, and clear what is not."""
+        """Divide the entries below and right of a pivot by the pivot, and set the others to
+        zero.
+        """
         b = self.b
         diagonal = b.load(self._entry(self.sides[0], pivot, pivot))
         b.store(diagonal, b.gep(self.pivots, [pivot]))
@@ -238,12 +284,15 @@ class _Emitter:
                 self._store(b.fadd(self._load(grown), change), grown)
 
     def _subtract(self, pivots: Sequence[Value], row: Value, last: Value) -> None:
-        """Take what pivots do to a row of either side, as far as `last`."""
-        b, scales = self.b, []
+        """Subtract the contribution of pivots from a row of either side, up to the position
+        `last`.
+        """
+        b = self.b
+        scales = []
         for pivot in pivots:
             diagonal = b.load(b.gep(self.pivots, [pivot]))
-            across = [b.load(self._entry(side, pivot, row)) for side in reversed(self.sides)]
-            scales.append([self._spread(b.fmul(diagonal, value)) for value in across])
+            row_entries = [b.load(self._entry(side, pivot, row)) for side in reversed(self.sides)]
+            scales.append([self._spread(b.fmul(diagonal, value)) for value in row_entries])
         with self._vectors(row, last) as start:
             for k, side in enumerate(self.sides):
                 target = self._entry(side, row, start)
@@ -253,7 +302,9 @@ class _Emitter:
                 self._store(value, target)
 
     def solve(self) -> Any:
-        """``solve(n, width, columns, stride, reach, first, second, pivots, rows)``."""
+        """Return the module of ``solve(n, width, columns, stride, reach, first, second, pivots,
+        rows)``.
+        """
         size, self.width, columns, stride, reach, first, second, pivots, rows = self._begin("solve")
         b = self.b
         kind = ir.FunctionType(DOUBLE, [DOUBLE, self.vector])
@@ -263,51 +314,58 @@ class _Emitter:
             last = b.load(b.gep(reach, [k]))
             with counting(b, I64(0), columns, "column") as column:
                 right = b.gep(rows, [b.mul(column, stride)])
-                known = self._spread(b.load(b.gep(right, [k])))
+                loaded = self._spread(b.load(b.gep(right, [k])))
                 with self._vectors(k, last) as start:
-                    place, factor = b.gep(right, [start]), self._entry(first, k, start)
-                    self._store(self._less(self._load(place), self._load(factor), known), place)
+                    place = b.gep(right, [start])
+                    factor = self._entry(first, k, start)
+                    self._store(self._less(self._load(place), self._load(factor), loaded), place)
         with counting(b, I64(0), size, "backward") as done:
             k = b.sub(b.sub(size, I64(1)), done)
-            last, diagonal = b.load(b.gep(reach, [k])), b.load(b.gep(pivots, [k]))
+            last = b.load(b.gep(reach, [k]))
+            diagonal = b.load(b.gep(pivots, [k]))
             with counting(b, I64(0), columns, "column") as column:
                 right = b.gep(rows, [b.mul(column, stride)])
                 b.store(ir.Constant(self.vector, [0.0] * self.lanes), dot)
                 with self._vectors(k, last) as start:
-                    known, factor = b.gep(right, [start]), self._entry(second, k, start)
-                    b.store(self._less(b.load(dot), self._load(known), self._load(factor)), dot)
-                here = b.gep(right, [k])
-                scaled = b.fdiv(b.load(here), diagonal)
-                b.store(b.call(total, [scaled, b.load(dot)], fastmath=("reassoc",)), here)
+                    loaded = b.gep(right, [start])
+                    factor = self._entry(second, k, start)
+                    b.store(self._less(b.load(dot), self._load(loaded), self._load(factor)), dot)
+                solution = b.gep(right, [k])
+                scaled = b.fdiv(b.load(solution), diagonal)
+                b.store(b.call(total, [scaled, b.load(dot)], fastmath=("reassoc",)), solution)
         b.ret_void()
         return self.module
 
     @contextmanager
     def _vectors(self, first: Value, last: Value) -> Iterator[Value]:
-        """The starts of the vectors that hold rows from `first` to `last`."""
-        b, lanes = self.b, I64(self.lanes)
+        """Loop over the start positions of the vectors that contain rows from `first` to `last`."""
+        b = self.b
+        lanes = I64(self.lanes)
         stop = b.add(b.sdiv(last, lanes), I64(1))
         with counting(b, b.sdiv(first, lanes), stop, "vector") as k:
             yield b.mul(k, lanes)
 
     def _entry(self, side: Value, row: Value, place: Value) -> Value:
-        """Where row `row` of a side has what belongs to `place` of the matrix."""
-        b, lanes = self.b, I64(self.lanes)
+        """Return the pointer to the entry of row `row` of a side at matrix position `place`."""
+        b = self.b
+        lanes = I64(self.lanes)
         start = b.mul(b.sdiv(row, lanes), lanes)
         return b.gep(side, [b.add(b.mul(row, self.width), b.sub(place, start))])
 
     def _load(self, place: Value) -> Value:
+        """Load a vector from a pointer."""
         return self.b.load(self.b.bitcast(place, self.vector.as_pointer()), align=8)
 
     def _store(self, value: Value, place: Value) -> None:
+        """Store a vector at a pointer."""
         self.b.store(value, self.b.bitcast(place, self.vector.as_pointer()), align=8)
 
     def _less(self, value: Value, x: Value, y: Value) -> Value:
-        """Value − x y."""
+        """Return value − x y."""
         return self.b.fsub(value, self.b.fmul(x, y, flags=FUSE), flags=FUSE)
 
     def _spread(self, value: Value) -> Value:
-        """A vector of equal numbers."""
+        """Return a vector of equal numbers."""
         nothing = ir.Constant(ir.VectorType(value.type, self.lanes), ir.Undefined)
         zeros = ir.Constant(ir.VectorType(I32, self.lanes), [0] * self.lanes)
         return self.b.shuffle_vector(self.b.insert_element(nothing, value, I32(0)), nothing, zeros)

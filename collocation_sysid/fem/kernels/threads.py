@@ -1,4 +1,8 @@
-"""Share a range of timesteps, or the experiments, among threads."""
+"""Distribution of time steps, or of experiments, over threads.
+
+`in_slices` distributes consecutive time steps of one evaluation; `side_by_side` distributes whole
+experiments, each of which then runs on one thread.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +18,14 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-# Of several threads that need a kernel the first builds it.
+# Lock for building kernels: of several threads that need the same one, the first builds it.
 COMPILING = threading.Lock()
-# Threads that do a whole experiment each share nothing of it with others.
+# State of a thread that evaluates whole experiments and therefore starts no further threads.
 _alone = threading.local()
 
 
 def available_threads() -> int:
-    """``COLLOCATION_SYSID_THREADS``, or as many as there are cores that this process may use."""
+    """Return ``COLLOCATION_SYSID_THREADS``, or the number of cores that this process may use."""
     override = os.environ.get("COLLOCATION_SYSID_THREADS")
     if override:
         return max(1, int(override))
@@ -33,11 +37,18 @@ def available_threads() -> int:
 @cache
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     # Keyed by process: a forked child must not wait for its parent's threads.
+    """Return the pool of threads of this process; a forked child must not wait for its parent's."""
     return ThreadPoolExecutor(threads)
 
 
 def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None:
-    """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread."""
+    """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On a thread of `side_by_side`, if another experiment was interrupted.
+    """
     if (stop := getattr(_alone, "stop", None)) is not None and stop.is_set():
         raise KeyboardInterrupt
     threads = min(threads, count)
@@ -53,9 +64,10 @@ def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None
 
 
 def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:
-    """``run`` of every item, in their order; each on a thread of its own, see `at_once`.
+    """Return ``run(item)`` of every item, in their order; each item runs on one thread, see
+    `at_once`.
 
-    Much of an experiment's row is too short to pass the interpreter's lock on and back: more
+    Much of the work of an experiment is too short to release and acquire the interpreter lock: more
     experiments than cores at a time fill the gaps.
     """
     count = at_once(len(items), threads)
@@ -77,13 +89,13 @@ def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> lis
 
 
 def alone(run: Callable[..., R], *arguments: Any) -> R:
-    """``run(*arguments)`` on this thread, which from now on shares nothing with others."""
+    """Return ``run(*arguments)``, and start no further threads from this thread from now on."""
     _alone.whole = True
     return run(*arguments)
 
 
 def at_once(items: int, threads: int) -> int:
-    """How many items are done side by side."""
+    """Return how many of these items run at the same time."""
     if threads == 1 or getattr(_alone, "whole", False):
         return 1
     return max(1, min(items, 2 * threads))
