@@ -127,7 +127,9 @@ def test_a_result_read_back_is_shown_as_it_was(run_folder: Path):
     result = Result.read(run_folder)
     elapsed_s = result.elapsed_s
     before = replace(result, elapsed_s=replace(elapsed_s, pictures=None))
-    shown = plain_text([*summary(before, run_folder), f"pictures drawn in {elapsed_s.pictures:.1f} s"])
+    shown = plain_text(
+        [*summary(before, run_folder), f"pictures drawn in {elapsed_s.pictures:.1f} s"]
+    )
     assert shown.split() == printed.split()
 
 

@@ -353,7 +353,8 @@ class Elapsed:
     Attributes
     ----------
     search : float
-        From the problem to the optimum: finding a start, and every search, also with finer steps.
+        From the problem to the optimum: finding a start, and every search that led to the answer,
+        also with finer steps.
     checks : float
         What follows: forward simulations, uncertainties, budget, probes and likely causes.
     pictures : float or None
