@@ -290,6 +290,16 @@ def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatc
     assert json.loads(run_command("solve", "problem.toml", "--json").out)["elapsed_s"]["checks"] > 0
 
 
+def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatch):
+    monkeypatch.setattr(record, "_write_all_frames", lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr(record, "_write_pictures", lambda *_: time.sleep(60))
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 130
+    assert "Verdict: check" in outcome.out
+    assert "the answer is kept in run" in outcome.err
+    assert result_in(tiny / "run")["status"] == "converged"
+
+
 def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(tiny, monkeypatch):
     file = tiny / "run" / "result.json"
     monkeypatch.setattr(record, "_write_pictures", lambda *_: file.write_text('{"another": 1}'))

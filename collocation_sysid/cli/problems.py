@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,14 +95,15 @@ def solve(options: Solve) -> None:
     problem = options.read()
     require_possible(folder)
     require_replaceable(folder)
-    with Progress(errors, problem, options.verbose, options.quiet) as progress:
-        how = options.method, progress.iteration, progress.say, options.start
-        finished = run(problem, *how, scheduler=options.scheduler, probe=options.probe)
-        progress.say("writing the run folder")
-        with INTERRUPTS.deferred():
+    with ExitStack() as until_shown:
+        with Progress(errors, problem, options.verbose, options.quiet) as progress:
+            how = options.method, progress.iteration, progress.say, options.start
+            finished = run(problem, *how, scheduler=options.scheduler, probe=options.probe)
+            until_shown.enter_context(INTERRUPTS.deferred())
+            progress.say("writing the run folder")
             finished.save(folder, pictures=False)
-    if not options.as_json:
-        show(summary(finished.result, folder, options.budget))
+        if not options.as_json:
+            show(summary(finished.result, folder, options.budget))
     result = _drawn(finished, folder, options) if options.pictures else finished.result
     if options.as_json:
         typer.echo(as_json(result))
