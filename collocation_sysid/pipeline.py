@@ -4,6 +4,7 @@ errors.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -24,7 +25,7 @@ from .runs.answer import Answer
 from .runs.check.cost import require_memory
 from .runs.forward_simulation import roll_outs, step_error
 from .runs.refine import refine
-from .runs.result import Result
+from .runs.result import Elapsed, Result
 from .runs.solving import read_where_found, shared, solve
 from .runs.told import result_of
 from .runs.warm_start import Earlier
@@ -54,7 +55,9 @@ class Run(Answer):
     """
 
     def __str__(self) -> str:
-        return self.table()
+        from .result.run_sections import summary  # how it looks is no part of a run
+
+        return plain_text(summary(self.result))
 
     @cached_property
     def result(self) -> Result:
@@ -104,15 +107,18 @@ class Run(Answer):
         bodies = {each.name: each.body for each in self.problem.experiments}
         return portrait(replay, bodies[replay.name], self.parameters, field, count)
 
-    def save(self, folder: str | Path, frames: bool = True) -> Path:
-        """Write the run folder, completely or not at all, and return its path.
+    def save(self, folder: str | Path, frames: bool = True, pictures: bool = True) -> Path:
+        """Write the run folder, completely or not at all, and return it.
+
+        The pictures are drawn after the folder is in its place.
 
         Parameters
         ----------
         folder : str or Path
-            New folder, or an earlier run, which is replaced.
         frames : bool
             Whether to write ParaView files of the motion.
+        pictures : bool
+            Whether to draw pictures, which may take as long as the search.
 
         Raises
         ------
@@ -121,7 +127,7 @@ class Run(Answer):
         """
         from .result.record import write_run  # what files hold is no part of a run
 
-        return write_run(self, folder, frames)
+        return write_run(self, folder, frames=frames, pictures=pictures)
 
 
 def run(
@@ -162,7 +168,16 @@ def run(
         If `solve` raises it.
     """
     say = log or (lambda _: None)
+    began_s = time.perf_counter()
     solution = solve(problem, method, watch, start, scheduler)
+    searched_s = time.perf_counter()
+
+    def timed(answer: Run) -> Run:
+        """Return the answer with the time until now; a search with finer steps is no check."""
+        finer_s = answer.solution.timing.total - solution.timing.total
+        checks_s = time.perf_counter() - searched_s - finer_s
+        return replace(answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s))
+
     bodies = (segment.body for segment in solution.collocation.segments)
     fields = {part.field_name: part.field for b in bodies for part in b.parts if part.field}
     problem = problem.with_lengths({name: field.length_m for name, field in fields.items()})
@@ -185,15 +200,16 @@ def run(
             answer = replace(answer, profiles=profiles, sources=sources)
             answer = replace(answer, probes=_probes(answer, fit, changes, say, deep=probe))
         if not seek_causes or answer.solution.status is Status.INTERRUPTED:
-            return answer
+            return timed(answer)
         say("looking for causes of the misfit")
         answer = replace(answer, causes=likely_causes(answer.solution))
         if problem.uncertainty.numerical and answer.uncertainty is not None:
-            return refine(answer, say=say)
-        return answer
+            answer = refine(answer, say=say)
+        return timed(answer)
     except KeyboardInterrupt:
         unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
-        return replace(answer, rollouts=unsimulated | dict(answer.rollouts), missing=missing)
+        rollouts = unsimulated | dict(answer.rollouts)
+        return timed(replace(answer, rollouts=rollouts, missing=missing))
 
 
 def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:

@@ -6,17 +6,72 @@ the imports ends the program without a traceback.
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import NoReturn
 
 COMMAND = "collocation-sysid"
 # Name of a thread that is left in a library's code, which no signal reaches.
 LEFT = "left behind"
+# File of the frames of an import, and how often a deferred signal tries again [s].
+IMPORTING = "<frozen importlib._bootstrap>"
+RETRY_S = 0.05
+
+
+class Interrupts:
+    """Handler of signals that raises `KeyboardInterrupt`, but not within imports and `deferred`.
+
+    Libraries convert an exception within their imports into an error of their own. There the first
+    signal is deferred until the import has ended; a second one raises at once.
+    """
+
+    def __init__(self) -> None:
+        self._deferring = 0
+        self._timer: threading.Timer | None = None
+        self._tries_again = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Raise `KeyboardInterrupt`, or defer the signal that interrupted this frame."""
+        is_second = self._timer is not None and not self._tries_again
+        self._tries_again = False
+        if not is_second and (self._deferring or _is_importing(frame)):
+            self._timer = threading.Timer(RETRY_S, self._try_again, (number,))
+            self._timer.daemon = True
+            self._timer.start()
+            return
+        self.forget()
+        raise KeyboardInterrupt
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Defer the first signal beyond the end of the block."""
+        self._deferring += 1
+        try:
+            yield
+        finally:
+            self._deferring -= 1
+
+    def forget(self) -> None:
+        """Drop a signal that is deferred."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None
+
+    def _try_again(self, number: int) -> None:
+        self._tries_again = True
+        if os.name == "posix":  # also wakes a main thread that waits
+            signal.pthread_kill(threading.main_thread().ident or 0, number)
+        else:
+            _thread.interrupt_main(number)
+
+
+INTERRUPTS = Interrupts()
 
 
 def _end_quietly() -> None:
@@ -30,7 +85,7 @@ def _end_quietly() -> None:
 
 
 def heed_interrupts() -> Callable[[], None]:
-    """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt`, so that results are kept.
+    """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt` as `Interrupts` does, unless ignored.
 
     Returns
     -------
@@ -38,15 +93,22 @@ def heed_interrupts() -> Callable[[], None]:
         Function that restores the previous signal handlers.
     """
     numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
-    changed = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
-    for number in changed:
-        signal.signal(number, signal.default_int_handler)
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    before = {n: handler for n in numbers if (handler := signal.getsignal(n)) in usual}
+    for number in before:
+        signal.signal(number, INTERRUPTS)
 
     def restore() -> None:
-        for number in changed:
-            signal.signal(number, signal.SIG_DFL)
+        INTERRUPTS.forget()
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
     return restore
+
+
+def raises_interrupt(handler: object) -> bool:
+    """Return whether a handler of signals raises `KeyboardInterrupt`."""
+    return handler is signal.default_int_handler or handler is INTERRUPTS
 
 
 def leave(code: object) -> NoReturn:
@@ -61,6 +123,15 @@ def leave(code: object) -> NoReturn:
         with suppress(OSError):
             stream.flush()
     os._exit(code if isinstance(code, int) else 1)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Return whether a frame, or one that called it, is of an import."""
+    while frame is not None:
+        if frame.f_code.co_filename == IMPORTING:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _in_main_thread() -> bool:

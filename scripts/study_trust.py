@@ -143,7 +143,7 @@ def errors_of(found: Run, truth: Mapping[str, float]) -> dict[str, float]:
     return {
         name: abs(found.parameters[name] - value) / error
         for name, value in truth.items()
-        if (error := bars[name]) is not None
+        if np.isfinite(error := bars[name])
     }
 
 

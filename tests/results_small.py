@@ -11,6 +11,7 @@ import numpy as np
 from collocation_sysid.files import SCHEMA
 from collocation_sysid.methods.solution import Timing
 from collocation_sysid.runs.result import (
+    Elapsed,
     FoundDynamics,
     FoundFit,
     FoundRollout,
@@ -87,6 +88,7 @@ def a_result(parameters: Mapping[str, ReportedEstimate] | None = None, **changes
         iterations=5,
         evaluations=5,
         timing_s=Timing(0.1, 0.2, 0.3, 0.6),
+        elapsed_s=Elapsed(search=2.0, checks=8.5, pictures=4.25),
         problem=ProgramSize(8, 6, 1, 10, 240, 200, "midpoint"),
         notes=(),
         history=(),

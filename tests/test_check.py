@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from problem_files import REFERENCES, Edit, both, replace_cell, replace_text, run_command, settings
-from problems_small import TRUTH, hung_cube
+from problems_small import TRUTH, bar_in_two_hands, hung_cube
 from test_static import block
 
 from collocation_sysid.display import plain_text
@@ -21,7 +21,7 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
-from collocation_sysid.result.check_sections import closer_table
+from collocation_sysid.result.check_sections import closer_table, glance_table
 from collocation_sysid.runs.check import Findings, check_problem, glance
 from collocation_sysid.runs.check.body import element_concerns, slenderness, worst_elements
 from collocation_sysid.runs.check.cost import Cost, cost_concerns, cost_notes
@@ -347,6 +347,13 @@ def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypat
     (first,) = shown
     assert "Body" in first
     assert "grasp of 'swing'  9 nodes" in first
+
+
+def test_every_grasp_of_an_experiment_is_shown():
+    shown = plain_text(glance_table(glance(Problem([bar_in_two_hands()], TRUTH))))
+    (first,) = re.findall(r"grasp 1 of 'bar in two hands' .* at \((.*?)\) mm", shown)
+    (second,) = re.findall(r"grasp 2 of 'bar in two hands' .* at \((.*?)\) mm", shown)
+    assert (first, second) == ("0, 0, 0", "150, 0, 0")
 
 
 def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -39,6 +40,7 @@ from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.result import progress as progress_shown
+from collocation_sysid.result import record
 from collocation_sysid.result.progress import Heartbeat
 from collocation_sysid.runs import forward_simulation, solving
 
@@ -53,6 +55,7 @@ RESULT_KEYS = {
     "rollout": {"rms_m", "max_m"},
     "iterations": set(),
     "timing_s": {"build", "evaluations", "linear_algebra", "total"},
+    "elapsed_s": {"search", "checks", "pictures"},
     "problem": {"nodes", "elements", "timesteps", "variables", "constraints"},
     "provenance": {"version", "casadi", "problem_sha256", "platform"},
 }
@@ -74,13 +77,19 @@ def frames_in(listing: Path) -> list[Path]:
 def solved(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("three")
     file = write_problem(folder, {"swing": 8, "nod": 12, "twist": 6}, validation="twist")
+    began_s = time.perf_counter()
     with pictures_drawn():
         outcome = run_command("solve", file, "--out", folder / "run")
-    run = folder / "run"
+    run, took_s = folder / "run", time.perf_counter() - began_s
     with np.load(run / "trajectory.npz") as stored:
         arrays = dict(stored)
     return SimpleNamespace(
-        file=file, outcome=outcome, run=run, result=result_in(run), arrays=arrays
+        file=file,
+        outcome=outcome,
+        run=run,
+        result=result_in(run),
+        arrays=arrays,
+        took_s=took_s,
     )
 
 
@@ -167,6 +176,19 @@ def test_plots_are_pictures(solved):
         assert imread(file).std() > 0.01
 
 
+def test_search_checks_and_pictures_are_timed_separately(solved):
+    elapsed_s = solved.result["elapsed_s"]
+    assert elapsed_s["search"] >= solved.result["timing_s"]["total"] > 0
+    assert min(elapsed_s["checks"], elapsed_s["pictures"]) > 0
+    assert sum(elapsed_s.values()) < solved.took_s
+    told = "time: search {search:.1f} s, checks {checks:.1f} s\n"
+    assert told.format(**elapsed_s) in solved.outcome.out
+    assert solved.outcome.out.endswith("\npictures drawn in {pictures:.1f} s\n".format(**elapsed_s))
+    assert run_command("report", solved.run, "--to", solved.run / "a.md").code == 0
+    told = "search {search:.1f} s, checks {checks:.1f} s, pictures {pictures:.1f} s"
+    assert told.format(**elapsed_s) in (solved.run / "a.md").read_text()
+
+
 def test_the_problem_as_run_is_kept(solved):
     assert (solved.run / "problem.toml").read_text() == solved.file.read_text()
 
@@ -219,12 +241,72 @@ def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlie
     assert "iteration limit" in outcome.out
     assert "Largest violations" in outcome.out
     assert len(outcome.err.splitlines()) >= 3
+    assert re.search(r"^drawing picture 2 of \d+: \w+\.png$", outcome.err, re.MULTILINE)
     result = result_in(tiny / "run")
     assert (result["status"], result["converged"]) == ("iteration-limit", False)
     assert result["parameters"]["mu_pa"]["statistical_std_error"] is None
     written = set(contents(tiny / "run"))
     assert {"trajectory.npz", "trajectory.pvd", "convergence.png", "problem.toml"} <= written
     assert "old.png" not in written
+
+
+def test_pictures_may_be_left_out(tiny):
+    with pictures_drawn():
+        outcome = run_command("solve", "problem.toml", "--out", "run", "--no-pictures")
+    assert outcome.code == 0
+    assert "pictures" not in outcome.out
+    assert not [*(tiny / "run").glob("*.png")]
+    assert result_in(tiny / "run")["elapsed_s"]["pictures"] is None
+    assert len(frames_in(tiny / "run" / "trajectory.pvd")) == 9
+
+
+def test_the_time_of_checks_is_none_of_the_search(tiny, monkeypatch):
+    wait_s = 1.5
+    monkeypatch.setattr(pipeline, "likely_causes", lambda _: time.sleep(wait_s) or ())
+    began_s = time.perf_counter()
+    assert run_command("solve", "problem.toml", "--out", "run").code == 0
+    took_s = time.perf_counter() - began_s
+    elapsed_s = result_in(tiny / "run")["elapsed_s"]
+    assert elapsed_s["checks"] > wait_s
+    assert elapsed_s["search"] < took_s - wait_s
+
+
+def test_the_answer_is_shown_and_kept_before_pictures_are_drawn(tiny, monkeypatch):
+    shown = []
+
+    def interrupt(*_: object) -> None:
+        shown.append((sys.stdout.getvalue(), result_in(tiny / "run")))
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(record, "_write_pictures", interrupt)
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    ((out, result),) = shown
+    assert "Verdict: check" in out
+    assert "written to run" in out
+    assert result == result_in(tiny / "run")
+    assert outcome.code == 130
+    assert "the answer is kept in run" in outcome.err
+    assert "collocation-sysid plot run" in outcome.err
+    assert json.loads(run_command("solve", "problem.toml", "--json").out)["elapsed_s"]["checks"] > 0
+
+
+def test_an_interrupt_while_the_folder_is_written_loses_nothing(tiny, monkeypatch):
+    monkeypatch.setattr(record, "_write_all_frames", lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr(record, "_write_pictures", lambda *_: time.sleep(60))
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 130
+    assert "Verdict: check" in outcome.out
+    assert "the answer is kept in run" in outcome.err
+    assert result_in(tiny / "run")["status"] == "converged"
+
+
+def test_another_result_in_the_folder_is_left_alone_when_the_pictures_are_drawn(tiny, monkeypatch):
+    file = tiny / "run" / "result.json"
+    monkeypatch.setattr(record, "_write_pictures", lambda *_: file.write_text('{"another": 1}'))
+    outcome = run_command("solve", "problem.toml", "--out", "run")
+    assert outcome.code == 2
+    assert "result.json was changed while the pictures were drawn" in outcome.err
+    assert file.read_text() == '{"another": 1}'
 
 
 def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):

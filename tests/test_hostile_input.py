@@ -17,6 +17,7 @@ from problem_files import replace_cell, replace_text, run_command, settings
 from collocation_sysid.problem import Problem
 from collocation_sysid.result import writers
 from collocation_sysid.runs.check import cost as memory
+from collocation_sysid.starting import INTERRUPTS, heed_interrupts
 
 pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
 
@@ -202,6 +203,23 @@ nlpsol._nlpsol = lambda *_: deaf
 nlpsol.GRACE_S = 0.2 if {times} == 1 else 600
 cli.main()
 """
+# Libraries do so with what is raised within their imports.
+CONVERTING = """
+import os, signal, sys, time
+from collocation_sysid import cli
+class Converting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "matplotlib.figure":
+            try:
+                for _ in range({times}):
+                    os.kill(os.getpid(), signal.SIGTERM)
+                    time.sleep(0.5)
+            except KeyboardInterrupt as error:
+                {raised}
+sys.meta_path.insert(0, Converting())
+sys.argv = ["collocation-sysid", "solve", "problem.toml", "--out", "run", "-q"]
+cli.main()
+"""
 
 
 def ended(program: str) -> subprocess.CompletedProcess[str]:
@@ -237,6 +255,41 @@ def test_two_signals_end_it_at_once(tiny: Path):
     done = ended(DEAF.format(name="SIGINT", times=2))
     assert (done.returncode, done.stderr) == (130, "")
     assert not (tiny / "run").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_signal_within_an_import_is_no_error_of_the_library(tiny: Path):
+    done = ended(CONVERTING.format(times=1, raised="raise RuntimeError('no fonts') from error"))
+    assert done.returncode == 130, done.stderr
+    assert "Verdict" in done.stdout
+    assert done.stderr == (
+        "interrupted: the answer is kept in run, without all pictures; draw them with: "
+        "collocation-sysid plot run\n"
+    )
+    assert json.loads((tiny / "run" / "result.json").read_text())["status"] == "converged"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_second_signal_ends_an_import(tiny: Path):
+    done = ended(CONVERTING.format(times=2, raised="os._exit(77)"))
+    assert done.returncode == 77
+    assert json.loads((tiny / "run" / "result.json").read_text())["status"] == "converged"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_deferred_signal_interrupts_what_follows():
+    restore = heed_interrupts()
+    try:
+        with INTERRUPTS.deferred():
+            signal.raise_signal(signal.SIGTERM)
+            time.sleep(0.2)
+            kept = "whole"
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(30)
+    finally:
+        restore()
+    assert kept == "whole"
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

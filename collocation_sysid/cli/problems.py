@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import json
+import shlex
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
+from rich.text import Text
 
 from ..errors import SimulationError
 from ..files import require_possible, run_name
 from ..methods import require_method
 from ..methods.solution import Status
-from ..pipeline import run
+from ..pipeline import Run, run
+from ..result.record import draw_run
 from ..result.synthesis import Recipe, write_data
 from ..result.writers import require_replaceable
 from ..runs.check import check_problem, glance
+from ..runs.result import Result
+from ..starting import INTERRUPTS
+from ..tree import as_json
 from .common import EXIT_DOUBTFUL, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors, show
 from .options import OfProblem, Out, Told, command
 
@@ -46,6 +53,8 @@ class Solve(OfProblem, Told):
         Show what the variance of each estimate is made of.
     probe : bool
         Look harder: refit parts of the data, and with each assumption freed.
+    pictures : bool
+        Draw pictures into the run folder; the command plot draws them later.
     """
 
     method: str | None = None
@@ -56,6 +65,7 @@ class Solve(OfProblem, Told):
     strict: bool = False
     budget: bool = False
     probe: bool = False
+    pictures: bool = True
 
 
 @command(
@@ -85,18 +95,42 @@ def solve(options: Solve) -> None:
     problem = options.read()
     require_possible(folder)
     require_replaceable(folder)
-    with Progress(errors, problem, options.verbose, options.quiet) as progress:
-        how = options.method, progress.iteration, progress.say, options.start
-        finished = run(problem, *how, scheduler=options.scheduler, probe=options.probe)
-        progress.say("writing the run folder")
-        finished.save(folder)
-    options.tell(finished.result, summary(finished.result, folder, options.budget))
+    with ExitStack() as until_shown:
+        with Progress(errors, problem, options.verbose, options.quiet) as progress:
+            how = options.method, progress.iteration, progress.say, options.start
+            finished = run(problem, *how, scheduler=options.scheduler, probe=options.probe)
+            until_shown.enter_context(INTERRUPTS.deferred())
+            progress.say("writing the run folder")
+            finished.save(folder, pictures=False)
+        if not options.as_json:
+            show(summary(finished.result, folder, options.budget))
+    result = _drawn(finished, folder, options) if options.pictures else finished.result
+    if options.as_json:
+        typer.echo(as_json(result))
+    elif result.elapsed_s.pictures is not None:
+        show(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
     status = finished.solution.status
+    if options.pictures and result.elapsed_s.pictures is None:
+        raise typer.Exit(EXIT_INTERRUPTED)
     if status is Status.INTERRUPTED or finished.missing:
         raise typer.Exit(EXIT_INTERRUPTED)
     if options.strict and finished.trust.verdict == "doubtful":
         raise typer.Exit(EXIT_DOUBTFUL)
     raise typer.Exit(0 if status.converged else EXIT_NOT_CONVERGED)
+
+
+def _drawn(finished: Run, folder: Path, options: Solve) -> Result:
+    """Draw the pictures; after an interrupt return the result without their time."""
+    from ..result.progress import Progress
+
+    try:
+        with Progress(errors, verbose=options.verbose, quiet=options.quiet) as progress:
+            return draw_run(finished, folder, progress.say)
+    except KeyboardInterrupt:
+        again = shlex.join(["collocation-sysid", "plot", str(folder)])
+        kept = f"interrupted: the answer is kept in {folder}, without all pictures"
+        errors.print(Text(f"{kept}; draw them with: {again}"), soft_wrap=True)
+        return finished.result
 
 
 @dataclass(frozen=True, kw_only=True)

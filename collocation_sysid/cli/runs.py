@@ -118,16 +118,20 @@ class Plot(OfRun):
     """Options of `plot`."""
 
     out: Out = None
+    quiet: Quiet = False
 
 
 @command(commands, "plot runs/swing")
 def plot(options: Plot) -> None:
     """Draw the pictures of a run again, from its files."""
     from ..result.pictures.album import redraw
+    from ..result.progress import Progress
 
     folder = options.out or options.run_folder
     require_possible(folder)
-    for file in redraw(options.run_folder, folder):
+    with Progress(errors, quiet=options.quiet) as progress:
+        files = redraw(options.run_folder, folder, progress.say)
+    for file in files:
         typer.echo(file)
 
 

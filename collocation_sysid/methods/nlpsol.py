@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..program.collocation import Collocation, carried_over
-from ..starting import LEFT
+from ..starting import LEFT, raises_interrupt
 from .callbacks import HessianValues, Monitor, NlpFunctions
 from .condensed import whole_multipliers
 from .initial_point import Multipliers
@@ -188,7 +188,7 @@ def _interruptible(monitor: Monitor) -> Iterator[None]:
     So does SIGTERM where it is heeded as Ctrl-C is.
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    if handlers[signal.SIGTERM] is not signal.default_int_handler:
+    if not raises_interrupt(handlers[signal.SIGTERM]):
         del handlers[signal.SIGTERM]
 
     def request(number: int, _frame: object) -> None:

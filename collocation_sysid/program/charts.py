@@ -102,8 +102,8 @@ class Chart:
     def of(cls, experiment: Experiment) -> Chart:
         """Build the chart of the stated places of an experiment's markers and depth cameras.
 
-        Markers without a stated place get the place that `Markers.placement` gives them, until
-        `Segment.placed` initialises it.
+        Markers without a stated place get the place where their first sample lies on the undeformed
+        body in its grasp; `Segment.placed` replaces it before a solve.
         """
         body = experiment.body
         markers = experiment.markers

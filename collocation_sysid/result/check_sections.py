@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from ..display import Line, Shown, Table, duration, labelled
 from ..fem.constants import symbol_of, unit_of
-from ..runs.check import BodyFinding, Findings, Glance, Recording
+from ..runs.check import BodyFinding, Findings, Glance, Hold, Recording
 from ..runs.check.body import hold_sentence
 from .run_sections import how_to
 
@@ -113,9 +115,17 @@ def _measurements_section(findings: Glance) -> Table:
         rows["…"] = f"and {len(findings.recordings) - SHOWN_RECORDINGS} more (all with --json)"
     densities = {recording.air_density_kg_m3 for recording in findings.recordings}
     rows["air"] = ", ".join(map(_air, sorted(densities)))
-    for hold in findings.holds[:SHOWN_RECORDINGS]:
-        rows[f"grasp of '{hold.experiment}'"] = hold_sentence(hold)
+    for recording in findings.recordings[:SHOWN_RECORDINGS]:
+        rows |= _grasps(recording.experiment, findings.holds)
     return labelled("Measurements", rows)
+
+
+def _grasps(experiment: str, holds: Iterable[Hold]) -> dict[str, str]:
+    """Return what each grasp of an experiment holds; several grasps are numbered from 1."""
+    own = [hold_sentence(hold) for hold in holds if hold.experiment == experiment]
+    if len(own) == 1:
+        return {f"grasp of '{experiment}'": own[0]}
+    return {f"grasp {k} of '{experiment}'": sentence for k, sentence in enumerate(own, start=1)}
 
 
 def _air(density_kg_m3: float) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Array
+from ..errors import InputError
 from ..fem.body import Body
+from ..files import RESULT_FILE, write_whole
 from ..program.depth_comparison import SurfaceComparison
 from ..program.touches import on_surface
 from ..recording.experiment import Experiment
@@ -26,37 +29,85 @@ from .writers import run_folder, write_frames
 REFINEMENT_FILE = "refinement.json"
 
 
-def write_run(finished: Answer, folder: str | Path, frames: bool = True) -> Path:
-    """Write the run folder, whole or not at all, and return it.
+def write_run(
+    finished: Answer, folder: str | Path, *, frames: bool = True, pictures: bool = True
+) -> Path:
+    """Write the run folder, whole or not at all, then its pictures, and return it.
 
-    ``result.json``, ``problem.toml`` as run where the problem has a file, ``trajectory.npz``,
-    pictures, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several experiments the
-    arrays' names and the frames' folders have the experiment's name in front.
+    ``result.json``, ``problem.toml`` as run where the problem has a file, ``trajectory.npz``, and
+    ``frames/`` with ``trajectory.pvd`` for ParaView. With several experiments the arrays' names and
+    the frames' folders have the experiment's name in front. `draw_run` adds the pictures, after the
+    folder is in its place, so that nothing which goes wrong there loses the answer.
     """
     result = result_of(finished)
     with run_folder(folder) as place:
         origin = finished.problem.origin
         if origin is not None:
             (place / "problem.toml").write_text(origin.text, encoding="utf-8")
-        (place / "result.json").write_text(as_json(result) + "\n", encoding="utf-8")
+        (place / RESULT_FILE).write_text(_as_text(result), encoding="utf-8")
         if finished.refinement is not None and finished.refinement.levels:
             text = as_json(finished.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
-        seen = replays(finished)
-        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **_arrays(seen))
-        _write_pictures(finished, result, seen, place)
+        arrays = _arrays(replays(finished))
+        np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **arrays)
         if frames:
             _write_all_frames(finished, place)
+    if pictures:
+        draw_run(finished, Path(folder))
     return Path(folder)
 
 
-def _write_pictures(finished: Answer, result: Result, seen: Sequence[Replay], place: Path) -> None:
+def draw_run(finished: Answer, folder: Path, say: Callable[[str], None] | None = None) -> Result:
+    """Draw the pictures of a run into its folder, and add to its result how long that took.
+
+    Parameters
+    ----------
+    finished : Answer
+    folder : Path
+        What `write_run` wrote of this answer.
+    say : callable, optional
+        Called with what is being done now, a text.
+
+    Returns
+    -------
+    Result
+        The content of ``result.json`` afterwards.
+
+    Raises
+    ------
+    InputError
+        If the folder holds another result, or cannot be written in.
+    """
+    began_s = time.perf_counter()
+    result, file = result_of(finished), folder / RESULT_FILE
+    _write_pictures(finished, result, folder, say or (lambda _: None))
+    if not file.is_file() or file.read_text(encoding="utf-8") != _as_text(result):
+        raise InputError(
+            f"{RESULT_FILE} was changed while the pictures were drawn; draw them again with: "
+            f"collocation-sysid plot {folder}",
+            folder,
+        )
+    pictures_s = time.perf_counter() - began_s
+    result = replace(result, elapsed_s=replace(result.elapsed_s, pictures=pictures_s))
+    write_whole(file, _as_text(result))
+    return result
+
+
+def _as_text(result: Result) -> str:
+    """Return the text of ``result.json``."""
+    return as_json(result) + "\n"
+
+
+def _write_pictures(
+    finished: Answer, result: Result, folder: Path, say: Callable[[str], None]
+) -> None:
+    say("drawing the pictures")
     # matplotlib takes a while to import, and nothing else needs it.
     from .pictures import album, jacobian_sparsity, save_pictures
 
     solution = finished.solution
     jacobian = jacobian_sparsity(solution.collocation, solution.z)
-    save_pictures(place, album(seen, result) | {"jacobian": jacobian})
+    save_pictures(folder, album(replays(finished), result) | {"jacobian": jacobian}, say)
 
 
 def _told_of_cells(finished: Answer, body: Body) -> dict[str, Any]:

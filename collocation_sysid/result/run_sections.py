@@ -29,7 +29,7 @@ from ..files import is_own
 from ..program.depth_comparison import DepthError
 from ..recording.nuisance import in_unit_for_people
 from ..runs.prediction import PredictionError
-from ..runs.result import Result, SimulatedExperiment
+from ..runs.result import Elapsed, Result, SimulatedExperiment
 from ..statistics.budget import largest_first, worded
 from ..statistics.concern import Concern, topics_of
 from ..statistics.trust import Trust
@@ -74,13 +74,14 @@ CAPTIONS = {
 }
 
 
-def summary(result: Result, folder: Path, budget: bool = False) -> list[Shown]:
-    """A run on one screen, with all of its budget where that is asked for."""
+def summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
+    """A run on one screen, with all of its budget where that is asked for, and its folder."""
     largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (_ended(result), *answer(result), _fit(result), _notes(result))
     tables = [budget_table(result)] if budget and result.budget else []
-    return [*flat(sections), *tables, *probe_lines(result), *ended, f"written to {folder}"]
+    written = [] if folder is None else [f"written to {folder}"]
+    return [*flat(sections), *tables, *probe_lines(result), *ended, *written]
 
 
 def answer(result: Result) -> list[Shown]:
@@ -100,8 +101,8 @@ def run_report(run: str | Path) -> Section:
     run = Path(run)
     result = Result.read(run)
     with reading_run(run):
-        verdict, took_s = verdict_of(result.trust, linked=True), f"{result.timing_s.total:.3g} s"
-        took = f" {result.method}, {result.iterations} iterations, {took_s}"
+        verdict = verdict_of(result.trust, linked=True)
+        took = f" {result.method}, {result.iterations} iterations; {_elapsed(result.elapsed_s)}"
         badge = Span(result.status, f"badge {result.trust.verdict}")
         meaning = Line(f"{MEANINGS[result.trust.verdict]}.", "quiet")
         parts: list[Shown] = [
@@ -291,7 +292,7 @@ def _interval(ends: tuple[float, float] | None) -> str:
 
 def _fit(result: Result) -> Section:
     """How well the markers and the equations are met, how long that took, and what is beside."""
-    fit, timing, experiments = result.fit, result.timing_s, result.fit.experiments
+    fit, experiments = result.fit, result.fit.experiments
     marked = any(each.samples for each in experiments.values())
     markers = f"markers: {_mm(fit.rms_m)} mm RMS, {_mm(fit.noise_rms_m)} mm from noise alone; "
     violated = result.dynamics.max_violation_n, result.dynamics.max_violation_relative
@@ -313,14 +314,27 @@ def _fit(result: Result) -> Section:
             lines.append(f"depth of {camera} in '{name}': {_depth(error)}")
     for name, each in result.rollout.experiments.items():
         lines += _simulated(name, each)
-    lines.append(
-        f"{result.iterations} iterations in {timing.total:.1f} s "
-        f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"
-    )
+    lines += [f"time: {_elapsed(result.elapsed_s)}", _iterations(result)]
     for name, each in experiments.items():
         if each.beside:
             lines.append(f"also estimated for '{name}': {'; '.join(each.beside)}")
     return Section("Fit", tuple(lines))
+
+
+def _elapsed(elapsed: Elapsed) -> str:
+    """Return how long each part of a run took; pictures that were not drawn are left out."""
+    parts = {"search": elapsed.search, "checks": elapsed.checks, "pictures": elapsed.pictures}
+    known = (f"{part} {time_s:.1f} s" for part, time_s in parts.items() if time_s is not None)
+    return ", ".join(known)
+
+
+def _iterations(result: Result) -> str:
+    """Return the number of iterations, and what of the search was spent on them."""
+    timing = result.timing_s
+    return (
+        f"{result.iterations} iterations in {timing.total:.1f} s of the search "
+        f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"
+    )
 
 
 def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:

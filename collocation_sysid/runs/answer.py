@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from typing import Any
@@ -31,7 +31,7 @@ from ..statistics.trust import Trust, cause_concerns, numerical_concerns, probe_
 from ..statistics.uncertainty import Place, Uncertainty, places_of
 from .check.motion import Motion
 from .forward_simulation import Rollout
-from .result import ReportedEstimate
+from .result import Elapsed, ReportedEstimate
 from .verdict import combined_concerns, concerns, expected_rms_m, motions_of
 
 
@@ -61,6 +61,8 @@ class Answer:
     probes : tuple of Probe
         Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
         of parts of the data, where these were asked for. Empty without error bars.
+    elapsed_s : Elapsed
+        How long search and checks took.
     """
 
     problem: Problem
@@ -75,6 +77,7 @@ class Answer:
     missing: str = ""
     sources: Sources | None = None
     probes: tuple[Probe, ...] = ()
+    elapsed_s: Elapsed = field(default_factory=Elapsed)
 
     def __repr__(self) -> str:
         solution = self.solution
@@ -208,29 +211,30 @@ class Answer:
         """RMS distance of the fitted markers that noise of the sigma_m given would leave."""
         return expected_rms_m(self.solution, self.uncertainty)
 
-    def interval(self, name: str) -> tuple[float, float] | None:
+    def interval(self, name: str) -> tuple[float, float]:
         """Return the combined 95 % interval of a parameter or derived modulus, the one to publish.
 
-        None for what was not estimated or has no error bar, see `ReportedEstimate`.
+        Both ends are NaN if there is none: the solve has not converged, or the parameter was not
+        estimated, is at a bound or has no error bar, see `ReportedEstimate`.
 
         Raises
         ------
         InputError
             For an unknown name.
         """
-        return self._estimate(name).combined95
+        return self._estimate(name).combined95 or (np.nan, np.nan)
 
-    def std_error(self, name: str) -> float | None:
+    def std_error(self, name: str) -> float:
         """Return the combined standard uncertainty of a parameter or derived modulus.
 
-        None for what was not estimated or has no error bar, see `ReportedEstimate`.
+        NaN where `interval` is.
 
         Raises
         ------
         InputError
             For an unknown name.
         """
-        return self._estimate(name).combined_std_error
+        return _or_nan(self._estimate(name).combined_std_error)
 
     def to_frame(self) -> Any:
         """Return the estimates as a pandas DataFrame, one row each.

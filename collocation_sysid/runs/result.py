@@ -346,10 +346,31 @@ class Provenance:
     mesh_sha256: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Elapsed:
+    """Wall-clock time of the parts of a run [s].
+
+    Attributes
+    ----------
+    search : float
+        From the problem to the optimum: finding a start, and every search that led to the answer,
+        also with finer steps.
+    checks : float
+        What follows: forward simulations, uncertainties, budget, probes and likely causes.
+    pictures : float or None
+        Drawing and writing the pictures; None if they have not been drawn.
+    """
+
+    search: float = 0.0
+    checks: float = 0.0
+    pictures: float | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The content of ``result.json``, whose names are its keys.
 
+    `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run.
     `basis` says what the values rest on: the law of the damping, and what sets the scale; `budget`
     has each source's share of an estimate's variance; `probes` are
     refits with an assumption relaxed and, where that was asked for, of parts of the data.
@@ -380,6 +401,7 @@ class Result:
     iterations: int
     evaluations: int
     timing_s: Timing
+    elapsed_s: Elapsed
     problem: ProgramSize
     notes: tuple[str, ...]
     history: tuple[Iteration, ...]

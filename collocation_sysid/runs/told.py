@@ -83,6 +83,7 @@ def result_of(answer: Answer) -> Result:
         iterations=solution.iterations,
         evaluations=solution.evaluations,
         timing_s=solution.timing,
+        elapsed_s=answer.elapsed_s,
         problem=ProgramSize(
             sum(len(body.nodes_m) for body in problem.bodies),
             sum(len(body.cells) for body in problem.bodies),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
 
@@ -97,14 +97,19 @@ def _finite(markers_m: Array | None) -> Array | None:
     return None if markers_m is None else np.where(np.isfinite(markers_m), markers_m, np.nan)
 
 
-def save_pictures(folder: str | Path, pictures: Mapping[str, Figure]) -> list[Path]:
+def save_pictures(
+    folder: str | Path, pictures: Mapping[str, Figure], say: Callable[[str], None] | None = None
+) -> list[Path]:
     """Write each picture as <name>.png and return the files.
 
-    What a file name cannot hold becomes an underscore.
+    What a file name cannot hold becomes an underscore. `say` is called before each of them with a
+    text that has its number, from 1.
     """
     files = []
-    for name, figure in pictures.items():
+    for k, (name, figure) in enumerate(pictures.items(), start=1):
         file = Path(folder) / f"{safe_name(name)}.png"
+        if say is not None:
+            say(f"drawing picture {k} of {len(pictures)}: {file.name}")
         # Harder compression takes longer than drawing, for a tenth of the size.
         with whole_file(file) as draft:
             figure.savefig(draft, dpi=RESOLUTION_DPI, pil_kwargs={"compress_level": 2})
@@ -112,8 +117,12 @@ def save_pictures(folder: str | Path, pictures: Mapping[str, Figure]) -> list[Pa
     return files
 
 
-def redraw(run: str | Path, folder: str | Path) -> list[Path]:
+def redraw(
+    run: str | Path, folder: str | Path, say: Callable[[str], None] | None = None
+) -> list[Path]:
     """Write the pictures of a run folder into `folder`, all but that of the Jacobian.
+
+    `say` is as in `save_pictures`.
 
     Raises
     ------
@@ -122,4 +131,4 @@ def redraw(run: str | Path, folder: str | Path) -> list[Path]:
     """
     result, replays = read_run(run)
     with reading_run(Path(run)):
-        return save_pictures(folder, album(replays, result))
+        return save_pictures(folder, album(replays, result), say)
