@@ -14,7 +14,8 @@ import typer
 
 from ..console import PlainConsole
 from ..display import Shown, Table, on_terminal
-from ..errors import located
+from ..errors import located, require_among
+from ..pages import page_files, page_text, page_title
 from ..tree import as_json
 from .common import errors, show
 from .options import AsJson, command
@@ -68,6 +69,43 @@ def schema() -> None:
     from ..problem.schema import ProblemFile
 
     typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explain:
+    """Options of `explain`.
+
+    Attributes
+    ----------
+    topic : str
+        The page that is shown.
+    """
+
+    topic: Annotated[str | None, typer.Argument()] = None
+
+
+@command(commands, "explain", "explain verdict", "explain theory | less")
+def explain(options: Explain) -> None:
+    """Show a page of the documentation, or list the topics.
+
+    Pages are part of the installation; no network is needed. In a pipe they are Markdown.
+    """
+    topic = options.topic
+    if topic is None:
+        show(
+            Table(
+                "", ("topic", ""), tuple((each, page_title(each)) for each in page_files()), texts=1
+            )
+        )
+        return
+    require_among(topic, page_files(), where="TOPIC")
+    console = PlainConsole()
+    if console.is_terminal:
+        from .markdown import TerminalPage
+
+        console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
+    else:
+        typer.echo(page_text(topic), nl=False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,6 +26,7 @@ from ..display import (
 from ..errors import listed
 from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import is_own
+from ..pages import explain_command, page_url
 from ..program.depth_comparison import DepthError
 from ..recording.nuisance import in_unit_for_people
 from ..runs.prediction import PredictionError
@@ -154,9 +155,9 @@ def _harder(result: Result) -> list[Line]:
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:
-    """The pages that say how to cure what gives concern."""
-    pages = dict.fromkeys(f"docs/howto/{t.page}.md" for t in topics_of(concerns).values())
-    return [Line(f"what to do: {', '.join(pages)}", "quiet")] if pages else []
+    """Return the commands that show how to cure what gives concern, as a shell takes them."""
+    commands = dict.fromkeys(explain_command(t.page) for t in topics_of(concerns).values())
+    return [Line(f"what to do: {'; '.join(commands)}", "quiet")] if commands else []
 
 
 def _parameters(result: Result) -> Section:
@@ -412,9 +413,12 @@ def _cards(result: Result) -> Cards:
 
 def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
     for name, topic in topics_of(concerns).items():
-        about, page = Span(f"{topic.about}.", "strong"), f"docs/howto/{topic.page}.md"
-        more = (Span(f" {topic.cure} More in the how-to page "), Span(page, "code"), Span("."))
-        yield Line((about, *more), name=f"cure-{name}")
+        about = Span(f"{topic.about}.", "strong")
+        command = Span(explain_command(topic.page), "code")
+        more = [Span(f" {topic.cure} More: "), command]
+        if (url := page_url(topic.page)) is not None:
+            more += [Span(", or "), Span("the documentation", to=url)]
+        yield Line((about, *more, Span(".")), name=f"cure-{name}")
 
 
 def _error_bars(result: Result) -> Iterator[Shown]:

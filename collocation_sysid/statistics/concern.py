@@ -24,7 +24,7 @@ class Topic:
     about : str
         Its title.
     page : str
-        The page of `docs/howto` that says more.
+        The topic of the page that says more, see `pages`.
     cure : str
         What to do, in a sentence or two.
     said : mapping
