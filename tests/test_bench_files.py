@@ -367,6 +367,26 @@ def test_a_shape_that_cannot_be_meshed_is_refused(tmp_path, shape, words):
     assert words in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        (
+            "cylinder = { diameter_m = 0.05, height_m = 24 }",
+            "object.cylinder.height_m: found 24 m; expected at most 10 m, likely 0.024",
+        ),
+        ("box_m = [0.02, 24, 0.02]", "object.box_m: found 24 m; expected at most 10 m, likely"),
+    ],
+)
+def test_a_length_in_millimetres_is_named_and_not_the_edges_that_it_makes_too_many(
+    tmp_path, shape, words
+):
+    text = SHARED.replace('mesh = "block.vtu"', f"{shape}\nedge_length_m = 0.0005")
+    with pytest.raises(InputError) as caught:
+        Problem.read(block_problem(tmp_path, text))
+    assert words in str(caught.value)
+    assert "edge_length_m" not in str(caught.value)
+
+
 def test_a_quarter_of_a_cylinder_has_a_quarter_of_its_volume():
     whole, quarter = (cylinder_of_edge(0.05, 0.03, 0.011, part) for part in (False, True))
     assert whole.volume_m3 == pytest.approx(np.pi * 0.025**2 * 0.03, rel=1e-9)
