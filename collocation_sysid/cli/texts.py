@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from ..console import PlainConsole
-from ..display import Shown, Table, on_terminal
+from ..display import Shown, Table
 from ..errors import located, require_among
 from ..pages import page_files, page_text, page_title
 from ..tree import as_json
@@ -60,7 +60,7 @@ def methods(options: Methods) -> None:
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
         parts = _options_table(name) if name else _methods_table()
-        PlainConsole().print(on_terminal(parts))
+        show(parts)
 
 
 @commands.command()
@@ -138,12 +138,14 @@ def topics(options: Topics) -> None:
             each.type,
             f"{each.messages}",
             f"{each.rate_hz:.3g}" if each.rate_hz else "",
-            "\n".join((each.serves, *each.write)) if each.serves else "",
+            each.serves,
         )
         for each in listed
     )
-    heads = ("topic", "type", "messages", "Hz", "serves as, and what to write in place of a file")
-    show(Table("", heads, rows, names=2, texts=1))
+    heads = ("topic", "type", "messages", "Hz", "serves as")
+    addresses = [f"  {address}" for each in listed for address in each.write]
+    what = ["", "In place of a file write:", *addresses] if addresses else []
+    show([Table("", heads, rows, names=2, texts=1), *what])
 
 
 @dataclass(frozen=True, kw_only=True)
