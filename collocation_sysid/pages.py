@@ -61,9 +61,9 @@ def page_text(topic: str) -> str:
     return _LINK_TO_PAGE.sub(named, page_files()[topic].read_text(encoding="utf-8"))
 
 
-def explain_command(topic: str) -> str:
-    """Return the command that shows a page in a terminal."""
-    return f"collocation-sysid explain {topic}"
+def explain_command(*topics: str) -> str:
+    """Return the command that shows pages in a terminal."""
+    return " ".join(("collocation-sysid explain", *topics))
 
 
 def page_url(topic: str) -> str | None:

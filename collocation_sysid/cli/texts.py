@@ -77,35 +77,36 @@ class Explain:
 
     Attributes
     ----------
-    topic : str
-        The page that is shown.
+    topics : TOPIC
+        The pages that are shown.
     """
 
-    topic: Annotated[str | None, typer.Argument()] = None
+    topics: Annotated[list[str] | None, typer.Argument()] = None
 
 
-@command(commands, "explain", "explain verdict", "explain theory | less")
+@command(commands, "explain", "explain verdict", "explain trust scheme", "explain theory | less")
 def explain(options: Explain) -> None:
-    """Show a page of the documentation, or list the topics.
+    """Show pages of the documentation, or list their topics.
 
     Pages are part of the installation; no network is needed. In a pipe they are Markdown.
     """
-    topic = options.topic
-    if topic is None:
+    if not options.topics:
         show(
             Table(
                 "", ("topic", ""), tuple((each, page_title(each)) for each in page_files()), texts=1
             )
         )
         return
-    require_among(topic, page_files(), where="TOPIC")
+    for topic in options.topics:
+        require_among(topic, page_files(), where="TOPIC")
     console = PlainConsole()
-    if console.is_terminal:
-        from .markdown import TerminalPage
+    for topic in options.topics:
+        if console.is_terminal:
+            from .markdown import TerminalPage
 
-        console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
-    else:
-        typer.echo(page_text(topic), nl=False)
+            console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
+        else:
+            typer.echo(page_text(topic))
 
 
 @dataclass(frozen=True, kw_only=True)

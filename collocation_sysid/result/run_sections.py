@@ -155,9 +155,9 @@ def _harder(result: Result) -> list[Line]:
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:
-    """Return the commands that show how to cure what gives concern, as a shell takes them."""
-    commands = dict.fromkeys(explain_command(t.page) for t in topics_of(concerns).values())
-    return [Line(f"what to do: {'; '.join(commands)}", "quiet")] if commands else []
+    """Return the command that shows how to cure what gives concern, or nothing."""
+    pages = dict.fromkeys(topic.page for topic in topics_of(concerns).values())
+    return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
 def _parameters(result: Result) -> Section:
@@ -305,15 +305,22 @@ def _fit(result: Result) -> Section:
         for reading, rms in (each.reading_rms or {}).items():
             sigma = short((each.reading_sigma or {})[reading])
             lines.append(f"{reading} of '{name}': {short(rms)} RMS (sigma {sigma})")
+        unit = "J in the modelled part" if name in (fit.symmetry or {}) else "J"
         for obstacle, rubbed in (each.friction or {}).items():
+            energy = f"{short(rubbed.dissipated_j)} {unit}"
             lines.append(
                 f"friction of {obstacle} in '{name}': at most {rubbed.used:.0%} of its limit, "
-                f"slips {rubbed.slipping:.0%} of the time, takes {short(rubbed.dissipated_j)} J"
+                f"slips {rubbed.slipping:.0%} of the time, takes {energy}"
             )
         for camera, error in (each.depth or {}).items():
             lines.append(f"depth of {camera} in '{name}': {_depth(error)}")
     for name, each in result.rollout.experiments.items():
         lines += _simulated(name, each)
+    for parts in sorted({*(fit.symmetry or {}).values()}):
+        names = listed(f"'{name}'" for name, each in (fit.symmetry or {}).items() if each == parts)
+        lines.append(
+            f"loads of {names}: of the whole specimen, {parts} times those of the modelled part"
+        )
     lines.append(
         f"{result.iterations} iterations in {timing.total:.1f} s "
         f"(linear algebra {timing.linear_algebra:.1f} s, evaluations {timing.evaluations:.1f} s)"

@@ -187,7 +187,11 @@ def _fit(answer: Answer) -> FoundFit:
     for part in solution.parts:
         experiment = part.segment.experiment
         name, markers, sensors = experiment.name, experiment.markers, part.segment.sensors
-        sigmas = [s.wrench.sigmas**2 * np.where(s.wrench.measured, 1.0, np.nan) for s in sensors]
+        wrenches = [sensor.wrench for sensor in sensors]
+        sigmas = [
+            (wrench.symmetry * wrench.sigmas) ** 2 * np.where(wrench.measured, 1.0, np.nan)
+            for wrench in wrenches
+        ]
         both = np.array(sigmas).reshape(-1, 2, 3).swapaxes(0, 1)
         experiments[name] = FittedExperiment(
             solution.rms_by_experiment_m[name],
@@ -204,7 +208,13 @@ def _fit(answer: Answer) -> FoundFit:
             air_density_kg_m3=experiment.air_density_kg_m3,
         )
     pooled = pooled_wrench_rms(solution)
-    return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled)
+    parts = {
+        experiment.name: experiment.symmetry
+        for experiment in answer.problem.experiments
+        if experiment.symmetry > 1
+    }
+    symmetry = parts or None
+    return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled, symmetry=symmetry)
 
 
 def _simulated(answer: Answer) -> FoundRollout:
