@@ -12,7 +12,7 @@ import pytest
 from problem_files import run_command
 
 from collocation_sysid import run
-from collocation_sysid.display import plain_text
+from collocation_sysid.display import as_markdown, plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
@@ -20,7 +20,7 @@ from collocation_sysid.problem.beginning import TEMPLATES
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.tables import read_pressure
-from collocation_sysid.result.run_sections import summary
+from collocation_sysid.result.run_sections import run_report, summary
 from collocation_sysid.statistics.modal import doubts
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -267,6 +267,13 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
     )
     assert words in said
     assert "specimen" not in plain_text(summary(alone.result, tmp_path / "part"))
+    priors_n = [
+        float(re.search(r"tare up to \S+ N \(prior (\S+)\)", said)[1])
+        for each in (found.result, alone.result)
+        if (said := each.fit.experiments["first"].beside[-1])
+    ]
+    assert priors_n[0] == pytest.approx(4 * priors_n[1])
+    assert "Forces are those of the modelled part." in as_markdown([run_report(tmp_path / "whole")])
 
 
 def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):

@@ -125,11 +125,10 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
     """Mesh a cylinder or a box; lengths larger than a body's are named in place of the edges."""
-    shape, box_m = section.cylinder, section.box_m
+    shape, box_m = section.cylinder, section.box_m or (0.0, 0.0, 0.0)  # one of both by the schema
     if shape is not None:
         lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
     else:
-        assert box_m is not None  # by the schema
         lengths_m = {"box_m": max(box_m)}
     try:
         if shape is not None:

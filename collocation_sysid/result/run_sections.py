@@ -471,7 +471,9 @@ def _nuisance(result: Result) -> Iterator[Section]:
             rows.append((words, *(_size(size, unit) for size in sizes)))
         table = Table("", ("", "value", "±", "prior ±"), tuple(rows))
         title = f"Nuisance parameters of '{experiment}'"
-        yield Section(title, (Line(said, "quiet"), table))
+        is_part = experiment in (result.fit.symmetry or {})
+        loads = " Forces are those of the modelled part." if is_part else ""
+        yield Section(title, (Line(said + loads, "quiet"), table))
 
 
 def _residuals(result: Result, run: Path) -> Iterator[Shown]:

@@ -266,7 +266,8 @@ class FoundFit:
     ----------
     symmetry : mapping of experiment to int, optional
         Of those whose loads are reported for the whole specimen, how many times the loads of the
-        modelled part they are. Energies of friction are those of the modelled part.
+        modelled part they are. Energies of friction and nuisance parameters are those of the
+        modelled part.
     """
 
     rms_m: float

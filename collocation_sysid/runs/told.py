@@ -21,7 +21,7 @@ from ..program.collocation import Part
 from ..program.depth_comparison import DepthError
 from ..program.touches import rubbings
 from ..recording.experiment import Experiment
-from ..recording.nuisance import GAUGE, JOINING, PLACE, in_unit_for_people
+from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_unit_for_people
 from ..statistics.fields import FieldEstimate
 from ..statistics.identifiability import verdicts
 from ..statistics.scale import relative_sentence
@@ -310,6 +310,8 @@ def _sentence(part: Part, own: Sequence[int], values: Array, answer: Answer) -> 
     known = answer.uncertainty.nuisance if answer.uncertainty else {}
     low, high = (limit[k] for limit in nuisance.limits(part.segment.chart.samples))
     factor, unit = in_unit_for_people(1.0, entry.unit)
+    if entry.row == TARE:  # of the sensor, on which the whole specimen acts
+        factor *= part.segment.experiment.symmetry
     size, error = float(np.linalg.norm(values)), entry.sigma * known.get(name, np.nan)
     allowed = low + 1e-3 < part.phi[k] < high - 1e-3
     sentence = (entry.row.told or "{which} {signed}").format(
