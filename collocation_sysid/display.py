@@ -7,6 +7,7 @@ The same description is rendered for terminals, HTML and Markdown, and written a
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape as escape_html
@@ -14,7 +15,8 @@ from io import StringIO
 from math import isfinite
 from pathlib import Path
 
-from rich.console import Group, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -185,64 +187,109 @@ def labelled(title: str, rows: dict[str, str]) -> Table:
 
 
 def on_terminal(parts: Shown | Iterable[Shown]) -> RenderableType:
-    """Return parts as a rich renderable for the terminal."""
+    """Return parts as a rich renderable: text is wrapped between words, and no word is broken.
+
+    Longer words go beyond the terminal's edge where they are printed with ``crop=False``.
+    """
     if isinstance(parts, Shown):
         return _on_terminal(parts)
     return Group(*map(_on_terminal, parts))
 
 
-def plain_text(parts: Shown | Iterable[Shown]) -> str:
-    """Return parts as plain text without colours, with lines as long as necessary."""
+def plain_text(parts: Shown | Iterable[Shown], width: int = WIDE) -> str:
+    """Return parts as plain text without colours; each row of a table is one line."""
     file = StringIO()
-    PlainConsole(file=file, width=WIDE).print(on_terminal(parts))
+    PlainConsole(file=file, width=width).print(on_terminal(parts), crop=False)
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
 
 
 def _on_terminal(part: Shown) -> RenderableType:
     match part:
         case str():
-            return Text(part)
+            return _text(part)
         case Line():
             pieces = ((span.text, _colour(span.style)) for span in part.spans)
-            return Text.assemble(*pieces, style=_colour(part.style))
+            return UnbrokenWords(Text.assemble(*pieces, style=_colour(part.style)))
         case Items():
-            return Text("\n".join(f"- {text}" for text in part.texts))
+            return _text("\n".join(f"- {text}" for text in part.texts))
         case Table():
-            return _titled(part.title, _rich_table(part))
+            return _titled(part.title, TerminalTable(part))
         case Cards():
             rows = tuple((what, f"{value} ({beside})") for what, value, beside in part.items)
-            return _rich_table(Table("", (), rows, texts=1))
+            return TerminalTable(Table("", (), rows, texts=1))
         case Picture():
-            return Text(f"{part.caption} {part.file}")
+            return _text(f"{part.caption} {part.file}")
         case Listing():
-            return Group(Text(part.title, "bold"), Text(part.text))
+            return Group(_text(part.title, "bold"), _text(part.text))
         case Section():
             return _titled(part.title, *map(_on_terminal, part.parts))
 
 
 def _titled(title: str, *parts: RenderableType) -> RenderableType:
-    return Group(Text(title, style="bold"), *parts) if title else Group(*parts)
+    return Group(_text(title, "bold"), *parts) if title else Group(*parts)
+
+
+def _text(text: str, style: str = "") -> UnbrokenWords:
+    return UnbrokenWords(Text(text, style=style))
+
+
+@dataclass(frozen=True)
+class UnbrokenWords:
+    """Text wrapped between words; a word longer than a line goes beyond the terminal's edge."""
+
+    text: Text
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the lines."""
+        for line in self.text.split(allow_blank=True):
+            breaks = [0]
+            for word in re.finditer(r"\S+", line.plain):
+                before = line.plain[breaks[-1] : word.start()]
+                with_word = line.plain[breaks[-1] : word.end()]
+                if before.strip() and cell_len(with_word) > options.max_width:
+                    breaks.append(word.start())
+            for piece in line.divide(breaks[1:]):
+                piece.rstrip()
+                piece.no_wrap = True
+                piece.overflow = "ignore"
+                yield piece
 
 
 def _colour(style: str) -> str:
     return " ".join(COLOURS.get(word, "") for word in style.split())
 
 
-def _rich_table(table: Table) -> RichTable:
+@dataclass(frozen=True)
+class TerminalTable:
+    """A table as rich shows it; off a terminal, where others read lines, no head or row has two."""
+
+    table: Table
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the table."""
+        yield _rich_table(self.table, parted=console.is_terminal)
+
+
+def _rich_table(table: Table, *, parted: bool) -> RichTable:
     # Rows that speak for themselves are nearer to what they say.
     shown = RichTable(box=None, pad_edge=False) if table.heads else RichTable.grid(padding=(0, 1))
     columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (table.aside or 0)
     for place, head in enumerate((table.heads or ("",) * columns)[:columns]):
         number = table.is_number(place)
-        if number and columns > MANY:  # names of materials are parted where they have a hyphen
+        cells = [row[place] for row in table.rows if place < len(row)]
+        if not parted:
+            pass
+        elif number and columns > MANY:  # names of materials are parted where they have a hyphen
             head = head.replace("-", "-\n")
         elif not number:  # dotted keys may take two lines
             head = head.replace(".", ".\n", 1)
         whole = place == 0 and (table.texts or 0) > (table.aside or 0)
         side = "right" if number else "left"
-        shown.add_column(head, justify=side, overflow="fold", no_wrap=whole)
+        longest_word = max(map(cell_len, " ".join((head, *cells)).split()), default=0)
+        shown.add_column(head, justify=side, min_width=longest_word, no_wrap=whole)
     for row in table.rows:
-        shown.add_row(*(Text(cell, style=_colour(table.style or "")) for cell in row[:columns]))
+        cells = row[:columns] if parted else (cell.replace("\n", "; ") for cell in row[:columns])
+        shown.add_row(*(Text(cell, style=_colour(table.style or "")) for cell in cells))
     return shown
 
 

@@ -96,7 +96,11 @@ def read_json(file: Path, what: str) -> dict[str, Any]:
     require_own(file)
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
+    except NotADirectoryError:
+        folder = file.parent.parent
+        likely = f", likely {folder}" if (folder / file.name).is_file() else ""
+        raise InputError(f"this is a file; expected {what}{likely}", file.parent) from None
+    except FileNotFoundError:
         raise InputError(f"this is not {what}: it has no {file.name}", file.parent) from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{file.name} is damaged ({reason(error)}){AGAIN}", file.parent) from error

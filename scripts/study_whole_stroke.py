@@ -68,11 +68,12 @@ def _line(name: str, specimen: str, changes: Sequence[str]) -> str:
     except (InputError, SimulationError) as error:
         return f"| {name} | {error} | | | | | | | |"
     (wrench,) = (each.wrench for each in alone.obstacles if each.wrench is not None)
-    largest_n, missed_n = np.nanmax(np.abs(wrench.values)), pooled_wrench_rms(found.solution)[0]
+    largest_n = wrench.symmetry * np.nanmax(np.abs(wrench.values))
+    missed_n = pooled_wrench_rms(found.solution)[0]
     assert missed_n is not None
     young = _told(found.estimates["young_pa"], 1e-3, "{:.1f}")
     friction = _told(found.estimates["platen_friction"], 1.0, "{:.2f}")
-    misfit = f"{4 * missed_n:.2f} | {100 * missed_n / largest_n:.2f}"
+    misfit = f"{missed_n:.2f} | {100 * missed_n / largest_n:.2f}"
     return f"| {name} | {young} | {friction} | {misfit} |"
 
 

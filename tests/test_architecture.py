@@ -16,7 +16,18 @@ import collocation_sysid
 PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
-    {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"}
+    {
+        "arrays",
+        "errors",
+        "cluster",
+        "checked",
+        "files",
+        "folders",
+        "starting",
+        "apart",
+        "console",
+        "pages",
+    }
     | {"tree", "display", "section", "stated"},
     {"fem"},
     {"recording"},

@@ -168,6 +168,11 @@ PROBLEM_FILE = [
         edit=replace_text(MU, "mu_pa = { gues = 200.0, lower = 10.0 }"),
     ),
     bad(
+        "unknown-key-alone-in-a-parameter", "parameters.young_pa.gues: unknown key",
+        "expected one of guess, lower", "did you mean 'guess'?",
+        options=settings("parameters.young_pa.gues=3"),
+    ),
+    bad(
         "table-for-a-list", "experiment: found", "[[experiment]]",
         edit=replace_text("[[experiment]]", "[experiment]"),
     ),
@@ -695,6 +700,25 @@ def test_a_command_that_is_none_shows_how_to_ask(tiny, command):
     assert outcome.code == 2
     assert "Usage: collocation-sysid" in outcome.out + outcome.err
     assert contents(tiny) == before
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [("slove", "; did you mean 'solve'?"), ("repot", "; did you mean 'report'?"), ("xyzzy", ".")],
+)
+def test_an_unknown_command_is_refused_with_the_likely_one(word, hint):
+    outcome = run_command(word, "problem.toml")
+    assert outcome.code == 2
+    assert f"No such command {word!r}{hint}\n" in outcome.err
+
+
+def test_the_result_in_place_of_its_run_folder_leads_to_the_folder(tiny):
+    (tiny / "run").mkdir()
+    (tiny / "run" / "result.json").write_text("{}")
+    words = ("run/result.json: this is a file; expected a run folder, likely run",)
+    assert_refused(tiny, words, "report", "run/result.json")
+    words = ("problem.toml: this is a file; expected a run folder",)
+    assert_refused(tiny, words, "report", "problem.toml")
 
 
 def test_a_missing_file_leads_to_the_instructions_beside_it(tiny):

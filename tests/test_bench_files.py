@@ -12,6 +12,7 @@ import pytest
 from problem_files import run_command
 
 from collocation_sysid import run
+from collocation_sysid.display import as_markdown, plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
@@ -19,6 +20,7 @@ from collocation_sysid.problem.beginning import TEMPLATES
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.tables import read_pressure
+from collocation_sysid.result.run_sections import run_report, summary
 from collocation_sysid.statistics.modal import doubts
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -231,6 +233,49 @@ def test_experiments_share_what_they_do_not_say_themselves(tmp_path):
     np.testing.assert_allclose(overridden.experiments[0].t_s, [0, 0.3])
 
 
+def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
+    """As those of the same part whose file has its own loads, times four."""
+    part = SHARED.replace("sign = -1, symmetry = 4, sigma_n = 0.04", "sign = -1, sigma_n = 0.01")
+    block_problem(tmp_path)
+    (tmp_path / "part.toml").write_text(part)
+    for name in ("first", "second"):
+        head, *rows = (tmp_path / f"{name}.csv").read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        lines = [",".join([*row[:-1], repr(float(row[-1]) / 4)]) for row in cells]
+        (tmp_path / f"{name}_part.csv").write_text("\n".join([head, *lines, ""]))
+    parts = [f"experiment.{name}.file={name}_part.csv" for name in ("first", "second")]
+    found = run(Problem.read(tmp_path / "problem.toml"), seek_causes=False)
+    alone = run(Problem.read(tmp_path / "part.toml", parts), seek_causes=False)
+    whole_fit, part_fit = found.result.fit, alone.result.fit
+    assert part_fit.wrench_rms_n is not None
+    assert part_fit.wrench_rms_n > 0
+    assert whole_fit.wrench_rms_n == pytest.approx(4 * part_fit.wrench_rms_n, rel=1e-6)
+    assert whole_fit.experiments["first"].wrench_sigma_n == pytest.approx(0.04)
+    assert whole_fit.symmetry == {"first": 4, "second": 4}
+    assert part_fit.symmetry is None
+    simulated = [each.rollout.experiments["second"] for each in (found.result, alone.result)]
+    assert simulated[0].wrench_rms_n == pytest.approx(4 * simulated[1].wrench_rms_n, rel=1e-6)
+    arrays = []
+    for name, finished in (("whole", found), ("part", alone)):
+        finished.save(tmp_path / name, frames=False)
+        arrays.append(np.load(tmp_path / name / "trajectory.npz")["second/wrench_1"])
+    np.testing.assert_allclose(arrays[0][:, 3], [0, -2.5, -6, -9])  # as in the file
+    np.testing.assert_allclose(arrays[0][:, 1:], 4 * arrays[1][:, 1:], rtol=1e-6)
+    said = plain_text(summary(found.result, tmp_path / "whole"))
+    words = (
+        "loads of 'first' and 'second': of the whole specimen, 4 times those of the modelled part"
+    )
+    assert words in said
+    assert "specimen" not in plain_text(summary(alone.result, tmp_path / "part"))
+    priors_n = [
+        float(re.search(r"tare up to \S+ N \(prior (\S+)\)", said)[1])
+        for each in (found.result, alone.result)
+        if (said := each.fit.experiments["first"].beside[-1])
+    ]
+    assert priors_n[0] == pytest.approx(4 * priors_n[1])
+    assert "Forces are those of the modelled part." in as_markdown([run_report(tmp_path / "whole")])
+
+
 def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
     def said(text: str) -> list[str]:
         problem = Problem.read(block_problem(tmp_path, text))
@@ -365,6 +410,26 @@ def test_a_shape_that_cannot_be_meshed_is_refused(tmp_path, shape, words):
     with pytest.raises(InputError) as caught:
         Problem.read(block_problem(tmp_path, text))
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        (
+            "cylinder = { diameter_m = 0.05, height_m = 24 }",
+            "object.cylinder.height_m: found 24 m; expected at most 10 m, likely 0.024",
+        ),
+        ("box_m = [0.02, 24, 0.02]", "object.box_m: found 24 m; expected at most 10 m, likely"),
+    ],
+)
+def test_a_length_in_millimetres_is_named_and_not_the_edges_that_it_makes_too_many(
+    tmp_path, shape, words
+):
+    text = SHARED.replace('mesh = "block.vtu"', f"{shape}\nedge_length_m = 0.0005")
+    with pytest.raises(InputError) as caught:
+        Problem.read(block_problem(tmp_path, text))
+    assert words in str(caught.value)
+    assert "edge_length_m" not in str(caught.value)
 
 
 def test_a_quarter_of_a_cylinder_has_a_quarter_of_its_volume():

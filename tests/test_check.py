@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Iterable
@@ -14,6 +15,8 @@ from problem_files import REFERENCES, Edit, both, replace_cell, replace_text, ru
 from problems_small import TRUTH, bar_in_two_hands, hung_cube
 from test_static import block
 
+from collocation_sysid.cli import common
+from collocation_sysid.console import PlainConsole
 from collocation_sysid.display import plain_text
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
@@ -384,12 +387,14 @@ def test_of_equilibria_three_samples_have_all_kinds_of_rows():
 
 
 def test_the_findings_fit_a_screen_with_the_warnings_last(tiny: Path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
+    screen = io.StringIO()
+    console = PlainConsole(file=screen, width=80, force_terminal=True, color_system=None)
+    monkeypatch.setattr(common, "PlainConsole", lambda: console)
     nearly = ("parameters.mu_pa.guess=200", "parameters.lambda_pa.guess=9800")
     euler = "transcription.scheme=backward-euler"
     meshed = "object.rest_shape=stress_free"
     outcome = run_command("check", "problem.toml", *settings(*nearly, euler, meshed))
-    lines = outcome.out.rstrip("\n").split("\n")
+    lines = [line.rstrip() for line in screen.getvalue().rstrip("\n").split("\n")]
     assert len(lines) <= 40
     assert max(map(len, lines)) <= 80
     heads = [line.split()[0] for line in lines if line and not line.startswith(" ")]

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import pytest
 
+from collocation_sysid.console import PlainConsole
 from collocation_sysid.display import (
     Cards,
     Items,
     Line,
     Listing,
     Section,
+    Shown,
     Span,
     Table,
     as_html,
     as_markdown,
     labelled,
+    on_terminal,
     plain_text,
 )
 from collocation_sysid.tree import as_json, content, read
@@ -42,6 +46,36 @@ def test_a_terminal_shows_numbers_to_the_right_and_texts_to_the_left():
     assert "E Pa   1500  a|b" in lines
     assert "ν       0.3" in lines
     assert lines[-4:] == ["- one", "- two", "The file", "a = 1"]
+
+
+ADDRESS = "trial.mcap#/a/topic/with/a/long/name/of_its_own#a_base_frame>a_tool_frame"
+
+
+def shown_in(width: int, part: Shown, *, terminal: bool) -> list[str]:
+    file = io.StringIO()
+    console = PlainConsole(file=file, width=width, force_terminal=terminal, color_system=None)
+    console.print(on_terminal(part), crop=False)
+    return [line.rstrip() for line in file.getvalue().splitlines()]
+
+
+def test_a_terminal_breaks_no_word_that_is_longer_than_its_lines():
+    table = Table("", ("topic", "Hz", ""), (("/tf", "100", f"write {ADDRESS} there"),), texts=1)
+    for part in (f"write {ADDRESS} there", table, Items((f"write {ADDRESS} there",))):
+        lines = shown_in(40, part, terminal=True)
+        assert any(ADDRESS in line for line in lines), part
+    assert shown_in(40, f"write {ADDRESS} there", terminal=True) == ["write", ADDRESS, "there"]
+    assert shown_in(12, "  two words and more", terminal=True) == ["  two words", "and more"]
+
+
+def test_rows_are_lines_where_no_terminal_shows_them():
+    table = Table(
+        "", ("", "mooney-rivlin", *"abcde"), (("solver.key", *"12345", "above 0\nWhat it is."),)
+    )
+    head, row = plain_text(table, width=100_000).splitlines()
+    assert "mooney-rivlin" in head
+    assert row.split()[0] == "solver.key"
+    assert row.endswith("above 0; What it is.")
+    assert len(shown_in(200, table, terminal=True)) == 4  # two lines of heads, two of the row
 
 
 def test_a_page_escapes_texts_and_leads_to_names():

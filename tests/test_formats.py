@@ -166,10 +166,22 @@ def test_markers_are_chosen_ordered_and_renamed(file, name):
 )
 def test_missing_samples_are_counted(file, name, lost):
     table = read_markers(file(TEXTS[name]), **UNIT_GIVEN.get(name, {}))
-    assert table.notes == tuple(
-        f"{marker}: 1 of 4 samples missing ({kind})"
-        for marker, kind in zip(("Tip 1", "base"), lost, strict=True)
-    )
+    if lost[0] == lost[1]:
+        assert table.notes == (f"Tip 1 and base: each 1 of 4 samples missing ({lost[0]})",)
+    else:
+        assert table.notes == tuple(
+            f"{marker}: 1 of 4 samples missing ({kind})"
+            for marker, kind in zip(("Tip 1", "base"), lost, strict=True)
+        )
+
+
+def test_markers_that_miss_as_many_samples_share_a_note(file):
+    names = ("a", "b", "c", "d", "e", "f")
+    head = ",".join(f"{name}_{axis}" for name in names for axis in "xyz")
+    rows = [f"{t},{','.join(['1,2,3'] * 6)}" for t in range(3)]
+    lost = f"3,{',' * 14},4,5,6"
+    table = read_markers(file("\n".join([f"t_s,{head}", *rows, lost, ""])))
+    assert table.notes == ("a, b, c, d and e: each 1 of 4 samples missing (1 blank)",)
 
 
 def test_the_origin_is_a_place_in_a_plain_file(file):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import socket
 import sys
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,8 @@ from PIL import Image
 from problem_files import run_command, write_problem
 from scipy.spatial.transform import Rotation
 
+from collocation_sysid.cli import common
+from collocation_sysid.console import PlainConsole
 from collocation_sysid.errors import InputError
 from collocation_sysid.live.frames import FrameReader
 from collocation_sysid.problem import Problem
@@ -168,6 +172,68 @@ def test_a_log_tells_what_its_topics_can_serve_as(tmp_path: Path) -> None:
     assert topics["/wrench"]["rate_hz"] == pytest.approx(50, rel=1e-3)
     assert topics["/wrench"]["messages"] == len(T_S)
     assert "trial#/tf#base>tool" in run_command("topics", log).out
+
+
+def test_topics_offer_the_chains_of_frames_that_can_be_read(tmp_path: Path) -> None:
+    of = Messages()
+    fixed = (
+        of.transform(0.0, "world", "base", (1, 0, 0), STILL),
+        of.transform(0.0, "world", "table", (0, 1, 0), STILL),
+        of.transform(0.0, "flange", "tool0", (0, 0, 1), STILL),
+    )
+    moving = [of.tree(t, of.transform(t, "base", "flange", (0, t, 0), STILL)) for t in T_S]
+    log = bag(tmp_path / "trial", [of.tree(0.0, *fixed, topic="/tf_static"), *moving])
+    topics = {each.name: each for each in listed_topics(log)}
+    addresses = topics["/tf"].write
+    assert addresses == ("trial#/tf#world>tool0", "trial#/tf#world>flange")
+    for address in addresses:  # each can be read as it is written
+        np.testing.assert_allclose(read_poses(tmp_path / address).positions_m[:, 1], T_S, atol=1e-6)
+    assert topics["/tf_static"].write == ()
+    assert topics["/tf_static"].serves == "frames that do not move, part of the chains of /tf"
+
+
+def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkeypatch) -> None:
+    of = Messages()
+    tool = "a_tool_with_a_name_as_long_as_those_of_robots_are"
+    log = bag(
+        tmp_path / "trial",
+        [of.tree(t, of.transform(t, "world_of_the_robot", tool, (0, 0, t), STILL)) for t in T_S],
+    )
+    address = f"trial#/tf#world_of_the_robot>{tool}"
+    out = run_command("topics", log).out
+    assert f"  {address}" in out.splitlines()
+    row = next(line for line in out.splitlines() if line.startswith("/tf"))
+    assert "TFMessage" in row
+    assert row.endswith("poses of one frame in another")
+    file = io.StringIO()
+    console = PlainConsole(file=file, width=40, force_terminal=True, color_system=None)
+    monkeypatch.setattr(common, "PlainConsole", lambda: console)
+    run_command("topics", log)
+    assert f"  {address}" in file.getvalue().splitlines()
+
+
+def test_markers_of_several_namespaces_have_these_in_their_names(tmp_path: Path) -> None:
+    def array(t: float, spaces: tuple[str, ...]) -> tuple[float, dict[str, Any]]:
+        places = [(space, k) for space in spaces for k in range(2)]
+        markers = [
+            {"ns": space, "id": k, "pose": {"position": {"x": len(space), "y": k, "z": t}}}
+            for space, k in places
+        ]
+        return t, {"markers": markers}
+
+    name = "visualization_msgs/MarkerArray"
+    several = [array(t, ("body", "robot")) for t in (0.0, 1.0, 2.0)]
+    one = [array(t, ("body",)) for t in (0.0, 1.0, 2.0)]
+    log = json_mcap(tmp_path / "run.mcap", {"/several": (name, several), "/one": (name, one)})
+    topics = {each.name: each.serves for each in listed_topics(log)}
+    assert topics == {
+        "/several": "marker tracks: body/0, body/1; robot/0, robot/1",
+        "/one": "marker tracks: 0, 1",
+    }
+    table = read_markers(f"{log}#/several")
+    assert table.names == ("body/0", "body/1", "robot/0", "robot/1")
+    np.testing.assert_allclose(table.positions_m[1], [[4, 0, 1], [4, 1, 1], [5, 0, 1], [5, 1, 1]])
+    assert read_markers(f"{log}#/one").names == ("0", "1")
 
 
 RAYS = {

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import runpy
+import subprocess
+import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -26,6 +30,31 @@ def test_the_version_stands_in_one_place():
 def test_the_changelog_tells_of_the_version():
     dated = re.findall(r"^## \[([\d.]+)\] - \d{4}-\d\d-\d\d$", CHANGELOG, re.MULTILINE)
     assert dated[0] == PROJECT["version"]
+
+
+def test_the_wheel_explains_every_page_of_the_documentation(tmp_path: Path, monkeypatch):
+    hatchling = pytest.importorskip("hatchling.build")
+    monkeypatch.chdir(ROOT)  # the project that is built
+    wheel = tmp_path / hatchling.build_wheel(str(tmp_path))
+    installed = tmp_path / "installed"
+    zipfile.ZipFile(wheel).extractall(installed)
+    pages = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "howto").glob("*.md")]
+    program = "from collocation_sysid.cli import main; main()"
+
+    def explain(*topic: str) -> str:
+        return subprocess.run(
+            [sys.executable, "-c", program, "explain", *topic],
+            env=os.environ | {"PYTHONPATH": str(installed)},
+            cwd=tmp_path,
+            capture_output=True,
+            check=True,
+            text=True,
+            encoding="utf-8",
+        ).stdout
+
+    listed = [line.split()[0] for line in explain().splitlines()[1:]]
+    assert sorted(listed) == sorted({page.stem for page in pages} - {"index", "api"})
+    assert explain("verdict").startswith("# Reading the verdict\n")
 
 
 def test_the_package_is_typed():

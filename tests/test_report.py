@@ -226,7 +226,7 @@ def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
     page = (copy / "report.html").read_text()
     for topic in ("scheme", "information"):
         assert page.count(f'href="#cure-{topic}"') == page.count(f'id="cure-{topic}"') == 1
-    assert "docs/howto/scheme.md" in page
+    assert "<code>collocation-sysid explain scheme</code>" in page
     assert "mu_pa ended at its bound" in page
     assert "usable after a look at the reasons" in page
 

@@ -15,6 +15,7 @@ from problems_small import box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
@@ -180,6 +181,17 @@ def test_markers_that_are_hardly_ever_seen_are_nothing_sudden(count: int):
 def test_odd_sizes_and_densities_are_told(edge_m, density_kg_m3, expected):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
     assert [oddity.cause for oddity in oddities(body)] == expected
+
+
+def test_an_odd_size_leads_to_what_states_it():
+    generated = box_mesh((60.0,) * 3, (1, 1, 1))
+    read = TetMesh(generated.points_m, generated.tetrahedra)
+    for mesh, words in (
+        (generated, "check its lengths, which"),
+        (read, "check object.length_unit, "),
+    ):
+        (oddity,) = oddities(Body(mesh, density_kg_m3=1100.0))
+        assert words in oddity.sentence
 
 
 def test_a_metal_as_soft_as_rubber_is_odd():

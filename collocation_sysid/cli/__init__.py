@@ -20,7 +20,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 from typer.main import get_command, get_command_from_info
 
-from ..errors import InputError, SimulationError
+from ..errors import InputError, SimulationError, hint_at
 from ..starting import heed_interrupts, leave
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, errors
 
@@ -56,6 +56,15 @@ class Commands(TyperGroup):
         info = next(each for each in family if each.callback.__name__ == cmd_name)
         how = {"pretty_exceptions_short": False, "rich_markup_mode": None}
         return get_command_from_info(info, **how)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the name and the command that the arguments begin with, and the others.
+
+        A name that is none is refused with the command that was probably meant.
+        """
+        if args and args[0] not in _written() and not ctx.resilient_parsing:
+            ctx.fail(f"No such command {args[0]!r}{hint_at(args[0], _written()) or '.'}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a line on each."""

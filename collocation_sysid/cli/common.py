@@ -10,11 +10,13 @@ import typer
 from rich.text import Text
 
 from ..console import PlainConsole
-from ..display import Shown, on_terminal
+from ..display import Shown, on_terminal, plain_text
 
 errors = PlainConsole(stderr=True)
 
 EXIT_NOT_CONVERGED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+# Width of what others read, in columns: more than any line has.
+UNBROKEN = 100_000
 EXIT_DOUBTFUL = EXIT_NOT_CONVERGED
 
 
@@ -26,6 +28,9 @@ def interrupted(kept: str) -> typer.Exit:
 
 
 def show(content: Shown | Iterable[Shown]) -> None:
-    """Print on stdout: on a terminal wrapped between words, in files with lines kept whole."""
+    """Print on stdout: on a terminal wrapped between words, elsewhere each line and row whole."""
     console = PlainConsole()
-    console.print(on_terminal(content), soft_wrap=not console.is_terminal)
+    if console.is_terminal:
+        console.print(on_terminal(content), crop=False)
+    elif text := plain_text(content, width=UNBROKEN):
+        console.print(Text(text), soft_wrap=True)

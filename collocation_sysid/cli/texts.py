@@ -13,8 +13,9 @@ from typing import Annotated, Any
 import typer
 
 from ..console import PlainConsole
-from ..display import Shown, Table, on_terminal
-from ..errors import located
+from ..display import Shown, Table
+from ..errors import located, require_among
+from ..pages import page_files, page_text, page_title
 from ..tree import as_json
 from .common import errors, show
 from .options import AsJson, command
@@ -59,7 +60,7 @@ def methods(options: Methods) -> None:
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
         parts = _options_table(name) if name else _methods_table()
-        PlainConsole().print(on_terminal(parts))
+        show(parts)
 
 
 @commands.command()
@@ -68,6 +69,44 @@ def schema() -> None:
     from ..problem.schema import ProblemFile
 
     typer.echo(json.dumps(ProblemFile.model_json_schema(), indent=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explain:
+    """Options of `explain`.
+
+    Attributes
+    ----------
+    topics : TOPIC
+        The pages that are shown.
+    """
+
+    topics: Annotated[list[str] | None, typer.Argument()] = None
+
+
+@command(commands, "explain", "explain verdict", "explain trust scheme", "explain theory | less")
+def explain(options: Explain) -> None:
+    """Show pages of the documentation, or list their topics.
+
+    Pages are part of the installation; no network is needed. In a pipe they are Markdown.
+    """
+    if not options.topics:
+        show(
+            Table(
+                "", ("topic", ""), tuple((each, page_title(each)) for each in page_files()), texts=1
+            )
+        )
+        return
+    for topic in options.topics:
+        require_among(topic, page_files(), where="TOPIC")
+    console = PlainConsole()
+    for topic in options.topics:
+        if console.is_terminal:
+            from .markdown import TerminalPage
+
+            console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
+        else:
+            typer.echo(page_text(topic))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,12 +139,14 @@ def topics(options: Topics) -> None:
             each.type,
             f"{each.messages}",
             f"{each.rate_hz:.3g}" if each.rate_hz else "",
-            "\n".join((each.serves, *each.write)) if each.serves else "",
+            each.serves,
         )
         for each in listed
     )
-    heads = ("topic", "type", "messages", "Hz", "serves as, and what to write in place of a file")
-    show(Table("", heads, rows, names=2, texts=1))
+    heads = ("topic", "type", "messages", "Hz", "serves as")
+    addresses = [f"  {address}" for each in listed for address in each.write]
+    what = ["", "In place of a file write:", *addresses] if addresses else []
+    show([Table("", heads, rows, names=2, texts=1), *what])
 
 
 @dataclass(frozen=True, kw_only=True)

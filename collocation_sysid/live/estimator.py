@@ -44,10 +44,10 @@ from .track import JoinedPasses, Track
 from .trust import UNSETTLED, Scatter, data_concerns, estimate_concerns, widened
 from .whole import recording_of, solved
 
-# Standard deviation, in steps of the trust region, of a prior that keeps the next linearisation point
-# near the last one until many samples are available.
+# Standard deviation, in steps of the trust region, of a prior that keeps the next linearisation
+# point near the last one until many samples are available.
 STAY = 0.5
-# Distance of the estimate from the linearisation point, in standard errors, that starts another pass.
+# Distance of the estimate from the linearisation point, in standard errors, that starts a new pass.
 MOVED = 0.1
 # Distance, in standard errors, at which a pass that is catching up changes its linearisation point.
 TURN = 1.0
@@ -136,8 +136,8 @@ class Update:
     relinearised: int
 
     def __repr__(self) -> str:
-        found = ", ".join(f"{name} = {each.value:.4g}" for name, each in self.estimates.items())
-        return f"Update(t = {self.t_s:.4g} s: {found}; {self.trust.verdict})"
+        values = ", ".join(f"{name} = {each.value:.4g}" for name, each in self.estimates.items())
+        return f"Update(t = {self.t_s:.4g} s: {values}; {self.trust.verdict})"
 
 
 def _require_phases(problem: Problem) -> None:
@@ -683,7 +683,7 @@ class Estimator:
         return again.rows - first_row
 
     def _left(self, done: int, elapsed_s: float) -> int:
-        """Return the number of rows for which there is time."""
+        """Return the number of rows that fit into the rest of the budget."""
         if self.rows is not None:
             return self.rows - done
         return self.budget.rows(self.budget_s - elapsed_s)

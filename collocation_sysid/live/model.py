@@ -184,7 +184,7 @@ class Model:
 
     @cached_property
     def size(self) -> int:
-        """Number of parameters p."""
+        """Number P of parameters p."""
         return self.collocation.nq + self.collocation.nphi
 
     @property
@@ -194,7 +194,7 @@ class Model:
 
     @property
     def interval_s(self) -> float:
-        """Time between samples [s]."""
+        """Time between two samples [s]."""
         return self.experiment.timestep_s
 
     @cached_property

@@ -31,8 +31,8 @@ from ..program.sweep import Columns, Forward, GraspMotion, LastRows, Step
 from .felt import LATE, Felt, Poses
 from .model import NEAR, TOGETHER, Model
 
-# Largest correction of a row, divided by the size of the body, after which the row is not linearised
-# again: the next correction would be about its square.
+# Largest correction of a row, divided by the size of the body, after which the row is not
+# linearised again: the next correction would be about its square.
 LAST_STEP = 3e-4
 # Factor of this limit for rows that are solved together; beyond the limit another pass follows.
 ROUGH = 10
@@ -266,10 +266,10 @@ class LiveSweep:
             Kept(self.flat, w[:, 0], k.columns)
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
-        told = np.array([wrenches for *_, wrenches in state.read])
-        told[..., 0] += told[..., 1:] @ ((self.flat - flat) / old_rates)
-        told[..., 1:] *= self.rates / old_rates
-        read = tuple(zip(stored_rows, point_columns, told, strict=True))
+        all_wrenches = np.array([wrenches for *_, wrenches in state.read])
+        all_wrenches[..., 0] += all_wrenches[..., 1:] @ ((self.flat - flat) / old_rates)
+        all_wrenches[..., 1:] *= self.rates / old_rates
+        read = tuple(zip(stored_rows, point_columns, all_wrenches, strict=True))
         felt = state.felt.at(step, factors)
         return replace(state, x=x, force=force, felt=felt, memory=memory, read=read)
 
@@ -462,13 +462,14 @@ class LiveSweep:
             self.longest_m = max(self.longest_m, length)
             self.x[t] += row_columns[:, 0]
             if forward.weighs_past:
-                # What the row says F_t is then.
+                # Correct the forces by their increment in this row.
                 self.force[t, solver.free] += forward.past_increments[0][:, 0]
         return solved, None
 
     def _kept(self, columns: Sequence[Array]) -> list[Kept]:
-        """Return the last rows for later passes, from their columns (3n, 1 + m), and observe
-        them.
+        """Return the last rows for later passes, from their columns (3n, 1 + m).
+
+        Observed quantities of these rows are stored, too.
         """
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
@@ -552,15 +553,14 @@ class LiveSweep:
             for k, (residual, slope) in zip(positions, pairs_of_instrument, strict=True):
                 slope /= self.rates
                 residuals[k] = Said(residual - slope @ self.flat, slope, of)
-        return [
-            residual_of_sample for residual_of_sample in residuals if residual_of_sample is not None
-        ]
+        return [each for each in residuals if each is not None]
 
     def _of_instrument(
         self, of: int, pairs: Sequence[tuple[Sample, int]]
     ) -> Iterator[tuple[Array, Array]]:
-        """Yield residuals and derivatives by p of samples of an instrument, from the rows around
-        them.
+        """Yield residuals and derivatives by p of samples of an instrument.
+
+        They are evaluated from the rows around each sample.
         """
         model = self.model
         reading, stencil, observable = self.model.instruments[of - 1]
@@ -586,8 +586,15 @@ class LiveSweep:
         return zip(np.where(sensor.there(len(needed_rows)), residual, np.nan), slope, strict=True)
 
     def _of_markers(self, reading: Sample, rows: int) -> tuple[Array, Array]:
-        """Return residuals (M, 3) of marker samples, NaN where missing, and derivatives (M, 3, P)
-        by p.
+        """Return residuals (M, 3) of a marker sample and their derivatives (M, 3, P) by p.
+
+        Residuals of missing markers are NaN.
+
+        Parameters
+        ----------
+        reading : Sample
+        rows : int
+            Number of rows computed since the row after which the sample is evaluated.
         """
         model = self.model
         neighbours = self.model.samples_around

@@ -290,12 +290,13 @@ class Solution:
 def wrench_rms(
     experiment: Experiment, readings: Sequence[Array]
 ) -> tuple[float | None, float | None]:
-    """RMS of each component of force [N] and torque [N m] between readings (S, 6) and measured.
+    """Return the RMS of each component of force [N] and torque [N m], readings (S, 6) to measured.
 
-    None of what is not measured.
+    They are those of the whole specimen where the body is a part of it, see `Wrench.symmetry`; None
+    of what is not measured.
     """
     pairs = zip(readings, experiment.wrenches, strict=True)
-    apart = [read - sensor.values for read, sensor in pairs]
+    apart = [sensor.symmetry * (read - sensor.values) for read, sensor in pairs]
     both = np.concatenate(apart) if apart else np.zeros((0, 6))
     force, torque = (
         float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else None

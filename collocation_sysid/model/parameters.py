@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import casadi as ca
@@ -61,6 +61,10 @@ class Unknown:
     prior: tuple[float, float] | None = None
     scale: Scale | None = None
     typical: Positive | None = None
+
+
+# What the table of a parameter may hold in a problem file.
+KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
 
 
 @dataclass(frozen=True)
@@ -466,6 +470,13 @@ class Parameters:
         known = [name for body in bodies for name in body.parameter_names]
         for name in self.names:
             if name not in known:
+                parameter, _, key = name.rpartition(".")
+                if parameter in known:  # a misspelt key of a parameter's table reads like a region
+                    raise InputError(
+                        f"unknown key; expected one of {', '.join(KEYS)}{hint_at(key, KEYS)}",
+                        None,
+                        name,
+                    )
                 expected = ", ".join(dict.fromkeys(n for body in bodies for n in body.constants))
                 raise InputError(
                     f"no such parameter; the model's are {expected}{hint_at(name, known)}",

@@ -431,7 +431,8 @@ def _until(grasp: Grasp, end_s: float) -> Grasp:
 def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[str, Any]:
     """How far held-out samples are from the simulation: RMS, number, and Σ of squares by block.
 
-    Of the markers [m], or of the forces [N] where there are none; `unit` says which.
+    Of the markers [m], or of the forces [N] on the whole specimen where there are none; `unit` says
+    which.
     """
     markers, unit = experiment.markers, "m"
     t_s, apart = experiment.t_s, rollout.trajectory.markers_m - markers.positions_m
@@ -439,7 +440,9 @@ def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[st
     if not markers.samples:
         t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
         pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
-        apart = np.concatenate([(read - sensor.values)[:, :3] for read, sensor in pairs])
+        apart = np.concatenate(
+            [sensor.symmetry * (read - sensor.values)[:, :3] for read, sensor in pairs]
+        )
         order, unit = np.argsort(t_s, kind="stable"), "N"
         t_s, apart = t_s[order], apart[order, None]
         counted = np.asarray(np.isfinite(apart).any(axis=2))

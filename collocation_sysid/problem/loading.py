@@ -21,7 +21,7 @@ from ..recording import Experiment
 from ..recording.selected import selection
 from ..section import Section, stated_in
 from ..stated import keys_of, tables_of
-from ..statistics.plausible import oddities
+from ..statistics.plausible import SIZES_M, oddities
 from .code import Code, existing_file
 from .densities import completed, guessed
 from .options import Origin, RolloutOptions, UncertaintyOptions
@@ -116,16 +116,34 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
         file = existing_file(folder, section.mesh, "mesh")
         return TetMesh.read(file, section.length_unit)
     assert section.edge_length_m is not None  # by the schema
-    if section.cylinder is not None:
-        shape = section.cylinder
-        size_m = shape.diameter_m, shape.height_m, section.edge_length_m
-        return cylinder_of_edge(*size_m, shape.quarter)
-    if section.box_m is not None:
-        return box_of_edge(section.box_m, section.edge_length_m)
-    assert section.surface is not None
+    if section.surface is None:
+        return _generate_mesh(section, section.edge_length_m)
     surface = existing_file(folder, section.surface, "surface")
     cache = folder / ".meshes"
     return TetMesh.from_surface(surface, section.edge_length_m, section.length_unit, cache)
+
+
+def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
+    """Mesh a cylinder or a box; lengths larger than a body's are named in place of the edges."""
+    shape, box_m = section.cylinder, section.box_m or (0.0, 0.0, 0.0)  # one of both by the schema
+    if shape is not None:
+        lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
+    else:
+        lengths_m = {"box_m": max(box_m)}
+    try:
+        if shape is not None:
+            return cylinder_of_edge(
+                shape.diameter_m, shape.height_m, edge_length_m, quarter=shape.quarter
+            )
+        return box_of_edge(box_m, edge_length_m)
+    except InputError as error:
+        key, length_m = max(lengths_m.items(), key=lambda each: each[1])
+        largest_m = SIZES_M[1]
+        if length_m <= largest_m:
+            raise
+        likely = f"likely {length_m / 1e3:g}, if it was in mm"
+        message = f"found {length_m:g} m; expected at most {largest_m:g} m, {likely}"
+        raise InputError(message, None, key) from error
 
 
 def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:

@@ -81,7 +81,7 @@ class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
         Undeformed area that an engineering stress multiplies.
     symmetry : int
         The mesh is one of so many equal parts of what was measured, 4 for a quarter: forces and
-        sigmas are divided by it.
+        sigmas are divided by it, and results are reported for the whole.
     """
 
     area_m2: Positive | None = None

@@ -174,6 +174,12 @@ class Experiment:
         return tuple(grasp.wrench for grasp in self.grasps if grasp.wrench is not None)
 
     @property
+    def symmetry(self) -> int:
+        """How many times the body's loads those of the specimen are; 1 if its sensors disagree."""
+        stated = {wrench.symmetry for wrench in self.wrenches}
+        return stated.pop() if len(stated) == 1 else 1
+
+    @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """What it may touch, the last of the grasps."""
         return tuple(grasp for grasp in self.grasps if isinstance(grasp, Obstacle))

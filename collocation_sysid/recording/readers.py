@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError, hint_at
+from ..errors import InputError, hint_at, listed
 from ..stated import key, stated
 from .arrays import floats, read_only_tracks
 from .clock import first_time_fault
@@ -206,14 +206,19 @@ def _refuse_other_rate(t_s: Array, key: str, rate_hz: float) -> None:
 
 
 def _present(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
-    """Coordinates with NaN for every missing sample, and a sentence for each marker with some."""
+    """Coordinates with NaN for every missing sample, and a sentence for markers with as many."""
     x = raw.coordinates
     blank = np.asarray(np.isnan(x).any(axis=2))
     zero = np.asarray((x == 0.0).all(axis=2)) & raw.zeros_are_missing
-    notes = []
+    markers_by_loss: dict[str, list[str]] = {}
     for k, name in enumerate(names):
         counts = {"blank": blank[:, k].sum(), "zeros": zero[:, k].sum()}
         if missing := sum(counts.values()):
             kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-            notes.append(f"{name}: {missing} of {len(x)} samples missing ({kinds})")
+            loss = f"{missing} of {len(x)} samples missing ({kinds})"
+            markers_by_loss.setdefault(loss, []).append(name)
+    notes = [
+        f"{listed(markers)}: {'each ' * (len(markers) > 1)}{loss}"
+        for loss, markers in markers_by_loss.items()
+    ]
     return np.where((blank | zero)[:, :, None], np.nan, x), notes

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
-from ..checked import Positive
+from ..checked import AtLeastOne, Positive
 from ..errors import InputError
 from ..section import Vector
 from ..stated import key, stated
@@ -48,6 +48,9 @@ class Wrench:
     point_m : (3,) array
         Point [x, y, z] of the torque: fixed in the world, or on the undeformed body and moving
         along.
+    symmetry : int
+        Number of equal parts of the specimen that share the load, 4 where a quarter is modelled.
+        Values and sigmas are those of the modelled part; results are reported for the specimen.
 
     Raises
     ------
@@ -63,6 +66,7 @@ class Wrench:
     point_m: Array = key(
         Vector, converter=floats((3,), "point_m of the wrench"), default=(0.0,) * 3
     )
+    symmetry: int = key(AtLeastOne, default=1)
 
     def __post_init__(self) -> None:
         if not len(self.t_s):

@@ -210,13 +210,21 @@ def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:
 
 
 def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
-    """(S, 19) of each sensor: time, and the wrench as measured, fitted and simulated."""
+    """Return (S, 19) of each sensor: time, and the wrench as measured, fitted and simulated.
+
+    Wrenches are those of the whole specimen where the body is a part of it.
+    """
     sensors = experiment.wrenches
     rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
     fit = fitted.get(experiment.name, [None] * len(sensors))
     rolled = rollout.wrenches if isinstance(rollout, Rollout) else [None] * len(sensors)
     both = zip(sensors, fit, rolled, strict=True)
-    return [_compared(sensor.t_s, sensor.values, *models) for sensor, *models in both]
+    sensed = []
+    for sensor, *models in both:
+        columns = _compared(sensor.t_s, sensor.values, *models)
+        columns[:, 1:] *= sensor.symmetry
+        sensed.append(columns)
+    return sensed
 
 
 def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:

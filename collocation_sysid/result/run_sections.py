@@ -26,6 +26,7 @@ from ..display import (
 from ..errors import listed
 from ..fem.constants import symbol_of, unit_of, with_unit
 from ..files import is_own
+from ..pages import explain_command, page_url
 from ..program.depth_comparison import DepthError
 from ..recording.nuisance import in_unit_for_people
 from ..runs.prediction import PredictionError
@@ -155,9 +156,9 @@ def _harder(result: Result) -> list[Line]:
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:
-    """The pages that say how to cure what gives concern."""
-    pages = dict.fromkeys(f"docs/howto/{t.page}.md" for t in topics_of(concerns).values())
-    return [Line(f"what to do: {', '.join(pages)}", "quiet")] if pages else []
+    """Return the command that shows how to cure what gives concern, or nothing."""
+    pages = dict.fromkeys(topic.page for topic in topics_of(concerns).values())
+    return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
 def _parameters(result: Result) -> Section:
@@ -305,15 +306,22 @@ def _fit(result: Result) -> Section:
         for reading, rms in (each.reading_rms or {}).items():
             sigma = short((each.reading_sigma or {})[reading])
             lines.append(f"{reading} of '{name}': {short(rms)} RMS (sigma {sigma})")
+        unit = "J in the modelled part" if name in (fit.symmetry or {}) else "J"
         for obstacle, rubbed in (each.friction or {}).items():
+            energy = f"{short(rubbed.dissipated_j)} {unit}"
             lines.append(
                 f"friction of {obstacle} in '{name}': at most {rubbed.used:.0%} of its limit, "
-                f"slips {rubbed.slipping:.0%} of the time, takes {short(rubbed.dissipated_j)} J"
+                f"slips {rubbed.slipping:.0%} of the time, takes {energy}"
             )
         for camera, error in (each.depth or {}).items():
             lines.append(f"depth of {camera} in '{name}': {_depth(error)}")
     for name, each in result.rollout.experiments.items():
         lines += _simulated(name, each)
+    for parts in sorted({*(fit.symmetry or {}).values()}):
+        names = listed(f"'{name}'" for name, each in (fit.symmetry or {}).items() if each == parts)
+        lines.append(
+            f"loads of {names}: of the whole specimen, {parts} times those of the modelled part"
+        )
     lines += [f"time: {_elapsed(result.elapsed_s)}", _iterations(result)]
     for name, each in experiments.items():
         if each.beside:
@@ -426,9 +434,12 @@ def _cards(result: Result) -> Cards:
 
 def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
     for name, topic in topics_of(concerns).items():
-        about, page = Span(f"{topic.about}.", "strong"), f"docs/howto/{topic.page}.md"
-        more = (Span(f" {topic.cure} More in the how-to page "), Span(page, "code"), Span("."))
-        yield Line((about, *more), name=f"cure-{name}")
+        about = Span(f"{topic.about}.", "strong")
+        command = Span(explain_command(topic.page), "code")
+        more = [Span(f" {topic.cure} More: "), command]
+        if (url := page_url(topic.page)) is not None:
+            more += [Span(", or "), Span("the documentation", to=url)]
+        yield Line((about, *more, Span(".")), name=f"cure-{name}")
 
 
 def _error_bars(result: Result) -> Iterator[Shown]:
@@ -474,7 +485,9 @@ def _nuisance(result: Result) -> Iterator[Section]:
             rows.append((words, *(_size(size, unit) for size in sizes)))
         table = Table("", ("", "value", "±", "prior ±"), tuple(rows))
         title = f"Nuisance parameters of '{experiment}'"
-        yield Section(title, (Line(said, "quiet"), table))
+        is_part = experiment in (result.fit.symmetry or {})
+        loads = " Forces are those of the modelled part." if is_part else ""
+        yield Section(title, (Line(said + loads, "quiet"), table))
 
 
 def _residuals(result: Result, run: Path) -> Iterator[Shown]:

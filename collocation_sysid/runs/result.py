@@ -260,13 +260,22 @@ class FittedExperiment:
 
 @dataclass(frozen=True)
 class FoundFit:
-    """The same of all experiments."""
+    """The same of all experiments.
+
+    Attributes
+    ----------
+    symmetry : mapping of experiment to int, optional
+        Of those whose loads are reported for the whole specimen, how many times the loads of the
+        modelled part they are. Energies of friction and nuisance parameters are those of the
+        modelled part.
+    """
 
     rms_m: float
     noise_rms_m: float
     experiments: Mapping[str, FittedExperiment]
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
+    symmetry: Mapping[str, int] | None = optional()
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ..program.collocation import Part
 from ..program.depth_comparison import DepthError
 from ..program.touches import rubbings
 from ..recording.experiment import Experiment
-from ..recording.nuisance import GAUGE, JOINING, PLACE, in_unit_for_people
+from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE, in_unit_for_people
 from ..statistics.fields import FieldEstimate
 from ..statistics.identifiability import verdicts
 from ..statistics.scale import relative_sentence
@@ -188,7 +188,11 @@ def _fit(answer: Answer) -> FoundFit:
     for part in solution.parts:
         experiment = part.segment.experiment
         name, markers, sensors = experiment.name, experiment.markers, part.segment.sensors
-        sigmas = [s.wrench.sigmas**2 * np.where(s.wrench.measured, 1.0, np.nan) for s in sensors]
+        wrenches = [sensor.wrench for sensor in sensors]
+        sigmas = [
+            (wrench.symmetry * wrench.sigmas) ** 2 * np.where(wrench.measured, 1.0, np.nan)
+            for wrench in wrenches
+        ]
         both = np.array(sigmas).reshape(-1, 2, 3).swapaxes(0, 1)
         experiments[name] = FittedExperiment(
             solution.rms_by_experiment_m[name],
@@ -205,7 +209,13 @@ def _fit(answer: Answer) -> FoundFit:
             air_density_kg_m3=experiment.air_density_kg_m3,
         )
     pooled = pooled_wrench_rms(solution)
-    return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled)
+    parts = {
+        experiment.name: experiment.symmetry
+        for experiment in answer.problem.experiments
+        if experiment.symmetry > 1
+    }
+    symmetry = parts or None
+    return FoundFit(solution.rms_m, answer.noise_rms_m, experiments, *pooled, symmetry=symmetry)
 
 
 def _simulated(answer: Answer) -> FoundRollout:
@@ -301,6 +311,8 @@ def _sentence(part: Part, own: Sequence[int], values: Array, answer: Answer) -> 
     known = answer.uncertainty.nuisance if answer.uncertainty else {}
     low, high = (limit[k] for limit in nuisance.limits(part.segment.chart.samples))
     factor, unit = in_unit_for_people(1.0, entry.unit)
+    if entry.row == TARE:  # of the sensor, on which the whole specimen acts
+        factor *= part.segment.experiment.symmetry
     size, error = float(np.linalg.norm(values)), entry.sigma * known.get(name, np.nan)
     allowed = low + 1e-3 < part.phi[k] < high - 1e-3
     sentence = (entry.row.told or "{which} {signed}").format(

@@ -24,7 +24,7 @@ class Topic:
     about : str
         Title.
     page : str
-        Page of `docs/howto` with more information.
+        Topic of the page with more information, see `pages`.
     cure : str
         Remedy, in a sentence or two.
     said : mapping of str to str
@@ -71,7 +71,7 @@ TOPICS: Mapping[str, Topic] = {
             'grasp.quaternion = "{order}" or swap the columns',
             "length-unit": "{who} were {factor:g} times as large: {remedy}",
             "length-unit/size": "the body is {size_m:.3g} m large; expected {least:g} to {most:g} "
-            "m: check object.length_unit, {likely}",
+            "m: check {likely}",
             "density": "the body's density is {density_kg_m3:.4g} kg/m³; expected {least:g} to "
             "{most:g}: set object.density_kg_m3 or mass_kg, {likely}, and check object.length_unit",
             "density/metal": "the body is as dense as metal, {density_kg_m3:.4g} kg/m³, and as "

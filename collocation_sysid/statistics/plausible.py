@@ -57,7 +57,7 @@ def oddities(body: Body) -> tuple[Hypothesis, ...]:
         "size_m": size_m,
         "least": little_m,
         "most": much_m,
-        "likely": 'likely "mm"' if size_m > much_m else "the mesh may be in metres already",
+        "likely": _likely_length(body, too_large=size_m > much_m),
     }
     density = {
         "density_kg_m3": density_kg_m3,
@@ -75,6 +75,14 @@ def oddities(body: Body) -> tuple[Hypothesis, ...]:
         if each.strength > IMPOSSIBLE:
             raise InputError(each.sentence, None, "object")
     return tuple(each for each in tried if each.strength > 1)
+
+
+def _likely_length(body: Body, *, too_large: bool) -> str:
+    """Return what to check of a body that is too large, or too small."""
+    if body.mesh.is_generated:
+        return "its lengths, which are in metres"
+    unit = 'likely "mm"' if too_large else "the mesh may be in metres already"
+    return f"object.length_unit, {unit}"
 
 
 def odd_material(body: Body, theta: Array) -> Hypothesis | None:

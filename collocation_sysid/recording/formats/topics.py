@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,12 @@ SLACK = 0.01
 # So many messages tell what a topic is.
 _FIRST = 20
 
+# What follows the name of the topic of frames that do not move.
+STATIC = "_static"
+
 Row = dict[str, float]
+# Poses by time of each child in its parent.
+Edges = dict[tuple[str, str], dict[float, tuple[float, ...]]]
 
 
 @dataclass(frozen=True)
@@ -98,11 +103,11 @@ def table(address: Address) -> bytes:
         if held := depth_in(messages[0][1]):
             raise InputError(f"the topic {address.topic} holds {held}; expected one of numbers")
         if _is_transforms(messages[0][1]):
-            static = address.topic + "_static"
-            more = list(log.messages(static)) if static in log.topics else []
-            return _written(POSE, *_chained(messages, more, address, log.start_ns))
+            return _written(POSE, *_chained(_frames(log, messages, address.topic), address))
         times, ordered = by_time(messages, log.start_ns)
-        rows, unit = [_row(each) for each in ordered], address.unit or log.unit
+        by_namespace = has_namespaces(ordered)
+        rows = [_row(each, by_namespace=by_namespace) for each in ordered]
+        unit = address.unit or log.unit
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
         raise InputError(
@@ -122,16 +127,20 @@ def _told(log: Log, path: Path, name: str) -> LogTopic:
     rate = 1e9 * (len(first) - 1) / span if span > 0 else None
     serves, write = "", [f"{path.name}#{name}"]
     if first and _is_transforms(first[0][1]):
-        edges = _edges(log.messages(name), log.start_ns)
-        serves = "poses of one frame in another: " + ", ".join(f"{p}>{c}" for p, c in edges)
-        write = [f"{write[0]}#{parent}>{child}" for parent, child in edges]
+        chains = moving_chains(_frames(log, log.messages(name), name))
+        serves = "poses of one frame in another" if chains else "frames that do not move"
+        write = [f"{write[0]}#{parent}>{child}" for parent, child in chains]
+        if name.removesuffix(STATIC) in log.topics and name.endswith(STATIC):
+            serves += f", part of the chains of {name.removesuffix(STATIC)}"
     elif first and (held := depth_in(first[0][1])):
         serves = f"{held}: [[experiment.depth]]"
     elif first and is_camera(first[0][1]):
         serves, write = "the camera's matrix, for the depth images beside it", []
     elif first:
-        columns = set[str]().union(*(_row(each) for _, each in first))
-        serves = _served(columns, first[0][1])
+        messages = [message for _, message in first]
+        by_namespace = has_namespaces(messages)
+        columns = set[str]().union(*(_row(each, by_namespace=by_namespace) for each in messages))
+        serves = _served(columns, messages[0])
         if serves.startswith("positions"):
             write.append(f"{write[0]}#ROBOT.urdf#BASE>TOOL")
     return LogTopic(name, kind, count, rate, serves, tuple(write if serves else ()))
@@ -147,7 +156,9 @@ def _served(columns: set[str], message: Any) -> str:
     if hasattr(message, "name") and hasattr(message, "position"):
         return "positions of joints; poses with the robot's URDF"
     if all(column[-2:] in ("_x", "_y", "_z") for column in columns):
-        return "marker tracks: " + ", ".join(sorted({column[:-2] for column in columns}))
+        markers = sorted({column[:-2] for column in columns})
+        spaces = groupby(markers, key=lambda marker: marker.rpartition("/")[0])
+        return "marker tracks: " + "; ".join(", ".join(markers) for _, markers in spaces)
     return "numbers: a pressure, a tension, a reading"
 
 
@@ -181,8 +192,11 @@ def _nanoseconds(stamp: Any) -> int:
     )
 
 
-def _row(message: Any) -> Row:
-    """The numbers of a message by the columns that they stand in."""
+def _row(message: Any, *, by_namespace: bool) -> Row:
+    """Return the numbers of a message by their columns.
+
+    With `by_namespace` the names of markers have that of their namespace in front.
+    """
     wrench = _at(message, "wrench") or message
     if _is_vector(force := _at(wrench, "force")):
         values = [*_vector(force), *_vector(_at(wrench, "torque"))]
@@ -192,7 +206,7 @@ def _row(message: Any) -> Row:
         return {str(name): float(value) for name, value in pairs}
     if (pose := _pose(message)) is not None:
         return dict(zip(POSE, pose, strict=True))
-    points = _points(message)
+    points = _points(message, by_namespace=by_namespace)
     if points:
         return {f"{name}_{axis}": p[k] for name, p in points.items() for k, axis in enumerate(AXES)}
     for name, column in _NUMBERS.items():
@@ -210,11 +224,12 @@ def _pose(message: Any) -> tuple[float, ...] | None:
     return None
 
 
-def _points(message: Any) -> dict[str, tuple[float, ...]]:
+def _points(message: Any, *, by_namespace: bool) -> dict[str, tuple[float, ...]]:
     """Places by name: one, or those of the first list that has some."""
     if _is_vector(one := _at(message, "point")):
         return {_at(message, "header.frame_id") or "point": _vector(one)}
-    places = {_called(item, k): _place(item) for k, item in enumerate(_items(message))}
+    items = enumerate(_items(message))
+    places = {_called(item, k, by_namespace=by_namespace): _place(item) for k, item in items}
     return {key: place for key, place in places.items() if place is not None}
 
 
@@ -230,9 +245,15 @@ def _place(item: Any) -> tuple[float, ...] | None:
     return next((_vector(p) for name in _POINTS if _is_vector(p := _at(item, name))), None)
 
 
-def _called(item: Any, k: int) -> str:
+def _called(item: Any, index: int, *, by_namespace: bool) -> str:
     names = (_at(item, name) for name in _NAMES)
-    return str(next((name for name in names if name not in (None, "")), k + 1))
+    name = str(next((name for name in names if name not in (None, "")), index + 1))
+    return f"{namespace}/{name}" if by_namespace and (namespace := _at(item, "ns")) else name
+
+
+def has_namespaces(messages: Iterable[Any]) -> bool:
+    """Whether markers of several namespaces are in these messages, which may number them alike."""
+    return len({_at(item, "ns") for each in messages for item in _items(each)} - {None, ""}) > 1
 
 
 def _at(message: Any, path: str) -> Any:
@@ -264,11 +285,9 @@ def _child(transform: Any) -> tuple[str, str] | None:
     return (parent.lstrip("/"), child.lstrip("/")) if is_one else None
 
 
-def _edges(
-    messages: Iterator[tuple[int, Any]] | list[tuple[int, Any]], start_ns: int
-) -> dict[tuple[str, str], dict[float, tuple[float, ...]]]:
+def _edges(messages: Iterable[tuple[int, Any]], start_ns: int) -> Edges:
     """Poses by time of each child in its parent; of several at a time the first."""
-    edges: dict[tuple[str, str], dict[float, tuple[float, ...]]] = {}
+    edges: Edges = {}
     for at_ns, message in messages:
         for each in _at(message, "transforms") or [message]:
             pose = _pose(each)
@@ -277,13 +296,35 @@ def _edges(
     return edges
 
 
-def _chained(
-    moving: list[tuple[int, Any]],
-    still: list[tuple[int, Any]],
-    address: Address,
-    start_ns: int,
-) -> tuple[Array, Array]:
-    """Times and poses of one frame in another, through all between them.
+def _frames(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
+    """Return the poses of a topic's transforms, and of the fixed ones of its static topic."""
+    still = log.messages(topic + STATIC) if topic + STATIC in log.topics else ()
+    fixed = {
+        edge: {0.0: next(iter(of.values()))} for edge, of in _edges(still, log.start_ns).items()
+    }
+    return fixed | _edges(moving, log.start_ns)
+
+
+def moving_chains(edges: Edges) -> list[tuple[str, str]]:
+    """Return pairs of a root and each frame that moves in it; frames that carry none come first.
+
+    A root is a frame that is placed in no other one.
+    """
+    above = {child: parent for parent, child in edges}
+    moving = {child for (_, child), poses in edges.items() if len(poses) > 1}
+    chains = []
+    for frame in above:
+        chain = [frame]
+        while (parent := above.get(chain[-1])) is not None and parent not in chain:
+            chain.append(parent)
+        if chain[-1] not in above and moving & set(chain):
+            chains.append((chain[-1], frame))
+    carrying = set(above.values())
+    return sorted(chains, key=lambda chain: chain[1] in carrying)
+
+
+def _chained(edges: Edges, address: Address) -> tuple[Array, Array]:
+    """Return times and poses of one frame in another, through all between them.
 
     At the times of the one that is told most often; the others are interpolated along screws.
     """
@@ -293,8 +334,6 @@ def _chained(
     from pytransform3d.transform_manager import StaticTransform as Static
     from pytransform3d.transform_manager import TemporalTransformManager as Manager
 
-    fixed = {edge: {0.0: next(iter(of.values()))} for edge, of in _edges(still, start_ns).items()}
-    edges = fixed | _edges(moving, start_ns)
     parent, child = _between(edges, address)
     path = _path(edges, parent, child)
     told = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]

@@ -1,0 +1,22 @@
+"""Markdown on a terminal, with code that can be copied."""
+
+from __future__ import annotations
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.markdown import CodeBlock, Markdown
+from rich.text import Text
+
+
+class UnbrokenCode(CodeBlock):
+    """A code block of Markdown whose lines are never broken."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the code, indented by two spaces."""
+        for line in str(self.text).rstrip().splitlines():
+            yield Text(f"  {line}", style="cyan", no_wrap=True, overflow="ignore")
+
+
+class TerminalPage(Markdown):
+    """Markdown whose text is wrapped to the terminal and whose code is not."""
+
+    elements = {**Markdown.elements, "fence": UnbrokenCode, "code_block": UnbrokenCode}  # noqa: RUF012
