@@ -39,8 +39,9 @@ SMOOTH_BELOW_M_S = 1e-4
 
 @cache
 def unit_drag() -> NodeForce:
-    """Return the drag on surface nodes in a fluid of density 1 kg/m³; drag is linear in the
-    density.
+    """Return the drag on surface nodes in a fluid of density 1 kg/m³.
+
+    Drag is linear in the density.
     """
 
     def air_drag(x: ca.SX, v: ca.SX, at: AtNode) -> ca.SX:

@@ -214,8 +214,9 @@ class Body(Discretisation):
 
     @property
     def scan(self) -> UnderGravity | None:
-        """Gravity and held nodes of the scan of the mesh; None if the mesh counts as
-        stress-free.
+        """Gravity and held nodes of the scan of the mesh.
+
+        None if the mesh counts as stress-free.
         """
         return self.rest_shape if isinstance(self.rest_shape, UnderGravity) else None
 

@@ -265,8 +265,9 @@ class Discretisation(Model):
         return self._width("curvature")
 
     def volume_ratios(self, positions: ArrayLike) -> Array:
-        """Return J = det F at every quadrature point (T, E, q); elements with J ≤ 0 are
-        inverted.
+        """Return J = det F at every quadrature point (T, E, q).
+
+        Elements with J ≤ 0 are inverted.
         """
         nodes = len(self.nodes_m)
         count, points = self.geometry.shape[:2]

@@ -98,8 +98,9 @@ class Law:
         return potential(psi, F, rate, **self._of_damping(theta)) if potential else ca.SX(0)
 
     def damping_stress(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX] | None:
-        """Return P_v (9,) and ∂P_v/∂F (9, 9) of the damping law; None if it has a potential
-        instead.
+        """Return P_v (9,) and ∂P_v/∂F (9, 9) of the damping law.
+
+        None if it has a potential instead.
 
         Parameters
         ----------

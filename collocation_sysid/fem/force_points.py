@@ -118,8 +118,9 @@ class ForcePoints:
         to[:, places[nonempty]] += (assembly @ values.T).T / 2
 
     def _some(self, what: str, chosen: Index | None) -> Any:
-        """Return the columns or rows of a matrix that belong to chosen instances; the latest are
-        cached.
+        """Return the columns or rows of a matrix that belong to chosen instances.
+
+        The latest are cached.
 
         Parameters
         ----------

@@ -249,8 +249,9 @@ class Derivative:
         return contractions[len(self.by) - self.by.count("theta")]
 
     def of(self, piece: ca.SX) -> ca.SX:
-        """Return the stated part of the (9, 9) piece of a second derivative by fields; others
-        unchanged.
+        """Return the stated part of the (9, 9) piece of a second derivative by fields.
+
+        Others unchanged.
         """
         if self.contraction != "pairs":
             return piece

@@ -206,8 +206,9 @@ def yeoh(F: ca.SX, c10_pa: ca.SX, c20_pa: ca.SX, c30_pa: ca.SX, kappa_pa: ca.SX)
 
 
 def gent(F: ca.SX, mu_pa: ca.SX, gent_limit: ca.SX, kappa_pa: ca.SX) -> ca.SX:
-    """Gent's energy ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U; Ī₁ < 3 + J_m for every stretch (Gent
-    1996).
+    """Gent's energy ψ = −½ μ J_m ln(1 − (Ī₁ − 3)/J_m) + U.
+
+    Ī₁ < 3 + J_m for every stretch (Gent 1996).
     """
     remaining = 1 - (_isochoric_invariants(F)[0] - 3) / gent_limit
     # The square root makes the derivatives NaN beyond the limit, too; otherwise a solver that
@@ -326,8 +327,9 @@ class Damping:
 
 
 def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Kelvin–Voigt damping P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹; return P_v and
-    ∂P_v/∂F.
+    """Kelvin–Voigt damping P_v = F S_v with S_v = 2η C⁻¹ Ė C⁻¹ + ζ (C⁻¹:Ė) C⁻¹.
+
+    Return P_v and ∂P_v/∂F.
 
     The viscosities are η = γ_r μ and ζ = γ_r λ. This is the Kirchhoff stress 2η d + ζ (tr d) 1 of
     the rate of deformation d, the symmetric part of L = Ḟ F⁻¹; its dissipation 2η d:d + ζ (tr d)²
@@ -349,8 +351,9 @@ def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[c
 
 
 def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Damping in material form, P_v = F S_v with S_v = γ_r (λ tr(Ė) I + 2μ Ė); return P_v and
-    ∂P_v/∂F.
+    """Damping in material form, P_v = F S_v with S_v = γ_r (λ tr(Ė) I + 2μ Ė).
+
+    Return P_v and ∂P_v/∂F.
 
     Ė is the rate of the Green strain. S_v : Ė = γ_r (λ (tr Ė)² + 2μ Ė:Ė) is positive for any F;
     half of it is the potential D of the stress, P_v = ∂D/∂Ḟ. For a St. Venant–Kirchhoff material

@@ -136,8 +136,9 @@ class TetMesh:
 
     @classmethod
     def read(cls, path: str | Path, length_unit: str = "m") -> TetMesh:
-        """Read the tetrahedra of any file that meshio can read; other cells are omitted with a
-        note.
+        """Read the tetrahedra of any file that meshio can read.
+
+        Other cells are omitted with a note.
 
         Quadratic tetrahedra are reduced to their corners: the element of the body determines the
         nodes on edges. Slightly curved sides are straightened, with a note.

@@ -112,8 +112,9 @@ def checked_arrays(
 def cleaned(
     points_m: np.ndarray, tetrahedra: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Drop nodes that are no element's corner and reverse negatively oriented elements; orders are
-    kept.
+    """Drop nodes that are no element's corner and reverse negatively oriented elements.
+
+    Orders are kept.
 
     Returns
     -------
@@ -159,8 +160,9 @@ def orient(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np
 
 
 def signed_volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the volume of each tetrahedron (E,) [m³]; positive if x₁−x₀, x₂−x₀, x₃−x₀ is
-    right-handed.
+    """Return the volume of each tetrahedron (E,) [m³].
+
+    Positive if x₁−x₀, x₂−x₀, x₃−x₀ is right-handed.
     """
     corner = points_m[tetrahedra]
     a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))

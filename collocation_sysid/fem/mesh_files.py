@@ -254,8 +254,9 @@ def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
 
 
 def _of_tetrahedra(data: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the values on tetrahedra of arrays given block by block; all-false masks are
-    omitted.
+    """Return the values on tetrahedra of arrays given block by block.
+
+    All-false masks are omitted.
     """
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
     selected = {}

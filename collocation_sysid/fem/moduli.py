@@ -91,8 +91,9 @@ def source_of(
     """
 
     def name_of(own: str) -> str | None:
-        """Return the parameter that gives a constant, that of the region first; None if there is
-        none.
+        """Return the parameter that gives a constant, that of the region first.
+
+        None if there is none.
         """
         prefixed = f"{region}.{own}" if region else own
         return prefixed if prefixed in known else own if own in known else None

@@ -113,8 +113,9 @@ class NodeForce:
         on: On = "nodes",
         carries: int = 0,
     ) -> NodeForce:
-        """Return a force from a law; its arguments after x, v and at are the constants, with their
-        units.
+        """Return a force from a law.
+
+        Its arguments after x, v and at are the constants, with their units.
 
         Parameters
         ----------

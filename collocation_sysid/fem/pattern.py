@@ -121,8 +121,9 @@ class Joined:
         return Joined(union, tuple(union.position(p.rows, p.columns) for p in patterns))
 
     def spread(self, values: Array) -> Array:
-        """Return values (T, m) of the first pattern as values of the union; unchanged if they are
-        equal.
+        """Return values (T, m) of the first pattern as values of the union.
+
+        Unchanged if they are equal.
         """
         if not values.size or values.shape[1] == self.pattern.entries:
             return values

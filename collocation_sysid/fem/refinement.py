@@ -67,8 +67,9 @@ def faces_in_four(faces: Index, mesh: TetMesh) -> Index:
 
 
 def refined(body: Body) -> Body:
-    """Return the body on a mesh with half the element size; its regions consist of the split
-    cells.
+    """Return the body on a mesh with half the element size.
+
+    Its regions consist of the split cells.
     """
     cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
     regions = [
@@ -120,8 +121,9 @@ def _finer_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stre
 
 
 def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:
-    """Return a force for the refined mesh; it acts in the middle of an edge if it does at both
-    ends.
+    """Return a force for the refined mesh.
+
+    It acts in the middle of an edge if it does at both ends.
     """
     chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
     nodes = chosen[: len(body.mesh.points_m)]

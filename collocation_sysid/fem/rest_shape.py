@@ -583,8 +583,9 @@ class InverseEquilibrium:
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
     def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
-        """Return X at a given weight, from `start` (n, 3); None if Newton's method does not
-        converge.
+        """Return X at a given weight, from `start` (n, 3).
+
+        None if Newton's method does not converge.
 
         A step is accepted if the next one, with the same factors, is shorter (Deuflhard's natural
         monotonicity test), and no element is nearly inverted.

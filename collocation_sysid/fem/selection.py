@@ -267,8 +267,9 @@ Selection = Box | Ball | Indices | Named
 
 
 def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """Return the rows of the surface (F, 3) that equal faces (k, 3) in any orientation; −1 for
-    none.
+    """Return the rows of the surface (F, 3) that equal faces (k, 3) in any orientation.
+
+    −1 for none.
     """
     row_of_face = {tuple(face): row for row, face in enumerate(np.sort(surface, axis=1).tolist())}
     sorted_faces = np.sort(faces, axis=1).tolist()

@@ -138,8 +138,9 @@ _PERMUTATIONS = [
 
 
 class Volume:
-    """Volume V(x) [m³] of the cones from an apex over faces; for a closed surface the enclosed
-    volume.
+    """Volume V(x) [m³] of the cones from an apex over faces.
+
+    For a closed surface the enclosed volume.
 
     Parameters
     ----------
@@ -199,8 +200,9 @@ class Volume:
 
     @cached_property
     def rim(self) -> Index:
-        """Nodes (k, 2) or (k, 3) of edges with a face on one side only; empty for a closed
-        surface.
+        """Nodes (k, 2) or (k, 3) of edges with a face on one side only.
+
+        Empty for a closed surface.
         """
         corners = self.faces[:, :3]
         edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2)

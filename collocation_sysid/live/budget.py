@@ -65,8 +65,9 @@ class Budget:
         self.turn_s = max(self.turn_s, took_s)
 
     def ended(self, took_s: float) -> None:
-        """Record how long the work after the time steps took [s]; not every frame needs all of
-        it.
+        """Record how long the work after the time steps took [s].
+
+        Not every frame needs all of it.
         """
         self.after_s = max(SELDOM * self.after_s, took_s)
 

@@ -302,8 +302,9 @@ class Estimator:
 
     @one_blas_thread()
     def settle(self) -> Update | None:
-        """Return the final result of all frames, however long that takes; call it after the last
-        frame.
+        """Return the final result of all frames, however long that takes.
+
+        Call it after the last frame.
 
         If the window holds the whole recording, this is the run of the batch. Otherwise, and if
         markers were measured between samples, the rows in the window are computed again until the
@@ -349,8 +350,9 @@ class Estimator:
             return None
 
     def _pass_to_the_end(self, began: float, notes: list[str]) -> int:
-        """Compute the rows in the window again until the estimate stays; return the number of
-        rows.
+        """Compute the rows in the window again until the estimate stays.
+
+        Return the number of rows.
         """
         rows_per_frame, self.rows = self.rows, PASSES * len(self.log)
         try:
@@ -462,8 +464,9 @@ class Estimator:
         return Search(self.model, self.p[self.model.collocation.nq :])
 
     def _warmed_up(self) -> tuple[Poses, Array] | None:
-        """Compile the kernels before the first frame; return poses and positions (3n,) of the
-        start.
+        """Compile the kernels before the first frame.
+
+        Return poses and positions (3n,) of the start.
 
         None if the start cannot be computed.
         """
@@ -651,8 +654,9 @@ class Estimator:
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
-        """Complete a second pass that lags by few rows before new rows come; return the number of
-        rows.
+        """Complete a second pass that lags by few rows before new rows come.
+
+        Return the number of rows.
         """
         again = self.again
         if again is None or again.base is None:
@@ -664,8 +668,9 @@ class Estimator:
         return self._advance(again, lag, notes)
 
     def _advance(self, again: Track, count: int, notes: list[str]) -> int:
-        """Continue a second pass by some rows and judge it if it has caught up; return the number
-        of rows.
+        """Continue a second pass by some rows and judge it if it has caught up.
+
+        Return the number of rows.
         """
         before = self.clock()
         first_row = again.rows

@@ -79,8 +79,9 @@ class Intake:
         return self._poses[-1][0] if self._poses else None
 
     def seen(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
-        """Yield time and positions (M, 3) of all marker samples; times in samples from the first
-        row on.
+        """Yield time and positions (M, 3) of all marker samples.
+
+        Times in samples from the first row on.
         """
         for of, when, tracks_m in self.told(log):
             if not of:

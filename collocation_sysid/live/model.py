@@ -140,8 +140,9 @@ class Model:
         return replace(still, grasps=_held_at(still, poses))
 
     def placed(self, tracks_m: Array, x: Array) -> Model:
-        """Return the model with unknown marker places set from the first frame; self if all are
-        known.
+        """Return the model with unknown marker places set from the first frame.
+
+        Self if all are known.
 
         Parameters
         ----------
@@ -165,7 +166,7 @@ class Model:
 
     @cached_property
     def solver(self) -> Sweep:
-        """Of its rows."""
+        """Solver of the rows of the template."""
         return Sweep(self.segment, self.rows)
 
     @cached_property
@@ -245,8 +246,9 @@ class Model:
 
     @cached_property
     def samples_around(self) -> int:
-        """Number of samples before and after one that its evaluation needs; 0 if no clock is
-        estimated.
+        """Number of samples before and after one that its evaluation needs.
+
+        0 if no clock is estimated.
         """
         return NEIGHBOURS // 2 if len(self.segment.nuisance.of_clock) else 0
 
@@ -384,8 +386,9 @@ class Model:
 
     @cached_property
     def stencils(self) -> tuple[Array, Array, Array, Array]:
-        """Coefficients p, q, w and s of all rows, as (rows, rows) matrices; q and s include the
-        time step.
+        """Coefficients p, q, w and s of all rows, as (rows, rows) matrices.
+
+        q and s include the time step.
         """
         dynamics = self.segment.dynamics.first_rows(self.rows)
         tables = dynamics.tables

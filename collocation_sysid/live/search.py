@@ -52,8 +52,9 @@ class Search:
         return np.concatenate([self._waiting[0], self._phi]) if self._waiting else None
 
     def compare(self, track: Track) -> None:
-        """Record the result of a trial; two failures in a row, after the first one, end the
-        search.
+        """Record the result of a trial.
+
+        Two failures in a row, after the first one, end the search.
         """
         self._waiting.pop(0)
         self._tried.append((np.inf if track.failed else track.loss, track.p))

@@ -28,8 +28,9 @@ HERE = "127.0.0.1"
 
 
 def as_text(lines: Iterable[bytes]) -> Iterator[str]:
-    """Decode lines of UTF-8; invalid bytes are replaced by a character that no number or name
-    contains.
+    """Decode lines of UTF-8.
+
+    Invalid bytes are replaced by a character that no number or name contains.
     """
     return (line.decode("utf-8", errors="replace") for line in lines)
 

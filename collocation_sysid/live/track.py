@@ -142,8 +142,9 @@ class Track:
 
     @property
     def turned(self) -> int:
-        """Index of the row of the window at which the linearisation point was changed last; 0 if
-        never.
+        """Index of the row of the window at which the linearisation point was changed last.
+
+        0 if never.
         """
         return self._turns[-1][0]
 
@@ -214,8 +215,9 @@ class Track:
         return base.x + base.columns @ step.astype(np.float32)
 
     def drop_oldest(self) -> int:
-        """Add the oldest block to the prior and remove it from the window; return its number of
-        rows.
+        """Add the oldest block to the prior and remove it from the window.
+
+        Return its number of rows.
         """
         block = self.blocks.pop(0)
         self.rows -= len(block.kept)

@@ -254,8 +254,9 @@ class Dynamics:
 
     @property
     def until_next_s(self) -> Array:
-        """Time from each evaluation to the next (N,); the last entry is one step, or 1 s if
-        static.
+        """Time from each evaluation to the next (N,).
+
+        The last entry is one step, or 1 s if static.
         """
         if self.static:
             return np.append(np.diff(self.t_s), 1.0)

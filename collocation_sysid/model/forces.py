@@ -160,8 +160,9 @@ class Forces:
         return replace(self, weight=self.weight.rows(rows), further=further)
 
     def scaled(self, share: float) -> Forces:
-        """Return these forces with all external ones multiplied by a factor; masses are
-        unchanged.
+        """Return these forces with all external ones multiplied by a factor.
+
+        Masses are unchanged.
         """
         further = tuple(term.scaled(share) for term in self.further)
         return replace(self, weight=self.weight.scaled(share), further=further)

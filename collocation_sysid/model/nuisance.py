@@ -275,8 +275,9 @@ class NuisanceMap:
         return self._where(lambda e: "drives" in e.row.changes)
 
     def drive_places(self, number: int) -> tuple[int, int]:
-        """Return the indices in φ of factor and loss of an actuator; −1 where they are not
-        estimated.
+        """Return the indices in φ of factor and loss of an actuator.
+
+        −1 where they are not estimated.
         """
         indices = [-1, -1]
         for k in self.of_drives:

@@ -270,8 +270,9 @@ class History:
 
     @property
     def gaps(self) -> Array:
-        """Residuals m_k − d_k m_{k−1} − a_k S_k (N − 1, all branches); zero if m satisfies the
-        recursion.
+        """Residuals m_k − d_k m_{k−1} − a_k S_k (N − 1, all branches).
+
+        Zero if m satisfies the recursion.
         """
         d, a = (self.memory.spread(each[:, :-1]) for each in (self.fading.d, self.fading.a))
         m = self.brought
@@ -413,8 +414,9 @@ class Remembered:
         return replace(forces, past=past)
 
     def following(self, forces: Forces, x: Array, v: Array, interval_s: float) -> Remembered:
-        """Return the memory in the state x (3n,) one interval later; forces and velocity are not
-        used.
+        """Return the memory in the state x (3n,) one interval later.
+
+        Forces and velocity are not used.
         """
         memory = self.body.memory
         brought, c = self._brought(interval_s)

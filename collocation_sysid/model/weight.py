@@ -88,8 +88,9 @@ class Mass:
 
     @cached_property
     def tied(self) -> Array | None:
-        """Tied masses as (3n,) if they are constant in time, else (T, 3n); None if there are
-        none.
+        """Tied masses as (3n,) if they are constant in time, else (T, 3n).
+
+        None if there are none.
         """
         if not len(self.tied_kg) or self.tied_kg.strides[0]:
             return self.tied_kg
@@ -304,8 +305,9 @@ class Weight(ForceTerm):
 
 
 def _own_kg(body: Body) -> Array:
-    """Return the masses (3n,) of a body whose constants are not known yet; NaN for free
-    densities.
+    """Return the masses (3n,) of a body whose constants are not known yet.
+
+    NaN for free densities.
     """
     return body.mass_of_dofs(np.full(len(body.constants), np.nan))
 

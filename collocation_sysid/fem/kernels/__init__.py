@@ -82,8 +82,9 @@ def choose_evaluator(choice: str = "auto") -> str:
 
 
 def _asked_for(choice: str) -> str:
-    """Return the choice, or for "auto" that of the environment variable; an `InputError` if
-    unknown.
+    """Return the choice, or for "auto" that of the environment variable.
+
+    An `InputError` if unknown.
     """
     if choice == "auto":
         choice = os.environ.get("COLLOCATION_SYSID_EVALUATOR", "auto")

@@ -247,8 +247,9 @@ def _digest(key: str, code: bytes) -> bytes:
 
 
 def _read_own(path: Path) -> bytes:
-    """Return the content of a plain file that belongs to the user alone; an OSError for any
-    other.
+    """Return the content of a plain file that belongs to the user alone.
+
+    An OSError for any other.
     """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     with os.fdopen(os.open(path, flags | getattr(os, "O_BINARY", 0)), "rb") as file:

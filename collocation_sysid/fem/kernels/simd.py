@@ -274,8 +274,9 @@ class _Emitter:
         return buffer
 
     def _clear(self, row: ir.Value, length: ir.Value) -> None:
-        """Set the outputs of one time step to zero; they stay in the cache while they are
-        summed.
+        """Set the outputs of one time step to zero.
+
+        They stay in the cache while they are summed.
         """
         b = self.builder
         bytes_ = ir.IntType(8).as_pointer()

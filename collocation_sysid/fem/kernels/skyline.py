@@ -101,8 +101,9 @@ class Skyline:
         )
 
     def factorise(self, room: Room, symmetric: Array, skew: Array) -> tuple[Array, Array]:
-        """Compute L and U without their unit diagonals in the given memory; for a symmetric matrix
-        only L.
+        """Compute L and U without their unit diagonals in the given memory.
+
+        For a symmetric matrix only L.
 
         Parameters
         ----------

@@ -64,8 +64,9 @@ def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None
 
 
 def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:
-    """Return ``run(item)`` of every item, in their order; each item runs on one thread, see
-    `at_once`.
+    """Return ``run(item)`` of every item, in their order.
+
+    Each item runs on one thread, see `at_once`.
 
     Much of the work of an experiment is too short to release and acquire the interpreter lock: more
     experiments than cores at a time fill the gaps.
