@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import require_regular
 from .mesh_checks import straightened
+from .meshio_reader import MeshContent, read_content
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 
@@ -65,7 +67,7 @@ def read_tetrahedra(
 
 
 def _tetrahedra(
-    data: Any, metres: float
+    data: MeshContent, metres: float
 ) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
     counts = _cell_counts(data)
     points_m = np.asarray(data.points, dtype=float) * metres
@@ -142,20 +144,22 @@ def _numbers(values: np.ndarray) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _reading(path: str | Path) -> Iterator[Any]:
-    """What meshio reads; a damaged file may also fail where that is taken apart."""
-    import meshio  # slow to import
-
+def _reading(path: str | Path) -> Iterator[MeshContent]:
+    """Content of a file; what fails while it is evaluated is reported as damage of the file."""
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
+    require_regular(path)
+    try:
+        content = read_content(path)
+    except InputError as error:
+        raise _refusal("read", error.message, path) from error
     with _one_error(path, "read"):
-        yield meshio.read(path)
+        yield content
 
 
 @contextlib.contextmanager
 def _one_error(path: str | Path, done: str) -> Iterator[None]:
-    """Turn whatever meshio does on a bad file into one InputError."""
-    # Its readers raise whatever their parsing trips over, print, warn, and may exit.
+    """Turn whatever fails on a bad file into one InputError, and print nothing."""
     said = io.StringIO()
     try:
         with (
@@ -171,14 +175,18 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
         if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise
         reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise InputError(
-            f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
-            ".mesh and .inp are known, told by the file's ending",
-            path,
-        ) from error
+        raise _refusal(done, reason, path) from error
 
 
-def _point_sets(data: Any) -> dict[str, np.ndarray]:
+def _refusal(done: str, reason: str, path: str | Path) -> InputError:
+    return InputError(
+        f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
+        ".mesh and .inp are known, told by the file's ending",
+        path,
+    )
+
+
+def _point_sets(data: MeshContent) -> dict[str, np.ndarray]:
     sets = {}
     for name, nodes in (data.point_sets or {}).items():
         sets[name] = np.zeros(len(data.points), dtype=bool)
@@ -186,7 +194,7 @@ def _point_sets(data: Any) -> dict[str, np.ndarray]:
     return sets
 
 
-def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
+def _cell_sets(data: MeshContent) -> dict[str, list[np.ndarray]]:
     """Cell sets as booleans, block by block."""
     sets = {}
     for name, per_block in (data.cell_sets or {}).items():
@@ -199,7 +207,7 @@ def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
     return sets
 
 
-def _physical_groups(data: Any) -> dict[str, list[np.ndarray]]:
+def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
     """Physical groups of a .msh file by name, as booleans block by block.
 
     One without a name is "physical_<tag>", and its dimension follows where others have its tag.
@@ -223,7 +231,7 @@ def _called(tag: int, dimension: int, ambiguous: bool) -> str:
     return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
 
 
-def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
+def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
     """Nodes of cells chosen block by block, as booleans."""
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
@@ -231,7 +239,7 @@ def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
     return chosen
 
 
-def _of_tetrahedra(data: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The tetrahedra's part of arrays given block by block; those that are of none are left out."""
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
     kept = {}
@@ -243,7 +251,7 @@ def _of_tetrahedra(data: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray
     return kept
 
 
-def _triangle_sets(data: Any, arrays: Mapping[str, Any]) -> Arrays:
+def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
     """Corners of the triangles on which arrays given block by block are 1."""
     blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
     found = {}
@@ -256,7 +264,7 @@ def _triangle_sets(data: Any, arrays: Mapping[str, Any]) -> Arrays:
     return found
 
 
-def _cell_counts(data: Any) -> Counter[str]:
+def _cell_counts(data: MeshContent) -> Counter[str]:
     counts: Counter[str] = Counter()
     for block in data.cells:
         counts[block.type] += len(block.data)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, located
+from ...fem.meshio_reader import read_content
 from ...files import reason, require_regular
 from .depth_messages import (
     ENCODINGS,
@@ -221,7 +222,7 @@ def _exr(path: Path) -> Array:
 
 
 def _ply(path: Path) -> Array:
-    mesh = import_module("meshio").read(path)
+    mesh = read_content(path)
     points = np.asarray(mesh.points, dtype=float)
     return _with_normals(points, mesh.point_data)
 
