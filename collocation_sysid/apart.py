@@ -1,4 +1,4 @@
-"""Work of libraries that may crash, hang, litter or ignore Ctrl-C, in a process and folder apart."""
+"""Work of libraries that may crash, hang or litter, in an isolated process and folder."""
 
 from __future__ import annotations
 

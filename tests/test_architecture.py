@@ -17,7 +17,7 @@ PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
     {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"}
-    | {"tree", "display", "section", "stated"},
+    | {"tree", "display", "section", "stated", "machine", "array_files", "written_files"},
     {"fem"},
     {"recording"},
     {"model"},

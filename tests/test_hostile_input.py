@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+import tracemalloc
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from problem_files import replace_cell, replace_text, run_command, settings
 
+from collocation_sysid import machine
+from collocation_sysid.apart import Failed, Limits, computed_apart
+from collocation_sysid.errors import InputError
 from collocation_sysid.problem import Problem
+from collocation_sysid.recording import read_poses
+from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.result import writers
 from collocation_sysid.runs.check import cost as memory
 
@@ -60,6 +68,81 @@ def test_a_c3d_of_random_blocks_is_refused(tiny: Path):
         blocks[:2] = b"\x02\x50"
         (tiny / "swing.c3d").write_bytes(blocks)
         assert "swing.c3d" in refused("check", "problem.toml")
+
+
+# Meshes and points of which the readers of meshio do not find the end.
+ENDLESS = {
+    "comment.off": "OFF\n# C7",
+    "comments.msh": "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Comments\n",
+    "header.ply": "ply\nformat ascii 1.0\ncomment",
+}
+READ_ENDLESS = """
+import sys
+from collocation_sysid import apart
+from collocation_sysid.errors import InputError
+from collocation_sysid.fem.mesh import TetMesh
+apart.READING_S = 3
+for name in sys.argv[1:]:
+    try:
+        TetMesh.read(name)
+    except InputError as error:
+        print(error)
+"""
+
+
+def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
+    for name, content in ENDLESS.items():
+        (tmp_path / name).write_text(content)
+    done = subprocess.run(
+        [sys.executable, "-c", READ_ENDLESS, *ENDLESS],
+        cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(ENDLESS)
+    for line, name in zip(lines, ENDLESS, strict=True):
+        assert line.startswith(f"{name}: the file cannot be read as a mesh (")
+    assert "it was not finished after 3 s" in lines[0]
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits of Linux")
+def test_readers_have_a_limit_of_memory():
+    take = "found = {'a': numpy.ones(int(sys.argv[1]))}"
+    limits = Limits(time_s=60, memory_mb=300)
+    assert len(computed_apart(take, "1000", limits=limits)["a"]) == 1000
+    with pytest.raises(Failed, match="MemoryError"):
+        computed_apart(take, "100000000", limits=limits)
+
+
+@pytest.mark.parametrize("content", ["ply\nformat ascii 1.0\nelement vertex 3\n", "ply\n", "x"])
+def test_a_damaged_cloud_is_refused_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], content: str
+):
+    (tmp_path / "a.ply").write_text(content)
+    with pytest.raises(InputError, match=r"a\.ply: .*expected \.ply") as refusal:
+        read_depth(tmp_path / "a.ply", None, 1.0)
+    assert "SystemExit" not in str(refusal.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_array_that_its_header_states_too_large_is_refused(tmp_path: Path):
+    array = np.zeros((20_000, 100, 100), dtype="u1")
+    np.savez_compressed(tmp_path / "zeros.npz", depth_m=array)
+    np.savez_compressed(tmp_path / "poses.npz", t_s=np.zeros(3), matrices=array)
+    head = io.BytesIO()
+    stated = {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}
+    np.lib.format.write_array_header_1_0(head, stated)
+    (tmp_path / "cut.npy").write_bytes(head.getvalue() + bytes(1000))
+    with zipfile.ZipFile(tmp_path / "cut.npz", "w") as archive:
+        archive.writestr("points_m.npy", head.getvalue() + bytes(1000))
+    tracemalloc.start()
+    for name in ("zeros.npz", "cut.npy", "cut.npz"):
+        with pytest.raises(InputError, match=rf"{name}: the array .* takes .* GB"):
+            read_depth(tmp_path / name, None, 1.0)
+    with pytest.raises(InputError, match=r"poses\.npz: the array matrices"):
+        read_poses(tmp_path / "poses.npz")
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
 
 
 # Numbers ------------------------------------------------------------------------------------------
@@ -152,12 +235,12 @@ def test_where_the_memory_is_not_known_nothing_is_refused(tiny: Path, monkeypatc
 
 def test_limits_of_containers_count_as_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(memory, "CGROUP_LIMITS", (limit,))
-    machine = memory.machine_memory_mb()
+    monkeypatch.setattr(machine, "CGROUP_LIMITS", (limit,))
+    whole_mb = machine.machine_memory_mb()
     limit.write_text("max\n")
-    assert memory.machine_memory_mb() == machine
+    assert machine.machine_memory_mb() == whole_mb
     limit.write_text("5000000\n")
-    assert memory.machine_memory_mb() == 5.0
+    assert machine.machine_memory_mb() == 5.0
 
 
 # Interrupts ---------------------------------------------------------------------------------------

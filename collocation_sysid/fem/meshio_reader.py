@@ -129,11 +129,8 @@ def _is_harmless(path: Path) -> bool:
     if path.suffix.lower() != ".vtu" or path.stat().st_size > SMALL_BYTES:
         return False
     content = path.read_bytes()
-    return b"<VTKFile" in content and b"LZMA" not in content and b"<!" not in _uncommented(content)
-
-
-def _uncommented(content: bytes) -> bytes:
-    return content.replace(b"<!--", b"")
+    has_entities = b"<!" in content.replace(b"<!--", b"")
+    return b"<VTKFile" in content and b"LZMA" not in content and not has_entities
 
 
 def _read_here(path: str | Path) -> MeshContent:
