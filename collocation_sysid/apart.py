@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -26,6 +27,7 @@ numpy.savez("found.npz", allow_pickle=False, **found)
 _LIMIT = """
 try:
     import resource
+    resource.setrlimit(resource.RLIMIT_CPU, ({time_s}, {time_s} + 5))
     with open("/proc/self/statm") as mapped:
         already = int(mapped.read().split()[0]) * resource.getpagesize()
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
@@ -48,13 +50,18 @@ class Limits:
     Attributes
     ----------
     time_s : float
-        Wall-clock time after which the process is killed.
+        Processor time after which the process is killed; enforced on POSIX systems only.
     memory_mb : float
         Memory beyond that of Python and numpy; enforced on Linux only.
     """
 
     time_s: float
     memory_mb: float
+
+    @property
+    def waiting_s(self) -> float:
+        """Wall-clock limit."""
+        return WAITING_FACTOR * self.time_s
 
     @classmethod
     def for_file(cls, path: str | Path) -> Limits:
@@ -66,6 +73,8 @@ class Limits:
         )
 
 
+# A busy machine may give a process this part of a processor, or less.
+WAITING_FACTOR = 10.0
 # What reading a file may take. meshio reads 0.2 s or less of imports and 2 to 20 MB of text a
 # second, and takes up to 20 times the size of a text file.
 READING_S = 20.0
@@ -93,7 +102,13 @@ def computed_apart(
     Failed
         If the process does not get to its end, or reaches a limit.
     """
-    limit = "" if limits is None else _LIMIT.format(memory_bytes=int(1e6 * limits.memory_mb))
+    limit = (
+        ""
+        if limits is None
+        else _LIMIT.format(
+            memory_bytes=int(1e6 * limits.memory_mb), time_s=math.ceil(limits.time_s)
+        )
+    )
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         folder = Path(place)
         np.savez(folder / "given.npz", allow_pickle=False, **given)
@@ -104,11 +119,13 @@ def computed_apart(
                 capture_output=True,
                 text=True,
                 errors="replace",
-                timeout=None if limits is None else limits.time_s,
+                timeout=None if limits is None else limits.waiting_s,
             )
         except subprocess.TimeoutExpired as late:
             raise Failed(f"it was not finished after {late.timeout:.3g} s") from None
         if done.returncode:
+            if limits is not None and done.returncode == -getattr(signal, "SIGXCPU", 0):
+                raise Failed(f"it was not finished after {limits.time_s:.3g} s of processor time")
             said = (done.stderr.strip().splitlines() or ["no message"])[-1]
             raise Failed(killed_by(done.returncode) or said)
         with np.load(folder / "found.npz") as found:
