@@ -77,7 +77,7 @@ class Limits:
 WAITING_FACTOR = 10.0
 # What reading a file may take. meshio reads 0.2 s or less of imports and 2 to 20 MB of text a
 # second, and takes up to 20 times the size of a text file.
-READING_S = 20.0
+READING_S = 10.0
 READING_S_PER_MB = 5.0
 READING_MB = 1000.0
 READING_MB_PER_MB = 60.0

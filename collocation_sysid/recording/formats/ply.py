@@ -43,6 +43,8 @@ def read_columns(path: Path) -> Mapping[str, Array]:
     columns = _plain_columns(content)
     if columns is not None:
         return columns
+    if b"end_header" not in content[:LONGEST_HEADER]:
+        raise InputError("has no line end_header; expected .ply")
     try:
         mesh = read_content(path)
     except InputError as error:
