@@ -1,12 +1,15 @@
-"""Work of libraries that may crash, litter or ignore Ctrl-C, in a process and folder apart."""
+"""Work of libraries that may crash, hang or litter, in an isolated process and folder."""
 
 from __future__ import annotations
 
 import contextlib
+import math
+import os
 import signal
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +19,23 @@ _AROUND = """
 import sys, numpy
 with numpy.load("given.npz") as given:
     given = dict(given)
+{limit}
 {code}
-numpy.savez("found.npz", **found)
+numpy.savez("found.npz", allow_pickle=False, **found)
+"""
+# Beyond what the process has mapped when the libraries of numpy are there.
+_LIMIT = """
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CPU, ({time_s}, {time_s} + 5))
+    with open("/proc/self/statm") as mapped:
+        already = int(mapped.read().split()[0]) * resource.getpagesize()
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    most = already + {memory_bytes}
+    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    resource.setrlimit(resource.RLIMIT_AS, (most, hard))
+except (ImportError, OSError, ValueError):
+    pass  # not on every system
 """
 
 
@@ -25,7 +43,49 @@ class Failed(RuntimeError):
     """The process left nothing; the message is its last line, or how it was killed."""
 
 
-def computed_apart(code: str, *words: str, **given: ArrayLike) -> dict[str, NDArray]:
+@dataclass(frozen=True)
+class Limits:
+    """Limits of an isolated process.
+
+    Attributes
+    ----------
+    time_s : float
+        Processor time after which the process is killed; enforced on POSIX systems only.
+    memory_mb : float
+        Memory beyond that of Python and numpy; enforced on Linux only.
+    """
+
+    time_s: float
+    memory_mb: float
+
+    @property
+    def waiting_s(self) -> float:
+        """Wall-clock limit."""
+        return WAITING_FACTOR * self.time_s
+
+    @classmethod
+    def for_file(cls, path: str | Path) -> Limits:
+        """Return what reading a file may take: some tens of times what readers mostly need."""
+        size_mb = os.stat(path).st_size / 1e6
+        return cls(
+            time_s=READING_S + READING_S_PER_MB * size_mb,
+            memory_mb=READING_MB + READING_MB_PER_MB * size_mb,
+        )
+
+
+# A busy machine may give a process this part of a processor, or less.
+WAITING_FACTOR = 10.0
+# What reading a file may take. meshio reads 0.2 s or less of imports and 2 to 20 MB of text a
+# second, and takes up to 20 times the size of a text file.
+READING_S = 10.0
+READING_S_PER_MB = 5.0
+READING_MB = 1000.0
+READING_MB_PER_MB = 60.0
+
+
+def computed_apart(
+    code: str, *words: str, limits: Limits | None = None, **given: ArrayLike
+) -> dict[str, NDArray]:
     """Arrays that Python code makes in another process.
 
     Parameters
@@ -33,24 +93,39 @@ def computed_apart(code: str, *words: str, **given: ArrayLike) -> dict[str, NDAr
     code : str
         Reads the arrays `given` by name and the words in `sys.argv`, and leaves arrays in `found`.
     words : str
+    limits : Limits, optional
+        None by default.
     given : arrays by name
 
     Raises
     ------
     Failed
-        If the process does not get to its end.
+        If the process does not get to its end, or reaches a limit.
     """
+    limit = (
+        ""
+        if limits is None
+        else _LIMIT.format(
+            memory_bytes=int(1e6 * limits.memory_mb), time_s=math.ceil(limits.time_s)
+        )
+    )
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         folder = Path(place)
         np.savez(folder / "given.npz", allow_pickle=False, **given)
-        done = subprocess.run(
-            [sys.executable, "-c", _AROUND.format(code=code), *words],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            errors="replace",
-        )
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", _AROUND.format(limit=limit, code=code), *words],
+                cwd=folder,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=None if limits is None else limits.waiting_s,
+            )
+        except subprocess.TimeoutExpired as late:
+            raise Failed(f"it was not finished after {late.timeout:.3g} s") from None
         if done.returncode:
+            if limits is not None and done.returncode == -getattr(signal, "SIGXCPU", 0):
+                raise Failed(f"it was not finished after {limits.time_s:.3g} s of processor time")
             said = (done.stderr.strip().splitlines() or ["no message"])[-1]
             raise Failed(killed_by(done.returncode) or said)
         with np.load(folder / "found.npz") as found:

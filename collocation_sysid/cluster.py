@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -37,10 +38,15 @@ def connected(scheduler: Any) -> Iterator[Any]:
             None,
             "--scheduler",
         ) from error
+    # What it logs of a scheduler that was lost is said by the one message of the command.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         yield client
-    finally:
-        client.close()
+    except BaseException:
+        with suppress(Exception):  # of a scheduler that was lost, which is not the reason
+            client.close()
+        raise
+    client.close()
 
 
 def distributed() -> Any:

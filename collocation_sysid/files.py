@@ -15,6 +15,7 @@ from typing import Any
 from zipfile import BadZipFile
 
 from .errors import InputError
+from .written_files import add_to_list
 
 # What reading and drawing raise where files do not hold what they should. Errors of the disk tell
 # their file themselves.
@@ -139,7 +140,8 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """Give a file of the same ending beside `path` to write, and name it `path` at the end.
 
     So nobody ever sees half of it, and what was there is kept until then. A link is replaced and
-    not followed; into a device or a pipe, where nothing can be replaced, is written directly.
+    not followed; into a device or a pipe, where nothing can be replaced, is written directly. In a
+    folder with a list of its files, see `written_files`, the file is added to the list.
 
     Raises
     ------
@@ -155,6 +157,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
                 return
             target.parent.mkdir(parents=True, exist_ok=True)
             yield draft
+            add_to_list(target, draft)
             os.replace(draft, target)
     finally:
         with suppress(OSError):

@@ -16,19 +16,8 @@ import collocation_sysid
 PACKAGE = Path(collocation_sysid.__file__).parent
 # As in CONTRIBUTING.md.
 LAYERS = (
-    {
-        "arrays",
-        "errors",
-        "cluster",
-        "checked",
-        "files",
-        "folders",
-        "starting",
-        "apart",
-        "console",
-        "pages",
-    }
-    | {"tree", "display", "section", "stated"},
+    {"arrays", "errors", "cluster", "checked", "files", "folders", "starting", "apart", "console"}
+    | {"tree", "display", "section", "stated", "machine", "array_files", "written_files", "pages"},
     {"fem"},
     {"recording"},
     {"model"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import signal
 import subprocess
@@ -25,6 +26,7 @@ from problem_files import (
     contents,
     pictures_drawn,
     remove,
+    replace_text,
     run_command,
     settings,
     write_problem,
@@ -455,6 +457,53 @@ def test_simulation_writes_what_a_laboratory_would(tiny):
     poses, given = read_poses(tiny / files[1]), read_poses(tiny / "swing_motion.csv")
     np.testing.assert_allclose(poses.quaternions_xyzw, given.quaternions_xyzw, atol=1e-10)
     assert len(frames_in(tiny / files[2])) == 9
+
+
+@pytest.mark.parametrize("name", ["chapter.tex", "swing_markers.csv", "deep/chapter.tex"])
+def test_a_simulation_adds_nothing_to_a_foreign_folder(tiny: Path, name: str):
+    (tiny / "data" / name).parent.mkdir(parents=True)
+    (tiny / "data" / name).write_text("precious")
+    before = contents(tiny)
+    outcome = run_command("simulate", "problem.toml", "--out", "data", *settings(*AT_TRUTH))
+    assert outcome.code == 2
+    assert name in outcome.err
+    assert "this program" in outcome.err
+    assert contents(tiny) == before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
+def test_a_simulation_is_not_written_through_a_link(tiny: Path):
+    (tiny / "theirs").mkdir()
+    (tiny / "data").symlink_to("theirs")
+    outcome = run_command("simulate", "problem.toml", "--out", "data", *settings(*AT_TRUTH))
+    assert outcome.code == 2
+    assert "data: is a link to theirs" in outcome.err
+    assert not list((tiny / "theirs").iterdir())
+
+
+def test_a_simulation_replaces_an_earlier_one(tiny: Path):
+    simulate = ["simulate", "problem.toml", "--out", "data", "--frames"]
+    for young_pa in (300, 400):
+        changed = settings(*AT_TRUTH, f"parameters.mu_pa.guess={young_pa}")
+        assert run_command(*simulate, *changed).code == 0
+    (tiny / "data" / "swing" / "notes.txt").write_text("precious")
+    refusal = run_command(*simulate, *settings(*AT_TRUTH))
+    assert refusal.code == 2
+    assert "notes.txt" in refusal.err
+
+
+def test_a_simulation_beside_the_problem_keeps_what_others_wrote(tiny: Path):
+    recording = tiny / "swing_markers.csv"
+    recording.rename("recorded.csv")
+    replace_text('"swing_markers.csv"', '"recorded.csv"')(tiny)
+    simulate = ["simulate", "problem.toml", "--out", ".", *settings(*AT_TRUTH)]
+    for _ in range(2):
+        assert run_command(*simulate).code == 0
+    recording.write_text("precious")
+    refusal = run_command(*simulate)
+    assert refusal.code == 2
+    assert "swing_markers.csv: is there and was not written by this program" in refusal.err
+    assert recording.read_text() == "precious"
 
 
 def test_noise_follows_the_seed(tiny):

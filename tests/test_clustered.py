@@ -280,6 +280,18 @@ def test_workers_of_another_version_are_refused():
         OnCluster(client)
 
 
+@pytest.mark.parametrize("error", [OSError, distributed.client.CancelledError])
+def test_a_scheduler_lost_while_versions_are_asked_for_is_reported(monkeypatch, error):
+    def lost(*_: object, **__: object) -> None:
+        raise error("gone")
+
+    client = SimpleNamespace(run=lost, close=lost)
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: client)
+    with pytest.raises(InputError, match="--scheduler: the scheduler stopped answering"):  # noqa: SIM117
+        with workers_of("tcp://a:1"):
+            pytest.fail("the work was started")
+
+
 def test_costly_experiments_are_shared_out_first():
     threads = {"a": 1, "b": 1}
     assert workers._shared_out([1, 5, 2, 3], threads) == ["a", "a", "b", "b"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import re
 import runpy
 import shutil
@@ -409,6 +410,23 @@ def test_other_files_are_left_alone(run_folder, tmp_path):
     assert ended.code == 2
     assert "not an earlier export" in ended.err
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
+def test_an_export_is_not_written_through_a_link(run_folder: Path, tmp_path: Path):
+    run, theirs = tmp_path / "run", tmp_path / "theirs"
+    shutil.copytree(run_folder, run)
+    theirs.mkdir()
+    (theirs / "identified.json").write_text("{}")
+    (theirs / "recording.csv").write_text("precious")
+    (run / "export-json").symlink_to(theirs)
+    ended = run_command("export", run, "--to", "json")
+    assert ended.code == 2
+    assert f"export-json: is a link to {theirs}" in ended.err
+    assert sorted(file.name for file in theirs.iterdir()) == ["identified.json", "recording.csv"]
+    (run / "export-json").unlink()
+    for _ in range(2):
+        assert run_command("export", run, "--to", "json").code == 0
 
 
 def test_an_earlier_export_is_replaced(run_folder, tmp_path):

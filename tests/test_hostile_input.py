@@ -2,22 +2,40 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+import tracemalloc
+import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from problem_files import replace_cell, replace_text, run_command, settings
 
-from collocation_sysid.problem import Problem
+from collocation_sysid import machine
+from collocation_sysid.apart import Failed, Limits, computed_apart
+from collocation_sysid.errors import InputError
+from collocation_sysid.fem.mesh import TetMesh
+from collocation_sysid.fem.structured import (
+    box_of_edge,
+    counts_of_box,
+    counts_of_cylinder,
+    cylinder_of_edge,
+)
+from collocation_sysid.problem import Problem, loading, size
+from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
+from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.result import writers
 from collocation_sysid.runs.check import cost as memory
 from collocation_sysid.starting import INTERRUPTS, heed_interrupts
+
+COMMAND_LINE = "from collocation_sysid import cli; cli.main()"
 
 pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
 
@@ -61,6 +79,107 @@ def test_a_c3d_of_random_blocks_is_refused(tiny: Path):
         blocks[:2] = b"\x02\x50"
         (tiny / "swing.c3d").write_bytes(blocks)
         assert "swing.c3d" in refused("check", "problem.toml")
+
+
+# Meshes and points of which the readers of meshio do not find the end.
+ENDLESS = {
+    "comment.off": "OFF\n# C7",
+    "header.msh": '$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n1\n3 1 "a"\n',
+    "header.ply": "ply\nformat ascii 1.0\ncomment",
+}
+READ_ENDLESS = """
+import sys
+from collocation_sysid import apart
+from collocation_sysid.errors import InputError
+from collocation_sysid.fem.mesh import TetMesh
+apart.READING_S = 3
+for name in sys.argv[1:]:
+    try:
+        TetMesh.read(name)
+    except InputError as error:
+        print(error)
+"""
+
+
+def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
+    for name, content in ENDLESS.items():
+        (tmp_path / name).write_text(content)
+    done = subprocess.run(
+        [sys.executable, "-c", READ_ENDLESS, *ENDLESS],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=True,
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(ENDLESS)
+    for line, name in zip(lines, ENDLESS, strict=True):
+        assert line.startswith(f"{name}: the file cannot be read as a mesh (")
+    assert "it was not finished after 3 s of processor time" in lines[0]
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits of Linux")
+def test_readers_have_a_limit_of_memory():
+    take = "found = {'a': numpy.ones(int(sys.argv[1]))}"
+    limits = Limits(time_s=60, memory_mb=300)
+    assert len(computed_apart(take, "1000", limits=limits)["a"]) == 1000
+    with pytest.raises(Failed, match="MemoryError"):
+        computed_apart(take, "100000000", limits=limits)
+
+
+@pytest.mark.parametrize("content", ["ply\nformat ascii 1.0\nelement vertex 3\n", "ply\n", "x"])
+def test_a_damaged_cloud_is_refused_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], content: str
+):
+    (tmp_path / "a.ply").write_text(content)
+    with pytest.raises(InputError, match=r"a\.ply: .*expected \.ply") as refusal:
+        read_depth(tmp_path / "a.ply", None, 1.0)
+    assert "SystemExit" not in str(refusal.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_array_that_its_header_states_too_large_is_refused(tmp_path: Path):
+    array = np.zeros((20_000, 100, 100), dtype="u1")
+    np.savez_compressed(tmp_path / "zeros.npz", depth_m=array)
+    np.savez_compressed(tmp_path / "poses.npz", t_s=np.zeros(3), matrices=array)
+    head = io.BytesIO()
+    stated = {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}
+    np.lib.format.write_array_header_1_0(head, stated)
+    (tmp_path / "cut.npy").write_bytes(head.getvalue() + bytes(1000))
+    with zipfile.ZipFile(tmp_path / "cut.npz", "w") as archive:
+        archive.writestr("points_m.npy", head.getvalue() + bytes(1000))
+    tracemalloc.start()
+    for name in ("zeros.npz", "cut.npy", "cut.npz"):
+        with pytest.raises(InputError, match=rf"{name}: the array .* takes .* GB"):
+            read_depth(tmp_path / name, None, 1.0)
+    with pytest.raises(InputError, match=r"poses\.npz: the array matrices"):
+        read_poses(tmp_path / "poses.npz")
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
+
+
+@pipes
+@pytest.mark.parametrize("name", ["log.bag", "log.db3", "log.mcap", "bag/part.db3"])
+def test_a_log_that_is_a_pipe_is_refused(tiny: Path, name: str):
+    (tiny / name).parent.mkdir(exist_ok=True)
+    (tiny / "bag").mkdir(exist_ok=True)
+    (tiny / "bag" / "metadata.yaml").write_text("")
+    os.mkfifo(tiny / name)
+    words = ["topics", name.partition("/")[0]]
+    done = subprocess.run(
+        [sys.executable, "-c", COMMAND_LINE, *words], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 2, done
+    assert "is a pipe; expected a regular file" in done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="descriptors of POSIX")
+def test_a_closed_standard_input_is_refused(tiny: Path):
+    done = subprocess.run(
+        [sys.executable, "-c", COMMAND_LINE, "live", "problem.toml"],
+        capture_output=True, text=True, timeout=300, preexec_fn=partial(os.close, 0),
+    )  # fmt: skip
+    assert done.returncode == 2, done
+    assert done.stderr.startswith("error: standard input: is closed; expected frames")
+    assert done.stderr.count("\n") == 1
 
 
 # Numbers ------------------------------------------------------------------------------------------
@@ -144,6 +263,75 @@ def test_a_solve_that_memory_cannot_hold_is_refused(tiny: Path, monkeypatch: pyt
     )
 
 
+@pytest.mark.parametrize(
+    ("setting", "found"),
+    [
+        ("experiment.swing.resample_hz=1e8", "samples of a body of 36 nodes take about"),
+        ("experiment.swing.resample_hz=1e12", "samples of a body of 36 nodes take about"),
+        ("transcription.substeps=1000000", "9 samples of 1,000,000 substeps of a body of 36"),
+    ],
+)
+def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch, setting: str, found: str
+):
+    monkeypatch.setattr(size, "machine_memory_mb", lambda: 16e3)
+    began = time.process_time()
+    for command in (("check",), ("solve", "--out", "run")):
+        assert found in refused(command[0], "problem.toml", *command[1:], *settings(setting))
+    assert time.process_time() - began < 10
+    assert not (tiny / "run").exists()
+
+
+def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(size, "machine_memory_mb", lambda: 2e3)
+    monkeypatch.setattr(loading, "box_of_edge", lambda *_: pytest.fail("the mesh was made"))
+    box = "box_m = [0.06, 0.06, 0.09]\nedge_length_m = 0.0015"
+    replace_text('mesh = "body.vtu"', box)(tiny)
+    assert "a body of 102,541 nodes take about" in refused("check", "problem.toml")
+
+
+@pytest.mark.parametrize(
+    ("made", "counts"),
+    [
+        (box_of_edge((0.06, 0.05, 0.09), 0.01), counts_of_box((0.06, 0.05, 0.09), 0.01)),
+        (cylinder_of_edge(0.06, 0.09, 0.01), counts_of_cylinder(0.06, 0.09, 0.01)),
+    ],
+)
+def test_generated_meshes_have_the_counts_that_were_expected(made: TetMesh, counts: tuple):
+    assert (len(made.points_m), len(made.tetrahedra)) == counts
+
+
+def test_long_work_is_announced_before_it_begins(tiny: Path, monkeypatch: pytest.MonkeyPatch):
+    announced: list[str] = []
+    Problem.read("problem.toml", say=announced.append)
+    assert announced == []
+    Problem.read("problem.toml", ["transcription.substeps=1000"], say=announced.append)
+    assert len(announced) == 1
+    assert "9 samples of 1,000 substeps" in announced[0]
+    assert "a solve takes about" in announced[0]
+    monkeypatch.setattr(size, "TEXT_MB_PER_S", 1e-6)
+    Problem.read("problem.toml", say=announced.append)
+    assert "MB of recordings, most of them in swing_markers.csv" in announced[1]
+
+
+def test_so_it_is_on_the_command_line(tiny: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(size, "ANNOUNCED_SOLVE_S", 0.0)
+    assert "a solve takes about" in run_command("check", "problem.toml").err
+    assert "takes about" not in run_command("check", "problem.toml", "--quiet").err
+
+
+def test_ten_thousand_markers_are_read_in_time(tiny: Path):
+    names = [f"m{k}" for k in range(10_000)]
+    tracks_m = np.zeros((3, len(names), 3))
+    write_markers_csv(tiny / "many.csv", np.arange(3) / 100, names, tracks_m)
+    began = time.process_time()
+    table = read_markers(tiny / "many.csv", names=names[::-1])
+    assert time.process_time() - began < 5
+    assert table.names == tuple(names[::-1])
+
+
 def test_where_the_memory_is_not_known_nothing_is_refused(tiny: Path, monkeypatch):
     monkeypatch.setattr(memory, "SMALL", 0)
     monkeypatch.setattr(memory, "machine_memory_mb", lambda: None)
@@ -153,12 +341,12 @@ def test_where_the_memory_is_not_known_nothing_is_refused(tiny: Path, monkeypatc
 
 def test_limits_of_containers_count_as_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(memory, "CGROUP_LIMITS", (limit,))
-    machine = memory.machine_memory_mb()
+    monkeypatch.setattr(machine, "CGROUP_LIMITS", (limit,))
+    whole_mb = machine.machine_memory_mb()
     limit.write_text("max\n")
-    assert memory.machine_memory_mb() == machine
+    assert machine.machine_memory_mb() == whole_mb
     limit.write_text("5000000\n")
-    assert memory.machine_memory_mb() == 5.0
+    assert machine.machine_memory_mb() == 5.0
 
 
 # Interrupts ---------------------------------------------------------------------------------------

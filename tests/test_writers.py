@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import os
+import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -11,8 +13,10 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import element_named
 from collocation_sysid.fem.structured import box_mesh
+from collocation_sysid.files import write_whole
 from collocation_sysid.result.fields import ElementFields
 from collocation_sysid.result.writers import run_folder, write_frames, write_pvd, write_vtu
+from collocation_sysid.written_files import LIST_FILE, list_files
 
 MESH = box_mesh((0.1, 0.2, 0.3), (1, 2, 1))
 TET4 = element_named("tet4")
@@ -136,11 +140,13 @@ def earlier_run(path: Path) -> Path:
     path.mkdir()
     (path / "result.json").write_text("old")
     (path / "old.png").write_text("old")
+    list_files(path)
     return path
 
 
 def listing(folder: Path) -> list[str]:
-    return sorted(str(file.relative_to(folder)) for file in folder.rglob("*"))
+    files = (file for file in folder.rglob("*") if file.name != LIST_FILE)
+    return sorted(str(file.relative_to(folder)) for file in files)
 
 
 def test_a_run_appears_whole_at_the_end(tmp_path):
@@ -201,6 +207,74 @@ def test_somebody_elses_folder_is_left_alone(tmp_path):
     ):
         pytest.fail("the work was started")
     assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("foreign", ["notes.txt", "frames/notes.txt", "films/swing.gif"])
+def test_an_earlier_run_with_a_foreign_file_is_left_alone(tmp_path, foreign):
+    target = earlier_run(tmp_path / "run")
+    (target / foreign).parent.mkdir(exist_ok=True)
+    (target / foreign).write_text("precious")
+    before = listing(tmp_path)
+    with pytest.raises(InputError, match=rf"run: {foreign} .* not written"), run_folder(target):
+        pytest.fail("the work was started")
+    assert listing(tmp_path) == before
+
+
+def test_a_result_file_alone_does_not_make_a_run(tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "result.json").write_text("{}")
+    (tmp_path / "thesis" / "chapter.tex").write_text("precious")
+    with pytest.raises(InputError, match=r"chapter\.tex"), run_folder(tmp_path / "thesis"):
+        pytest.fail("the work was started")
+
+
+def test_an_edited_file_keeps_an_earlier_run_from_being_replaced(tmp_path):
+    target = earlier_run(tmp_path / "run")
+    (target / "old.png").write_text("edited")
+    with pytest.raises(InputError, match=r"old\.png .* changed since"), run_folder(target):
+        pytest.fail("the work was started")
+
+
+def test_what_is_written_into_a_run_later_may_be_replaced_with_it(tmp_path):
+    target = earlier_run(tmp_path / "run")
+    write_whole(target / "report.html", "a page")
+    write_whole(target / "old.png", "drawn again")
+    with run_folder(target / "export-json", mark="identified.json") as folder:
+        (folder / "identified.json").write_text("{}")
+    (target / ".DS_Store").write_text("of a file manager")
+    with run_folder(target) as folder:
+        (folder / "result.json").write_text("new")
+    assert listing(target) == ["result.json"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
+def test_nothing_is_written_through_a_link(tmp_path):
+    earlier_run(tmp_path / "precious")
+    (tmp_path / "run").symlink_to("precious")
+    (tmp_path / "later").symlink_to("missing")
+    before = listing(tmp_path)
+    for name, where in (("run", "precious"), ("later", "missing")):
+        with pytest.raises(InputError, match=f"{name}: is a link to {where}"):  # noqa: SIM117
+            with run_folder(tmp_path / name):
+                pytest.fail("the work was started")
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
+def test_a_link_in_an_earlier_run_keeps_it_from_being_replaced(tmp_path):
+    target = earlier_run(tmp_path / "run")
+    (target / "old.png").rename(tmp_path / "old.png")
+    (target / "old.png").symlink_to(tmp_path / "old.png")
+    with pytest.raises(InputError, match=r"old\.png in it is a link"), run_folder(target):
+        pytest.fail("the work was started")
+
+
+def test_a_run_may_be_moved_and_copied_before_it_is_replaced(tmp_path):
+    earlier_run(tmp_path / "run").rename(tmp_path / "moved")
+    shutil.copytree(tmp_path / "moved", tmp_path / "copied")
+    for name in ("moved", "copied"):
+        with run_folder(tmp_path / name) as folder:
+            (folder / "result.json").write_text("new")
 
 
 def test_a_file_is_left_alone(tmp_path):

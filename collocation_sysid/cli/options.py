@@ -28,6 +28,7 @@ from typing import (
 )
 
 import typer
+from rich.text import Text
 from typer.models import OptionInfo, ParameterInfo
 
 from ..checked import Options
@@ -169,8 +170,13 @@ class OfProblem:
         with errors.status(f"reading {self.problem}"):
             from ..problem import Problem
 
-            how = self.set_ or (), self.allow_code
-            return Problem.read(self.problem, *how, simulation=simulation)
+            def say(sentence: str) -> None:
+                if not getattr(self, "quiet", False):
+                    errors.print(Text(sentence, style="dim"), soft_wrap=True)
+
+            return Problem.read(
+                self.problem, self.set_ or (), self.allow_code, simulation=simulation, say=say
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

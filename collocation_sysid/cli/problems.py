@@ -13,7 +13,7 @@ import typer
 from rich.text import Text
 
 from ..errors import SimulationError
-from ..files import require_possible, run_name
+from ..files import require_possible, run_name, whole_file
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import Run, run
@@ -183,7 +183,8 @@ def _draw_instability(error: SimulationError, folder: Path) -> None:
 
     file = folder / "instability.png"
     folder.mkdir(parents=True, exist_ok=True)
-    instability_picture(error.lost_stability).savefig(file, dpi=RESOLUTION_DPI)
+    with whole_file(file) as draft:
+        instability_picture(error.lost_stability).savefig(draft, dpi=RESOLUTION_DPI)
     errors.print(f"the mode is drawn in {file}")
 
 

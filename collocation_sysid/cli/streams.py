@@ -74,13 +74,19 @@ def live(options: Live) -> None:
     from ..live.frames import FrameReader
     from ..live.sources import as_json, as_text, collected_before, datagrams
 
+    if options.udp is None and sys.stdin is None:  # closed by whoever started the process
+        raise InputError(
+            "is closed; expected frames, as in live problem.toml < frames.jsonl, or --udp PORT",
+            "standard input",
+        )
     estimator = options.estimator(options.problem)
 
     def opened(port: int) -> None:
         errors.print(f"listening on UDP port {port} of this machine")
 
-    lines, source = as_text(sys.stdin.buffer), "standard input"
-    if options.udp is not None:
+    if options.udp is None:
+        lines, source = as_text(sys.stdin.buffer), "standard input"
+    else:
         lines, source = datagrams(options.udp, opened), f"UDP port {options.udp}"
     reader = FrameReader(
         estimator.model.moved_grasps + 1,

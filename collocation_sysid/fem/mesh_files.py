@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import require_regular
 from .mesh_checks import straightened
+from .meshio_reader import MeshContent, read_content
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 
@@ -74,7 +76,7 @@ def read_tetrahedra(
 
 
 def _tetrahedra(
-    data: Any, metres: float
+    data: MeshContent, metres: float
 ) -> tuple[np.ndarray, np.ndarray, Arrays, Arrays, Arrays, tuple[str, ...]]:
     """Return the same as `read_tetrahedra` from the data of meshio."""
     counts = _cell_counts(data)
@@ -139,9 +141,9 @@ def write_tetrahedra(
     """Write a mesh, in metres, to any format that meshio knows by the file's extension."""
     import meshio  # slow to import
 
-    point_data: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
-    cell_data: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
-    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data, cell_data)
+    of_points: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
+    of_cells: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
+    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], of_points, of_cells)
     with _one_error(path, "written"):
         meshio.write(path, mesh)
 
@@ -152,32 +154,27 @@ def _numbers(values: np.ndarray) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _reading(path: str | Path) -> Iterator[Any]:
-    """Context of the data of meshio; errors in its body are also reported as those of the file."""
-    import meshio  # slow to import
-
+def _reading(path: str | Path) -> Iterator[MeshContent]:
+    """Content of a file; what fails while it is evaluated is reported as damage of the file."""
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
+    require_regular(path)
+    try:
+        content = read_content(path)
+    except InputError as error:
+        raise _refusal("read", error.message, path) from error
     with _one_error(path, "read"):
-        yield meshio.read(path)
+        yield content
 
 
 @contextlib.contextmanager
 def _one_error(path: str | Path, done: str) -> Iterator[None]:
-    """Context that turns any failure of meshio on an invalid file into one `InputError`.
-
-    Parameters
-    ----------
-    path : str or Path
-    done : {"read", "written"}
-        What is done with the file, for the message.
-    """
-    # Its readers raise whatever their parsing trips over, print, warn, and may exit.
-    captured = io.StringIO()
+    """Turn whatever fails on a bad file into one InputError, and print nothing."""
+    said = io.StringIO()
     try:
         with (
-            contextlib.redirect_stdout(captured),
-            contextlib.redirect_stderr(captured),
+            contextlib.redirect_stdout(said),
+            contextlib.redirect_stderr(said),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
@@ -187,15 +184,19 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise
-        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise InputError(
-            f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
-            ".mesh and .inp are known, told by the file's ending",
-            path,
-        ) from error
+        reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
+        raise _refusal(done, reason, path) from error
 
 
-def _point_sets(data: Any) -> dict[str, np.ndarray]:
+def _refusal(done: str, reason: str, path: str | Path) -> InputError:
+    return InputError(
+        f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
+        ".mesh and .inp are known, told by the file's ending",
+        path,
+    )
+
+
+def _point_sets(data: MeshContent) -> dict[str, np.ndarray]:
     """Return the point sets of a file as boolean arrays."""
     sets = {}
     for name, nodes in (data.point_sets or {}).items():
@@ -204,7 +205,7 @@ def _point_sets(data: Any) -> dict[str, np.ndarray]:
     return sets
 
 
-def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
+def _cell_sets(data: MeshContent) -> dict[str, list[np.ndarray]]:
     """Return the cell sets of a file as boolean arrays, block by block."""
     sets = {}
     for name, per_block in (data.cell_sets or {}).items():
@@ -217,7 +218,7 @@ def _cell_sets(data: Any) -> dict[str, list[np.ndarray]]:
     return sets
 
 
-def _physical_groups(data: Any) -> dict[str, list[np.ndarray]]:
+def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
     """Return the physical groups of a .msh file by name, as boolean arrays block by block.
 
     A group without a name is "physical_<tag>", followed by its dimension if other dimensions use
@@ -227,16 +228,14 @@ def _physical_groups(data: Any) -> dict[str, list[np.ndarray]]:
     if not tags:
         return {}
     names = {tuple(map(int, key)): name for name, key in (data.field_data or {}).items()}
-    masks: dict[tuple[int, int], list[np.ndarray]] = {}
+    found: dict[tuple[int, int], list[np.ndarray]] = {}
     for dimension in range(4):
-        tags_of_dimension = [
-            np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)
-        ]
-        for tag in np.unique(np.concatenate(tags_of_dimension)):
+        here = [np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)]
+        for tag in np.unique(np.concatenate(here)):
             if tag > 0:
-                masks[int(tag), dimension] = [block == tag for block in tags_of_dimension]
-    nameless = Counter(tag for tag, dimension in masks if (tag, dimension) not in names)
-    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in masks.items()}
+                found[int(tag), dimension] = [block == tag for block in here]
+    nameless = Counter(tag for tag, dimension in found if (tag, dimension) not in names)
+    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in found.items()}
 
 
 def _called(tag: int, dimension: int, ambiguous: bool) -> str:
@@ -245,7 +244,7 @@ def _called(tag: int, dimension: int, ambiguous: bool) -> str:
     return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
 
 
-def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
+def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
     """Return the mask of the nodes of cells that are selected block by block."""
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
@@ -253,39 +252,35 @@ def _nodes_of(data: Any, masks: list[np.ndarray]) -> np.ndarray:
     return chosen
 
 
-def _of_tetrahedra(data: Any, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return the values on tetrahedra of arrays given block by block.
 
     All-false masks are omitted.
     """
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
-    selected = {}
+    kept = {}
     for name, per_block in arrays.items():
-        parts = [
-            np.asarray(p)
-            for p, is_selected in zip(per_block, tetrahedra, strict=True)
-            if is_selected
-        ]
-        values = np.concatenate(parts)
-        if values.dtype != bool or values.any():
-            selected[name] = values
-    return selected
+        parts = [np.asarray(p) for p, wanted in zip(per_block, tetrahedra, strict=True) if wanted]
+        whole = np.concatenate(parts)
+        if whole.dtype != bool or whole.any():
+            kept[name] = whole
+    return kept
 
 
-def _triangle_sets(data: Any, arrays: Mapping[str, Any]) -> Arrays:
+def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
     """Return the corners of the triangles on which arrays given block by block are 1."""
     blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
-    sets = {}
+    found = {}
     for name, per_block in arrays.items():
         masks = [np.asarray(per_block[k]) for k in blocks]
         if masks and all(m.ndim == 1 and np.isin(m, (0, 1)).all() for m in masks):
             chosen = [data.cells[k].data[m == 1, :3] for k, m in zip(blocks, masks, strict=True)]
             if any(map(len, chosen)):
-                sets[name] = np.concatenate(chosen)
-    return sets
+                found[name] = np.concatenate(chosen)
+    return found
 
 
-def _cell_counts(data: Any) -> Counter[str]:
+def _cell_counts(data: MeshContent) -> Counter[str]:
     """Return the number of cells by their type."""
     counts: Counter[str] = Counter()
     for block in data.cells:

@@ -62,6 +62,22 @@ def cylinder_of_edge(
     return TetMesh(points_m[corners_kept], tetrahedra.reshape(-1, 4), is_generated=True)
 
 
+def counts_of_box(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
+    """Return how many nodes and elements `box_of_edge` makes, without making them."""
+    divisions = _divided(np.asarray(size_m, dtype=float), edge_length_m)
+    return int(np.prod(divisions + 1)), int(6 * np.prod(divisions))
+
+
+def counts_of_cylinder(
+    diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
+) -> tuple[int, int]:
+    """Return about how many nodes and elements `cylinder_of_edge` makes, without making them."""
+    rings, layers = _divided(np.array([diameter_m / 2, height_m]), edge_length_m)
+    sectors = _SECTORS / 4 if quarter else _SECTORS
+    nodes = (1 + sectors * rings * (rings + 1) / 2) * (layers + 1)
+    return int(nodes), int(3 * sectors * rings**2 * layers)
+
+
 def _divided(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
     """Return the numbers of elements along lengths, rounded, at least 1."""
     return np.maximum(np.round(size_m / edge_length_m), 1)

@@ -20,6 +20,7 @@ from ..cluster import connected, distributed
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.kernels import alone, side_by_side
+from ..files import reason
 from ..program.charts import Chart
 from ..program.collocation import Collocation
 from ..program.segment import Segment
@@ -212,7 +213,13 @@ def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 def _require_package(client: Any) -> set[str]:
     """The workers; those without this version are refused."""
     ours = version("collocation-sysid")
-    versions = client.run(_version, on_error="return")
+    try:
+        versions = client.run(_version, on_error="return")
+    except (Exception, distributed().client.CancelledError) as error:
+        raise _refusal(
+            f"the scheduler stopped answering while its workers were asked for their versions "
+            f"({reason(error)}); start it again"
+        ) from error
     if not versions:
         raise _refusal("the scheduler has no workers; start some, as with dask worker ADDRESS")
     for address, theirs in versions.items():

@@ -15,7 +15,7 @@ from ..fem.field import Field
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
-from ..fem.structured import box_of_edge, cylinder_of_edge
+from ..fem.structured import box_of_edge, counts_of_box, counts_of_cylinder, cylinder_of_edge
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
 from ..recording.selected import selection
@@ -28,6 +28,7 @@ from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader
 from .schema import CodeSection, ObjectSection, ParameterSection, PriorSection, ProblemFile
+from .size import Say, Size, announce_reading, require_feasible
 
 # The key of `Experiment` that stands in a table of its own, of all experiments.
 AIR_KEY = "air_density_kg_m3"
@@ -39,6 +40,7 @@ def contents_of(
     allow_code: bool,
     simulation: bool,
     folder: str | Path | None = None,
+    say: Say | None = None,
 ) -> dict[str, Any]:
     """The arguments of a `Problem` by a file and the files it names, see `Problem.read`."""
     file, text = read_problem_file(path, overrides)
@@ -48,8 +50,15 @@ def contents_of(
         )
     folder = path.parent if folder is None else Path(folder)
     unknowns, code = file.parameters, Code(folder, allow_code)
+    if say is not None:
+        announce_reading({*_named_files(file, folder)}, say)
     with _in_table(path, "object"):
+        if counts := _generated_counts(file.object):
+            require_feasible(_smallest_size(file, *counts, simulation=simulation), say)
         mesh = _load_mesh(file.object, folder)
+        counts = len(mesh.points_m), len(mesh.tetrahedra)
+        size = _smallest_size(file, *counts, simulation=simulation)
+        require_feasible(size, None if _generated_counts(file.object) else say)
         body = _load_body(completed(file.object, unknowns), mesh, code)
         body = body.with_free_densities(body.weighed_by(unknowns))
         odd = [oddity.sentence for oddity in oddities(body)]
@@ -61,7 +70,15 @@ def contents_of(
     experiments, notes = [], []
     for section in file.experiment:
         reader = RecordingReader(
-            section, folder, body, parameters, simulation, code, file.environment.air_density_kg_m3
+            section,
+            folder,
+            body,
+            parameters,
+            simulation,
+            code,
+            file.environment.air_density_kg_m3,
+            size=size,
+            say=say,
         )
         with _in_table(path, f"experiment '{section.name}'", odd):
             experiments.append(reader.read())
@@ -79,6 +96,36 @@ def contents_of(
         "notes": notes,
         "origin": Origin(path, text, _named_files(file, folder)),
     }
+
+
+def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
+    """Nodes and elements of a mesh that is to be generated; None where they are not known yet."""
+    if section.box_m is not None:
+        return counts_of_box(section.box_m, section.edge_length_m)
+    if (shape := section.cylinder) is not None:
+        return counts_of_cylinder(
+            shape.diameter_m, shape.height_m, section.edge_length_m, quarter=shape.quarter
+        )
+    return None
+
+
+def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation: bool) -> Size:
+    """Size of a problem of one sample, by the corners and elements of its mesh."""
+    # A quadratic element has a node on every edge; a mesh has about 7 edges per corner.
+    nodes = corners if file.object.element == "tet4" else 8 * corners
+    substeps = file.transcription.substeps
+    estimated = [
+        section
+        for section in file.parameters.values()
+        if isinstance(section, ParameterSection) and section.fixed is None
+    ]
+    return Size(
+        nodes=nodes,
+        elements=elements,
+        samples=1,
+        substeps=substeps if isinstance(substeps, int) else 1,
+        unknowns=0 if simulation else max(1, len(estimated)),
+    )
 
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:

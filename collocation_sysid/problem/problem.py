@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, field, replace
 from pathlib import Path
 from typing import Literal
@@ -109,6 +109,7 @@ class Problem:
         allow_code: bool = False,
         simulation: bool = False,
         folder: str | Path | None = None,
+        say: Callable[[str], None] | None = None,
     ) -> Problem:
         """Read a problem file (TOML) and the files it names.
 
@@ -123,16 +124,19 @@ class Problem:
             And every experiment may be for validation.
         folder : str or Path, optional
             Where the files that it names are sought; next to it by default.
+        say : callable, optional
+            Called with a sentence before work that takes long.
 
         Raises
         ------
         InputError
-            One clear message for the first thing that is wrong.
+            One clear message for the first thing that is wrong, or that this machine's memory
+            cannot hold.
         """
         from .loading import contents_of  # the schema is only built to read a file
 
         path = Path(path)
-        contents = contents_of(path, overrides, allow_code, simulation, folder)
+        contents = contents_of(path, overrides, allow_code, simulation, folder, say)
         with located(path):
             return cls(**contents)
 

@@ -54,6 +54,7 @@ from .recording_schema import (
     TableSection,
     WrenchSection,
 )
+from .size import MOST_SAMPLES, Say, Size, require_feasible
 from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
 
 Moved = GraspSection | ObstacleSection
@@ -74,6 +75,8 @@ class RecordingReader:
     code: Code
     air_density_kg_m3: float | Literal["none"]
     notes: list[str] = field(default_factory=list)
+    size: Size | None = None
+    say: Say | None = None
 
     def read(self) -> Experiment:
         """Return the experiment.
@@ -394,6 +397,11 @@ class RecordingReader:
             if name is not None and len(t_s) and not static:
                 refuse_untold(sequence, t_s, held, self.folder / name)
         rate_hz = section.resample_hz
+        if self.size is not None and len(t_s):
+            samples = len(t_s) // section.every
+            if rate_hz and not static:
+                samples = int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
+            require_feasible(replace(self.size, samples=samples), self.say)
         try:
             aligned = align(poses, table, section.window_s, rate_hz, section.every, held_s, static)
         except InputError as error:
@@ -436,8 +444,9 @@ def _each(values: Mapping[str, float] | float, names: Sequence[str], usual: floa
 
 
 def _refuse_unknown(asked: Iterable[str], names: Sequence[str], key: str) -> None:
+    present = set(names)
     for name in asked:
-        if name not in names:
+        if name not in present:
             known = f"{', '.join(names)}{hint_at(name, names)}"
             raise InputError(f"found {name!r}; expected names of the markers {known}", where=key)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -95,7 +96,7 @@ class Markers:
         if len(self.names) != m:
             message = f"{len(self.names)} marker names for {m} tracks; expected one for each"
             raise InputError(message)
-        if repeated := [name for name in self.names if self.names.count(name) > 1]:
+        if repeated := [name for name, count in Counter(self.names).items() if count > 1]:
             raise InputError(f"the marker name '{repeated[0]}' is given more than once")
         each = np.broadcast_to(self.sigma_m, m) if self.sigma_m.ndim == 0 else self.sigma_m
         sigma_m = read_only_floats(each, (m,), "sigma_m")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..array_files import load_arrays
 from ..arrays import Array
 from ..errors import InputError
+from ..files import DAMAGE
 from .formats.columns import TIME, column_of, name_and_unit
 from .formats.text import (
     Grid,
@@ -167,9 +168,10 @@ def _components(grid: Grid, order: str | None, others: list[int]) -> list[int]:
 
 def _archive(path: str | Path) -> tuple[Array, Array]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: np.asarray(archive[key]) for key in archive.files}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        arrays = load_arrays(path)
+    except InputError:
+        raise
+    except (*DAMAGE, OSError) as error:
         raise InputError(f"is not a NumPy archive of numbers: {error}") from error
     shapes = {key: array.shape for key, array in arrays.items()}
     shape = shapes.get("t_s", ())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -138,14 +139,15 @@ def _choice(names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
         for name in names:
             _require_one_of(name, known, "marker")
         _refuse_repeated(names, "asked for more than once: marker")
-        return [known.index(name) for name in names]
+        index_of = {name: k for k, name in enumerate(known)}
+        return [index_of[name] for name in names]
 
     return choose
 
 
 def _refuse_repeated(names: Sequence[str], message: str) -> None:
-    for name in names:
-        if list(names).count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise InputError(f"{message} '{name}'; expected names that differ")
 
 

@@ -22,7 +22,15 @@ from ..recording import (
     write_poses_csv,
     write_wrench_csv,
 )
-from .writers import FRAMES_FILE, require_replaceable, run_folder, write_frames
+from ..written_files import LIST_FILE, hashes_of, is_written_here, list_as_text, listed_hashes
+from .writers import (
+    FRAMES_FILE,
+    require_no_link,
+    require_only_written,
+    require_replaceable,
+    run_folder,
+    write_frames,
+)
 
 
 @dataclass(frozen=True)
@@ -97,13 +105,15 @@ def write_data(
     Raises
     ------
     InputError
-        For a parameter without a guess, and before a file that the problem reads is overwritten.
+        For a parameter without a guess, and before anything is written into a folder that has
+        files of others, or a file is overwritten that the problem reads or that this program did
+        not write. The problem's own folder may have other files.
     SimulationError
         Before anything is written.
     """
     place, recipe = Path(folder), recipe or Recipe()
     _refuse_unguessed(problem)
-    _refuse_inputs(problem, place)
+    _refuse_foreign(problem, place)
     for experiment in problem.experiments if recipe.frames else ():
         require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
     rng = np.random.default_rng(recipe.seed)
@@ -120,10 +130,12 @@ def write_data(
         for experiment in problem.experiments
     ]
     written = []
+    drafts_of: dict[Path, Path] = {}
     with ExitStack() as whole:  # all files appear at its end, or none
         for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
             files = _tables(experiment, place)
             drafts = [whole.enter_context(whole_file(file)) for file in files]
+            drafts_of |= dict(zip(files, drafts, strict=True))
             _write_tables(experiment, trajectory, drafts, rng, recipe)
             written += files
             if recipe.frames:
@@ -132,6 +144,10 @@ def write_data(
                 at = whole.enter_context(there), trajectory.t_s, trajectory.positions_m
                 write_frames(*at, body.cells, body.element, body.nodes_m)
                 written.append(folder / FRAMES_FILE)
+        by_name = {file.name: draft for file, draft in drafts_of.items()}
+        listing = whole.enter_context(whole_file(place / LIST_FILE))
+        hashes = listed_hashes(place) | hashes_of(by_name)
+        listing.write_text(list_as_text(hashes), encoding="utf-8")
     return written
 
 
@@ -168,8 +184,12 @@ def _refuse_unguessed(problem: Problem) -> None:
         )
 
 
-def _refuse_inputs(problem: Problem, place: Path) -> None:
-    """Refuse to overwrite a file that the problem reads: it may be a recording."""
+def _refuse_foreign(problem: Problem, place: Path) -> None:
+    """Refuse a folder with files of others, and to overwrite one that the problem reads.
+
+    What the problem reads may be a recording. Its own folder may have other files.
+    """
+    require_no_link(place)
     read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
     for experiment in problem.experiments:
         for file in _tables(experiment, place):
@@ -179,6 +199,15 @@ def _refuse_inputs(problem: Problem, place: Path) -> None:
                     "folder, or move it away",
                     file,
                 )
+            if (file.exists() or file.is_symlink()) and not is_written_here(file):
+                raise InputError(
+                    "is there and was not written by this program, or was changed since, so it is "
+                    "not overwritten; choose another folder, or move it away",
+                    file,
+                )
+    at_home = problem.path is not None and problem.path.resolve().parent == place.resolve()
+    if place.is_dir() and not at_home:
+        require_only_written(place)
 
 
 def _tables(experiment: Experiment, place: Path) -> list[Path]:

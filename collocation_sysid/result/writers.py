@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..fem.elements import Element
 from ..files import RESULT_FILE, naming
+from ..written_files import LIST_FILE, foreign_files, list_files
 from .fields import ElementFields
 
 VTK_CELL_TYPES = ("tetra", "tetra10")  # by meshio's names
@@ -165,8 +166,9 @@ def run_folder(
 ) -> Iterator[Path]:
     """Give a temporary folder beside `path` to write into, and name it `path` at the end.
 
-    An earlier run at `path` is replaced, at the end and whole. After an exception the temporary
-    folder is removed and `path` is as it was.
+    An earlier run at `path` is replaced, at the end and whole, if every file in it was written by
+    this program and is unchanged. After an exception the temporary folder is removed and `path` is
+    as it was. The folder gets a list of its files, see `written_files`.
 
     Parameters
     ----------
@@ -179,9 +181,9 @@ def run_folder(
     Raises
     ------
     InputError
-        If there is anything else at `path`; at once, so that no work is lost.
+        If there is anything else at `path`, or a link; at once, so that no work is lost.
     """
-    target = Path(path).resolve()
+    target = _unlinked(Path(path))
     require_replaceable(target, overwrite, mark, what)
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
@@ -191,6 +193,7 @@ def run_folder(
     try:
         with naming(target, temporary):
             yield temporary
+            list_files(temporary)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
@@ -204,6 +207,11 @@ def run_folder(
         raise InputError(
             f"the finished run cannot be put there ({error}); it is kept in {temporary}", target
         ) from error
+
+
+def _unlinked(path: Path) -> Path:
+    """The absolute path without links in the folders above; the last one is kept."""
+    return path.resolve() if path.name in ("", "..") else path.parent.resolve() / path.name
 
 
 def _remove_stale(target: Path) -> None:
@@ -238,8 +246,9 @@ def require_replaceable(
     Raises
     ------
     InputError
-        Naming the place and what is there.
+        Naming the place, and the first link or file there that this program did not write.
     """
+    require_no_link(target)
     if not target.exists():
         return
     if not target.is_dir():
@@ -258,6 +267,46 @@ def require_replaceable(
         raise InputError(
             "the folder holds an earlier run; choose another, or allow it to be overwritten", target
         )
+    require_only_written(target)
+
+
+def require_no_link(folder: Path) -> None:
+    """Refuse a link where a folder is to be written.
+
+    Raises
+    ------
+    InputError
+        Naming the link.
+    """
+    if folder.is_symlink():
+        raise InputError(
+            f"is a link to {os.readlink(folder)}, and nothing is written through links; give that "
+            "folder itself or another, or remove the link",
+            folder,
+        )
+
+
+def require_only_written(folder: Path) -> None:
+    """Refuse a folder with a file or link that this program did not write, or that was changed.
+
+    Raises
+    ------
+    InputError
+        Naming the folder and the first such file.
+    """
+    file = next(foreign_files(folder), None)
+    if file is None:
+        return
+    name = file.relative_to(folder).as_posix()
+    if file.is_symlink():
+        why = f"{name} in it is a link"
+    elif (folder / LIST_FILE).is_file():
+        why = f"{name} in it was not written by this program, or was changed since"
+    else:
+        why = f"it has no {LIST_FILE}, which lists what this program wrote, but has {name}"
+    raise InputError(
+        f"{why}, so the folder is left alone; choose another, or move that away", folder
+    )
 
 
 def _put_in_place(new: Path, target: Path, aside: Path) -> None:

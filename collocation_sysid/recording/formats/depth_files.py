@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from ...array_files import load_array, load_arrays
 from ...arrays import Array
 from ...errors import InputError, located
 from ...files import reason, require_regular
+from . import ply
 from .depth_messages import (
     ENCODINGS,
     columns_of,
@@ -190,8 +192,7 @@ def _cloud(points: Array, path: Path, length_m: float) -> Array:
 
 
 def _npz(path: Path) -> DepthFile:
-    with np.load(path) as held:
-        arrays = {name: held[name] for name in held.files}
+    arrays = load_arrays(path)
     names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
     if len(names) != 1:
         raise InputError(
@@ -218,12 +219,6 @@ def _exr(path: Path) -> Array:
     channels: Mapping[str, Any] = made.channels()
     names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [*channels]
     return np.asarray(channels[names[0]].pixels, dtype=float)
-
-
-def _ply(path: Path) -> Array:
-    mesh = import_module("meshio").read(path)
-    points = np.asarray(mesh.points, dtype=float)
-    return _with_normals(points, mesh.point_data)
 
 
 def _of_columns(columns: Mapping[str, Array]) -> Array:
@@ -271,8 +266,8 @@ _READERS: dict[str, Callable[[Path], Array | DepthFile]] = {
     ".npz": _npz,
     ".png": png,
     ".exr": _exr,
-    ".ply": _ply,
+    ".ply": lambda path: _of_columns(ply.read_columns(path)),
     ".pcd": _pcd,
-    ".npy": lambda path: np.load(path),
+    ".npy": load_array,
     ".xyz": lambda path: np.loadtxt(path, ndmin=2),
 }

@@ -21,7 +21,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, hint_at
-from ...files import reason
+from ...files import reason, require_regular
 
 MARK = "#"
 # Of the positions of joints.
@@ -124,6 +124,8 @@ def opened(path: Path, episode: int | None = None) -> Iterator[Log]:
     InputError
         If it is none, is damaged, or a package that reads it is missing.
     """
+    for each in (path, *(path.iterdir() if path.is_dir() else ())):
+        require_regular(each)
     if (path / "meta" / "info.json").is_file():
         log: Any = partial(_Dataset, path, episode)
     elif path.is_file() and path.suffix == ".mcap":

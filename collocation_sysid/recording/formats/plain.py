@@ -7,6 +7,8 @@ missing there. In both a blank cell or NaN is a missing sample, and (0, 0, 0) is
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from ...errors import InputError
@@ -23,10 +25,11 @@ def read(text: str, choose: Choose) -> RawTracks:
 
 
 def _read_wide(table: Grid, choose: Choose) -> RawTracks:
-    labels, place = _wide_labels(table), table.columns.index
-    places = [[place(f"{label}_{axis}") for axis in "xyz"] for label in labels]
+    labels = _wide_labels(table)
+    place = {column: k for k, column in enumerate(table.columns)}
+    places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
     said = {"zeros_are_missing": False, "default_unit": "m"}
-    return tracks(table, labels, places, choose(labels), place("t_s"), **said)
+    return tracks(table, labels, places, choose(labels), place["t_s"], **said)
 
 
 def _wide_labels(table: Grid) -> list[str]:
@@ -36,10 +39,12 @@ def _wide_labels(table: Grid) -> list[str]:
         column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
     )
     expected = ["t_s", *(f"{label}_{axis}" for label in labels for axis in "xyz")]
+    counts = Counter(header)
+    known = set(expected)
     faulty = {
-        "unknown": [column for column in header if column not in expected],
-        "missing": [column for column in expected if column not in header],
-        "repeated": sorted({column for column in header if header.count(column) > 1}),
+        "unknown": [column for column in header if column not in known],
+        "missing": [column for column in expected if column not in counts],
+        "repeated": sorted(column for column, count in counts.items() if count > 1),
     }
     faults = [f"{what} {', '.join(columns)}" for what, columns in faulty.items() if columns]
     if not faults and labels:

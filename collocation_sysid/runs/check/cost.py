@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import InputError, SimulationError
+from ...machine import machine_memory_mb
 from ...methods.interior_point import InteriorPoint
 from ...methods.reduced_space import ReducedSpace, memory_mb
 from ...problem import Problem
@@ -27,11 +25,6 @@ from .derivatives import few, first_samples, shortened
 BYTES = 280.0
 # Programs with less variables than this fit anywhere.
 SMALL = 50_000
-# Where containers state their limits.
-CGROUP_LIMITS = (
-    Path("/sys/fs/cgroup/memory.max"),
-    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-)
 
 
 def require_memory(problem: Problem, collocation: Collocation, method: object) -> None:
@@ -66,25 +59,6 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
 def interior_point_mb(entries: int) -> float:
     """What IPOPT takes for so many nonzeros of Jacobian and Hessian."""
     return BYTES * entries / 1e6
-
-
-def machine_memory_mb() -> float | None:
-    """Memory that this process may have: the machine's, or what a container or limit leaves."""
-    return min(_limits_mb(), default=None)
-
-
-def _limits_mb() -> Iterator[float]:
-    with suppress(AttributeError, OSError, ValueError):  # not on every system
-        yield os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
-    for file in CGROUP_LIMITS:
-        with suppress(OSError, ValueError):  # "max" is no limit
-            yield int(file.read_text()) / 1e6
-    with suppress(ImportError, OSError, ValueError):
-        import resource
-
-        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-        if limit != resource.RLIM_INFINITY:
-            yield limit / 1e6
 
 
 def nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:

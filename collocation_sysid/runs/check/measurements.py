@@ -88,7 +88,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     if positions_m is not None:
         seen_m = markers.positions_m[: len(positions_m)]
         miss = np.linalg.norm(markers.observe(positions_m) - seen_m, axis=2)
-    findings = []
+    findings, missing = [], markers.missing
     for k, name in enumerate(markers.names):
         seen = np.flatnonzero(markers.present[:, k])
         findings.append(
@@ -96,7 +96,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
                 name,
                 float(markers.placement.distance_m[k]),
                 len(seen),
-                int(markers.missing[k]),
+                int(missing[k]),
                 float(miss[seen[0], k]) if len(seen) and seen[0] < len(miss) else None,
             )
         )
@@ -108,7 +108,7 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
         1 / experiment.timestep_s,
         len(experiment.t_s),
         markers.samples,
-        int(markers.missing.sum()),
+        int(missing.sum()),
         tuple(findings),
         (
             *["the wrench"] * bool(experiment.wrenches),

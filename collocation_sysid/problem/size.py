@@ -1,0 +1,131 @@
+"""Memory and time that a problem will take, estimated from its sizes before the work begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..display import duration
+from ..errors import InputError
+from ..machine import machine_memory_mb
+
+Say = Callable[[str], None]
+
+# Text of recordings that is read in a second, on one core [MB].
+TEXT_MB_PER_S = 2.0
+TEXT_SUFFIXES = frozenset({".csv", ".tsv", ".txt", ".trc"})
+# What takes longer is announced.
+ANNOUNCED_READING_S = 5.0
+ANNOUNCED_SOLVE_S = 60.0
+ANNOUNCED_NODES = 20_000
+# Timestep of a sweep on one thread, and numbers in the factor of its matrix, as measured in
+# docs/howto/large.md at this number of nodes, and the powers by which they grow.
+NODES = 4953
+STEP_S = 0.57
+STEP_POWER = 1.5
+FACTOR_NUMBERS = 4.8e6
+FACTOR_POWER = 1.4
+# Rows shorter than this take as long: Python calls [s].
+LEAST_STEP_S = 2e-3
+SWEEPS = 10
+# Counts beyond this are not told apart.
+MOST_SAMPLES = 10**15
+# Positions that a simulation keeps, and, at each of two points of a search, those and the
+# multipliers, with copies for the answer and its gradients; beside them the sensitivities.
+SIMULATION_COPIES = 3
+SEARCH_COPIES = 10
+SENSITIVITY_COPIES = 2
+# Memory of the body's arrays and patterns [bytes].
+BYTES_PER_ELEMENT = 8000
+
+
+@dataclass(frozen=True)
+class Size:
+    """Sizes that decide what an experiment takes.
+
+    Attributes
+    ----------
+    nodes, elements : int
+    samples : int
+    substeps : int
+        Timesteps per sample.
+    unknowns : int
+        Parameters that are estimated; none for a simulation.
+    """
+
+    nodes: int
+    elements: int
+    samples: int
+    substeps: int = 1
+    unknowns: int = 0
+
+    @property
+    def timesteps(self) -> int:
+        """Timesteps of the recording."""
+        return self.samples * self.substeps
+
+    def memory_mb(self) -> float:
+        """Memory that it takes at least."""
+        copies = SIMULATION_COPIES
+        if self.unknowns:
+            copies = SEARCH_COPIES + SENSITIVITY_COPIES * self.unknowns
+        numbers = copies * 3 * self.nodes * self.timesteps
+        numbers += FACTOR_NUMBERS * (self.nodes / NODES) ** FACTOR_POWER
+        return (8 * numbers + BYTES_PER_ELEMENT * self.elements) / 1e6
+
+    def time_s(self) -> float:
+        """Time of a solve in the reduced space, or of a simulation, on one thread."""
+        step_s = max(LEAST_STEP_S, STEP_S * (self.nodes / NODES) ** STEP_POWER)
+        return (SWEEPS if self.unknowns else 1) * self.timesteps * step_s
+
+
+def require_feasible(size: Size, say: Say | None = None) -> None:
+    """Refuse what this machine's memory cannot hold, and announce what takes long.
+
+    Parameters
+    ----------
+    size : Size
+    say : callable, optional
+        Called with a sentence where the estimate is beyond `ANNOUNCED_SOLVE_S`, or a single sample
+        of a body of more than `ANNOUNCED_NODES` is asked about.
+
+    Raises
+    ------
+    InputError
+        With the sizes, both amounts of memory, and the remedy.
+    """
+    steps = f"{size.samples:,} sample" + "s" * (size.samples > 1)
+    if size.substeps > 1:
+        steps += f" of {size.substeps:,} substeps"
+    what = f"{steps} of a body of {size.nodes:,} nodes"
+    there_mb = machine_memory_mb()
+    if there_mb is not None and size.memory_mb() > there_mb:
+        raise InputError(
+            f"{what} take about {size.memory_mb() / 1e3:.3g} GB of memory, and this machine has "
+            f"{there_mb / 1e3:.3g} GB; expected a coarser mesh (edge_length_m), a shorter "
+            "window_s, a lower resample_hz, a larger every, or fewer substeps"
+        )
+    is_large = size.samples == 1 and size.nodes > ANNOUNCED_NODES
+    if say is not None and (is_large or size.time_s() > ANNOUNCED_SOLVE_S):
+        act = "a solve" if size.unknowns else "a simulation"
+        say(
+            f"{what}: {act} takes about {duration(size.time_s())} and "
+            f"{size.memory_mb() / 1e3:.2g} GB of memory, or more"
+        )
+
+
+def announce_reading(files: Iterable[Path], say: Say) -> None:
+    """Announce how long it takes to read files of text, where that is long."""
+    sizes_mb = {
+        file: file.stat().st_size / 1e6
+        for file in files
+        if file.suffix.lower() in TEXT_SUFFIXES and file.is_file()
+    }
+    time_s = sum(sizes_mb.values()) / TEXT_MB_PER_S
+    if time_s > ANNOUNCED_READING_S:
+        largest = max(sizes_mb, key=lambda file: sizes_mb[file])
+        say(
+            f"reading {sum(sizes_mb.values()):.0f} MB of recordings, most of them in "
+            f"{largest.name}, takes about {duration(time_s)}"
+        )

@@ -1,0 +1,132 @@
+"""Lists of the files that this program wrote into a folder, by which others are told from them.
+
+A folder may be replaced only if all its files are listed and unchanged; a recording or a note that
+somebody put there is not, nor is an exported file after it was edited.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import secrets
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+LIST_FILE = ".collocation-sysid.json"
+# Nobody's data: drafts of a process that was killed, see `files.whole_file`, and what file managers
+# leave in folders that they show.
+IGNORED_NAME = re.compile(r"\..+\.[0-9a-f]{8}\.partial(\.\w+)?|\.DS_Store|Thumbs\.db|desktop\.ini")
+
+
+def list_files(folder: Path) -> None:
+    """Write the list of all files that are in a folder now; those of folders with a list are in it.
+
+    Parameters
+    ----------
+    folder : Path
+        Every file in it was written by this program.
+    """
+    hashes = {
+        file.relative_to(folder).as_posix(): _hash(file)
+        for file in _files(folder)
+        if _home(file, folder) == folder
+    }
+    (folder / LIST_FILE).write_text(list_as_text(hashes), encoding="utf-8")
+
+
+def add_to_list(file: Path, content: Path) -> None:
+    """Add a file to the list of its folder, if that has one.
+
+    Parameters
+    ----------
+    file : Path
+    content : Path
+        Where its content is now.
+    """
+    listing = file.parent / LIST_FILE
+    if file != listing and listing.is_file() and not listing.is_symlink():
+        hashes = listed_hashes(file.parent)
+        hash_now = _hash(content)
+        if hashes.get(file.name) != hash_now:
+            draft = listing.with_name(f"{LIST_FILE}.{secrets.token_hex(4)}.partial")
+            draft.write_text(list_as_text({**hashes, file.name: hash_now}), encoding="utf-8")
+            os.replace(draft, listing)
+
+
+def hashes_of(contents: Mapping[str, Path]) -> dict[str, str]:
+    """Hashes by name of files whose content is at a path."""
+    return {name: _hash(content) for name, content in contents.items()}
+
+
+def list_as_text(hashes: Mapping[str, str]) -> str:
+    """Content of a list."""
+    return json.dumps({"written": dict(sorted(hashes.items()))}, indent=1) + "\n"
+
+
+def listed_hashes(folder: Path) -> dict[str, str]:
+    """Hashes by relative path of the files that are listed; none where there is no valid list."""
+    try:
+        content: Any = json.loads((folder / LIST_FILE).read_text(encoding="utf-8"))
+        return {str(name): str(value) for name, value in content["written"].items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def is_written_here(file: Path, folder: Path | None = None) -> bool:
+    """Whether a regular file is on the list of its folder, and as it was written.
+
+    Parameters
+    ----------
+    file : Path
+    folder : Path, optional
+        The folder with the list; that of the file by default.
+    """
+    folder = folder or file.parent
+    if file.is_symlink() or not file.is_file():
+        return False
+    known = listed_hashes(folder).get(file.relative_to(folder).as_posix())
+    return known is not None and known == _hash(file)
+
+
+def foreign_files(folder: Path) -> Iterator[Path]:
+    """Yield files and links below a folder that are not on its list, or were changed since.
+
+    Links are not followed. A list in a subfolder, such as that of an export in a run folder, is
+    valid for the files of that subfolder.
+    """
+    lists: dict[Path, dict[str, str]] = {}
+    for file in _files(folder):
+        home = _home(file, folder)
+        if home not in lists:
+            lists[home] = listed_hashes(home)
+        known = lists[home].get(file.relative_to(home).as_posix())
+        if file.is_symlink() or not file.is_file() or known is None or known != _hash(file):
+            yield file
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Everything below a folder that is no folder, in order; links are not followed."""
+    for entry in sorted(os.scandir(folder), key=lambda each: each.name):
+        path = folder / entry.name
+        if entry.is_dir(follow_symlinks=False):
+            yield from _files(path)
+        elif not IGNORED_NAME.fullmatch(entry.name) and (
+            entry.name != LIST_FILE or entry.is_symlink()
+        ):
+            yield path
+
+
+def _home(file: Path, folder: Path) -> Path:
+    """The nearest folder above a file, up to `folder`, that has a list; else `folder`."""
+    for parent in file.parents:
+        if parent == folder or (parent / LIST_FILE).is_file():
+            return parent
+    return folder
+
+
+def _hash(file: Path) -> str:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
