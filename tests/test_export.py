@@ -253,7 +253,9 @@ def test_usd_plays_the_motion_of_the_body_at_the_rate_of_the_recording(tmp_path)
     assert stage.GetFramesPerSecond() == rate_hz
     codes = points.GetTimeSamples()
     np.testing.assert_allclose(np.array(codes) / rate_hz, t_s, atol=1e-12)
-    np.testing.assert_allclose([stage.GetStartTimeCode(), stage.GetEndTimeCode()], np.array(codes)[[0, -1]])
+    np.testing.assert_allclose(
+        [stage.GetStartTimeCode(), stage.GetEndTimeCode()], np.array(codes)[[0, -1]]
+    )
     assert body.rolled_out_m is not None
     for code, shape_m in zip(codes, body.rolled_out_m, strict=True):
         np.testing.assert_allclose(np.array(points.Get(code)), shape_m, atol=1e-7)

@@ -261,7 +261,7 @@ class Model:
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
-        """What looks at a grasp, and its number."""
+        """What looks at a grasp, and its index, from 0."""
         channels = [reading.channel for reading in self.segment.readings]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
         feels = (channel for channel in channels if isinstance(channel, GraspWrench))
@@ -275,7 +275,7 @@ class Model:
 
     @cached_property
     def moved_grasps(self) -> Index:
-        """Numbers of the grasps whose poses come with the frames; others never move."""
+        """Indices, from 0, of the grasps whose poses come with the frames; others never move."""
         grasps = self.experiment.grasps
         return np.flatnonzero([len(grasp.poses.t_s) > 1 for grasp in grasps])
 

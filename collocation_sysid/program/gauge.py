@@ -170,7 +170,7 @@ def gauge_readings(
         if gauge.grasp is None:
             channel, at_s = points_of(experiment, gauge, len(t_s)), t_s
         else:
-            grasp, origin = experiment.grasps[gauge.grasp], np.zeros(3)
+            grasp, origin = experiment.grasps[gauge.grasp - 1], np.zeros(3)
             channel = GraspWrench.of(experiment, grasp, gauge.frame, origin, grid, nuisance)
             at_s = channel.t_s
         how = channel, at_s, nuisance, huber, experiment.static

@@ -54,7 +54,13 @@ class NodesSection(Section):
 Nodes = Annotated[Text | NodesSection, ByForm(str)]
 
 
-KINDS: dict[str, Any] = {"box_m": Box, "ball_m": Ball, "face": Face, "indices": Indices, "name": Named}
+KINDS: dict[str, Any] = {
+    "box_m": Box,
+    "ball_m": Ball,
+    "face": Face,
+    "indices": Indices,
+    "name": Named,
+}
 
 
 def selection(section: NodesSection | str) -> Selection:

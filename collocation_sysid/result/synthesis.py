@@ -168,7 +168,9 @@ def _write_tables(
     for k, grasp in enumerate(experiment.grasps):
         if (key := _numbered("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)
-    layouts = _wrench_layouts(section) or [WrenchSection.model_construct()] * len(experiment.wrenches)
+    layouts = _wrench_layouts(section) or [WrenchSection.model_construct()] * len(
+        experiment.wrenches
+    )
     wrenches = []
     for sensor, wrench, layout in zip(
         experiment.wrenches, trajectory.wrenches, layouts, strict=True
