@@ -10,7 +10,7 @@ from .fem.mesh import TetMesh
 from .fem.node_force import NodeForce
 from .fem.regions import Region
 from .fem.rest_shape import UnderGravity
-from .fem.selection import Ball, Box, Indices, Named
+from .fem.selection import Ball, Box, Face, Indices, Named
 from .fem.structured import box_mesh, cylinder_mesh
 from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
 from .methods.comparison.penalty import AugmentedLagrangian, Penalty
@@ -69,6 +69,7 @@ __all__ = [
     "Depth",
     "DepthCamera",
     "Experiment",
+    "Face",
     "Field",
     "Force",
     "Gauge",

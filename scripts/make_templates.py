@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.arrays import Array
@@ -85,9 +84,7 @@ def benched(folder: Path, names: str, t_s: Array, moved: Array, noise: float, sc
     problem = Problem.read(folder / "problem.toml", at_truth, simulation=True)
     (experiment,) = problem.experiments
     (reaction,) = simulate(experiment, problem.parameters).wrenches
-    (sensor,) = experiment.wrenches
-    measured = scale * CubicSpline(sensor.t_s, reaction[:, 2])(t_s)  # between equilibria smooth
-    write(measured + np.random.default_rng(SEED).normal(scale=noise, size=len(t_s)))
+    write(scale * reaction[:, 2] + np.random.default_rng(SEED).normal(scale=noise, size=len(t_s)))
 
 
 KINDS = {"swing": swing, "compression": compression, "tension": tension}

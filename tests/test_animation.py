@@ -7,11 +7,13 @@ import re
 import shutil
 import subprocess
 from base64 import b64decode
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from PIL import Image
 from problem_files import TRUTH, run_command, settings, write_problem
 from results_small import a_result, value
@@ -19,9 +21,17 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.result import animation
-from collocation_sysid.result.animation import Film, animate, film_samples
+from collocation_sysid.result.animation import (
+    FOOT_MM,
+    HEAD_MM,
+    WIDTH_MM,
+    Film,
+    animate,
+    film_samples,
+)
 from collocation_sysid.result.page import surface_strain
 from collocation_sysid.result.replay import headline, read_run
+from collocation_sysid.result.style import GREEN
 from collocation_sysid.result.view import frame_files, view
 from collocation_sysid.statistics.concern import Concern
 from collocation_sysid.statistics.trust import Trust
@@ -87,10 +97,42 @@ def test_a_film_is_a_gif_in_the_run_folder_by_default(run, tmp_path):
     assert len(frames_in(copy / "nod.gif")) == 4
 
 
-def test_fitted_and_rolled_out_stand_side_by_side(run):
+def test_the_simulation_is_drawn_as_edges_over_the_fit(run):
     _, (swing, nod) = read_run(run)
-    assert [name for name, *_ in Film(swing).panels] == ["fitted", "simulated"]
-    assert [name for name, *_ in Film(nod).panels] == ["simulated"]
+    film = Film(swing)
+    assert [name for name, *_ in film.panels] == ["fitted", "simulated"]
+    film.show(3)
+    (*_, fitted, _), (*_, simulated, title) = film.panels
+    assert len(fitted.skin.get_facecolor()) > 1
+    assert len(simulated.skin.get_facecolor()) == 0
+    assert simulated.skin.get_paths()
+    assert to_hex(simulated.skin.get_edgecolor()[0]) == to_hex(title.get_color()) == to_hex(GREEN)
+    (alone,) = Film(nod).panels
+    assert alone[0] == "simulated"
+    assert alone[3].wire is None
+
+
+def test_a_film_has_the_errors_of_both_beside_the_body_and_a_line_at_its_time(run):
+    _, (swing, _) = read_run(run)
+    film = Film(swing)
+    film.show(4)
+    _, errors = film.figure.axes
+    assert [line.get_label() for line in errors.lines[:2]] == ["fitted", "simulated"]
+    assert film.cursor is not None
+    assert film.cursor.get_xdata()[0] == pytest.approx(swing.t_s[4] - swing.t_s[0])
+    unmarked = replace(swing, measured_m=np.full_like(swing.measured_m, np.nan))
+    assert Film(unmarked).cursor is None
+
+
+def test_the_body_fills_a_large_part_of_the_frame(run):
+    """It stood in a half of the frame beside its double."""
+    _, (swing, _) = read_run(run)
+    film = Film(swing)
+    film.show(3)
+    corners = np.concatenate([path.vertices for path in film.panels[0][3].skin.get_paths()])
+    width, height = np.ptp(corners, axis=0)
+    room = film.figure.axes[0].get_ylim()[1] - HEAD_MM - FOOT_MM
+    assert max(height / room, width / WIDTH_MM) > 0.6
 
 
 def test_the_film_says_how_far_the_markers_are_off(run):

@@ -136,7 +136,7 @@ PROBLEM_FILE = [
         edit=replace_text("gamma_m_1_s = { guess = 0.5, lower = 1e-3, upper = 100.0 }", ""),
     ),
     bad(
-        "missing-nodes", "grasp.nodes", "missing", "box_m, ball_m or indices",
+        "missing-nodes", "grasp.nodes", "missing", "box_m, ball_m, face or indices",
         edit=replace_text(f"nodes = {BOX}, ", ""),
     ),
     bad(

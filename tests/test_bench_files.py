@@ -14,13 +14,17 @@ from problem_files import run_command
 from collocation_sysid import run
 from collocation_sysid.display import as_markdown, plain_text
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.mesh import Nodes
+from collocation_sysid.fem.selection import Face
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.beginning import TEMPLATES
+from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.tables import read_pressure
 from collocation_sysid.result.run_sections import run_report, summary
+from collocation_sysid.result.synthesis import write_data
 from collocation_sysid.statistics.modal import doubts
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -380,6 +384,105 @@ def test_the_recordings_of_templates_are_what_a_simulation_gives(tmp_path, kind)
         assert made.splitlines()[0] == there.splitlines()[0]
         numbers = [np.genfromtxt(t.splitlines()[1:], delimiter=",") for t in (made, there)]
         np.testing.assert_allclose(*numbers, rtol=1e-6, atol=1e-6 if kind == "swing" else 2e-4)
+
+
+@pytest.mark.parametrize("kind", ["compression", "tension"])
+def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
+    shutil.copytree(TEMPLATES / kind, tmp_path / "measured")
+    file, twin = tmp_path / "measured" / "problem.toml", tmp_path / "twin"
+    told = run_command(
+        *("simulate", file, "--out", twin, "--set", "parameters.young_pa.guess=4e4"),
+        *("--noise-n", "0.01"),
+    )
+    assert told.code == 0, told.err
+    assert [each.name for each in twin.iterdir()] == ["run_1.csv"]
+    rows = len((TEMPLATES / kind / "run_1.csv").read_text().splitlines())
+    assert len((twin / "run_1.csv").read_text().splitlines()) == rows
+    shutil.copy(file, twin)
+    again, measured = (Problem.read(at / "problem.toml") for at in (twin, file.parent))
+    for ours, theirs in zip(again.experiments, measured.experiments, strict=True):
+        np.testing.assert_allclose(ours.t_s, theirs.t_s)
+        for grasp, recorded in zip(ours.grasps, theirs.grasps, strict=True):
+            np.testing.assert_allclose(
+                grasp.poses.positions_m, recorded.poses.positions_m, atol=1e-12
+            )
+    found = run(again, seek_causes=False)
+    assert found.estimates["young_pa"].value == pytest.approx(4e4, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("displacement", "wrench", "measured", "simulated"),
+    [
+        (
+            "sign = -1",
+            "sign = -1, symmetry = 4",
+            "Time (s),Displacement (mm),Force (N)",
+            "t_s,displacement_m,force_n",
+        ),
+        (
+            'columns = { displacement = "Weg 1 (mm)", t = "Takt [ms]" }',
+            'sign = -1, columns = { force = "Kanal 2 (kN)", t = "Takt [ms]" }',
+            "Takt [ms],Weg 1 (mm),Kanal 2 (kN)",
+            "Takt [ms],Weg 1 (mm),Kanal 2 (kN)",
+        ),
+        (
+            'length_m = "body", sign = -1',
+            "area_m2 = 2e-3",
+            "Time (s),Strain (%),Stress (Pa)",
+            "t_s,strain_1,stress_pa",
+        ),
+        (
+            "sign = -1",
+            'columns = { fz = "F (N)" }',
+            "Time (s),Displacement (mm),F (N)",
+            "Time (s),displacement_m,F (N)",
+        ),
+    ],
+    ids=["signs", "names", "strain and stress", "a name for one"],
+)
+def test_a_simulated_table_reads_back_as_what_was_simulated(
+    tmp_path, displacement, wrench, measured, simulated
+):
+    text = SHARED.replace("displacement = { sign = -1 }", f"displacement = {{ {displacement} }}")
+    file = block_problem(tmp_path, text.replace("sign = -1, symmetry = 4", wrench))
+    columns = measured
+    rows = "0,0,0\n100,0.02,0.001\n200,0.04,0.002\n300,0.06,0.003\n"
+    for name in ("first", "second"):
+        (tmp_path / f"{name}.csv").write_text(f"{columns}\n{rows}")
+    problem = Problem.read(file, simulation=True)
+    write_data(problem, tmp_path / "twin")
+    for name in ("first", "second"):
+        assert (tmp_path / "twin" / f"{name}.csv").read_text().splitlines()[0] == simulated
+    for name in ("block.vtu", "problem.toml"):
+        shutil.copy(tmp_path / name, tmp_path / "twin")
+    again = Problem.read(tmp_path / "twin" / "problem.toml", simulation=True)
+    for ours, theirs in zip(again.experiments, problem.experiments, strict=True):
+        np.testing.assert_allclose(
+            ours.grasps[1].poses.positions_m, theirs.grasps[1].poses.positions_m, atol=1e-12
+        )
+        (sensed,) = simulate(theirs, problem.parameters).wrenches
+        np.testing.assert_allclose(ours.wrenches[0].values[:, 2], sensed[:, 2], rtol=1e-9)
+
+
+def test_one_table_of_two_recordings_is_not_simulated(tmp_path):
+    file = block_problem(tmp_path, SHARED.replace("second.csv", "first.csv"))
+    with pytest.raises(InputError, match=r"'second': file: is read by 'first' too"):
+        write_data(Problem.read(file, simulation=True), tmp_path / "twin")
+    assert not (tmp_path / "twin").exists()
+
+
+def test_faces_are_found_without_any_length():
+    mesh = box_mesh((0.02, 0.03, 0.04), (2, 2, 2), origin_m=(0.01, 0.0, -0.5))
+    nodes = Nodes.corners(mesh)
+    for face, axis, place in (("top", 2, -0.46), ("bottom", 2, -0.5), ("side_x", 0, 0.01)):
+        chosen = mesh.points_m[Face(face).resolve(nodes)]
+        np.testing.assert_allclose(chosen[:, axis], place)
+        assert len(chosen) == (3 if face == "side_x" else 9)
+    assert len(Face("side_x").resolve_faces(mesh)) == 8
+    with pytest.raises(InputError, match="the face top selects nodes, and no cells"):
+        Face("top").resolve_cells(mesh)
+    with pytest.raises(InputError, match="face"):
+        Face("left")  # pyright: ignore[reportArgumentType]
 
 
 def test_a_machines_own_file_takes_the_examples_place(tmp_path, monkeypatch):

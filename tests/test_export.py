@@ -235,13 +235,48 @@ def test_usd_gets_the_motion_of_the_gripper_and_what_it_holds(tmp_path):
     )
     from pxr import UsdGeom
 
+    rate_hz = stage.GetTimeCodesPerSecond()
     local = np.array(grasp.GetAttribute("physics:coords1").Get())
     for k, t in enumerate(body.experiment.t_s):
         # USD's matrices act on rows.
-        matrix = np.array(UsdGeom.Xformable(gripper).ComputeLocalToWorldTransform(float(t)))
+        matrix = np.array(UsdGeom.Xformable(gripper).ComputeLocalToWorldTransform(t * rate_hz))
         there = local @ matrix[:3, :3] + matrix[3, :3]
         held = body.experiment.grasped([t])[1][0][body.grasped]
         np.testing.assert_allclose(there, held, atol=1e-7, err_msg=f"sample {k}")
+
+
+def test_usd_plays_the_motion_of_the_body_at_the_rate_of_the_recording(tmp_path):
+    body = held_bar(moving=True)
+    stage = stage_of(exported(body, "usd", tmp_path))
+    points = stage.GetPrimAtPath("/World/Body/Mesh").GetAttribute("points")
+    t_s, rate_hz = body.experiment.t_s, stage.GetTimeCodesPerSecond()
+    assert rate_hz == pytest.approx(1 / body.experiment.timestep_s)
+    assert stage.GetFramesPerSecond() == rate_hz
+    codes = points.GetTimeSamples()
+    np.testing.assert_allclose(np.array(codes) / rate_hz, t_s, atol=1e-12)
+    np.testing.assert_allclose(
+        [stage.GetStartTimeCode(), stage.GetEndTimeCode()], np.array(codes)[[0, -1]]
+    )
+    assert body.rolled_out_m is not None
+    for code, shape_m in zip(codes, body.rolled_out_m, strict=True):
+        np.testing.assert_allclose(np.array(points.Get(code)), shape_m, atol=1e-7)
+    assert np.ptp(body.rolled_out_m, axis=0).max() > 1e-3  # and it moves
+    placed_m = np.where(body.held, body.held_m, body.nodes_m)
+    np.testing.assert_allclose(np.array(points.Get()), placed_m, atol=1e-7)
+
+
+def test_usd_says_that_gravity_is_tilted_and_that_nothing_moves(tmp_path):
+    body = held_bar()
+    limits = export_run(body, "usd", tmp_path / "level").limits
+    assert not any("gravity" in limit for limit in limits)
+    assert any("no forward simulation" in limit for limit in limits)
+    angle = np.radians(0.5)
+    tilted = replace(
+        body.experiment, gravity_m_s2=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    )
+    limits = export_run(replace(body, experiment=tilted), "usd", tmp_path / "tilted").limits
+    assert any("gravity points 0.5° away from −z" in limit for limit in limits)
+    assert "0.5°" in (tmp_path / "tilted" / "body.usda").read_text()
 
 
 def test_usd_gets_a_material_for_each_region_and_says_what_simulators_make_of_them(tmp_path):

@@ -22,7 +22,9 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_readings
 from collocation_sysid.recording import Experiment, Gauge, Look, Markers, Wrench
+from collocation_sysid.result.pictures.album import _of_experiment as album_pictures
 from collocation_sysid.result.pictures.over_time import readings_picture
+from collocation_sysid.result.replay import read_run
 
 LOW_M = [[0.05, 0.05, 0.01]]
 ENDS_M = [[0.0, 0.0, 0.02], [0.0, 0.0, 0.08]]
@@ -102,6 +104,14 @@ def test_the_truth_is_found_from_an_accelerometer_and_a_foil_alone(method):
     (part,) = solution.collocation.parts(solution.z)
     found = part.phi * part.segment.nuisance.scales
     np.testing.assert_allclose(found, [0.3, 0.04], atol=0.02)
+    full = part.segment.nuisance.names[0]
+    for name in ("bias_m_s2", full, full.partition(": ")[2], "bias of accelerometer"):
+        assert solution.nuisance(name) == found[0]
+    assert solution.nuisance("scale") == found[1]
+    with pytest.raises(InputError, match="'reading' stands for several; expected one of"):
+        solution.nuisance("reading")
+    with pytest.raises(InputError, match="no nuisance parameter 'gain'; expected one of"):
+        solution.nuisance("gain")
     for name in ("lambda_pa", "mu_pa"):
         assert solution.parameters[name] == pytest.approx(TRUTH[name], rel=0.05)
 
@@ -160,12 +170,24 @@ def test_what_a_reading_lacks_is_said(changes: dict, words: str):
         replace(good, **changes)
 
 
+def test_a_grasp_has_a_number_from_one_on():
+    cube = hung_cube(9)
+    last = replace(accelerometer(cube.t_s), points_m=(), grasp=1, **CLAMPED)
+    assert instrumented(cube, last).sensed == (0,)
+    with pytest.raises(
+        InputError, match="looks at grasp 0; expected the number of a grasp, 1 to 1"
+    ):
+        instrumented(cube, replace(last, grasp=0))
+
+
 def test_a_reading_of_another_time_or_place_is_refused():
     cube = hung_cube(9)
     with pytest.raises(InputError, match="accelerometer"):
         instrumented(cube, accelerometer(cube.t_s + 100))
-    nobody = replace(accelerometer(cube.t_s), points_m=(), grasp=1, **CLAMPED)
-    with pytest.raises(InputError, match="looks at the grasp 1, but there are 1"):
+    nobody = replace(accelerometer(cube.t_s), points_m=(), grasp=2, **CLAMPED)
+    with pytest.raises(
+        InputError, match="looks at grasp 2; expected the number of a grasp, 1 to 1"
+    ):
         instrumented(cube, nobody)
     far = instrumented(cube, accelerometer(cube.t_s, points_m=[[1.0, 0, 0]]))
     with pytest.raises(InputError, match="accelerometer 1"):
@@ -179,7 +201,7 @@ def clamped(steps: int = 16) -> Experiment:
     """The cube in a hand, a load cell of one axis in it and a foil on the cube; nothing sees it."""
     cube = replace(hung_cube(steps), nuisance=IDEAL)
     inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
-    cell = Gauge("cell", pull, inner, np.zeros(len(inner)), 1e-3, unknowns={"gain": 0.1}, grasp=0)
+    cell = Gauge("cell", pull, inner, np.zeros(len(inner)), 1e-3, unknowns={"gain": 0.1}, grasp=1)
     made = replace(cube, markers=Markers.none(cube.t_s), readings=[cell, strain_gauge(cube.t_s)])
     felt, strains = simulate(made, TRUTH, "midpoint", substeps=1).readings
     return with_readings(made, [1.05 * felt, 1.04 * strains])
@@ -196,7 +218,7 @@ def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
             cube.t_s,
             np.zeros((len(cube.t_s), 6)),
             1.0,
-            grasp=0,
+            grasp=1,
             frame=frame,
         )
         made = replace(cube, grasps=[replace(grasp, wrench=wrench)], readings=[both])
@@ -235,6 +257,7 @@ code = "mine.py"
 function = "specific_force"
 file = "data/swing_reading_chip.csv"
 sigma = 0.02
+unit = "m/s²"
 points_m = [[0.03, 0.02, 0.03]]
 unknowns = { bias_m_s2 = 0.5 }
 
@@ -273,13 +296,19 @@ def test_readings_in_a_file_are_simulated_and_identified_from(worn: Path):
     assert abs(result["nuisance"]["swing"]["bias of chip [m/s²]"]["value"]) < 0.02
     sizes = result["fit"]["experiments"]["swing"]["reading_rms"]
     assert sizes.keys() == {"chip", "cell"}
-    assert f"chip of 'swing': {sizes['chip']:.2g} RMS (sigma 0.02)" in done.out
+    assert f"chip of 'swing': {sizes['chip']:.2g} m/s² RMS (sigma 0.02 m/s²)" in done.out
+    assert f"cell of 'swing': {sizes['cell']:.2g} RMS (sigma 0.001)" in done.out
     assert "also estimated for 'swing': bias of chip" in " ".join(done.out.split())
     with np.load(worn / "found" / "trajectory.npz") as arrays:
         drawn = (
             readings_picture(arrays["reading_chip"], "xyz"),
             readings_picture(arrays["reading_cell"], ["cell"]),
         )
+    _, (replay,) = read_run(worn / "found")
+    assert replay.reading_units == {"chip": "m/s²"}
+    pictures = dict(album_pictures(replay))
+    assert pictures["reading_swing_chip"].axes[0].get_ylabel() == "[m/s²]"
+    assert pictures["reading_swing_cell"].axes[0].get_ylabel() == ""
     shown = [[len(axes.lines) for axes in figure.axes] for figure in drawn]
     assert shown == [[3, 3, 3], [3]]  # measured, fitted, simulated
 

@@ -37,7 +37,7 @@ def weighed(scheme: str = "midpoint", frame: str = "grasp", **unknown: float) ->
     """A cube swung by its top, with a load cell there and a clamp, on clocks of their own."""
     (seen,) = swing(nuisance=Nuisance.none(**unknown)).experiments
     inner = seen.t_s[0] + np.linspace(0.0, 0.355, 83)
-    clamp = cs.Gauge("clamp", CLAMPED["expression"], inner[::3], None, 2e-3, grasp=0)
+    clamp = cs.Gauge("clamp", CLAMPED["expression"], inner[::3], None, 2e-3, grasp=1)
     made = instrumented(sensing(seen, inner, frame=frame), clamp)
     told, rng = cs.simulate(made, TRUTH, scheme, substeps=1), np.random.default_rng(3)
     (wrench,), (force,) = told.wrenches, told.readings

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from matplotlib.text import Text
 from problems_small import (
@@ -46,14 +47,14 @@ from collocation_sysid.result.pictures import (
     tracks,
 )
 from collocation_sysid.result.pictures.camera import Camera
-from collocation_sysid.result.pictures.confidence import ellipse
+from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse
 from collocation_sysid.result.pictures.jacobian import RASTER, SHOWN_STEPS
 from collocation_sysid.result.pictures.mesh import apart
 from collocation_sysid.result.pictures.scene import Drawn, View, sheet
 from collocation_sysid.result.pictures.shapes import COLOURS, Coloured
 from collocation_sysid.result.pictures.spectrum import spectral_density
 from collocation_sysid.result.replay import Replay
-from collocation_sysid.result.style import COLUMN_MM, RESOLUTION_DPI, SMALL_PT
+from collocation_sysid.result.style import COLUMN_MM, CYCLE, RESOLUTION_DPI, SMALL_PT
 from collocation_sysid.runs.result import Result
 
 THETA = np.array([*TRUTH.values()])
@@ -169,6 +170,29 @@ def test_missing_samples_leave_gaps():
     figure = tracks(TIMES, ["tip", "side"], measured_m, fitted)
     side = figure.axes[6].lines[0].get_ydata()
     assert np.flatnonzero(np.isnan(side)).tolist() == [5, 6, 7]
+
+
+def test_tracks_keep_to_a_page_on_which_they_are_legible():
+    measured_m, fitted = noisy_tracks(markers=9)
+    figure = tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted)
+    assert len(figure.axes) == 2 * 3 * 3
+    assert figure.get_figheight() < 0.75 * figure.get_figwidth()
+
+
+def test_a_budget_has_its_whole_legend_and_colours_that_differ():
+    names = [f"a long name of source {k}" for k in range(12)]
+    shares = {"young_pa": dict.fromkeys(names, 1 / 12), "poisson": {names[3]: 1.0}}
+    figure = budget_picture(shares)
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    inside, whole = legend.get_window_extent(), figure.bbox
+    assert inside.x0 >= 0
+    assert inside.x1 <= whole.width
+    assert inside.y0 >= figure.axes[0].get_window_extent().y1
+    drawn = [to_hex(bars[0].get_facecolor()).upper() for bars in figure.axes[0].containers]
+    assert drawn == [*CYCLE, GREY]  # for any colour vision, each once
+    ends = [bars[-1].get_x() + bars[-1].get_width() for bars in figure.axes[0].containers]
+    assert ends[-1] == pytest.approx(1.0)
 
 
 def test_of_many_markers_the_worst_are_shown():

@@ -202,8 +202,9 @@ def test_a_surface_is_filled_once_and_kept(tiny):
         f"{{ indices = {top_nodes().tolist()} }}",
         '{ name = "top" }',
         '"top"',
+        '{ face = "top" }',
     ],
-    ids=["box", "ball", "indices", "name", "bare-name"],
+    ids=["box", "ball", "indices", "name", "bare-name", "face"],
 )
 def test_every_kind_of_selection_finds_its_nodes(tiny, selection):
     replace_text(BOX, selection)(tiny)

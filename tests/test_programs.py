@@ -234,7 +234,7 @@ def watched(**changes) -> Collocation:
 def clamp(**changes) -> Collocation:
     """A user's load cell in the hand, beside a sensor and markers."""
     cube = wristed_cube(6, ALL_UNKNOWN, frame="grasp")
-    cell = cs.Gauge("cell", bent, cube.t_s, np.ones((7, 2)), 0.3, unknowns={"gain": 0.1}, grasp=0)
+    cell = cs.Gauge("cell", bent, cube.t_s, np.ones((7, 2)), 0.3, unknowns={"gain": 0.1}, grasp=1)
     return program(replace(cube, readings=[cell]), **changes)
 
 

@@ -102,6 +102,14 @@ def test_the_page_holds_everything(page: str, run_folder: Path):
     assert "The problem file as run" in found.text
 
 
+def test_a_figure_of_measurement_and_fit_stands_before_the_tables(page: str):
+    first, *others = (match.start() for match in re.finditer("<figure", page))
+    assert first < page.index("<table")
+    assert first < page.index("<h2")
+    assert page.index("Measured, fitted and simulated markers") < others[0]
+    assert page.count("Measured, fitted and simulated markers") == 1
+
+
 def test_text_is_escaped(run_folder: Path, tmp_path: Path):
     copy = tmp_path / "run"
     shutil.copytree(run_folder, copy)

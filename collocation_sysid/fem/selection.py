@@ -9,15 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
-from ..errors import InputError, hint_at
+from ..errors import InputError, hint_at, require_among
 from .mesh import Nodes, TetMesh
 
 # Tolerance in diagonals of the body: nodes on a box's face must not be lost by rounding.
 ROUND_OFF = 1e-9
 OF_CELLS = "cells, by their centres"
+# Of the body's diagonal: nodes of a file in single precision on one plane are this close to it.
+FACE_TOLERANCE = 1e-6
+FaceName = Literal["top", "bottom", "side_x", "side_y"]
 
 
 class _Within:
@@ -118,6 +122,55 @@ class Ball(_Within):
     def __str__(self) -> str:
         center = ", ".join(f"{x:g}" for x in self.center_m)
         return f"the ball of radius {self.radius_m:g} m about ({center}) m"
+
+
+@dataclass(frozen=True)
+class Face(_Within):
+    """The nodes on an end or a plane side of the body; no length needs to be stated.
+
+    Parameters
+    ----------
+    name : {"top", "bottom", "side_x", "side_y"}
+        The nodes with the highest or the lowest z of the body; or those with its lowest x or y, as
+        in a plane of symmetry, that are neither on the top nor on the bottom, so that a grasp of
+        the side goes with grasps of these. As a selection of faces a side has its edges.
+    """
+
+    name: FaceName
+
+    def __post_init__(self) -> None:
+        require_among(self.name, get_args(FaceName), None, "face")
+
+    def resolve(self, nodes: Nodes) -> np.ndarray:
+        """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
+        points_m = nodes.points_m
+        mask = self._holds(points_m)
+        if self.name.startswith("side"):
+            mask &= ~(Face("top")._holds(points_m) | Face("bottom")._holds(points_m))
+        return _chosen(mask, nodes.mesh, str(self))
+
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+        """Refuse: a face of the body holds no cell.
+
+        Raises
+        ------
+        InputError
+        """
+        raise InputError(
+            f"{self} selects nodes, and no cells; expected box_m, ball_m, indices or name"
+        )
+
+    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+        """Whether points are in the plane through the one that is farthest out, (n,) bool."""
+        axis, sign = {"top": (2, -1), "bottom": (2, 1), "side_x": (0, 1), "side_y": (1, 1)}[
+            self.name
+        ]
+        inwards_m = sign * points_m[:, axis]
+        tolerance_m = FACE_TOLERANCE * float(np.linalg.norm(np.ptp(points_m, axis=0)))
+        return np.asarray(inwards_m <= inwards_m.min() + tolerance_m)
+
+    def __str__(self) -> str:
+        return f"the face {self.name}"
 
 
 @dataclass(frozen=True)
@@ -263,7 +316,7 @@ class Named:
         return values.astype(bool)
 
 
-Selection = Box | Ball | Indices | Named
+Selection = Box | Ball | Face | Indices | Named
 
 
 def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:

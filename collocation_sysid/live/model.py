@@ -306,7 +306,7 @@ class Model:
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
-        """Wrenches of grasps that are observed, and the index of the grasp."""
+        """Wrenches of grasps that are observed, and the index of the grasp, from 0."""
         channels = [reading.channel for reading in self.segment.readings]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
         wrenches = (channel for channel in channels if isinstance(channel, GraspWrench))
@@ -320,7 +320,7 @@ class Model:
 
     @cached_property
     def moved_grasps(self) -> Index:
-        """Indices of the grasps whose poses come with the frames; the others never move."""
+        """Indices, from 0, of the grasps whose poses come with the frames; others never move."""
         grasps = self.experiment.grasps
         return np.flatnonzero([len(grasp.poses.t_s) > 1 for grasp in grasps])
 

@@ -12,12 +12,13 @@ from typing import Protocol
 import numpy as np
 
 from ..arrays import Array, root_mean
-from ..errors import SimulationError
+from ..errors import InputError, SimulationError, hint_at
 from ..fem.kernels import side_by_side
 from ..program.collocation import Collocation, Part, Violation
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
 from ..recording.experiment import Experiment
+from ..recording.nuisance import GAUGE
 from .scan import Scan
 
 
@@ -206,6 +207,38 @@ class Solution:
     def parts(self) -> list[Part]:
         """Every fitted experiment at the solution."""
         return self.collocation.parts(self.z)
+
+    def nuisance(self, name: str) -> float:
+        """Return the value of a nuisance parameter of a recording in its unit.
+
+        Parameters
+        ----------
+        name : str
+            As in `result.json` and the report, "swing: time shift [s]"; without experiment or unit,
+            "time shift"; or the name of a row of your own or of an unknown of a `Gauge`.
+
+        Raises
+        ------
+        InputError
+            If none, or several with different values, are called so.
+        """
+        found: dict[str, float] = {}
+        known: list[str] = []
+        for part in self.parts:
+            nuisance, readings = part.segment.nuisance, part.segment.experiment.readings
+            values = (part.phi * nuisance.scales).tolist()
+            for entry, full, value in zip(nuisance.entries, nuisance.names, values, strict=True):
+                known.append(full)
+                names = {full, entry.label, entry.label.rpartition(" [")[0], entry.row.name}
+                if entry.row == GAUGE:
+                    names.add([*readings[entry.number].unknowns][entry.axis])
+                if name in names:
+                    found[full] = value
+        if len(found) == 1:
+            return next(iter(found.values()))
+        which = f"{name!r} stands for several" if found else f"no nuisance parameter {name!r}"
+        expected = ", ".join(map(repr, found or dict.fromkeys(known)))
+        raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
 
     def part_of(self, experiment: str) -> Part | None:
         """That of one experiment, by name; None where it was not fitted."""

@@ -37,8 +37,8 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
     ----------
     path : str or Path
     overrides : sequence of "dotted.key=value"
-        Values in TOML syntax; bare words are strings; list items by number, tables in a list also
-        by name.
+        Values in TOML syntax; bare words are strings; list items by index, counted from 0,
+        tables in a list also by name.
 
     Returns
     -------

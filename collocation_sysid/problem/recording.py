@@ -44,6 +44,7 @@ from ..recording.tables import read_gauge, within
 from ..section import stated_in
 from ..stated import keys_of, tables_of
 from ..statistics.modal import doubts
+from .bench_files import length_m
 from .code import Code, existing_file
 from .nuisance_schema import nuisance_of
 from .recording_schema import (
@@ -158,7 +159,9 @@ class RecordingReader:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
         if grasp.displacement is not None:
             file = self._file(grasp.displacement, self._grasp_key(k, "displacement"))
-            poses = read_displacement(file, **grasp.displacement.layout, timed=self._timed)
+            layout = grasp.displacement.layout
+            layout |= {"length_m": length_m(grasp.displacement, self.body)}
+            poses = read_displacement(file, **layout, timed=self._timed)
         elif grasp.poses is None:
             return PoseSequence.fixed()
         else:
@@ -184,7 +187,8 @@ class RecordingReader:
         section, zero = self.section.moved[k], ""
         if (table := section.displacement) is not None:
             file = self._file(table, self._grasp_key(k, "displacement"))
-            zero = displaced_axes(file, table.columns, table.axis, table.length_m)
+            rest_m = length_m(table, self.body)
+            zero = displaced_axes(file, table.columns, table.axis, rest_m)
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasps)
@@ -397,13 +401,15 @@ class RecordingReader:
             if name is not None and len(t_s) and not static:
                 refuse_untold(sequence, t_s, held, self.folder / name)
         rate_hz = section.resample_hz
+        # The files that a simulation writes are thinned when they are read.
+        every = 1 if self.simulation else section.every
         if self.size is not None and len(t_s):
-            samples = len(t_s) // section.every
+            samples = len(t_s) // every
             if rate_hz and not static:
                 samples = int(min((t_s[-1] - t_s[0]) * rate_hz, MOST_SAMPLES)) + 1
             require_feasible(replace(self.size, samples=samples), self.say)
         try:
-            aligned = align(poses, table, section.window_s, rate_hz, section.every, held_s, static)
+            aligned = align(poses, table, section.window_s, rate_hz, every, held_s, static)
         except InputError as error:
             files = dict.fromkeys(name for name in (*moved, section.markers.file) if name)
             raise InputError(error.message, where=" and ".join(files)) from error

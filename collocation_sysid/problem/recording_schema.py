@@ -62,11 +62,12 @@ class DisplacementSection(TableSection):
 
     Attributes
     ----------
-    length_m : float, optional
-        Undeformed length that an engineering strain multiplies.
+    length_m : float or "body", optional
+        Undeformed length that an engineering strain multiplies; or "body", that of the body along
+        the axis.
     """
 
-    length_m: Positive | None = None
+    length_m: Annotated[Literal["body"] | Positive, ByForm(str)] | None = None
 
 
 class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):

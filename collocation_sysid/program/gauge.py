@@ -216,7 +216,7 @@ def gauge_readings(
             channel = points_of(experiment, gauge, len(t_s))
             at_s = t_s
         else:
-            grasp = experiment.grasps[gauge.grasp]
+            grasp = experiment.grasps[gauge.grasp - 1]
             origin = np.zeros(3)
             channel = GraspWrench.of(experiment, grasp, gauge.frame, origin, grid, nuisance)
             at_s = channel.t_s

@@ -296,7 +296,7 @@ class Experiment:
     @property
     def sensed(self) -> tuple[int, ...]:
         """The grasps, by their places, whose force or torque is measured."""
-        looked = {gauge.grasp for gauge in self.readings}
+        looked = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
         sensed = (k for k, g in enumerate(self.grasps) if g.wrench is not None or k in looked)
         return tuple(sensed)
 
@@ -434,10 +434,10 @@ class Experiment:
             if [other.name for other in self.readings].count(gauge.name) > 1:
                 raise InputError(f"two readings are called {gauge.name!r}; expected another name")
             within(gauge.times, self.t_s, what, self.static)
-            if gauge.grasp is not None and gauge.grasp not in range(len(self.grasps)):
+            if gauge.grasp is not None and not 1 <= gauge.grasp <= len(self.grasps):
                 raise InputError(
-                    f"{what} looks at the grasp {gauge.grasp}, but there are {len(self.grasps)}; "
-                    "expected its place among them, from 0"
+                    f"{what} looks at grasp {gauge.grasp}; expected the number of a grasp, 1 to "
+                    f"{len(self.grasps)}"
                 )
 
         for depth in self.depths:

@@ -49,7 +49,6 @@ _COLUMNS = Key("columns", list[Text], default=[])
 _GRASP = Key(
     "grasp",
     AtLeastOne | None,
-    lambda number: number - 1,
     said="In place of points: the number of the grasp, from 1, whose force and torque it looks at.",
 )
 
@@ -75,13 +74,15 @@ class Gauge:
     unknowns : mapping of name to float
         Standard deviation of each of its unknowns, about zero, by the argument's name.
     grasp : int, optional
-        In place of points the grasp, by its place among those of the experiment, whose force and
-        torque it looks at.
+        In place of points the number of the grasp, counted from 1, whose force and torque it looks
+        at; obstacles count behind the grasps.
     frame : {"grasp", "world"}
         Axes and origin of these: those of the undeformed body as the grasp carries it, or the
         poses' world.
     columns : sequence of str, optional
         Columns of the numbers, in their order; all besides t_s by default.
+    unit : str
+        Unit of the numbers, for the terminal, reports and figures.
 
     Raises
     ------
@@ -102,6 +103,7 @@ class Gauge:
     grasp: int | None = key(_GRASP, converter=as_given, default=None)
     frame: Frame = key(Frame, default="grasp")
     columns: Sequence[str] = key(_COLUMNS, converter=as_given, default=())
+    unit: str = key(str, default="")
 
     def __post_init__(self) -> None:
         where, points = f"the reading '{self.name}'", cast(Sequence[Any], self.points_m)

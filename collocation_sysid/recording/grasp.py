@@ -40,8 +40,8 @@ class Grasp:
     Parameters
     ----------
     nodes : (h,) int array or Selection
-        Selection: a table of box_m, ball_m or indices, or the name of a point array or physical
-        group.
+        Selection: a table of box_m, ball_m, face or indices, or the name of a point array or
+        physical group.
     poses : PoseSequence or (T, 4, 4) array
         Where they are held.
     from_s : float

@@ -12,7 +12,7 @@ from pydantic import model_validator
 from ..arrays import Index
 from ..checked import Positive, Text, Whole
 from ..errors import InputError
-from ..fem.selection import Ball, Box, Indices, Named, Selection
+from ..fem.selection import Ball, Box, Face, FaceName, Indices, Named, Selection
 from ..section import ByForm, Corner, Section, Vector, require_one
 from .arrays import read_only_nodes
 
@@ -29,6 +29,9 @@ class NodesSection(Section):
         Lowest and highest corner [[x, y, z], [x, y, z]].
     ball_m : list, optional
         Centre and radius [[x, y, z], radius].
+    face : str, optional
+        top or bottom: nodes with the highest or lowest z of the body; side_x or side_y: nodes with
+        its lowest x or y that are on neither.
     indices : list of int, optional
         List of node numbers as in the mesh file, counted from 0.
     name : str, optional
@@ -38,6 +41,7 @@ class NodesSection(Section):
 
     box_m: tuple[Corner, Corner] | None = None
     ball_m: tuple[Vector, Positive] | None = None
+    face: FaceName | None = None
     indices: list[Whole] | None = None
     name: Text | None = None
 
@@ -50,7 +54,13 @@ class NodesSection(Section):
 Nodes = Annotated[Text | NodesSection, ByForm(str)]
 
 
-KINDS: dict[str, Any] = {"box_m": Box, "ball_m": Ball, "indices": Indices, "name": Named}
+KINDS: dict[str, Any] = {
+    "box_m": Box,
+    "ball_m": Ball,
+    "face": Face,
+    "indices": Indices,
+    "name": Named,
+}
 
 
 def selection(section: NodesSection | str) -> Selection:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,11 @@ def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> Non
     _write_csv(path, header, np.column_stack([np.asarray(t_s), rows[:, there]]))
 
 
+def write_columns_csv(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
+    """Write columns (T,) under their names, blank for NaN."""
+    _write_csv(path, [*columns], np.column_stack([np.asarray(each) for each in columns.values()]))
+
+
 def write_gauge_csv(
     path: str | Path, t_s: ArrayLike, names: Sequence[str], values: ArrayLike
 ) -> None:
@@ -58,5 +63,5 @@ def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
     with whole_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
-        for row in values:
+        for row in values + 0.0:  # without the sign of a zero
             writer.writerow("" if math.isnan(value) else _DIGITS % value for value in row)

@@ -1,4 +1,7 @@
-"""A run as a film: the body as fitted beside its forward simulation, with measured markers."""
+"""A run as a film: the body as fitted, edges of its forward simulation over it, and markers.
+
+Beside it is how far the markers are from their measurements over time.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,14 @@ from matplotlib import rc_context
 from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import InputError, require_among
 from ..files import safe_name, whole_file
 from .pictures.camera import Camera
+from .pictures.over_time import rms_over_markers
 from .pictures.scene import (
     Drawn,
     View,
@@ -30,12 +35,15 @@ from .pictures.scene import (
     with_outlines,
 )
 from .replay import Replay, headline, read_run, reading_run
-from .style import TEXT_PT
+from .style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, dress, legend_above
 
 WIDTH_MM, TALLEST_MM, LOWEST_MM = 160.0, 110.0, 30.0
 # GIF packs badly. H.264 wants even numbers of pixels either way, see `_even`.
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
 HEAD_MM, FOOT_MM, LINE_MM = 12.0, 12.0, 5.0
+# Room for the distance of the markers over time, beside the body; and the colour of their paths.
+ERRORS_MM = 60.0
+PATH = "#C4CBD4"
 MOST_FRAMES = 3000
 # Of a static experiment, however long it took.
 STATES_A_SECOND = 8
@@ -183,7 +191,10 @@ class Film:
         beside = with_outlines(outer, None if outlines_m is None else outlines_m[there])
         seen_m = [rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.seen.values()]
         everything = np.vstack([beside.reshape(-1, 3), replay.measured_m.reshape(-1, 3), *seen_m])
-        width = WIDTH_MM / len(told)
+        compared = [
+            (n, m) for n, _, m in told if m.size and np.isfinite(m - replay.measured_m).any()
+        ]
+        width = WIDTH_MM - (ERRORS_MM if compared else 0.0)
         aspect = width_over_height(camera, everything)
         height = float(np.clip((width - 8) / aspect, LOWEST_MM, TALLEST_MM))
         head = HEAD_MM + (LINE_MM if headline else 0.0)
@@ -192,15 +203,40 @@ class Film:
         self.figure.set_facecolor("white")
         axes.text(WIDTH_MM / 2, total - 3, headline, ha="center", va="top", fontsize=TEXT_PT)
         self.panels = []
+        view = View.fitting(camera, everything, (width - 8, height), (4, FOOT_MM))
+        for path_m in np.moveaxis(replay.measured_m, 1, 0):
+            axes.plot(*view.places(path_m).T, color=PATH, lw=0.6, zorder=0.2)
+        shape = replay.surface, replay.surface_parts, replay.surface_nodes
         for k, (name, positions, markers) in enumerate(told):
-            corner = (k * width + 4, FOOT_MM)
-            view = View.fitting(camera, everything, (width - 8, height), corner)
             top = total - 3 - (head - HEAD_MM)
-            title = axes.text(corner[0], top, "", va="top", fontsize=TEXT_PT, zorder=6)
-            body = Drawn(axes, view, replay.surface, replay.surface_parts, replay.surface_nodes)
+            wire = GREEN if k else None
+            title = axes.text(
+                4 + k * WIDTH_MM / 4, top, "", va="top", fontsize=TEXT_PT, zorder=6,
+                color=wire or BLACK,
+            )  # fmt: skip
+            body = Drawn(axes, view, *shape, wire=wire)
             self.panels.append((name, positions, markers, body, title))
         self._surround(axes, camera, view.mm_per_m, total)
+        self.cursor = self._draw_errors(compared, width, height, total) if compared else None
         self.clock = axes.text(WIDTH_MM - 4, 4.0, "", ha="right", va="center", fontsize=TEXT_PT)
+
+    def _draw_errors(
+        self, compared: Sequence[tuple[str, Array]], left_mm: float, height_mm: float, total: float
+    ) -> Line2D:
+        """Draw the distance of the markers (T, M, 3) over time, and return the line of the time."""
+        t_s = self.replay.t_s - self.replay.t_s[0]
+        place = left_mm + 12, FOOT_MM + 9, ERRORS_MM - 16, min(height_mm - 12, 45.0)
+        panel = self.figure.add_axes(
+            (place[0] / WIDTH_MM, place[1] / total, place[2] / WIDTH_MM, place[3] / total)
+        )
+        for (name, markers), colour in zip(compared, (BLUE, GREEN), strict=False):
+            squares = np.sum((markers - self.replay.measured_m) ** 2, axis=2)
+            style = {"color": colour, "lw": LINE_PT, "ls": "-" if colour == BLUE else (0, (4, 2))}
+            panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
+        dress(panel, "", "time [s]", "markers, RMS [mm]")
+        panel.set_ylim(bottom=0.0)
+        legend_above(panel, columns=1)
+        return panel.axvline(0.0, color=BLACK, lw=0.8)
 
     def _surround(self, axes: Axes, camera: Camera, mm_per_m: float, total: float) -> None:
         draw_directions(axes, camera, (7.0, 4.0))
@@ -222,6 +258,9 @@ class Film:
             present = distances[np.isfinite(distances)]
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
             title.set_text(name if markers is replay.measured_m else f"{name}: {off}")
+        if self.cursor is not None:
+            now_s = replay.t_s[t] - replay.t_s[0]
+            self.cursor.set_xdata([now_s, now_s])
         self.clock.set_text(f"{replay.t_s[t] - replay.t_s[0]:.2f} s")
 
 

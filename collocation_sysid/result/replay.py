@@ -28,6 +28,8 @@ from ..runs.result import Result
 ARRAYS_FILE = "trajectory.npz"
 # What stands before the number of a wrench, and the names of readings of one's own and of fields.
 WRENCH, GROUPS = "wrench_", {"readings": "reading_", "fields": "field_", "seen": "seen_"}
+# What stands before the name of a reading whose unit it is.
+UNIT = "unit_"
 # Of the body, and so the same for all experiments of a run.
 OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes,
@@ -92,6 +94,8 @@ class Replay:
     static : bool
         Whether every sample is an equilibrium of its own.
     tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
+    reading_units : mapping of name to str
+        Units of the readings that state one.
     obstacles_m : (T, o, 3) points of the obstacles' outlines, NaN after each line
     fields : mapping of name to (E, 4)
         Constants that differ from place to place: value, the ends of its interval, and its
@@ -131,6 +135,7 @@ class Replay:
     pressures_pa: Array | None = None
     fields: Mapping[str, Array] = field(default_factory=dict)
     seen: Mapping[str, Array] = field(default_factory=dict)
+    reading_units: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -179,6 +184,7 @@ class Replay:
             readings or {},
             _outlines(experiment),
             *(touched or (None, None)),
+            reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit},
         )
 
     @property
@@ -218,6 +224,7 @@ class Replay:
         stored |= {f"{WRENCH}{k}": values for k, values in enumerate(self.wrenches, start=1)}
         for group, front in GROUPS.items():
             stored |= {f"{front}{name}": values for name, values in getattr(self, group).items()}
+        stored |= {f"{UNIT}{n}": np.array(unit) for n, unit in self.reading_units.items()}
         there = {key: value for key, value in stored.items() if value is not None}
         return {key if key in OF_BODY else prefix + key: value for key, value in there.items()}
 
@@ -241,6 +248,11 @@ class Replay:
         for group, front in GROUPS.items():
             said = f"{prefix}{front}"
             stored[group] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
+        stored["reading_units"] = {
+            name: str(arrays[at])
+            for name in stored["readings"]
+            if (at := f"{prefix}{UNIT}{name}") in arrays
+        }
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)
         stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,6 +75,10 @@ CAPTIONS = {
 }
 
 
+# Pictures that show measurement and fit, one of which leads the page.
+COMPARED = ("tracks", "wrench", "reading", "depth")
+
+
 def summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
     """A run on one screen, with all of its budget where that is asked for, and its folder."""
     largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
@@ -105,12 +109,14 @@ def run_report(run: str | Path) -> Section:
         verdict = verdict_of(result.trust, linked=True)
         took = f" {result.method}, {result.iterations} iterations; {_elapsed(result.elapsed_s)}"
         badge = Span(result.status, f"badge {result.trust.verdict}")
+        pictures = _pictures(run)
         meaning = Line(f"{MEANINGS[result.trust.verdict]}.", "quiet")
         parts: list[Shown] = [
             Line((badge, Span(took)), "quiet"),
             replace(verdict, parts=(verdict.parts[0], meaning, *verdict.parts[1:])),
             _cards(result),
             *flat([_ended(result)]),
+            *pictures[:1],
             Section("What to do", (*_cures(result.trust.concerns), *_harder(result))),
             _parameters(result),
             Section("Error bars", tuple(_error_bars(result))),
@@ -120,7 +126,7 @@ def run_report(run: str | Path) -> Section:
             *_places(result),
             *_nuisance(result),
             Section("Residuals", tuple(_residuals(result, run))),
-            Section("Pictures", tuple(_pictures(run))),
+            Section("Pictures", tuple(pictures[1:])),
             Section("Problem and provenance", tuple(_provenance(result, run))),
         ]
         there = (each for each in parts if not isinstance(each, Section) or each.parts)
@@ -304,8 +310,9 @@ def _fit(result: Result) -> Section:
             sigma = _forces(each.wrench_sigma_n, each.wrench_sigma_nm)
             lines.append(f"wrench of '{name}': {sizes} RMS (sigma {sigma})")
         for reading, rms in (each.reading_rms or {}).items():
+            unit = _unit(each.reading_unit, reading)
             sigma = short((each.reading_sigma or {})[reading])
-            lines.append(f"{reading} of '{name}': {short(rms)} RMS (sigma {sigma})")
+            lines.append(f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})")
         unit = "J in the modelled part" if name in (fit.symmetry or {}) else "J"
         for obstacle, rubbed in (each.friction or {}).items():
             energy = f"{short(rubbed.dissipated_j)} {unit}"
@@ -359,29 +366,42 @@ def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
         reading_rms=simulated.reading_rms,
         depth=simulated.depth,
     )
-    yield f"{kind} '{name}': {_errors(own) or 'compared with nothing'}"
+    units = simulated.reading_unit
+    yield f"{kind} '{name}': {_errors(own, units) or 'compared with nothing'}"
     if simulated.fitted:
         return
     if simulated.blind is not None:
-        blind = _errors(simulated.blind)
+        blind = _errors(simulated.blind, units)
         yield f"  with the nuisance parameters of the fitted recordings (blind): {blind}"
     if simulated.copied is not None:
         copied = simulated.copied
-        yield f"  the measurements of '{copied.copied}' copied: {_errors(copied.error)}"
+        yield f"  the measurements of '{copied.copied}' copied: {_errors(copied.error, units)}"
     elif simulated.not_copied:
         yield f"  no copy as a yardstick: {simulated.not_copied}"
 
 
-def _errors(error: PredictionError) -> str:
-    """Return the errors of a prediction in words; "" if nothing is compared."""
+def _errors(error: PredictionError, units: Mapping[str, str] | None) -> str:
+    """Return the errors of a prediction in words; "" if nothing is compared.
+
+    `units` are those of readings, by name.
+    """
     said = []
     if error.rms_m:  # none without markers
         said.append(f"{_mm(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
     if forces := _forces(error.wrench_rms_n, error.wrench_rms_nm):
         said.append(f"{forces} RMS")
-    said += [f"{reading} {rms:.2g} RMS" for reading, rms in (error.reading_rms or {}).items()]
+    said += [
+        f"{reading} {rms:.2g}{_unit(units, reading)} RMS"
+        for reading, rms in (error.reading_rms or {}).items()
+    ]
     said += [f"depth of {camera} {_depth(each)}" for camera, each in (error.depth or {}).items()]
     return "; ".join(said)
+
+
+def _unit(units: Mapping[str, str] | None, reading: str) -> str:
+    """Return the unit of a reading behind a space; empty where none is stated."""
+    unit = (units or {}).get(reading, "")
+    return f" {unit}" if unit else ""
 
 
 def _depth(error: DepthError) -> str:
@@ -528,9 +548,10 @@ def _worst_errors(run: Path) -> list[tuple[float, float, str]]:
     return sorted(worst, key=lambda each: -each[0])[:WORST]
 
 
-def _pictures(run: Path) -> Iterator[Picture]:
-    """Every PNG of the folder, those known here first."""
+def _pictures(run: Path) -> list[Picture]:
+    """Every PNG of the folder: first one of measurement and fit, then those known here."""
     order = [*CAPTIONS, ""]
+    pictures: list[Picture] = []
 
     def kind(file: Path) -> str:
         return next(k for k in order if file.stem.startswith(k))
@@ -538,7 +559,10 @@ def _pictures(run: Path) -> Iterator[Picture]:
     for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):
         about = file.stem.removeprefix(kind(file)).strip("_")
         caption = CAPTIONS.get(kind(file), file.stem)
-        yield Picture(file, f"{about}: {caption}" if about and kind(file) else caption)
+        pictures.append(Picture(file, f"{about}: {caption}" if about and kind(file) else caption))
+    compared = (each for each in pictures if kind(each.file) in COMPARED)
+    first = next(compared, None)
+    return pictures if first is None else [first, *(p for p in pictures if p is not first)]
 
 
 def _provenance(result: Result, run: Path) -> Iterator[Shown]:

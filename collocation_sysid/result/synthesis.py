@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +14,18 @@ from ..errors import InputError, require_among
 from ..files import whole_file
 from ..model.schemes import SCHEMES
 from ..problem import Problem
+from ..problem.bench_files import BenchTable, add_wrench, bench_tables, is_bench, table_name
+from ..problem.reading import parse_toml
+from ..problem.recording_schema import ExperimentSection, WrenchSection
+from ..problem.schema import ProblemFile
 from ..program.simulation import NEWMARK, Trajectory, simulate
 from ..recording import (
     Experiment,
     write_gauge_csv,
     write_markers_csv,
     write_poses_csv,
-    write_wrench_csv,
 )
+from ..recording.writers import write_columns_csv
 from ..written_files import LIST_FILE, hashes_of, is_written_here, list_as_text, listed_hashes
 from .writers import (
     FRAMES_FILE,
@@ -31,6 +35,9 @@ from .writers import (
     run_folder,
     write_frames,
 )
+
+# The key of the file of markers, see `_table_names`.
+_MARKERS = "markers"
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,8 @@ class Recipe(Options):
     noise_m : float
         Standard deviation of the markers' noise.
     noise_n : float
-        That of measured forces.
+        That of measured forces, as the sensor measures them: of a modelled quarter, for which the
+        problem states ``symmetry = 4``, that of the whole.
     noise_nm : float
         That of measured torques.
     noise_own : float
@@ -88,10 +96,13 @@ def write_data(
     ----------
     problem : Problem
     folder : str or Path
-        Made where it is missing; gets ``<experiment>_markers.csv``, ``<experiment>_poses.csv``
-        (``_poses_2`` … for further grasps), ``<experiment>_wrench.csv`` (``_wrench_2`` …) of
-        grasps whose wrench is measured, ``<experiment>_reading_<name>.csv`` of readings of one's
-        own, and ``<experiment>/`` with frames when asked for.
+        Made where it is missing; gets ``<experiment>_markers.csv`` where there are markers,
+        ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) of grasps whose
+        poses the problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) of grasps whose
+        wrench is measured, ``<experiment>_reading_<name>.csv`` of readings of one's own, and
+        ``<experiment>/`` with frames when asked for. An experiment that is displaced by a table,
+        as on a test bench, gets its tables of displacement and load under the names that the
+        problem file has for them in place of poses and wrenches.
     recipe : Recipe, optional
         Without noise by default.
     progress : callable, optional
@@ -113,7 +124,11 @@ def write_data(
     """
     place, recipe = Path(folder), recipe or Recipe()
     _refuse_unguessed(problem)
-    _refuse_foreign(problem, place)
+    sections = _sections(problem)
+    names = [_table_names(each, sections.get(each.name)) for each in problem.experiments]
+    _refuse_shared(problem, names)
+    files = [place / name for named in names for name in named.values()]
+    _refuse_foreign(problem, place, files)
     for experiment in problem.experiments if recipe.frames else ():
         require_replaceable(place / experiment.name, mark=FRAMES_FILE, what="simulation")
     rng = np.random.default_rng(recipe.seed)
@@ -129,14 +144,17 @@ def write_data(
         )
         for experiment in problem.experiments
     ]
-    written = []
+    written: list[Path] = []
     drafts_of: dict[Path, Path] = {}
     with ExitStack() as whole:  # all files appear at its end, or none
-        for experiment, trajectory in zip(problem.experiments, simulated, strict=True):
-            files = _tables(experiment, place)
+        for experiment, trajectory, named in zip(
+            problem.experiments, simulated, names, strict=True
+        ):
+            section, files = sections.get(experiment.name), [place / n for n in named.values()]
             drafts = [whole.enter_context(whole_file(file)) for file in files]
             drafts_of |= dict(zip(files, drafts, strict=True))
-            _write_tables(experiment, trajectory, drafts, rng, recipe)
+            by_key = dict(zip(named, drafts, strict=True))
+            _write_tables(experiment, section, trajectory, by_key, rng, recipe)
             written += files
             if recipe.frames:
                 folder, body = place / experiment.name, experiment.body
@@ -153,25 +171,49 @@ def write_data(
 
 def _write_tables(
     experiment: Experiment,
+    section: ExperimentSection | None,
     trajectory: Trajectory,
-    files: Sequence[Path],
+    files: Mapping[str, Path],
     rng: np.random.Generator,
     recipe: Recipe,
 ) -> None:
-    """Write markers, poses and wrenches into the files of `_tables`."""
+    """Write what is measured and how grasps move into the files of `_table_names`, by key."""
     noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
     names, tracks = experiment.markers.names, trajectory.markers_m + noise
-    left = iter(files)
-    write_markers_csv(next(left), experiment.t_s, names, tracks)
-    for grasp in experiment.grasps:
-        write_poses_csv(next(left), grasp.poses)
-    for sensor, wrench in zip(experiment.wrenches, trajectory.wrenches, strict=True):
+    if _MARKERS in files:
+        write_markers_csv(files[_MARKERS], experiment.t_s, names, tracks)
+    for k, grasp in enumerate(experiment.grasps):
+        if (key := _numbered("poses", k)) in files:
+            write_poses_csv(files[key], grasp.poses)
+    layouts = _wrench_layouts(section) or [WrenchSection.model_construct()] * len(
+        experiment.wrenches
+    )
+    wrenches = []
+    for sensor, wrench, layout in zip(
+        experiment.wrenches, trajectory.wrenches, layouts, strict=True
+    ):
         measured = np.where(sensor.measured, wrench, np.nan)
-        noise = np.repeat([recipe.noise_n, recipe.noise_nm], 3) * rng.normal(size=wrench.shape)
-        write_wrench_csv(next(left), sensor.t_s, measured + noise)
+        # The load cell's noise: that of the modelled part is as much smaller as its load.
+        sigmas = np.repeat([recipe.noise_n, recipe.noise_nm], 3) / layout.symmetry
+        wrenches.append(measured + sigmas * rng.normal(size=wrench.shape))
+    if section is not None and is_bench(section):
+        for name, table in bench_tables(section, experiment, wrenches).items():
+            write_columns_csv(files[name], table.columns)
+    else:
+        for k, (sensor, layout) in enumerate(zip(experiment.wrenches, layouts, strict=True)):
+            table = BenchTable(sensor.t_s)
+            add_wrench(table, layout, sensor.t_s, wrenches[k])
+            write_columns_csv(files[_numbered("wrench", k)], table.columns)
     for gauge, read in zip(experiment.readings, trajectory.readings, strict=True):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
-        write_gauge_csv(next(left), gauge.times, gauge.columns, read + noise)
+        key = f"reading_{gauge.name}"
+        write_gauge_csv(files[key], gauge.times, gauge.columns, read + noise)
+
+
+def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
+    """How the tables of the sensors are read, in their order; empty for a problem without file."""
+    moved = section.moved if section is not None else []
+    return [each.wrench for each in moved if each.wrench is not None]
 
 
 def _refuse_unguessed(problem: Problem) -> None:
@@ -184,36 +226,74 @@ def _refuse_unguessed(problem: Problem) -> None:
         )
 
 
-def _refuse_foreign(problem: Problem, place: Path) -> None:
+def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> None:
     """Refuse a folder with files of others, and to overwrite one that the problem reads.
 
     What the problem reads may be a recording. Its own folder may have other files.
     """
     require_no_link(place)
     read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
-    for experiment in problem.experiments:
-        for file in _tables(experiment, place):
-            if file.exists() and file.resolve() in read:
-                raise InputError(
-                    f"{problem.path} reads this file, so it is not overwritten; choose another "
-                    "folder, or move it away",
-                    file,
-                )
-            if (file.exists() or file.is_symlink()) and not is_written_here(file):
-                raise InputError(
-                    "is there and was not written by this program, or was changed since, so it is "
-                    "not overwritten; choose another folder, or move it away",
-                    file,
-                )
+    for file in files:
+        if file.exists() and file.resolve() in read:
+            raise InputError(
+                f"{problem.path} reads this file, so it is not overwritten; choose another "
+                "folder, or move it away",
+                file,
+            )
+        if (file.exists() or file.is_symlink()) and not is_written_here(file):
+            raise InputError(
+                "is there and was not written by this program, or was changed since, so it is "
+                "not overwritten; choose another folder, or move it away",
+                file,
+            )
     at_home = problem.path is not None and problem.path.resolve().parent == place.resolve()
     if place.is_dir() and not at_home:
         require_only_written(place)
 
 
-def _tables(experiment: Experiment, place: Path) -> list[Path]:
-    """The marker file, one of poses for each grasp, and one for each sensor and own reading."""
-    kinds = [("poses", k) for k in range(len(experiment.grasps))]
-    kinds += [("wrench", k) for k in range(len(experiment.wrenches))]
-    names = [f"{kind}_{k + 1}" if k else kind for kind, k in kinds]
-    names += [f"reading_{gauge.name}" for gauge in experiment.readings]
-    return [place / f"{experiment.name}_{name}.csv" for name in ("markers", *names)]
+def _sections(problem: Problem) -> dict[str, ExperimentSection]:
+    """How the problem file reads each experiment, by name; empty without a file."""
+    if (origin := problem.origin) is None:
+        return {}
+    file = ProblemFile.model_validate(parse_toml(origin.text, origin.path))
+    return {section.name: section for section in file.experiment}
+
+
+def _table_names(experiment: Experiment, section: ExperimentSection | None) -> dict[str, str]:
+    """The names of the files of an experiment, by what they hold: markers, poses_2, …
+
+    Those of a bench are the problem's own.
+    """
+    keys = [_MARKERS] * bool(experiment.markers.names)
+    for k in range(len(experiment.grasps)):
+        moved = section and section.moved[k]
+        if moved is None or moved.poses is not None or moved.markers is not None:
+            keys.append(_numbered("poses", k))
+    bench: list[str] = []
+    if section is not None and is_bench(section):
+        tables = [t for each in section.moved for t in (each.displacement, each.wrench) if t]
+        bench = [table_name(section, table) for table in tables]
+    else:
+        keys += [_numbered("wrench", k) for k in range(len(experiment.wrenches))]
+    keys += [f"reading_{gauge.name}" for gauge in experiment.readings]
+    return {key: f"{experiment.name}_{key}.csv" for key in keys} | {name: name for name in bench}
+
+
+def _numbered(kind: str, index: int) -> str:
+    """The key of a file by its index, counted from 0: poses, poses_2, …"""
+    return f"{kind}_{index + 1}" if index else kind
+
+
+def _refuse_shared(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
+    """Refuse experiments that read the same file, of which a simulation has one for each."""
+    owners: dict[str, str] = {}
+    for experiment, files in zip(problem.experiments, names, strict=True):
+        for name in files.values():
+            if name in owners:
+                raise InputError(
+                    f"is read by '{owners[name]}' too, and a simulation gives each its own; "
+                    f"expected another file than {name}",
+                    problem.path,
+                    f"experiment '{experiment.name}': file",
+                )
+            owners[name] = experiment.name

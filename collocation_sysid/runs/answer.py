@@ -236,6 +236,16 @@ class Answer:
         """
         return _or_nan(self._estimate(name).combined_std_error)
 
+    def nuisance(self, name: str) -> float:
+        """Return the value of a nuisance parameter of a recording, see `Solution.nuisance`.
+
+        Raises
+        ------
+        InputError
+            If none, or several with different values, are called so.
+        """
+        return self.solution.nuisance(name)
+
     def to_frame(self) -> Any:
         """Return the estimates as a pandas DataFrame, one row each.
 

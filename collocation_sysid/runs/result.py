@@ -236,6 +236,8 @@ class FittedExperiment:
         What was estimated of this recording alone, in words.
     wrench_sigma_n, wrench_sigma_nm, reading_sigma
         What is stated of the noise.
+    reading_unit : mapping of name to str, optional
+        Units of the readings that state one.
     friction : by obstacle, of those that rub
     depth : by depth camera, distances of its points from the fitted surface
     air_density_kg_m3 : float
@@ -253,6 +255,7 @@ class FittedExperiment:
     wrench_sigma_n: float | None = optional()
     wrench_sigma_nm: float | None = optional()
     reading_sigma: Mapping[str, float] | None = optional()
+    reading_unit: Mapping[str, str] | None = optional()
     friction: Mapping[str, Rubbing] | None = optional()
     depth: Mapping[str, DepthError] | None = optional()
     air_density_kg_m3: float = 0.0
@@ -299,6 +302,7 @@ class SimulatedExperiment:
     failed: str | None = optional()
     rms_m: float | None = optional()
     max_m: float | None = optional()
+    reading_unit: Mapping[str, str] | None = optional()
     nuisance: Mapping[str, float] | None = optional()
     places_m: Mapping[str, tuple[float, ...]] | None = optional()
     wrench_rms_n: float | None = optional()

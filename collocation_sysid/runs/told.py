@@ -204,6 +204,7 @@ def _fit(answer: Answer) -> FoundFit:
             reading_rms(experiment, solution.readings[name]) or None,
             *(root_mean(each[np.isfinite(each)]) or None for each in both),
             reading_sigma={gauge.name: gauge.sigma for gauge in experiment.readings} or None,
+            reading_unit=_units(experiment),
             depth=depths.get(name),
             friction=rubbings(experiment, part.setting.dynamics, part.x) or None,
             air_density_kg_m3=experiment.air_density_kg_m3,
@@ -231,6 +232,11 @@ def _simulated(answer: Answer) -> FoundRollout:
     return FoundRollout(float(np.sqrt(total / max(1, count))), max(largest), experiments)
 
 
+def _units(experiment: Experiment) -> dict[str, str] | None:
+    """Units of the readings that state one, by name; None where none does."""
+    return {gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit} or None
+
+
 def _compared(answer: Answer, experiment: Experiment) -> SimulatedExperiment:
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
@@ -245,6 +251,7 @@ def _compared(answer: Answer, experiment: Experiment) -> SimulatedExperiment:
         wrench_rms_n=force,
         wrench_rms_nm=torque,
         reading_rms=simulated.reading_rms or None,
+        reading_unit=_units(experiment),
         depth=simulated.depth or None,
         copied=simulated.copied if isinstance(simulated.copied, CopyError) else None,
         not_copied=simulated.copied if isinstance(simulated.copied, str) else None,

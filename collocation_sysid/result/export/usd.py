@@ -44,6 +44,15 @@ REGIONS = (
     "material a body, as Newton 1.8, takes that of the largest"
 )
 TIED = "point masses on nodes are left out"
+TILT = (
+    "gravity points {degrees:.3g}° away from −z of the stage, as was found of the recording; a "
+    "simulator that takes its magnitude alone, and lets it point along −z, leaves that out"
+)
+UNMOVED = "the points of the body are those of the first sample: the run has no forward simulation"
+# Gravity counts as tilted from here on [°]: single precision of its direction rounds to less.
+LEAST_TILT_DEG = 1e-3
+# Frames per second of a single sample, which has no rate of its own.
+SINGLE_RATE_HZ = 24.0
 AXES = "nodes that are held along single axes only are free"
 
 
@@ -60,11 +69,19 @@ def export(body: Identified) -> Exported:
     limits += [TIED] * bool(body.tied_kg.any())
     limits += [REGIONS] * (len(body.regions) > 1)
     limits += [AXES] * bool((body.held.any(axis=1) != body.grasped).any())
+    limits += [UNMOVED] * (body.rolled_out_m is None)
+    tilt_deg = _tilt_deg(body.experiment.gravity_m_s2)
+    limits += [TILT.format(degrees=tilt_deg)] * (tilt_deg > LEAST_TILT_DEG)
     stage = pxr.Usd.Stage.CreateInMemory()
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     pxr.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(1.0)  # time codes are seconds
+    t_s = body.experiment.t_s
+    rate_hz = _rate_hz(t_s)
+    stage.SetTimeCodesPerSecond(rate_hz)
+    stage.SetFramesPerSecond(rate_hz)
+    stage.SetStartTimeCode(float(rate_hz * t_s[0]))
+    stage.SetEndTimeCode(float(rate_hz * t_s[-1]))
     world = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
     stage.SetDefaultPrim(world)
     world.SetDocumentation(heading(body, limits, ""))
@@ -80,6 +97,17 @@ def export(body: Identified) -> Exported:
     for k, obstacle in enumerate(body.obstacles, start=1):
         _obstacle(pxr, stage, f"/World/Obstacle_{k}", obstacle, body)
     return Exported({STAGE: stage.GetRootLayer().ExportToString()}, tuple(limits))
+
+
+def _rate_hz(t_s: Array) -> float:
+    """Time codes per second: one for each sample (T,), on average where samples are uneven."""
+    return (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
+
+
+def _tilt_deg(gravity_m_s2: Array) -> float:
+    """Angle between gravity (3,) and −z [°]; 0 without gravity."""
+    downwards, across = -gravity_m_s2[2], np.linalg.norm(gravity_m_s2[:2])
+    return float(np.degrees(np.arctan2(across, downwards))) if gravity_m_s2.any() else 0.0
 
 
 def _library() -> Any:
@@ -100,7 +128,13 @@ def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
     prim = mesh.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableSimAPI")
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
-    mesh.CreatePointsAttr(placed_m.astype(np.float32))
+    # A simulator begins with the default; the samples are played back where nothing is simulated.
+    points = mesh.CreatePointsAttr(placed_m.astype(np.float32))
+    t_s = body.experiment.t_s
+    codes = (_rate_hz(t_s) * t_s).tolist()
+    if body.rolled_out_m is not None:
+        for code, shape_m in zip(codes, body.rolled_out_m, strict=True):
+            points.Set(shape_m.astype(np.float32), code)
     mesh.CreateTetVertexIndicesAttr(np.concatenate(cells).astype(np.int32))
     mesh.CreateSurfaceFaceVertexIndicesAttr(pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh))
     number = pxr.Sdf.ValueTypeNames
@@ -182,11 +216,15 @@ def _gripper(
 
 
 def _put(pxr: Any, prim: Any, places_m: Array, turns: Rotation, t_s: Array) -> None:
-    """Where something is (T, 3), and turned how; at the first of the times by default."""
+    """Place something at (T, 3) with rotations, at times (T,); by default as in the first row.
+
+    Without times, the one row is for all time.
+    """
+    codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = turns.as_quat(scalar_first=True)
     place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
     turn = prim.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble)
-    for k, time in enumerate([pxr.Usd.TimeCode.Default(), *t_s.tolist()]):
+    for k, time in enumerate([pxr.Usd.TimeCode.Default(), *codes]):
         row = max(k - 1, 0)
         place.Set(pxr.Gf.Vec3d(*places_m[row].tolist()), time)
         turn.Set(pxr.Gf.Quatd(*wxyz[row].tolist()), time)

@@ -83,7 +83,9 @@ def _of_experiment(replay: Replay) -> Iterator[tuple[str, Figure]]:
     for name, said in replay.readings.items():
         places = said.shape[1] // 3
         names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
-        yield f"reading_{replay.name}_{name}", readings_picture(said, names)
+        unit = replay.reading_units.get(name)
+        units = [unit] * places if unit else []
+        yield f"reading_{replay.name}_{name}", readings_picture(said, names, units)
     for name, seen in replay.seen.items():
         yield f"depth_{replay.name}_{name}", depth_picture(seen)
     if replay.has_shapes:

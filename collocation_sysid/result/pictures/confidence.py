@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
@@ -20,6 +19,7 @@ from ..style import (
     BLACK,
     BLUE,
     COLUMN_MM,
+    CYCLE,
     SKY,
     SMALL_PT,
     TEXT_PT,
@@ -182,9 +182,14 @@ def correlation_matrix(known: Confidence) -> Figure:
     return figure
 
 
-# Sources below this share of every variance are drawn together.
+# Sources below this share of every variance are drawn together, and so are all but the largest, of
+# which there are as many as colours that can be told apart.
 LITTLE = 0.03
 OTHERS = "others"
+GREY = "#B4B4B4"
+# Of the legend: columns, and the height of a line.
+LEGEND_COLUMNS = 2
+LEGEND_LINE_MM = 3.8
 
 
 def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
@@ -194,22 +199,28 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
     ----------
     shares : mapping of estimate to mapping of source to its share of the variance
     """
-    drawn = largest_first(shares, LITTLE)
+    drawn = largest_first(shares, LITTLE)[: len(CYCLE)]
     rows = list(shares)[::-1]
-    figure = framed_figure(COLUMN_MM, 30 + 7 * len(rows), 14, 4, 10, 20)
+    sources = [*drawn, OTHERS]
+    legend_mm = LEGEND_LINE_MM * -(-len(sources) // LEGEND_COLUMNS) + 3
+    figure = framed_figure(COLUMN_MM, 12 + legend_mm + 7 * len(rows), 14, 4, 10, legend_mm)
     axes, left = figure.subplots(), [0.0] * len(rows)
-    colours = colormaps["tab20"](range(20))
-    for source, colour in zip([*drawn, OTHERS], colours, strict=False):
+    for source, colour in zip(sources, [*CYCLE[: len(drawn)], GREY], strict=True):
         widths = [
             1 - sum(shares[row].get(s, 0.0) for s in drawn)
             if source == OTHERS
             else shares[row].get(source, 0.0)
             for row in rows
         ]
-        axes.barh(range(len(rows)), widths, left=left, color=colour, label=worded(source))
+        bars = axes.barh(range(len(rows)), widths, left=left, color=colour, label=worded(source))
+        for bar in bars:  # a white line keeps neighbours apart
+            bar.set(edgecolor="white", linewidth=0.4)
         left = [a + b for a, b in zip(left, widths, strict=True)]
     axes.set_yticks(range(len(rows)), [mathematical(row) for row in rows])
     axes.set_xlim(0, 1)
     dress(axes, "", "share of the variance", "")
-    figure.legend(loc="upper center", ncols=3, frameon=False, fontsize="x-small")
+    figure.legend(
+        loc="upper left", ncols=LEGEND_COLUMNS, frameon=False, fontsize=SMALL_PT,
+        handlelength=1.2, labelspacing=0.3, columnspacing=1.5,
+    )  # fmt: skip
     return figure

@@ -43,7 +43,8 @@ def models(
 
 Box = tuple[float, float, float, float]
 
-MOST_MARKERS = 6
+# More markers make a figure higher than a page, in which it is scaled down to illegible numbers.
+MOST_MARKERS = 3
 ROW_MM, GAP_MM, LEGEND_MM, FOOT_MM = 27.0, 6.5, 12.0, 10.0
 LEFT_MM, RIGHT_MM, BETWEEN_MM = 15.0, 2.0, 10.0
 UPPER_SHARE = 0.64
@@ -163,7 +164,7 @@ def error_over_time(
             continue
         totals.append(float(1e3 * np.sqrt(np.nanmean(squares))))
         label = f"{label}: {totals[-1]:.3g} mm over all"
-        axes.plot(t_s, 1e3 * _rms_over_markers(squares), label=label, **style)
+        axes.plot(t_s, 1e3 * rms_over_markers(squares), label=label, **style)
     dress(axes, "", "time [s]", "RMS over markers [mm]")
     if totals and max(totals) > FAR_APART * min(totals) > 0:
         log_axis(axes)
@@ -174,7 +175,8 @@ def error_over_time(
     return figure
 
 
-def _rms_over_markers(squares: Array) -> Array:
+def rms_over_markers(squares: Array) -> Array:
+    """Return the root mean square distance (T,) by squares (T, M); NaN where none is present."""
     present = np.isfinite(squares)
     total = np.where(present, squares, 0.0).sum(axis=1)
     with np.errstate(invalid="ignore"):

@@ -105,6 +105,8 @@ class Drawn:
     surface : (F, 3)
     parts : (F,) the part of the body that each triangle belongs to; one part by default
     nodes : (F, k) the nodes of each triangle, of which grasped ones are marked; by default corners
+    wire : str, optional
+        Colour of the edges of its triangles, which alone are drawn then, over all else.
     """
 
     def __init__(
@@ -114,14 +116,18 @@ class Drawn:
         surface: Triangles,
         parts: NDArray[np.integer] | None = None,
         nodes: NDArray[np.integer] | None = None,
+        wire: str | None = None,
     ) -> None:
-        self.view, self.surface = view, surface
+        self.view, self.surface, self.wire = view, surface, wire
         self.nodes = surface if nodes is None else nodes
         numbers = np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(SKINS)
         self.skins = np.array([to_rgb(skin) for skin in SKINS])[numbers]
         self.edged = len(surface) <= EDGED
         self.skin = PolyCollection([], linewidths=0.3 if self.edged else 0.1, edgecolors=EDGE)
         self.skin.set_joinstyle("round")
+        if wire is not None:
+            self.skin.set(facecolor="none", edgecolor=wire, zorder=2.5)
+            self.skin.set_linewidth(0.6 if self.edged else 0.1)
         axes.add_collection(self.skin, autolim=False)
         self.grasped = axes.add_line(Line2D([], [], zorder=3, **_SQUARE))
         self.outlines = axes.add_line(Line2D([], [], zorder=0.5, lw=0.6, color=BLACK))
@@ -150,6 +156,8 @@ class Drawn:
             brightness = (1 + brightness) / 2
         colours: Any = brightness[:, None] * (self.skins if skins is None else skins)[faces]
         self.skin.set_verts(list(self.view.origin_mm + self.view.mm_per_m * polygons))
+        if self.wire is not None:
+            return
         self.skin.set_facecolor(colours)
         if not self.edged:
             self.skin.set_edgecolor(colours)

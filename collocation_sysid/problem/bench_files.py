@@ -1,0 +1,196 @@
+"""Tables of a test bench as its problem reads them, made of what a simulation gives.
+
+A problem states for each table which columns it has, along which axis and with which sign they are
+measured, and which part of the specimen the mesh is. These functions undo all of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePath
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import InputError
+from ..fem.body import Body
+from ..recording import Experiment, Grasp
+from ..recording.formats.columns import (
+    DISPLACEMENT,
+    FORCE,
+    FORCES,
+    SHIFTS,
+    STRAIN,
+    STRESS,
+    TIME,
+    TORQUES,
+    Quantity,
+    name_and_unit,
+)
+from ..recording.formats.units import si_factor
+from .recording_schema import DisplacementSection, ExperimentSection, TableSection, WrenchSection
+
+# What the time is called in a table some of whose columns have names of the user's own: beside
+# `t_s` a reader would refuse these.
+OTHER_TIME = "Time (s)"
+
+
+def length_m(table: DisplacementSection, body: Body) -> float | None:
+    """The undeformed length that a strain multiplies; None where displacements are measured."""
+    if table.length_m != "body":
+        return table.length_m
+    return float(np.ptp(body.nodes_m[:, "xyz".index(table.axis)]))
+
+
+def is_bench(section: ExperimentSection) -> bool:
+    """Whether a table says how a grasp or an obstacle is displaced."""
+    return any(moved.displacement is not None for moved in section.moved)
+
+
+def table_name(section: ExperimentSection, table: TableSection) -> str:
+    """The name of a table of a bench within the folder of a simulation.
+
+    That under which the problem reads it, without folders where it is none below the problem's.
+    """
+    path = PurePath(section.file_of(table) or f"{section.name}.csv")
+    is_below = not path.is_absolute() and ".." not in path.parts
+    return str(path) if is_below else path.name
+
+
+@dataclass
+class BenchTable:
+    """Columns over time by their names, in the order of their addition.
+
+    Parameters
+    ----------
+    t_s : (T,) array
+    time_column : str
+        Name of the time where the problem does not state it.
+    columns : dict of name to (T,) array
+    """
+
+    t_s: Array
+    time_column: str = TIME.column
+    columns: dict[str, Array] = field(default_factory=dict)
+
+    def add(
+        self, layout: TableSection, values: Mapping[str, Array], known: Sequence[Quantity]
+    ) -> None:
+        """Add columns of quantities, by key, in the file's units and under the file's names.
+
+        Parameters
+        ----------
+        layout : TableSection
+            The names of its columns.
+        values : mapping of key to (T,) array
+            In SI; the time is added to these.
+        known : sequence of Quantity
+            What the keys mean.
+
+        Raises
+        ------
+        InputError
+            If a column of that name has other values.
+        """
+        quantities = {quantity.key: quantity for quantity in (TIME, *known)}
+        time = {TIME.key: self.t_s}
+        for key, column in (time | dict(values)).items():
+            quantity = quantities[key]
+            usual = self.time_column if key == TIME.key else quantity.column
+            name = layout.columns.get(key, usual)
+            unit = name_and_unit(name)[1] or quantity.unit
+            in_unit = column / (si_factor(unit, quantity.dimension) or 1.0)
+            there = self.columns.setdefault(name, in_unit)
+            if not np.array_equal(there, in_unit, equal_nan=True):
+                raise InputError(
+                    f"two grasps read the column {name}, to which a simulation gives different "
+                    "values; expected columns = { … } that names one for each, or files of their "
+                    "own"
+                )
+
+
+def add_displacement(
+    table: BenchTable, layout: DisplacementSection, grasp: Grasp, rest_length_m: float | None
+) -> None:
+    """Add the shifts of a grasp at the times of the table, as `read_displacement` reads them."""
+    shifts_m = layout.sign * grasp.poses.at(table.t_s)[1]
+    along = shifts_m[:, "xyz".index(layout.axis)]
+    values = {"displacement": along, **dict(zip("xyz", shifts_m.T, strict=True))}
+    usual = ["displacement"] if grasp.zero in ("", layout.axis) else [*grasp.zero]
+    if rest_length_m is not None:
+        values["strain"] = along / rest_length_m
+        usual = ["strain"]
+    chosen = _mapped(layout) or usual
+    known = (*SHIFTS, DISPLACEMENT, STRAIN)
+    table.add(layout, {key: values[key] for key in chosen}, known)
+
+
+def add_wrench(table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Array) -> None:
+    """Add a wrench of the modelled part (S, 6), NaN where missing, as `read_wrench` reads it.
+
+    Parameters
+    ----------
+    table : BenchTable
+    layout : WrenchSection
+    at_s : (S,) array
+        Times of its samples, each near one of the table's rows; the other rows are left blank.
+    wrench : (S, 6) array
+        fx, fy, fz [N], tx, ty, tz [N m].
+    """
+    rows = np.searchsorted((table.t_s[1:] + table.t_s[:-1]) / 2, at_s)
+    whole = np.full((len(table.t_s), 6), np.nan)
+    whole[rows] = layout.sign * layout.symmetry * wrench
+    components = [quantity.key for quantity in (*FORCES, *TORQUES)]
+    values = dict(zip(components, whole.T, strict=True))
+    along = f"f{layout.axis}"
+    values["force"] = values[along]
+    measured = [key for key in components if np.isfinite(values[key]).any()]
+    usual = ["force"] if measured == [along] else measured
+    if layout.area_m2 is not None:
+        values["stress"] = values[along] / layout.area_m2
+        usual = ["stress"]
+    chosen = _mapped(layout) or usual
+    known = (*FORCES, *TORQUES, FORCE, STRESS)
+    table.add(layout, {key: values[key] for key in chosen}, known)
+
+
+def _mapped(layout: TableSection) -> list[str]:
+    """The quantities whose columns the problem names."""
+    return [key for key in layout.columns if key != TIME.key]
+
+
+def bench_tables(
+    section: ExperimentSection, experiment: Experiment, wrenches: Iterable[Array]
+) -> dict[str, BenchTable]:
+    """The tables of a bench by file name, see `table_name`.
+
+    Parameters
+    ----------
+    section : ExperimentSection
+        How the problem reads the experiment.
+    experiment : Experiment
+    wrenches : iterable of (S, 6) array
+        What each sensor of the experiment measures in the simulation, at its own times.
+
+    Raises
+    ------
+    InputError
+        If two grasps read the same column.
+    """
+    moved = list(zip(section.moved, experiment.grasps, strict=True))
+    stated_tables = [t for each in section.moved for t in (each.displacement, each.wrench) if t]
+    time = OTHER_TIME if any(table.columns for table in stated_tables) else TIME.column
+    tables: dict[str, BenchTable] = {}
+    for stated, grasp in moved:
+        if (layout := stated.displacement) is not None:
+            name = table_name(section, layout)
+            table = tables.setdefault(name, BenchTable(grasp.poses.t_s, time))
+            add_displacement(table, layout, grasp, length_m(layout, experiment.body))
+    measured = iter(wrenches)
+    for stated, grasp in moved:
+        if (sensed := stated.wrench) is not None and grasp.wrench is not None:
+            at_s = grasp.wrench.t_s
+            table = tables.setdefault(table_name(section, sensed), BenchTable(at_s, time))
+            add_wrench(table, sensed, at_s, next(measured))
+    return tables
