@@ -230,10 +230,9 @@ def test_settings_change_the_run(tiny):
 
 
 def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlier_one(tiny):
-    earlier = tiny / "run"
-    earlier.mkdir()
-    (earlier / "result.json").write_text("{}")
-    (earlier / "old.png").write_text("old")
+    with pictures_drawn():
+        assert run_command("solve", "problem.toml", "--out", "run").code == 0
+    assert (tiny / "run" / "budget.png").exists()
     short = settings(
         "solver.interior-point.max_iterations=2", "solver.interior-point.initial=simulation"
     )
@@ -249,7 +248,7 @@ def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlie
     assert result["parameters"]["mu_pa"]["statistical_std_error"] is None
     written = set(contents(tiny / "run"))
     assert {"trajectory.npz", "trajectory.pvd", "convergence.png", "problem.toml"} <= written
-    assert "old.png" not in written
+    assert "budget.png" not in written
 
 
 def test_pictures_may_be_left_out(tiny):

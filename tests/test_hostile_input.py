@@ -19,7 +19,7 @@ import pytest
 from problem_files import replace_cell, replace_text, run_command, settings
 
 from collocation_sysid import machine
-from collocation_sysid.apart import Failed, Limits, computed_apart
+from collocation_sysid.apart import Failed, ProcessLimits, computed_apart
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import (
@@ -119,7 +119,7 @@ def test_readers_that_do_not_find_the_end_of_a_mesh_are_stopped(tmp_path: Path):
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits of Linux")
 def test_readers_have_a_limit_of_memory():
     take = "found = {'a': numpy.ones(int(sys.argv[1]))}"
-    limits = Limits(time_s=60, memory_mb=300)
+    limits = ProcessLimits(time_s=60, memory_mb=300)
     assert len(computed_apart(take, "1000", limits=limits)["a"]) == 1000
     with pytest.raises(Failed, match="MemoryError"):
         computed_apart(take, "100000000", limits=limits)

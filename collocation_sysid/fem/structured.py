@@ -63,19 +63,35 @@ def cylinder_of_edge(
 
 
 def counts_of_box(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
-    """Return how many nodes and elements `box_of_edge` makes, without making them."""
+    """Return the numbers of nodes and elements that `box_of_edge` makes, without making them.
+
+    Raises
+    ------
+    InputError
+        For more than a million elements.
+    """
     divisions = _divided(np.asarray(size_m, dtype=float), edge_length_m)
-    return int(np.prod(divisions + 1)), int(6 * np.prod(divisions))
+    elements = 6 * np.prod(divisions)
+    _refuse_many(elements)
+    return int(np.prod(divisions + 1)), int(elements)
 
 
 def counts_of_cylinder(
     diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
 ) -> tuple[int, int]:
-    """Return about how many nodes and elements `cylinder_of_edge` makes, without making them."""
+    """Return the approximate numbers of nodes and elements of `cylinder_of_edge`.
+
+    Raises
+    ------
+    InputError
+        For more than a million elements.
+    """
     rings, layers = _divided(np.array([diameter_m / 2, height_m]), edge_length_m)
     sectors = _SECTORS / 4 if quarter else _SECTORS
     nodes = (1 + sectors * rings * (rings + 1) / 2) * (layers + 1)
-    return int(nodes), int(3 * sectors * rings**2 * layers)
+    elements = 3 * sectors * rings**2 * layers
+    _refuse_many(elements)
+    return int(nodes), int(elements)
 
 
 def _divided(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:

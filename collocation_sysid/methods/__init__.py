@@ -1,4 +1,22 @@
-"""Methods that solve a `Collocation`, by name, and what options they have."""
+"""Methods that solve a `Collocation`: their names, options and option schemas.
+
+`METHODS` maps every name of a method (key `method` of the table `[solver]`) to its class.
+
+Methods
+    `reduced_space` eliminates the motion by the equations of motion and searches only for the
+    parameters; `search` is its trust region, `curvature` its second derivatives, `horizon` and
+    `trajectory` its linearised problem, and `workers` runs it in threads or on a Dask cluster.
+    `interior_point` solves for motion and parameters simultaneously with IPOPT; `condensed` removes
+    variables that follow from others, `initial_point` computes its start, and `complementarity`
+    adds hard contact. `continuation` runs any method on growing parts of the recordings.
+    `comparison` contains methods of the literature, to compare with.
+Start
+    `scan` finds a stiffness to start from, `start` simulates trajectories at given parameters.
+Common
+    `solution` defines the protocol of methods and the result, `recorder` the history, `options` the
+    construction of methods from options by name, `nlpsol` and `callbacks` the interface to CasADi's
+    solvers.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +34,20 @@ METHODS: dict[str, type] = STAGES | {Continuation.name: Continuation}
 
 
 def require_method(name: str, option: str) -> None:
-    """Refuse the name of a method that there is not, given as an option of the command line."""
+    """Raise `InputError` if no method has this name.
+
+    Parameters
+    ----------
+    name : str
+        Name of a method, for example "reduced-space".
+    option : str
+        Command-line option that contains the name, for the message.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, and for solvers of CasADi that are not offered, with the reason.
+    """
     if name not in METHODS:
         if (reason := why_not(name)) is not None:
             raise InputError(reason, None, option)
@@ -24,12 +55,18 @@ def require_method(name: str, option: str) -> None:
 
 
 def summary(method: str) -> str:
-    """What a method is, in a line."""
+    """Return the first line of a method's docstring."""
     return inspect.cleandoc(METHODS[method].__doc__ or "").splitlines()[0]
 
 
 def options_schema(method: str) -> dict[str, Any]:
-    """JSON schema of a method's options: types, ranges, defaults and descriptions."""
+    """Return the JSON schema of a method's options: types, ranges, defaults and descriptions.
+
+    Parameters
+    ----------
+    method : str
+        Name of a method, a key of `METHODS`.
+    """
     kind = METHODS[method]
     defaults, descriptions = kind(), documented(kind)
     options = TypeAdapter(kind).json_schema()["properties"]

@@ -1,8 +1,9 @@
-"""What Gauss–Newton leaves out of the Hessian: learned from the steps taken, or exactly.
+"""Second derivatives of the loss that Gauss–Newton neglects.
 
-The Hessian of ‖r‖² is 2 (SᵀS + B) with B = Σ r_i ∇²r_i, which is small where the residuals are.
-Where they are not, as with measurement noise, Gauss–Newton converges slowly; the update of
-Dennis, Gay and Welsch (NL2SOL, 1981) makes it superlinear at no cost.
+The Hessian of ‖r‖² is 2 (SᵀS + B) with S = ∂r/∂p and B = Σ r_i ∇²r_i, which is small if the
+residuals are small. If they are not, as with measurement noise, Gauss–Newton converges slowly.
+`updated` approximates B from the steps by the update of Dennis, Gay and Welsch (NL2SOL, 1981),
+which converges superlinearly at no cost; `exact_curvature` computes B from the Lagrangian.
 """
 
 from __future__ import annotations
@@ -23,27 +24,48 @@ LARGEST_SHARE = 0.9
 
 
 def updated(b: Array, before: Iterate, after: Iterate) -> Array:
-    """B (np, np) after a step from one point to another that was tried from it."""
-    step = after.p - before.p
-    change = after.fit.score - before.fit.score
-    wanted = after.fit.score - after.crossed  # B · step
-    along = float(change @ step)
-    if along <= 0:
-        return b
-    old = float(step @ b @ step)
-    if old != 0:  # a B that has become too large shrinks to what this step saw
-        b = b * min(1.0, abs(float(step @ wanted) / old))
-    missing = wanted - b @ step
-    rank_two = np.outer(missing, change) / along
-    return b + rank_two + rank_two.T - (missing @ step) / along**2 * np.outer(change, change)
-
-
-def with_curvature(fit: LeastSquares, b: Array) -> LeastSquares:
-    """A triangle with SᵀS + B in place of SᵀS; the same as it is where that is indefinite.
+    """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch.
 
     Parameters
     ----------
-    b : (np, np)
+    b : (np, np) array
+        B before the step.
+    before : Iterate
+        Iterate before the step.
+    after : Iterate
+        Iterate after the step, which was evaluated as a trial from `before`.
+    """
+    step = after.p - before.p
+    change = after.fit.score - before.fit.score
+    curvature_step = after.fit.score - after.crossed  # B · step
+    change_along_step = float(change @ step)
+    if change_along_step <= 0:
+        return b
+    previous_curvature = float(step @ b @ step)
+    if previous_curvature != 0:  # a B that has become too large shrinks to what this step saw
+        b = b * min(1.0, abs(float(step @ curvature_step) / previous_curvature))
+    missing = curvature_step - b @ step
+    rank_two = np.outer(missing, change) / change_along_step
+    return (
+        b
+        + rank_two
+        + rank_two.T
+        - (missing @ step) / change_along_step**2 * np.outer(change, change)
+    )
+
+
+def with_curvature(fit: LeastSquares, b: Array) -> LeastSquares:
+    """Return a least-squares problem with the normal matrix SᵀS + B instead of SᵀS.
+
+    The problem is returned unchanged if B is zero, S is rank-deficient, or B reduces the curvature
+    too much (`LARGEST_SHARE`).
+
+    Parameters
+    ----------
+    fit : LeastSquares
+        Residuals with slopes S.
+    b : (np, np) array
+        B, symmetric.
     """
     triangle, right = fit.slope[: len(b)], fit.residual[: len(b)]
     if not b.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
@@ -59,12 +81,13 @@ def with_curvature(fit: LeastSquares, b: Array) -> LeastSquares:
 
 
 def require_second_derivatives(collocation: Collocation) -> None:
-    """Refuse what has none.
+    """Raise `InputError` if the problem has no exact second derivatives.
 
     Raises
     ------
     InputError
-        For what is carried, such as by materials with memory, and what is measured of grasps.
+        For materials with memory, forces with internal variables, measured wrenches and custom
+        sensors of grasp forces.
     """
     if collocation.remembers:
         raise InputError(
@@ -82,15 +105,24 @@ def require_second_derivatives(collocation: Collocation) -> None:
 def exact_curvature(
     collocation: Collocation, point: Iterate, stopwatch: Stopwatch | None = None
 ) -> Array:
-    """B (np, np) of the Hessian 2 (SᵀS + B) of the loss in p, at a point of the whole horizon.
+    """Return B (np, np) at an iterate of the complete recordings, by one backward sweep.
 
-    From the reduced Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z); one sweep
-    backward for the multipliers y.
+    B follows from the reduced Hessian Wᵀ ∇²(L + yᵀ g) W of the Lagrangian with W = (I, Z), the
+    sensitivities Z and the multipliers y of the equations of motion.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    point : Iterate
+        Iterate of all rows; its trajectories must be in this process.
+    stopwatch : Stopwatch, optional
+        Stopwatch that measures the sweep.
 
     Raises
     ------
     SimulationError
-        Where a timestep's equations are singular.
+        If the equations of a time step are singular.
     """
     projected = [each.x + each.tangent.step for each in point.trajectories]
     z = collocation.pack(point.p, projected)
@@ -102,10 +134,12 @@ def exact_curvature(
 
 
 def _direction(collocation: Collocation, point: Iterate, k: int) -> Array:
-    """Variables per unit of p_k along the equations of motion."""
+    """Return the change of all variables per unit of parameter k (an index), along the
+    equations of motion.
+    """
     unit = np.eye(len(point.p))[k]
-    moved = [
+    position_changes = [
         each.tangent.by_p @ unit[segment.places[segment.moving]]
         for each, segment in zip(point.trajectories, collocation.segments, strict=True)
     ]
-    return collocation.pack(unit, moved)
+    return collocation.pack(unit, position_changes)

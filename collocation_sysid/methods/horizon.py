@@ -1,4 +1,8 @@
-"""The NLP on the first rows of every experiment, as the reduced-space method sees it."""
+"""Least-squares problem on the first rows of every experiment, linearised by sweeps.
+
+`Horizon` distributes the work on the experiments to `Workers` and joins the results to an
+`Iterate`. It is used by the reduced-space method and by shooting.
+"""
 
 from __future__ import annotations
 
@@ -35,16 +39,20 @@ from .workers import Here, Workers
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """Parameters and trajectories, with what one sweep found there.
+    """Parameters and trajectories with the linearised least-squares problem there.
 
     Attributes
     ----------
-    p : (np,) all parameters, see `Collocation.pack`
-    trajectories : list of Swept, one per experiment, kept where they were found
-    reports : list of SweepReport, of the trajectories
+    p : (np,) array
+        All parameters (q, φ), see `Collocation.pack`.
+    trajectories : list of Swept
+        Sweep of each experiment, stored by the workers.
+    reports : list of SweepReport
+        Reports of the sweeps.
     fit : LeastSquares
-        By a step from p: of markers after the feasibility step, sensors and priors.
-    crossed : (np,) S_0ᵀ r of its residuals, with the slopes S_0 of the point it was tried from
+        Residuals linearised in a step from p: measurements after the feasibility step, and priors.
+    crossed : (np,) array
+        S_0ᵀ r of its residuals r, with the slopes S_0 of the previous iterate.
     """
 
     p: Array
@@ -55,45 +63,49 @@ class Iterate:
 
     @cached_property
     def loss(self) -> float:
-        """Loss of the projected positions, priors included."""
+        """Loss after the feasibility step, priors included."""
         return self.fit.loss(np.zeros(len(self.p)))
 
     @cached_property
     def feasibility_m(self) -> float:
-        """Longest coordinate of the feasibility step."""
+        """Largest coordinate of the feasibility step [m]."""
         return max(report.feasibility_m for report in self.reports)
 
     @cached_property
     def moved_m(self) -> float:
-        """Longest coordinate of the way from the point it was tried from."""
+        """Largest change of a coordinate since the previous iterate [m]."""
         return max(report.moved_m for report in self.reports)
 
     @property
     def finite(self) -> bool:
-        """Whether loss and feasibility are numbers."""
+        """Whether the loss and the feasibility step are finite."""
         return bool(np.isfinite(self.loss) and np.isfinite(self.feasibility_m))
 
     def predicted_loss(self, step: Array) -> float:
-        """Loss after a step of the parameters, of the linearised problem."""
+        """Return the loss of the linearised problem after a step (np,) of the parameters."""
         return self.fit.loss(step)
 
 
 class Horizon:
-    """The NLP on the first rows of every experiment.
+    """The problem on the first rows of every experiment.
 
-    Trajectories are kept by the workers: of any kind that `positions` takes.
+    Arguments named `x` are lists with one entry per experiment, stored by the workers, of any kind
+    that `trajectory.positions` accepts.
 
     Parameters
     ----------
     collocation : Collocation
+        Complete problem.
     rows : sequence of int
-        Grid rows of each experiment.
+        Number of grid rows of each experiment.
     prior : float, optional
-        Standard deviation of a prior that holds q near the guess.
+        Standard deviation of a prior of q around the guess; None for no such prior.
     stopwatch : Stopwatch, optional
+        Stopwatch that measures the sweeps.
     factorisation : {"auto", "band", "sparse", "supernodal"}
+        Factorisation of a time step's matrix.
     workers : Workers, optional
-        Threads of this process by default.
+        Where the experiments are processed; by default threads of this process.
     """
 
     def __init__(
@@ -115,36 +127,69 @@ class Horizon:
             self.solvers = self.workers.each(Sweep, self.segments, self.rows, *options)
 
     def read_in(self, collocation: Collocation) -> None:
-        """Take the same problem, read elsewhere."""
+        """Use another collocation of the same problem, with measurements associated differently."""
         self.collocation, self.segments = collocation, self.workers.hold(collocation)
 
     def evaluate(self, p: Array, x: Sequence[Any], known: Iterate | None = None) -> Iterate:
-        """One sweep; a point of the first rows, at the same p and positions, is continued.
+        """Sweep all experiments at parameters p and trajectories x.
+
+        Parameters
+        ----------
+        p : (np,) array
+            All parameters (q, φ).
+        x : sequence
+            Trajectories, one per experiment.
+        known : Iterate, optional
+            Iterate of the first rows at the same p and positions, which is continued.
 
         Raises
         ------
         SimulationError
-            Where it is singular or not finite.
+            If a time step is singular or not finite.
         """
         trajectories = known.trajectories if known else self._all(None)
         return self._found(p, swept, x, trajectories)
 
     def tried(self, p: Array, before: Iterate, step: Array) -> Iterate:
-        """One sweep after a step from a point, static bodies in equilibrium where that is near.
+        """Sweep all experiments after a step of the parameters.
+
+        Static experiments are solved for their equilibria first, see `trajectory.tried`.
+
+        Parameters
+        ----------
+        p : (np,) array
+            Parameters after the step, within their bounds.
+        before : Iterate
+            Iterate before the step.
+        step : (np,) array
+            Step of the parameters.
 
         Raises
         ------
         SimulationError
-            Where it is singular or not finite.
+            If a time step is singular or not finite.
         """
         return self._found(p, tried, before.trajectories, self._own(step))
 
     def reread(self, p: Array, point: Iterate) -> Iterate:
-        """The point as the problem is read now, where its parameters are p."""
+        """Return an iterate at parameters p (np,) with the measurements of the present
+        collocation.
+        """
         return self._found(p, reread, point.trajectories)
 
     @one_blas_thread()
     def _found(self, p: Array, run: Callable[..., Swept], *columns: Sequence[Any]) -> Iterate:
+        """Run a function of `trajectory` for every experiment and join the results to an iterate.
+
+        Parameters
+        ----------
+        p : (np,) array
+            All parameters (q, φ).
+        run : callable
+            Function of (solver, segment, huber, p of the experiment, entries of the columns).
+        columns : sequence
+            Further arguments, one entry per experiment each.
+        """
         common = self.segments, self._all(self.collocation.huber), self._own(p)
         trajectories = self.workers.each(run, self.solvers, *common, *columns)
         reports: list[SweepReport] = self.workers.fetch(self.workers.each(_report, trajectories))
@@ -157,8 +202,8 @@ class Horizon:
         prior, prior_slopes = self.collocation.prior(p)
         priors = [(prior, np.diag(prior_slopes))]
         if self.prior is not None:
-            off = (p[:nq] - self.collocation.parameters.guess_q) / self.prior
-            priors.append((off, np.eye(nq, len(p)) / self.prior))
+            deviation = (p[:nq] - self.collocation.parameters.guess_q) / self.prior
+            priors.append((deviation, np.eye(nq, len(p)) / self.prior))
         for values, by in priors:
             fit = fit.add(values, by)
             # The slopes of priors are the same everywhere.
@@ -168,56 +213,74 @@ class Horizon:
     def extend(
         self, p: Array, x: Sequence[Any] | None = None, near: Iterate | None = None
     ) -> tuple[list[Any], SimulationError | None]:
-        """Trajectories at p as far as they go, continuing those given; and why they stopped.
+        """Simulate all experiments at parameters p, as far as the simulations succeed.
 
-        Equilibria are looked for first where those of `near` are.
+        Parameters
+        ----------
+        p : (np,) array
+            All parameters (q, φ).
+        x : sequence, optional
+            Trajectories of the first rows, which are continued; none by default.
+        near : Iterate, optional
+            Iterate near whose positions equilibria are searched first.
+
+        Returns
+        -------
+        tuple of list of Reached and SimulationError or None
+            Trajectories, stored by the workers, and the first failure; None if all are complete.
         """
-        known, beside = x or self._all(None), near.trajectories if near else self._all(None)
+        known, guesses = x or self._all(None), near.trajectories if near else self._all(None)
         common = self.solvers, self.segments, self._own(p)
-        found = self.workers.each(reached, *common, known, beside)
+        results = self.workers.each(reached, *common, known, guesses)
         failures = []
-        for failure, spent in self.workers.fetch(self.workers.each(_end, found)):
+        for failure, spent in self.workers.fetch(self.workers.each(_end, results)):
             self.stopwatch.add(*spent)
             failures += [failure] if failure else []
-        return found, failures[0] if failures else None
+        return results, failures[0] if failures else None
 
     def moved(self, point: Iterate, step: Array) -> list[Any]:
-        """Trajectories after a step of the parameters."""
+        """Return the positions, stored by the workers, after a step (np,) of the parameters."""
         return self.workers.each(moved, self.segments, point.trajectories, self._own(step))
 
     def seen(self, p: Array, x: Sequence[Any]) -> list[Seen]:
-        """How trajectories fit that were not swept."""
-        found = self.workers.each(seen, self.segments, self._own(p), x)
-        return self.workers.fetch(found)
+        """Return the fit of trajectories x at parameters p, without a sweep."""
+        summaries = self.workers.each(seen, self.segments, self._own(p), x)
+        return self.workers.fetch(summaries)
 
     def lengths(self, x: Sequence[Any]) -> list[int]:
-        """Rows of each trajectory."""
+        """Return the number of rows of each trajectory."""
         return self.workers.fetch(self.workers.each(_rows, x))
 
     def first_rows(self, x: Sequence[Any], counts: Sequence[int]) -> list[Array]:
-        """So many first rows of each trajectory."""
+        """Return the first `counts[i]` rows of each trajectory i, as arrays (counts[i], 3n) [m]."""
         return self.workers.fetch(self.workers.each(_first, x, counts))
 
     def _own(self, p: Array) -> list[Array]:
-        """The share of each experiment in what every parameter has an entry of."""
+        """Return the entries of p (np,) that belong to each experiment."""
         return [p[own] for own in self.collocation.places]
 
     def _all(self, value: Any) -> list[Any]:
-        """The same for every experiment."""
+        """Return a list with the same value for every experiment."""
         return [value] * len(self.rows)
 
 
 def _report(found: Swept) -> SweepReport:
+    """Return the report of a sweep; workers run this function."""
     return found.report
 
 
 def _rows(found: Swept | Reached | Array) -> int:
+    """Return the number of rows of a trajectory; workers run this function."""
     return len(positions(found))
 
 
 def _end(found: Reached) -> tuple[SimulationError | None, tuple[float, float, float]]:
+    """Return the failure (None if complete) and the times [s] of a simulation; workers run
+    this function.
+    """
     return found.failure, found.spent
 
 
 def _first(found: Swept | Reached | Array, count: int) -> Array:
+    """Return the first `count` rows of a trajectory; workers run this function."""
     return positions(found)[:count]

@@ -32,18 +32,19 @@ UNUSABLE = (Status.NOT_SIMULABLE, Status.NUMERICAL_FAILURE, Status.DIVERGED)
 
 @dataclass(frozen=True, eq=False)
 class InitialPoint:
-    """Where interior point starts.
+    """Initial point of IPOPT.
 
     Attributes
     ----------
     coarse : Solution
-        The solution by reduced space; its collocation is the problem read at these estimates.
+        Solution by reduced space; its collocation contains the measurements associated at these
+        estimates.
     is_usable : bool
         Whether its variables satisfy the equations of motion to the end of the recordings.
     is_near : bool
         Whether the optimum is within about `NEAR`, so that Newton's method converges.
     note : str
-        How the point was found, for people.
+        Explanation for the user how the point was computed.
     """
 
     coarse: Solution
@@ -55,20 +56,20 @@ class InitialPoint:
 def coarse_solution(
     recorder: Recorder, start: Array | None, *, max_time_s: float = np.inf
 ) -> InitialPoint:
-    """Search for an initial point by reduced space, from the start given or the guess.
-
-    Every line of the search is added to the recorder.
+    """Compute an initial point by reduced space, and add every iteration to the recorder.
 
     Parameters
     ----------
     recorder : Recorder
-        Of the solve that needs the point.
-    start : (variables,) ndarray, optional
+        Recorder of the solve that needs the point.
+    start : (variables,) array, optional
+        Initial variables of reduced space; the guess by default.
     max_time_s : float
         Time after which the search ends with `Status.TIME_LIMIT` [s].
     """
 
     def follow(line: Iteration) -> None:
+        """Record an iteration, and end the search if the time is over."""
         recorder.add(line)
         if recorder.elapsed_s > max_time_s:
             raise Ended(Status.TIME_LIMIT)
@@ -81,11 +82,11 @@ def coarse_solution(
     is_near = is_usable and coarse.status is Status.CONVERGED
     count = coarse.iterations
     sweeps = f"{count} sweep{'s' * (count != 1)} of reduced space" if count else "the start given"
-    then = "IPOPT solved the whole program from there"
+    continuation = "IPOPT solved the whole program from there"
     if is_near:
-        note = f"initial point: {sweeps}, to within {100 * NEAR:g} % of a parameter; {then}"
+        note = f"initial point: {sweeps}, to within {100 * NEAR:g} % of a parameter; {continuation}"
     elif is_usable:
-        note = f"initial point: {sweeps} ({coarse.status.value}); {then}"
+        note = f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
     else:
         note = f"initial point: reduced space found none ({coarse.message.rstrip('.')})"
     return InitialPoint(coarse, is_usable, is_near, note)
@@ -93,13 +94,14 @@ def coarse_solution(
 
 @dataclass(frozen=True, eq=False)
 class Multipliers:
-    """Initial multipliers of a program as IPOPT gets it.
+    """Initial multipliers of the program that is passed to IPOPT.
 
     Attributes
     ----------
-    constraints : (constraints,) ndarray
-    bounds : (variables,) ndarray
-        Of the bounds of the variables, positive at upper bounds; zero without bounds.
+    constraints : (constraints,) array
+        Multipliers of the constraints.
+    bounds : (variables,) array
+        Multipliers of the bounds, positive at upper bounds; zero for variables without bounds.
     """
 
     constraints: Array
@@ -114,36 +116,37 @@ def adjoint_multipliers(
     Parameters
     ----------
     program : Collocation
-        The program as IPOPT gets it: `collocation` itself, or explicit, or condensed.
+        Program that is passed to IPOPT: `collocation` itself, with lifted variables, or condensed.
     collocation : Collocation
-    z : (variables,) ndarray
+        Problem.
+    z : (variables,) array
         Variables of `collocation`.
 
     Returns
     -------
     Multipliers or None
-        None where a timestep's equations are singular.
+        None if the equations of a time step are singular or a multiplier is not finite.
     """
     try:
         of_motion = constraint_multipliers(collocation, z)
     except SimulationError:
         return None
-    whole = program.whole if isinstance(program, Condensed) else program
-    at = carried_over(z, collocation, whole)
-    constraints = np.zeros(whole.constraints)
+    complete_program = program.whole if isinstance(program, Condensed) else program
+    variables = carried_over(z, collocation, complete_program)
+    constraints = np.zeros(complete_program.constraints)
     constraints[: len(of_motion)] = of_motion
-    gradient, jacobian = whole.gradient(at), whole.jacobian(at)
-    if added := whole.added():
+    gradient, jacobian = complete_program.gradient(variables), complete_program.jacobian(variables)
+    if added := complete_program.added():
         # As many rows as variables: their multipliers follow from those of all other rows.
         slope = gradient + jacobian.T @ constraints
-        own = jacobian[-added:, -added:].T.tocsc()
-        constraints[-added:] = -spla.spsolve(own, slope[-added:])
+        lifted_jacobian = jacobian[-added:, -added:].T.tocsc()
+        constraints[-added:] = -spla.spsolve(lifted_jacobian, slope[-added:])
     if isinstance(program, Condensed):
         constraints = constraints[program.kept_rows]
-        at = carried_over(z, collocation, program)
-        gradient, jacobian = program.gradient(at), program.jacobian(at)
+        variables = carried_over(z, collocation, program)
+        gradient, jacobian = program.gradient(variables), program.jacobian(variables)
     lower, upper = program.bounds()
     bounded = (lower < upper) & (np.isfinite(lower) | np.isfinite(upper))
     bounds = np.where(bounded, -(gradient + jacobian.T @ constraints), 0.0)
-    found = Multipliers(constraints, bounds)
-    return found if np.isfinite(constraints).all() and np.isfinite(bounds).all() else None
+    multipliers = Multipliers(constraints, bounds)
+    return multipliers if np.isfinite(constraints).all() and np.isfinite(bounds).all() else None

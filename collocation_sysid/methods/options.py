@@ -1,6 +1,7 @@
-"""A method is made of its options, by name.
+"""Construction of methods from options by name, and shares of recordings.
 
-Many take growing first parts of every recording, solved one after another.
+Use `built` to make a method from a table of the problem file. `Shares` is the type of options that
+list growing first parts of every recording, which are solved one after another.
 """
 
 from __future__ import annotations
@@ -19,19 +20,21 @@ T = TypeVar("T", bound="Options")
 
 
 def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
-    """A method from its options by name.
+    """Return a method made from its options.
 
     Parameters
     ----------
     kind : type
+        Class of the method, with a class attribute `name`.
     given : mapping
+        Values by option name; options that are missing have their defaults.
     where : str
-        The key under which the options were given, for messages.
+        Key of the problem file that contains the options, for messages.
 
     Raises
     ------
     InputError
-        For an unknown option, with the nearest that there is, or a value that it cannot have.
+        For an unknown option, with the most similar known one, or an invalid value.
     """
     known = [field.name for field in fields(kind)]
     for name in given:
@@ -49,13 +52,18 @@ FEWEST = 8
 
 
 def part_of(count: int, share: float) -> int:
-    """How many of `count` a share is."""
+    """Return the number of samples in a share of `count` samples, at least `FEWEST` if
+    there are as many.
+    """
     return min(count, max(FEWEST, round(share * count)))
 
 
 def _ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
-    ascending = all(a < b for a, b in pairwise(shares))
-    if not ascending or shares[-1:] != (1.0,):
+    """Return the shares if they are strictly ascending and end with 1; raise `ValueError`
+    otherwise.
+    """
+    is_ascending = all(a < b for a, b in pairwise(shares))
+    if not is_ascending or shares[-1:] != (1.0,):
         raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")
     return shares
 

@@ -1,4 +1,4 @@
-"""The record that every method keeps of a solve: history, time, notes, and the answer."""
+"""Record of a running solve: history, time, notes, and the resulting `Solution`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,15 @@ from .start import initial_variables
 
 
 class Ended(Exception):
-    """Ends a search from within."""
+    """Exception that ends a search from within.
+
+    Attributes
+    ----------
+    status : Status
+        Reason.
+    message : str
+        Sentence for the user; by default that of the status.
+    """
 
     def __init__(self, status: Status, message: str = "") -> None:
         super().__init__(message)
@@ -26,22 +34,29 @@ class Ended(Exception):
 
 
 class Recorder:
-    """History and clock of one solve.
-
-    Parameters
-    ----------
-    method : str
-        Its name.
-    collocation : Collocation
-    watch : callable, optional
-        Called with every line of the history.
-    max_time_s : float
+    """History, clock and notes of one solve.
 
     Attributes
     ----------
     history : list of Iteration
+        Entries so far.
     notes : list of str
+        Remarks for the user.
     stopwatch : Stopwatch
+        Stopwatch of evaluations and linear algebra.
+    began : float
+        `time.perf_counter()` at construction [s].
+
+    Parameters
+    ----------
+    method : str
+        Name of the method.
+    collocation : Collocation
+        Problem; methods replace it when measurements are associated again.
+    watch : callable, optional
+        Function that is called with every new `Iteration`.
+    max_time_s : float
+        Time after which `late` becomes true [s].
     """
 
     def __init__(
@@ -60,16 +75,23 @@ class Recorder:
 
     @property
     def elapsed_s(self) -> float:
-        """Time since the solve began."""
+        """Time since construction [s]."""
         return time.perf_counter() - self.began
 
     @property
     def late(self) -> bool:
-        """Whether the time is over."""
+        """Whether the elapsed time exceeds `max_time_s`."""
         return self.elapsed_s > self.max_time_s
 
     def start(self, given: Array | None) -> Array:
-        """The variables given, or those of a simulation at the guess."""
+        """Return the initial variables (variables,).
+
+        Parameters
+        ----------
+        given : (variables,) array or None
+            Variables to start from, which are returned as they are; None means a simulation at the
+            guess, whose notes are added to `notes`.
+        """
         if given is not None:
             return given
         z, notes = initial_variables(self.collocation)
@@ -77,7 +99,19 @@ class Recorder:
         return z
 
     def search(self, steps: Callable[[], tuple[Status, str]]) -> tuple[Status, str]:
-        """Status and message of a search, also where that ends by an exception."""
+        """Run a search and return its status and message, also if it ends by an exception.
+
+        Parameters
+        ----------
+        steps : callable
+            The search; it returns status and message.
+
+        Returns
+        -------
+        tuple of Status and str
+            `Ended` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
+            `KeyboardInterrupt` gives `INTERRUPTED`. Other exceptions are not caught.
+        """
         try:
             return steps()
         except Ended as end:
@@ -88,16 +122,32 @@ class Recorder:
             return Status.INTERRUPTED, Status.INTERRUPTED.sentence
 
     def line(self, number: int, z: Array, loss: float) -> None:
-        """Add the line for variables z to the history."""
-        nlp = self.collocation
-        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in nlp.violations_n(z))
-        line = Iteration(number, loss, nlp.rms_m(z), violation_n, nlp.values(z), self.elapsed_s)
+        """Evaluate the problem at variables z and add the result to the history.
+
+        Parameters
+        ----------
+        number : int
+            Number of the iteration.
+        z : (variables,) array
+            Variables.
+        loss : float
+            Loss L at z, which is not evaluated again.
+        """
+        collocation = self.collocation
+        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in collocation.violations_n(z))
+        line = Iteration(
+            number, loss, collocation.rms_m(z), violation_n, collocation.values(z), self.elapsed_s
+        )
         self.add(line)
 
     def add(self, line: Iteration) -> None:
-        """Add a line to the history, and show it to who watches, but for shares of a field."""
-        told = {name: value for name, value in line.parameters.items() if not is_mode(name)}
-        line = replace(line, parameters=told)
+        """Add an entry to the history and pass it to `watch`.
+
+        Coefficients of spatially varying parameters are removed from the entry, because there are
+        many.
+        """
+        shown_values = {name: value for name, value in line.parameters.items() if not is_mode(name)}
+        line = replace(line, parameters=shown_values)
         self.history.append(line)
         if self.watch is not None:
             self.watch(line)
@@ -111,7 +161,23 @@ class Recorder:
         iterations: int,
         evaluations: int,
     ) -> Solution:
-        """The answer of the solve."""
+        """Return the solution with the recorded history, times and notes.
+
+        Parameters
+        ----------
+        status : Status
+            Reason why the solve ended.
+        message : str
+            Sentence for the user.
+        z : (variables,) array
+            Final variables.
+        multipliers : (constraints,) array or None
+            Multipliers of the method; None if it has none.
+        iterations : int
+            Iterations of the method.
+        evaluations : int
+            Evaluations of whole trajectories.
+        """
         return Solution(
             status,
             message,

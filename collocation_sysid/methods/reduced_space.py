@@ -1,21 +1,25 @@
-"""Reduced space: given θ the trajectory is determined, so only θ is searched for.
+"""Reduced-space method: the equations of motion determine the trajectory, only parameters are
+unknown.
 
-Each iteration is a Gauss–Newton step on the same NLP as interior point's, with the same optimum.
-One factorisation a timestep gives the feasibility step p and the sensitivities Z (`program.sweep`);
-the step of all variables is (p + Z dq, dq), and dq solves a bounded least-squares problem in the
-few parameters,
+Each iteration is a Gauss–Newton step on the NLP of the interior-point method, with the same
+optimum. One factorisation per time step gives the feasibility step p and the sensitivities Z
+(`program.sweep`); the step of all variables is (p + Z dq, dq), and dq solves a bounded
+least-squares problem in the few parameters,
 
     min ‖r + S_p + S dq‖² + priors,   |dq| ≤ trust region,
 
-with r the markers' residuals and S_p, S the markers' parts of p and Z.
+with the measurement residuals r, and S_p and S their changes due to p and Z.
 
-A trial is accepted when the loss of its own projected trajectory (r + S_p there) has decreased,
-and when its remaining infeasibility, measured by the length of p in metres, is short against
-the step. Static rows of a trial are brought to equilibrium first, where that is near.
+A trial is accepted if the loss of its projected trajectory (r + S_p there) has decreased, and if
+its remaining infeasibility, measured by the length of p in metres, is small relative to the step.
+Static rows of a trial are first solved for the equilibrium if one is near.
 
-That converges from where trajectories can be simulated; a ladder of horizons, the
-first quarter, half and whole of the recording, widens it to where only the start can be. Where
-even a rung cannot be simulated as a whole, the rows that can be are solved first.
+This converges if trajectories can be simulated. Horizons of increasing length (by default a
+quarter, half and all of the recording) extend the convergence to cases where only the start can be
+simulated at the guess. If even one horizon cannot be simulated completely, its first rows are
+solved before the others.
+
+Use it by default: it needs the least memory and time. Its search is in `search`.
 """
 
 from __future__ import annotations
@@ -57,10 +61,26 @@ class ReducedSpace(SearchOptions):
         start: Array | None = None,
         workers: Workers | None = None,
     ) -> Solution:
-        """Solve the NLP, see `Method`; experiments are on the workers given, by default here.
+        """Solve the NLP, see `Method`.
 
-        Lines of the history count sweeps, rejected ones included; the first are those of short
+        Entries of the history count sweeps, including rejected ones; the first belong to short
         horizons.
+
+        Parameters
+        ----------
+        collocation : Collocation
+            Problem to solve.
+        watch : callable, optional
+            Function that is called with every new `Iteration`.
+        start : (variables,) array, optional
+            Initial variables; the guess by default.
+        workers : Workers, optional
+            Where the experiments are processed; by default threads of this process.
+
+        Raises
+        ------
+        InputError
+            For hessian = "exact" with workers or with a problem that lacks second derivatives.
         """
         if self.hessian == "exact":
             require_second_derivatives(collocation)
@@ -75,31 +95,33 @@ class ReducedSpace(SearchOptions):
         status, message = recorder.search(search.run)
         collocation = recorder.collocation
         try:
-            found = search.x and workers.fetch(workers.each(positions, search.x))
+            trajectories = search.x and workers.fetch(workers.each(positions, search.x))
             recorder.notes += workers.notes()
         except Ended as lost:
             status, message = lost.status, lost.message
-            found, _ = marched(collocation, search.p)
-        z = completed(collocation, search.p, found)
+            trajectories, _ = marched(collocation, search.p)
+        z = completed(collocation, search.p, trajectories)
         rows = [segment.grid_rows for segment in collocation.segments]
-        reached = found is not None and [len(x) for x in found] == rows
+        is_complete = trajectories is not None and [len(x) for x in trajectories] == rows
         recorder.notes += _notes(collocation, search.indefinite, z, status)
-        multipliers = None if reached else np.zeros(collocation.constraints)
+        multipliers = None if is_complete else np.zeros(collocation.constraints)
         return recorder.solution(status, message, z, multipliers, search.sweeps, search.sweeps)
 
 
 def memory_mb(collocation: Collocation) -> float:
-    """Memory that a solve takes, estimated: linear in the number of timesteps."""
+    """Estimate the memory of a solve [MB]; it increases linearly with the number of time steps."""
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6
     numbers = columns * collocation.variables
     chunks = sorted(Sweep(segment).chunk_bytes for segment in collocation.segments)
-    together = at_once(len(chunks), collocation.threads)
-    return (8 * numbers + sum(chunks[-together:])) / 1e6
+    concurrent = at_once(len(chunks), collocation.threads)
+    return (8 * numbers + sum(chunks[-concurrent:])) / 1e6
 
 
 def _measured(collocation: Collocation) -> tuple[str, str]:
-    """Return in words what the recordings measure most of, and what states its noise."""
+    """Return the kind of measurement that dominates, in words, and the key that states its
+    noise.
+    """
     experiments = [segment.experiment for segment in collocation.segments]
     if any(each.markers.samples for each in experiments):
         return "markers", "sigma_m"
@@ -111,6 +133,19 @@ def _measured(collocation: Collocation) -> tuple[str, str]:
 
 
 def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) -> list[str]:
+    """Return notes for the user on the answer.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    indefinite : int
+        Number of time steps with an indefinite matrix.
+    z : (variables,) array
+        Final variables.
+    status : Status
+        Status of the search.
+    """
     notes = []
     if indefinite:
         steps = sum(segment.constraint_times for segment in collocation.segments)
@@ -123,11 +158,11 @@ def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) 
         misfit = float(np.sqrt(squares / max(1, collocation.measurements)))
         if misfit > MISFIT:
             size = f" ({1e3 * collocation.rms_m(z):.3g} mm rms)"
-            what, stated = _measured(collocation)
-            marked = stated == "sigma_m"
+            measurements, noise_key = _measured(collocation)
+            are_markers = noise_key == "sigma_m"
             notes.append(
-                f"the {what} are missed by {misfit:.3g} of their standard deviations"
-                f"{size if marked else ''}: {stated}, the model or the recording is off, or a "
+                f"the {measurements} are missed by {misfit:.3g} of their standard deviations"
+                f"{size if are_markers else ''}: {noise_key}, the model or the recording is off, or a "
                 "better fit lies elsewhere; another guess may tell"
             )
     return notes

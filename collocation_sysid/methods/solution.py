@@ -1,4 +1,8 @@
-"""What a method is, anything that solves a `Collocation`, and what it returns."""
+"""Result of a solve, and the protocol of methods that solve a `Collocation`.
+
+`Method` is the protocol, `Solution` the result with everything that is derived from it (positions,
+residuals, multipliers, optimality), `Status` the reason why the solve ended.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,7 @@ from .scan import Scan
 
 
 class Status(Enum):
-    """How a solve ended; the value is the name in files, `sentence` is for people."""
+    """Reason why a solve ended; the value is the name in files."""
 
     CONVERGED = "converged"
     ACCEPTABLE = "acceptable"
@@ -40,12 +44,14 @@ class Status(Enum):
 
     @property
     def converged(self) -> bool:
-        """Whether the answer satisfies the solver's tolerances."""
+        """Whether the solution satisfies the tolerances of the solver, at least the
+        acceptable ones.
+        """
         return self in (Status.CONVERGED, Status.ACCEPTABLE)
 
     @property
     def sentence(self) -> str:
-        """One sentence for people."""
+        """Explanation of the status for the user, one sentence with advice."""
         return _SENTENCES[self]
 
 
@@ -73,10 +79,27 @@ _SENTENCES = {
 
 @dataclass(frozen=True)
 class Iteration:
-    """One line of the history; the parameters by the user's names.
+    """One line of the history of a solve.
 
-    The loss is that of the first `share` of the timesteps where a method takes them one part after
-    the other: it rises where the next part comes in.
+    Where a method solves growing parts of the recordings, `loss` is that of the part and increases
+    when the next part begins.
+
+    Attributes
+    ----------
+    number : int
+        Number of the iteration, from 0.
+    loss : float
+        Loss L of the measurements and priors, without the scaling of the NLP.
+    rms_m : float
+        Root mean square distance of markers from their measurements [m].
+    violation_n : float
+        Largest residual of the equations of motion [N].
+    parameters : dict of str to float
+        Physical values by parameter name.
+    time_s : float
+        Time since the solve began [s].
+    share : float
+        Share of the time steps that are solved, at most 1.
     """
 
     number: int
@@ -90,7 +113,19 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Timing:
-    """Where the time went [s]."""
+    """Computing times of a solve [s].
+
+    Attributes
+    ----------
+    build : float
+        Time to set up the program.
+    evaluations : float
+        Time to evaluate residuals and derivatives.
+    linear_algebra : float
+        Time to factorise and solve.
+    total : float
+        Total time, which includes what the other three do not count.
+    """
 
     build: float = 0.0
     evaluations: float = 0.0
@@ -98,41 +133,58 @@ class Timing:
     total: float = 0.0
 
     def __add__(self, other: Timing) -> Timing:
-        both = zip(astuple(self), astuple(other), strict=True)
-        return Timing(*(mine + its for mine, its in both))
+        """Return the sum of both times, entry by entry."""
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return Timing(*(mine + its for mine, its in pairs))
 
     @classmethod
     def of(cls, watch: Stopwatch, began: float) -> Timing:
-        """What a stopwatch has added up since `began`, a `time.perf_counter`."""
+        """Return the times that a stopwatch has measured.
+
+        Parameters
+        ----------
+        watch : Stopwatch
+            Stopwatch of the solve.
+        began : float
+            `time.perf_counter()` at the start of the solve [s], for the total.
+        """
         total = time.perf_counter() - began
         return cls(watch.build, watch.evaluations, watch.linear_algebra, total)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Parameters and trajectory found by a method, converged or not.
+    """Parameters and trajectories computed by a method, whether or not it converged.
 
     Attributes
     ----------
     status : Status
+        Reason why the solve ended.
     message : str
-        A sentence for people, with what the solver said.
+        Sentence for the user, which includes the message of the solver.
     method : str
+        Name of the method.
     collocation : Collocation
-        The problem that was solved.
-    z : (variables,) the final variables, see `program.collocation`
-    given_multipliers : (constraints,) of g, in the scaling of the NLP, or None
+        Problem that was solved.
+    z : (variables,) array
+        Final variables, see `program.collocation`.
+    given_multipliers : (constraints,) array or None
+        Multipliers of the constraints g in the scaling of the NLP; None if the method computes
+        none, see `multipliers`.
     iterations : int
-        Those of the method itself; the history may also have lines of a search for its start.
+        Iterations of the method itself; the history may also contain those of the search for its
+        start.
     history : sequence of Iteration
+        One entry per iteration.
     timing : Timing
+        Computing times.
     notes : sequence of str
-        What the user should know, such as how the solve was started.
+        Remarks for the user, for example how the solve was started.
     evaluations : int
-        How often the method asked for residuals or derivatives of whole trajectories; a sweep
-        and a simulation count as one.
+        Number of evaluations of residuals or derivatives of whole trajectories; a sweep and a
+        simulation count as one each.
     scan : Scan or None
-        The scan of the stiffness that it started from, if there was one.
+        Scan of the stiffness that the solve started from; None if there was none.
     """
 
     status: Status
@@ -149,30 +201,40 @@ class Solution:
     scan: Scan | None = None
 
     def unless_interrupted(self) -> Solution:
-        """The solution of a part of some work, which ends by Ctrl-C as that does.
+        """Return the solution, or raise `KeyboardInterrupt` if the user interrupted the solve.
+
+        Use this where the solve is one step of a longer computation that should end as well.
 
         Raises
         ------
         KeyboardInterrupt
-            If it was interrupted.
+            If the status is `Status.INTERRUPTED`.
         """
         if self.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         return self
 
     def after(self, first: Solution, why: str) -> Solution:
-        """The answer with what the solve took that it started from, and why there was another."""
-        done = max([first.iterations, *(line.number for line in first.history[-1:])])
-        began_s = first.timing.total
-        own = [
-            replace(each, number=each.number + done, time_s=each.time_s + began_s)
+        """Return a copy that also counts a previous solve: its iterations, history, time and notes.
+
+        Parameters
+        ----------
+        first : Solution
+            Solve that ended before this one began.
+        why : str
+            Reason for the second solve; it is inserted between the notes of both.
+        """
+        previous_iterations = max([first.iterations, *(line.number for line in first.history[-1:])])
+        previous_s = first.timing.total
+        shifted_history = [
+            replace(each, number=each.number + previous_iterations, time_s=each.time_s + previous_s)
             for each in self.history
         ]
         return replace(
             self,
             iterations=self.iterations + first.iterations,
             evaluations=self.evaluations + first.evaluations,
-            history=(*first.history, *own),
+            history=(*first.history, *shifted_history),
             timing=self.timing + first.timing,
             notes=(*first.notes, why, *self.notes),
             scan=first.scan,
@@ -180,7 +242,12 @@ class Solution:
 
     @cached_property
     def multipliers(self) -> Array:
-        """(constraints,) the method's own, or those that one sweep finds; zeros where it fails."""
+        """Multipliers (constraints,) of the constraints, in the scaling of the NLP.
+
+        They are those of the method or, if it computes none, those that make the Lagrangian
+        stationary in the positions (one backward sweep); zeros if the equations of a time step are
+        singular.
+        """
         if self.given_multipliers is not None:
             return self.given_multipliers
         try:
@@ -190,22 +257,22 @@ class Solution:
 
     @property
     def q(self) -> Array:
-        """(nq,) the estimated parameters in the solver's coordinates."""
+        """Estimated shared parameters (nq,) in the transformed coordinates of the solver."""
         return self.z[: self.collocation.nq]
 
     @property
     def theta(self) -> Array:
-        """(k,) constants of the first experiment's body, see `Body.constants`."""
+        """Constants (k,) of the first experiment's body, see `Body.constants`."""
         return self.collocation.segments[0].body.theta(self.parameters)
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values by the user's names."""
+        """Physical values by parameter name."""
         return self.collocation.parameters.values(self.q)
 
     @cached_property
     def parts(self) -> list[Part]:
-        """Every fitted experiment at the solution."""
+        """Fitted experiments at the solution, in the order of `collocation.segments`."""
         return self.collocation.parts(self.z)
 
     def nuisance(self, name: str) -> float:
@@ -241,40 +308,51 @@ class Solution:
         raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
 
     def part_of(self, experiment: str) -> Part | None:
-        """That of one experiment, by name; None where it was not fitted."""
+        """Return one experiment at the solution, by name; None if it was not fitted."""
         named = {part.segment.experiment.name: part for part in self.parts}
         return named.get(experiment)
 
     @property
     def positions_m(self) -> list[Array]:
-        """Node positions (N, n, 3) on the collocation grid of each fitted experiment."""
+        """Node positions (N, n, 3) on the collocation grid of each fitted experiment [m]."""
         _, positions = self.collocation.unpack(self.z)
         return [x.reshape(len(x), -1, 3) for x in positions]
 
     @cached_property
     def readings_m(self) -> list[Array]:
-        """Fitted markers (T, M, 3) of each experiment, with its φ."""
+        """Predicted marker positions (T, M, 3) of each fitted experiment [m], at its
+        estimated nuisance parameters φ.
+        """
         return [part.segment.markers.of_positions(part.x, part.phi) for part in self.parts]
 
     @cached_property
     def wrenches(self) -> dict[str, list[Array]]:
-        """What the sensors of each fitted experiment should read, (S, 6), NaN where not known."""
+        """Predicted values (S, 6) of the wrench sensors, by experiment name.
+
+        Each experiment with wrench sensors has a list with one array per sensor: force [N] and
+        torque [N m]. NaN means that the sensor was not predicted at that sample.
+        """
         parts = [part for part in self.parts if part.segment.sensors]
         return {part.segment.experiment.name: part.sensing.wrenches(part.x) for part in parts}
 
     @cached_property
     def wrench_rms(self) -> dict[str, tuple[float | None, float | None]]:
-        """RMS of force [N] and torque [N m] of the sensors of each fitted experiment."""
-        found = {}
+        """RMS residuals of force [N] and torque [N m] by experiment name, see `wrench_rms`.
+
+        Only experiments with wrench sensors are included.
+        """
+        rms_by_experiment = {}
         for segment in self.collocation.segments:
             if segment.sensors:
                 readings = self.wrenches[segment.experiment.name]
-                found[segment.experiment.name] = wrench_rms(segment.experiment, readings)
-        return found
+                rms_by_experiment[segment.experiment.name] = wrench_rms(
+                    segment.experiment, readings
+                )
+        return rms_by_experiment
 
     @cached_property
     def readings(self) -> dict[str, dict[str, Array]]:
-        """What the readings of one's own of each fitted experiment should say, (S, m) by name."""
+        """Predicted values (S, m) of custom sensors, by experiment name and sensor name."""
         return {
             part.segment.experiment.name: {
                 gauge.gauge.name: gauge.said(gauge.of_motion(part.motion, part.phi))
@@ -285,71 +363,94 @@ class Solution:
 
     @cached_property
     def rms_m(self) -> float:
-        """Root mean square distance of markers from their measurements."""
+        """Root mean square distance of all markers from their measurements [m]."""
         return self.collocation.rms_m(self.z)
 
     @cached_property
     def rms_by_experiment_m(self) -> dict[str, float]:
-        """The same of each fitted experiment."""
-        found = {}
+        """Root mean square distance of markers from their measurements [m], by experiment name."""
+        rms_by_experiment = {}
         for segment, readings in zip(self.collocation.segments, self.readings_m, strict=True):
             markers = segment.experiment.markers
             squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.present]
-            found[segment.experiment.name] = root_mean(squares)
-        return found
+            rms_by_experiment[segment.experiment.name] = root_mean(squares)
+        return rms_by_experiment
 
     @cached_property
     def max_violation_n(self) -> float:
-        """Largest residual of the equations of motion [N], evaluated afresh."""
+        """Largest residual of the equations of motion [N], computed from `z`."""
         violations = self.collocation.violations_n(self.z)
         return float(max(np.abs(residual).max(initial=0.0) for residual in violations))
 
     @cached_property
     def max_violation_relative(self) -> float:
-        """The same over the largest force in the balance."""
+        """Largest residual of the equations of motion over the largest force in the equations."""
         return self.max_violation_n / max(self.collocation.largest_force_n(self.z), 1e-300)
 
     @cached_property
     def kkt_residual(self) -> float:
-        """Largest violation of the NLP's first-order conditions, see `Collocation`."""
+        """Largest violation of the NLP's first-order optimality conditions, see `Collocation`."""
         return self.collocation.kkt_residual(self.z, self.multipliers)
 
     @property
     def largest_violations(self) -> list[Violation]:
-        """The worst equations of motion."""
+        """Equations of motion with the largest residuals, in descending order."""
         return self.collocation.largest_violations(self.z)
 
 
 def wrench_rms(
     experiment: Experiment, readings: Sequence[Array]
 ) -> tuple[float | None, float | None]:
-    """Return the RMS of each component of force [N] and torque [N m], readings (S, 6) to measured.
+    """Return the RMS residuals of force [N] and torque [N m], over all wrench sensors of an
+    experiment.
 
-    They are those of the whole specimen where the body is a part of it, see `Wrench.symmetry`; None
-    of what is not measured.
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with the measured wrenches.
+    readings : sequence of (S, 6) array
+        Predicted wrenches of each sensor; NaN entries are ignored.
+
+    Returns
+    -------
+    tuple of two floats or None
+        RMS of one component of the force and of the torque. If the body is a symmetric part of the
+        specimen, the values refer to the whole specimen, see `Wrench.symmetry`. None means that no
+        component was measured.
     """
     pairs = zip(readings, experiment.wrenches, strict=True)
-    apart = [sensor.symmetry * (read - sensor.values) for read, sensor in pairs]
-    both = np.concatenate(apart) if apart else np.zeros((0, 6))
+    residuals = [sensor.symmetry * (read - sensor.values) for read, sensor in pairs]
+    components = np.concatenate(residuals) if residuals else np.zeros((0, 6))
     force, torque = (
         float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else None
-        for each in (both[:, :3], both[:, 3:])
+        for each in (components[:, :3], components[:, 3:])
     )
     return force, torque
 
 
 def reading_rms(experiment: Experiment, readings: Mapping[str, Array]) -> dict[str, float]:
-    """RMS between readings of one's own (S, m) and what was measured, by name."""
-    apart = ((g.name, readings[g.name] - g.measured) for g in experiment.readings)
-    return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in apart}
+    """Return the RMS residuals of custom sensors by name, in the unit of each sensor.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with the measured values.
+    readings : mapping of str to (S, m) array
+        Predicted values by sensor name; NaN entries are ignored.
+    """
+    residuals = ((g.name, readings[g.name] - g.measured) for g in experiment.readings)
+    return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals}
 
 
 def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
-    """The same of all fitted experiments, which count alike."""
+    """Return the RMS residuals of force [N] and torque [N m] over all fitted experiments.
+
+    All experiments have equal weight. None means that no experiment measured the component.
+    """
     squares, counts = np.zeros(2), np.zeros(2)
     for segment in solution.collocation.segments:
-        found = solution.wrench_rms.get(segment.experiment.name, (None, None))
-        for k, value in enumerate(found):
+        components = solution.wrench_rms.get(segment.experiment.name, (None, None))
+        for k, value in enumerate(components):
             if value is not None:
                 squares[k], counts[k] = squares[k] + value**2, counts[k] + 1
     force, torque = (
@@ -363,7 +464,11 @@ Watch = Callable[[Iteration], None]
 
 
 class Method(Protocol):
-    """A callable that solves a `Collocation`, as those of `METHODS` are with their options."""
+    """Callable that solves a `Collocation`.
+
+    The classes of `METHODS` are methods: an instance contains the options and is called with the
+    problem.
+    """
 
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -373,15 +478,16 @@ class Method(Protocol):
         Parameters
         ----------
         collocation : Collocation
+            Problem to solve; it is not modified.
         watch : callable, optional
-            Called with every line of the history, an `Iteration`.
-        start : (variables,) ndarray, optional
-            Initial variables; the method's own choice at the guess by default.
+            Function that is called with every new `Iteration` of the history.
+        start : (variables,) array, optional
+            Initial variables; by default the method chooses them from the guess.
 
         Returns
         -------
         Solution
-            Also when it did not converge or was interrupted (Ctrl-C): then the best iterate.
+            The best iterate if the method did not converge or was interrupted (Ctrl-C).
         """
         ...
 
@@ -389,32 +495,46 @@ class Method(Protocol):
 def constraint_multipliers(
     collocation: Collocation, z: Array, stopwatch: Stopwatch | None = None
 ) -> Array:
-    """Multipliers (constraints,) that make the Lagrangian stationary in the positions.
+    """Return multipliers (constraints,) that make the Lagrangian stationary in the positions.
 
-    From c_xᵀ y = −∂L/∂x, in the scaling of the NLP.
+    They solve c_xᵀ y = −∂L/∂x by one backward sweep per experiment (adjoint method), in the scaling
+    of the NLP.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    z : (variables,) array
+        Variables.
+    stopwatch : Stopwatch, optional
+        Stopwatch that measures the sweeps.
 
     Raises
     ------
     SimulationError
-        Where a timestep's equations are singular.
+        If the equations of a time step are singular.
     """
 
     def of(part: Part) -> Array:
+        """Return the multipliers of one experiment's equations of motion."""
         segment = part.segment
         gradient = collocation.loss_scale * part.gradient()[0]
         solver = Sweep(segment, stopwatch=stopwatch)
         y = segment.force_n * solver.backward(part.x, part.setting, gradient)
         return segment.of_rows(y)
 
-    found = side_by_side(of, collocation.parts(z), collocation.threads)
-    multipliers = np.concatenate(found)
+    multipliers_by_experiment = side_by_side(of, collocation.parts(z), collocation.threads)
+    multipliers = np.concatenate(multipliers_by_experiment)
     if any(segment.grasp_rows.any() for segment in collocation.segments):
         _add_grasps(collocation, z, multipliers)
     return multipliers
 
 
 def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
-    """Give the grasp rows, which are unit rows, what is left of the gradient."""
+    """Set the multipliers of prescribed displacements to minus the remaining gradient, in place.
+
+    Their constraints have unit Jacobian rows.
+    """
     slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
     for part in collocation.parts(slope):
         segment, grasped = part.segment, part.segment.grasp_rows

@@ -1,4 +1,9 @@
-"""Where a method starts: trajectories simulated at its parameters, as far as they go."""
+"""Initial trajectories: simulations at given parameters, as far as they succeed.
+
+Use `initial_variables` for a method that needs variables at the guess, and `marched` for
+simulations at any parameters. Where a simulation fails, `completed` appends the initial shape moved
+rigidly with the grasp.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +24,11 @@ from ..program.stopwatch import Stopwatch
 
 
 def placed_at_guess(collocation: Collocation) -> Collocation:
-    """The problem with unknown places started from the shape that the guess gives the body."""
+    """Associate markers and cameras of unknown position with the body's initial shape at the guess.
+
+    The initial shape is the initial equilibrium or, if that fails, the undeformed shape moved with
+    the grasp. The collocation is returned unchanged if all positions are known.
+    """
     if not any(segment.rows_to_place for segment in collocation.segments):
         return collocation
     p, positions = collocation.guess_p, []
@@ -35,10 +44,11 @@ def placed_at_guess(collocation: Collocation) -> Collocation:
 
 
 def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
-    """Variables z at the guess, and notes on how they were found.
+    """Return variables z (variables,) at the guess, and notes for the user.
 
-    Each experiment is simulated at the guess with the collocation scheme. Where that fails, the
-    rest shape carried rigidly by the grasp takes its place: collocation needs no feasible start.
+    Each experiment is simulated at the guess with the collocation scheme. If that fails, the
+    initial shape is moved rigidly with the grasp and a note is added: collocation needs no feasible
+    start.
     """
     p = collocation.guess_p
     positions, notes = [], []
@@ -64,27 +74,40 @@ def marched(
     stopwatch: Stopwatch | None = None,
     near: Sequence[Array] | None = None,
 ) -> tuple[list[Array], SimulationError | None]:
-    """Trajectories at p as far as they go, continuing those known; and why the first stopped.
+    """Simulate all experiments with the collocation scheme, as far as the simulations succeed.
 
     Parameters
     ----------
     collocation : Collocation
-    p : (np,) ndarray
-    known : sequence of (k, 3n) ndarray, optional
-        First rows of every trajectory; the experiments' starts by default.
+        Problem.
+    p : (np,) array
+        Shared and nuisance parameters (q, φ).
+    known : sequence of (k, 3n) array, optional
+        First rows of every trajectory [m], which are continued; by default simulations begin at the
+        experiments' starts.
     rows : sequence of int, optional
-        How many are wanted; all by default.
+        Number of grid rows of each trajectory; all by default.
     options : NewtonOptions, optional
+        Tolerances of Newton's method.
     stopwatch : Stopwatch, optional
-    near : sequence of (N, 3n) ndarray, optional
-        Trajectories at other parameters: where equilibria are looked for first.
+        Stopwatch that measures the simulations.
+    near : sequence of (N, 3n) array, optional
+        Trajectories at other parameters [m], from which Newton's method starts to search for
+        equilibria.
+
+    Returns
+    -------
+    tuple of list of (m, 3n) array and SimulationError or None
+        Trajectories, which are shorter than requested where the simulation failed, and the first
+        failure; None if there was none.
     """
     parts = collocation.parts_at(p, known or _nothing(collocation))
 
     def on(k: int) -> tuple[Array, SimulationError | None]:
+        """Simulate experiment number k, from 0."""
         count = parts[k].segment.grid_rows if rows is None else rows[k]
-        beside = None if near is None else near[k]
-        return continued(parts[k], count, options, stopwatch, beside)
+        guess = None if near is None else near[k]
+        return continued(parts[k], count, options, stopwatch, guess)
 
     reached = side_by_side(on, range(len(parts)), collocation.threads)
     failures = [failure for _, failure in reached if failure is not None]
@@ -98,7 +121,26 @@ def continued(
     stopwatch: Stopwatch | None = None,
     near: Array | None = None,
 ) -> tuple[Array, SimulationError | None]:
-    """A part's trajectory up to so many rows, as far as it goes, see `marched`."""
+    """Continue the trajectory of one experiment, as far as the simulation succeeds.
+
+    Parameters
+    ----------
+    part : Part
+        Experiment at its parameters, with its known first rows.
+    rows : int
+        Number of grid rows of the result.
+    options : NewtonOptions, optional
+        Tolerances of Newton's method.
+    stopwatch : Stopwatch, optional
+        Stopwatch that measures the simulation.
+    near : (N, 3n) array, optional
+        Trajectory at other parameters [m], see `marched`.
+
+    Returns
+    -------
+    tuple of (m, 3n) array and SimulationError or None
+        Trajectory with the known rows [m], and the failure; None if the trajectory is complete.
+    """
     return march_on(
         part.segment.experiment,
         part.setting.dynamics.first_rows(rows),
@@ -110,23 +152,40 @@ def continued(
 
 
 def completed(collocation: Collocation, p: Array, known: Sequence[Array] | None = None) -> Array:
-    """Variables z from p and the first rows of every trajectory, the rest carried rigidly."""
-    whole = []
+    """Return variables z from parameters and the first rows of every trajectory.
+
+    Missing rows are those of `carried_rigidly`.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    p : (np,) array
+        Shared and nuisance parameters (q, φ).
+    known : sequence of (k, 3n) array, optional
+        First rows of every trajectory [m]; none by default.
+    """
+    trajectories = []
     for part in collocation.parts_at(p, known or _nothing(collocation)):
         x = part.x
         if len(x) < part.segment.grid_rows:
-            carried = carried_rigidly(part.segment, part.setting.theta)
-            x = np.concatenate([x, carried[len(x) :]])
-        whole.append(x)
-    return collocation.pack(p, whole)
+            rigid_positions = carried_rigidly(part.segment, part.setting.theta)
+            x = np.concatenate([x, rigid_positions[len(x) :]])
+        trajectories.append(x)
+    return collocation.pack(p, trajectories)
 
 
 def _nothing(collocation: Collocation) -> list[Array]:
+    """Return an empty trajectory (0, 3n) of each experiment."""
     return [np.zeros((0, segment.dofs)) for segment in collocation.segments]
 
 
 def carried_rigidly(segment: Segment, theta: Array) -> Array:
-    """(N, 3n) start shape carried rigidly, held nodes where their grasps are."""
+    """Return a trajectory (N, 3n) in which the initial shape moves rigidly with the grasp [m].
+
+    Grasped nodes have their prescribed positions. The initial shape is the initial equilibrium at
+    constants `theta` (k,) or, if that fails, the undeformed shape.
+    """
     experiment, t_s = segment.experiment, segment.dynamics.t_s
     try:
         first = Forces.of(experiment, t_s[:1], theta)

@@ -53,9 +53,10 @@ def contents_of(
     if say is not None:
         announce_reading({*_named_files(file, folder)}, say)
     with _in_table(path, "object"):
-        if counts := _generated_counts(file.object):
-            require_feasible(_smallest_size(file, *counts, simulation=simulation), say)
-        mesh = _load_mesh(file.object, folder)
+        with _lengths_checked(file.object):
+            if counts := _generated_counts(file.object):
+                require_feasible(_smallest_size(file, *counts, simulation=simulation), say)
+            mesh = _load_mesh(file.object, folder)
         counts = len(mesh.points_m), len(mesh.tetrahedra)
         size = _smallest_size(file, *counts, simulation=simulation)
         require_feasible(size, None if _generated_counts(file.object) else say)
@@ -171,18 +172,23 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
 
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
-    """Mesh a cylinder or a box; lengths larger than a body's are named in place of the edges."""
-    shape, box_m = section.cylinder, section.box_m or (0.0, 0.0, 0.0)  # one of both by the schema
-    if shape is not None:
+    """Mesh the cylinder or the box that the section states."""
+    if (shape := section.cylinder) is not None:
+        return cylinder_of_edge(
+            shape.diameter_m, shape.height_m, edge_length_m, quarter=shape.quarter
+        )
+    return box_of_edge(section.box_m or (0.0, 0.0, 0.0), edge_length_m)
+
+
+@contextmanager
+def _lengths_checked(section: ObjectSection) -> Iterator[None]:
+    """Name a length of a generated body that no body has, in place of what follows from it."""
+    if (shape := section.cylinder) is not None:
         lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
     else:
-        lengths_m = {"box_m": max(box_m)}
+        lengths_m = {"box_m": max(section.box_m or (0.0,))}
     try:
-        if shape is not None:
-            return cylinder_of_edge(
-                shape.diameter_m, shape.height_m, edge_length_m, quarter=shape.quarter
-            )
-        return box_of_edge(box_m, edge_length_m)
+        yield
     except InputError as error:
         key, length_m = max(lengths_m.items(), key=lambda each: each[1])
         largest_m = SIZES_M[1]

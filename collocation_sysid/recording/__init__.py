@@ -1,4 +1,23 @@
-"""What is done to a body and measured on it: grasps, markers, files, and the experiment."""
+"""Recordings: what was done to a body and what was measured on it.
+
+Begin with `experiment` (one recording with all its parts). Its parts are in:
+
+- `grasp`, `poses`, `wrench`: prescribed displacements, the rigid motions that prescribe them, and
+measured reaction forces.
+- `obstacle`, `solids`: rigid obstacles for contact, and their shapes.
+- `loads`, `tendon`, `pressure`, `actuator`: point masses, forces, tendons and pressures.
+- `markers`, `placement`: tracked markers and where they sit on the body.
+- `depth`: depth cameras and scanners.
+- `gauge`: custom sensors.
+- `nuisance`: unknowns of a single recording, with their priors.
+- `environment`: the density of the air.
+
+Files are read by `readers` (markers), `pose_files` (poses), `tables` (forces, displacements,
+pressures, custom sensors) and the subpackage `formats`; `writers` writes them. `alignment`, `clock`
+and `rigid` prepare data: one time grid, sample times, rigid fits. `refinement` moves an experiment
+to a finer mesh, `turning` finds the fastest rotation of its grasps, and `arrays` and `selected`
+check arrays and node selections.
+"""
 
 from .alignment import align as align
 from .clock import sample_interval_s as sample_interval_s

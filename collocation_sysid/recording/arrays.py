@@ -1,4 +1,4 @@
-"""Array fields of the immutable classes: copied, checked against a shape, and made read-only."""
+"""Array fields of immutable classes: copies that are checked against a shape and made read-only."""
 
 from __future__ import annotations
 
@@ -14,12 +14,22 @@ from ..errors import InputError
 def read_only_floats(
     values: ArrayLike, shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Array:
-    """Return a read-only copy of `values`, whose shape must match `shape` (None: any length).
+    """Return a read-only float copy of an array whose shape has been checked.
+
+    Parameters
+    ----------
+    values : array
+    shape : tuple of int or None
+        Expected shape; None allows any length.
+    name : str
+        What the array is, for messages.
+    finite : bool
+        Whether every value must be finite; otherwise NaN and ±inf are accepted.
 
     Raises
     ------
     InputError
-        If the values are not numbers, their shape differs, or one that must be finite is not.
+        If the values are not numbers, the shape differs, or a value that must be finite is not.
     """
     try:
         array = np.array(values, dtype=np.float64)
@@ -36,14 +46,16 @@ def read_only_floats(
 def floats(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
-    """`read_only_floats` of a field."""
+    """Return a converter that applies `read_only_floats` with these arguments to a field's value.
+    """
     return lambda values: read_only_floats(values, shape, name, finite)
 
 
 def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
-    """Return a read-only copy of marker positions (T, M, 3).
+    """Return a read-only copy of marker positions (T, M, 3) whose shape has been checked.
 
-    A sample with a coordinate that is not finite is missing: all three become NaN.
+    A sample with a coordinate that is not finite is missing: all three of its coordinates become
+    NaN.
     """
     tracks = read_only_floats(values, shape, name, finite=False)
     whole = np.isfinite(tracks).all(axis=2, keepdims=True)
@@ -53,12 +65,13 @@ def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str
 
 
 def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Index:
-    """Return a read-only int64 copy of node numbers, whose shape must match `shape`.
+    """Return a read-only int64 copy of node indices, whose shape must match `shape` (None: any
+    length).
 
     Raises
     ------
     InputError
-        If the values are not whole numbers from 0 upwards, or their shape differs.
+        If the values are not whole numbers from 0 upwards, or the shape differs.
     """
     numbers = np.asarray(values)
     if numbers.size and not np.issubdtype(numbers.dtype, np.integer):
@@ -72,11 +85,12 @@ def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str)
 
 
 def triple(point: ArrayLike) -> str:
-    """A point (3,) in a message."""
+    """Return a point (3,) as text with four digits, "(x, y, z)", for messages."""
     return f"({', '.join(f'{x:.4g}' for x in np.asarray(point))})"
 
 
 def _require_shape(shape: tuple[int, ...], expected: tuple[int | None, ...], name: str) -> None:
+    """Raise an `InputError` unless `shape` matches `expected`, in which None allows any length."""
     matches = len(shape) == len(expected) and all(
         want is None or have == want for have, want in zip(shape, expected, strict=True)
     )

@@ -1,4 +1,4 @@
-"""The density of the air around a body, as a user states it."""
+"""Density of the air around a body, as stated in a problem."""
 
 from __future__ import annotations
 

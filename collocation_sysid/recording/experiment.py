@@ -1,4 +1,4 @@
-"""One recording of a body: its grasps, its markers, and the state it starts from."""
+"""One recording of a body: its grasps, loads and measurements, and the state it starts from."""
 
 from __future__ import annotations
 
@@ -44,12 +44,13 @@ AS_IN_A_LABORATORY = Nuisance()
 
 
 def _state(name: str) -> Callable[[ArrayLike], Array]:
+    """Return a converter of nodal vectors (n, 3) for the field ``start_<name>``."""
     return floats((None, 3), f"start_{name}")
 
 
 @stated
 class Experiment:
-    """What was done to a body and what was measured.
+    """One recording of a body: a motion or a series of equilibria, with loads and measurements.
 
     Parameters
     ----------
@@ -58,18 +59,19 @@ class Experiment:
     t_s : (T,) array
         At least three evenly spaced times; of a static experiment one or more, ascending.
     grasps : sequence of Grasp
-        And of `Obstacle`, which stand last. No node in two of them at a time along the same axis.
-        Selected nodes are looked up on the body, and poses given as matrices are those at `t_s`.
+        Grasps, then any `Obstacle`. Two grasps must not hold a node along the same axis at the same
+        time. Selections are looked up on the body, and poses given as matrices are those at `t_s`.
     markers : Markers, optional
-        Tracks at the times `t_s`, at least one sample present. Those given by their places are put
-        on the body, see `place_markers`. None are needed where wrenches or `readings` are measured.
+        Tracks at the times `t_s`, at least one sample present. Markers given by their places are
+        put on the body, see `place_markers`. Not needed if wrenches, depth or `readings` are
+        measured.
     gravity_m_s2 : (3,) array
         Acceleration of gravity [x, y, z].
     name : str
         For messages and reports; experiments of one problem have different names.
     kind : {"dynamic", "static"}
-        A motion; or samples each of which is an equilibrium of its own, at any times (with memory,
-        quasi-static in time).
+        A motion ("dynamic"); or samples each of which is an equilibrium of its own ("static"), at
+        any times (with memory, quasi-static in time).
     start : {"equilibrium", "undeformed", "given"}
         State at the first time: at rest under its loads; undeformed and at rest; or as given.
     start_rule : {"standard", "paper"}
@@ -77,10 +79,10 @@ class Experiment:
     start_positions_m, start_velocities_m_s : (n, 3) arrays, optional
         The state for "given"; at rest if the velocities are left out.
     loaded_since_s : float
-        How long a body with memory has been in the shape of its equilibrium; it has relaxed by
-        default.
+        How long a body with memory has been in the shape of its equilibrium; by default it has
+        relaxed completely.
     validation : bool
-        Not fitted, only predicted.
+        Whether the recording is only predicted, not fitted.
     masses : sequence of PointMass
         Point masses tied to the body.
     forces : sequence of Force
@@ -88,17 +90,17 @@ class Experiment:
     tendons : sequence of Tendon
         Tendons in the body.
     pressures : sequence of Pressure
-        Pressures in cavities or on patches that are held.
+        Pressures in cavities, or on patches with a held rim.
     readings : sequence of Gauge
-        Instruments of one's own.
+        Custom sensors.
     depths : sequence of Depth
         Depth cameras and scanners.
     air_density_kg_m3 : float or "none"
-        Of the air around the body, which lifts it, moves along and drags; "none", stored as zero,
-        in a vacuum, and for a recording that was simulated without air.
+        Density of the air around the body, which gives buoyancy, added mass and drag; "none",
+        stored as zero, in a vacuum and for a recording simulated without air.
     nuisance : Nuisance
-        What else is to be estimated about this recording alone: by default what a careful
-        laboratory does not know better; `Nuisance.none` for ideal data.
+        Standard deviations of the unknowns of this recording alone, which are estimated too: by
+        default those of a careful laboratory; `Nuisance.none` for ideal data.
 
     Raises
     ------
@@ -152,7 +154,7 @@ class Experiment:
 
     @property
     def place(self) -> str:
-        """What it is called in messages."""
+        """Name of the experiment with the word "experiment" in front, for messages."""
         return f"experiment '{self.name}'"
 
     def __repr__(self) -> str:
@@ -165,27 +167,31 @@ class Experiment:
 
     @property
     def gripping(self) -> tuple[Grasp, ...]:
-        """The grasps that hold nodes of the body."""
+        """Grasps that hold nodes of the body: all `grasps` but the obstacles."""
         return tuple(grasp for grasp in self.grasps if not isinstance(grasp, Obstacle))
 
     @property
     def wrenches(self) -> tuple[Wrench, ...]:
-        """What the sensors of its grasps have measured, in their order."""
+        """Measured wrenches of the grasps that have a sensor, obstacles included, in the order of
+        `grasps`.
+        """
         return tuple(grasp.wrench for grasp in self.grasps if grasp.wrench is not None)
 
     @property
     def symmetry(self) -> int:
-        """How many times the body's loads those of the specimen are; 1 if its sensors disagree."""
+        """Ratio of the specimen's loads to those of the modelled part; 1 if the wrenches state
+        different ones.
+        """
         stated = {wrench.symmetry for wrench in self.wrenches}
         return stated.pop() if len(stated) == 1 else 1
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """What it may touch, the last of the grasps."""
+        """Rigid obstacles that the body may touch; they come last in `grasps`."""
         return tuple(grasp for grasp in self.grasps if isinstance(grasp, Obstacle))
 
     def with_obstacles(self, obstacles: Iterable[Obstacle]) -> Experiment:
-        """The same with others in the place of its obstacles."""
+        """Return the experiment with these obstacles in place of its own."""
         return replace(self, grasps=(*self.gripping, *obstacles))
 
     @property
@@ -195,7 +201,7 @@ class Experiment:
 
     @property
     def timestep_s(self) -> float:
-        """Time between samples, on average; a second where there is one sample."""
+        """Mean time between samples [s]; 1 s if there is only one sample."""
         return self.duration_s / (len(self.t_s) - 1) if len(self.t_s) > 1 else 1.0
 
     @property
@@ -205,23 +211,26 @@ class Experiment:
 
     @cached_property
     def held_dofs(self) -> Index:
-        """Dofs, 3 node + axis, that are grasped throughout, sorted."""
+        """Sorted dofs (3 · node + axis) with prescribed displacements at every sample time."""
         held = self.held(self.t_s)
         return np.flatnonzero(held.all(axis=0))
 
     @cached_property
     def free_dofs(self) -> Index:
-        """All other dofs, sorted; grasps with a time window may hold some for a while."""
+        """Sorted dofs that are not in `held_dofs`; grasps with a time window may hold some of them
+        for a while.
+        """
         return np.setdiff1d(np.arange(self.body.nodes_m.size), self.held_dofs)
 
     def grasped(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
-        """Return which coordinates of the nodes are held at the times `t_s` (T,), and where.
+        """Return which nodal coordinates are prescribed at the times `t_s` (T,), and their values.
 
         Returns
         -------
         held : (T, n, 3) bool
+            Whether the coordinate is prescribed.
         positions_m : (T, n, 3)
-            NaN where a node is not held.
+            Prescribed coordinates [m]; NaN where a coordinate is free.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         held = self.held(times)
@@ -233,7 +242,9 @@ class Experiment:
         return held, positions
 
     def held(self, t_s: ArrayLike) -> NDArray[np.bool_]:
-        """Return which coordinates of the nodes are held at the times `t_s` (T,), (T, n, 3)."""
+        """Return whether each nodal coordinate is prescribed at the times `t_s` (T,), as (T, n, 3)
+        bool.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
         for grasp in self.grasps:
@@ -242,19 +253,22 @@ class Experiment:
         return held
 
     def held_positions(self, t_s: ArrayLike) -> Array:
-        """Return where `held_dofs` are carried at `t_s` (T,), as (T, held) metres."""
+        """Return the prescribed coordinates of `held_dofs` at the times `t_s` (T,), as (T, held)
+        [m].
+        """
         positions = self.grasped(t_s)[1]
         return positions.reshape(len(positions), -1)[:, self.held_dofs]
 
     def node_mass_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass that moves with each node at `t_s` (T,), (T, n) [kg].
+        """Return the mass that moves with each node at the times `t_s` (T,), as (T, n) [kg].
 
-        Of the body's densities as stated.
+        The sum of the body's mass at its stated densities and of the point masses.
         """
         return self.body.node_mass + self.tied_mass_kg(t_s)
 
     def tied_mass_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass of all point masses that each node carries at `t_s` (T,), (T, n) [kg]."""
+        """Return the mass of all point masses at each node at the times `t_s` (T,), as (T, n) [kg].
+        """
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
@@ -262,17 +276,20 @@ class Experiment:
         return mass
 
     def share(self, load: PointMass | Force, t_s: ArrayLike) -> Array:
-        """Return how much of a load is there at `t_s` (T,), from 0 to 1.
+        """Return the share of a load that acts at the times `t_s` (T,), from 0 to 1.
 
-        It joins and leaves between a sample before and a sample after its times, see `loads.ramp`;
-        all is there from the first sample on where it joins by then. Where the experiment is
-        static it joins and leaves at once.
+        In a motion the share rises, or falls, from one sample before to one sample after `from_s`
+        or `until_s`, see `loads.ramp`; a load that joins at or before the first sample acts fully
+        from the start. In a static experiment the share jumps at these times.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         joined, left = (self._changed(load, change, times) for change in get_args(Change))
         return joined - left
 
     def _changed(self, load: PointMass | Force, change: Change, times: Array) -> Array:
+        """Return the share (T,) of a load that has joined (or left, by `change`) at the given
+        times.
+        """
         at_s = getattr(load, change)
         if self.static:
             return (times >= at_s - TIME_TOLERANCE_S).astype(np.float64)
@@ -281,12 +298,13 @@ class Experiment:
         return np.full(len(times), float(at_s <= self.t_s[0]))
 
     def changes(self, load: PointMass | Force, change: Change) -> bool:
-        """Whether a load joins, or leaves, within the recording of a motion."""
+        """Return whether a load joins (or leaves, by `change`) within a motion; false if static."""
         within = self.t_s[0] < getattr(load, change) < self.t_s[-1]
         return bool(within) and not self.static
 
     def node_forces_n(self, t_s: ArrayLike) -> Array:
-        """Return the forces besides gravity on the nodes at `t_s` (T,), (T, n, 3)."""
+        """Return the forces besides gravity on each node at the times `t_s` (T,), as (T, n, 3) [N].
+        """
         n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
@@ -295,14 +313,17 @@ class Experiment:
 
     @property
     def sensed(self) -> tuple[int, ...]:
-        """The grasps, by their places, whose force or torque is measured."""
+        """Indices of the grasps whose force or torque is measured, by a wrench or a custom sensor.
+        """
         looked = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
         sensed = (k for k, g in enumerate(self.grasps) if g.wrench is not None or k in looked)
         return tuple(sensed)
 
     @property
     def knows_a_force(self) -> bool:
-        """Whether a known mass or force, or a measured one, sets the scale of all forces."""
+        """Whether a stated mass, force or actuator, or a measured force, sets the scale of all
+        forces.
+        """
         if self.sensed:
             return True
         if any(actuator.amplitude(self.t_s).any() for actuator in self.actuators):
@@ -313,17 +334,17 @@ class Experiment:
 
     @property
     def has_air_drag(self) -> bool:
-        """Whether air drags at the body: nothing does in a vacuum or in an equilibrium."""
+        """Whether air drag acts: false in a vacuum and in static experiments."""
         return self.air_density_kg_m3 > 0 and not self.static
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
-        """Its tendons, then its pressures."""
+        """Tendons, then pressures."""
         return (*self.tendons, *self.pressures)
 
     @property
     def joined(self) -> Joined:
-        """The mesh graph of its body, and the couplings of each actuator, obstacle and force."""
+        """Mesh graph of the body with the couplings of its actuators, obstacles and air drag."""
         couplings = [each.measure.couplings for each in self.actuators]
         couplings += [each.surface(self.body).points.couplings for each in self.obstacles]
         couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
@@ -331,14 +352,15 @@ class Experiment:
 
     @property
     def pattern(self) -> SymmetricPattern:
-        """Sparsity of the slopes of the forces on its body."""
+        """Sparsity pattern of the derivatives of the forces on the body."""
         return self.joined.pattern
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:
-        """Return all nodes (T, n, 3) as if a grasp carried the undeformed body rigidly.
+        """Return the node positions (T, n, 3) [m] if a grasp carried the undeformed body rigidly.
 
-        That is the first grasp that holds throughout along all axes; without one the first that
-        does along some, else the first. Without a grasp the body stays where it is undeformed.
+        The first grasp that holds all axes at every sample is used; without one, the first that
+        holds some axes at every sample, else the first. Without a grasp the body stays in its
+        undeformed place. The frames of obstacles follow their own poses.
         """
         rotations, translations = self.rigid_motion(t_s)
         places = np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
@@ -348,12 +370,12 @@ class Experiment:
 
     @property
     def up(self) -> Array:
-        """(3,) unit vector against gravity; z where there is none."""
+        """(3,) unit vector against gravity; the z axis if there is no gravity."""
         pull = np.linalg.norm(self.gravity_m_s2)
         return -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
 
     def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
+        """Return rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if not self.gripping:
             return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
@@ -365,13 +387,18 @@ class Experiment:
         return poses.at(times)
 
     def _carried_back(self, points_m: Array, t_s: Array) -> Array:
-        """Where points (M, 3) seen at `t_s` (M,) sit on the body if it was carried rigidly."""
+        """Return the undeformed places (M, 3) of points (M, 3) seen at `t_s` (M,) if the body moved
+        rigidly.
+        """
         rotations, translations = self.rigid_motion(t_s)
         return np.einsum("mji,mj->mi", rotations, points_m - translations)
 
     @property
     def place_sigma_m(self) -> Array:
-        """(M,) standard deviation of each marker's place, zero where it is exact."""
+        """(M,) prior standard deviation of each marker's place [m]; zero where the place is exact.
+
+        The diagonal of the body where no place is given.
+        """
         markers = self.markers
         usual = self.nuisance.marker_offset_m or 0.0
         sigma_m = np.full(len(markers.names), usual)
@@ -516,7 +543,14 @@ class Experiment:
             self._refuse_free_motions()
 
     def _start_frames(self, given: int) -> None:
-        """Where a state without them is given, put the frames of obstacles where they are."""
+        """Append positions and velocities of the obstacles' frames to a given start state without
+        them.
+
+        Parameters
+        ----------
+        given : int
+            Number of nodes of the given state.
+        """
         frames = self.body.frames.ravel()
         if given == len(self.body.nodes_m):
             return

@@ -1,4 +1,4 @@
-"""Pose files: CSV with quaternions or 4x4 matrices, and archives of matrices."""
+"""Files of poses: CSV with quaternions or 4×4 matrices, and NumPy archives of matrices."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ _ZIP = b"PK\x03\x04"
 def read_poses(
     path: str | Path, quaternion: str | None = None, length_unit: str | None = None
 ) -> PoseSequence:
-    """Read grasp poses, which map undeformed to current positions.
+    """Read poses of a grasp, which map undeformed to current positions.
 
     A CSV has the columns t_s, x_m, y_m, z_m (or in other units, also as "Time (ms)" and "X [mm]";
-    or x, y, z and `length_unit`) and a quaternion, in any order: qx, qy, qz, qw, or q0 … q3 or
-    q1 … q4 and its order in `quaternion`. A CSV without column names holds t, x, y, z and a
-    quaternion; `quaternion` and `length_unit` say the rest. A CSV with m00, m01 … m33 beside t_s
-    holds 4x4 matrices row by row, a NumPy archive (.npz) has them as `matrices` (T, 4, 4) beside
+    or x, y, z and `length_unit`) and a quaternion, in any order: qx, qy, qz, qw, or q0 … q3 or q1 …
+    q4 and its order in `quaternion`. A CSV without column names holds t, x, y, z and a quaternion,
+    whose order and unit are `quaternion` and `length_unit`. A CSV with m00, m01 … m33 beside t_s
+    holds 4×4 matrices row by row, a NumPy archive (.npz) has them as `matrices` (T, 4, 4) beside
     `t_s` (T,); both in metres unless `length_unit` is given.
 
     Parameters
@@ -59,9 +59,9 @@ def read_poses(
     Raises
     ------
     InputError
-        If a column is missing, unknown or repeated, a cell is not a number, time does not
-        increase, a quaternion is not of unit norm or a matrix is no rigid motion; the line is
-        named. Also where order or unit is neither in the file nor given, or they differ.
+        If a column is missing, unknown or repeated, a cell is not a number, time does not increase,
+        a quaternion is not of unit norm or a matrix is no rigid motion; the line is named. Also if
+        order or unit is neither in the file nor given, or both disagree.
     """
     refuse_unknown_unit(length_unit)
     if quaternion not in (None, *_ORDERS):
@@ -90,6 +90,9 @@ def read_poses(
 def _sequence(
     t_s: Array, positions_m: Array, quaternions: Array, places: list[str]
 ) -> PoseSequence:
+    """Return a pose sequence; a faulty pose raises an `InputError` that names its entry of
+    `places`.
+    """
     if fault := first_pose_fault(t_s, positions_m, quaternions):
         raise InputError(fault[1], where=places[fault[0]])
     return PoseSequence(t_s, positions_m, quaternions)
@@ -99,11 +102,16 @@ def _sequence(
 
 
 def _columns(grid: Grid, places: Iterable[int]) -> Array:
+    """Return the cells of these columns as numbers (rows, columns); blank cells raise an
+    `InputError`.
+    """
     return numbers(grid, list(places), blank_allowed=False)
 
 
 def _with_names(table: Grid) -> Grid:
-    """Give names to eight columns that have none: the first row is numbers then."""
+    """Name the columns of a table with eight columns whose first row is numbers; others are
+    unchanged.
+    """
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
     names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
@@ -111,6 +119,7 @@ def _with_names(table: Grid) -> Grid:
 
 
 def _other_columns(grid: Grid) -> InputError:
+    """Return the error for a table whose columns are not those of poses."""
     return grid.refusal(
         f"the columns are {', '.join(grid.columns)}; expected {', '.join(POSE_COLUMNS)}, each once "
         "(or t_s and m00, m01 … m33)"
@@ -118,7 +127,14 @@ def _other_columns(grid: Grid) -> InputError:
 
 
 def _axes(grid: Grid, length_unit: str | None) -> tuple[list[int], float]:
-    """The columns of the position, and what their unit is in metres; of two, one is a slip."""
+    """Return the indices of the columns of x, y, z, and the factor from their unit to metres.
+
+    Raises
+    ------
+    InputError
+        If they are not three columns of one unit, or the unit is stated nowhere or twice
+        differently.
+    """
     parts = [name_and_unit(column) for column in grid.columns]
     axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
     stated = [parts[k][1] for k in axes]
@@ -142,7 +158,16 @@ def _axes(grid: Grid, length_unit: str | None) -> tuple[list[int], float]:
 
 
 def _components(grid: Grid, order: str | None, others: list[int]) -> list[int]:
-    """The columns of the quaternion in the order x, y, z, w."""
+    """Return the indices of the columns of the quaternion in the order x, y, z, w.
+
+    Parameters
+    ----------
+    grid : Grid
+    order : {"xyzw", "wxyz"} or None
+        Stated order of the columns; needed if the columns are numbered.
+    others : list of int
+        Columns that hold neither time nor position.
+    """
     place = {grid.columns[k]: k for k in others}
     if sorted(place) == ["qw", "qx", "qy", "qz"]:
         named = "".join(name[1] for name in place)
@@ -167,6 +192,7 @@ def _components(grid: Grid, order: str | None, others: list[int]) -> list[int]:
 
 
 def _archive(path: str | Path) -> tuple[Array, Array]:
+    """Return `t_s` (T,) and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit."""
     try:
         arrays = load_arrays(path)
     except InputError:
@@ -189,6 +215,7 @@ def _archive(path: str | Path) -> tuple[Array, Array]:
 def _from_matrices(
     t_s: Array, matrices: Array, length_unit: str | None, places: list[str]
 ) -> PoseSequence:
+    """Return the poses of matrices (T, 4, 4); `places` name the rows in messages."""
     if fault := first_matrix_fault(t_s, matrices):
         raise InputError(fault[1], where=places[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]

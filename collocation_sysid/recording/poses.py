@@ -1,7 +1,7 @@
-"""Rigid motions over time, as they carry what a robot holds.
+"""Rigid motions over time, by which grasps carry nodes of a body.
 
 A pose maps undeformed to current positions, x = R X + p. Between the samples of a sequence the
-motion is smooth (splines with continuous accelerations), linear, or held (zero-order hold).
+motion is smooth (splines with continuous accelerations), linear, or constant (zero-order hold).
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ class PoseSequence:
     t_s : (m,) array
         Sample times, strictly increasing. A single sample is a pose that never changes.
     positions_m : (m, 3) array
-        p.
+        Translations p.
     quaternions_xyzw : (m, 4) array
-        R, scalar last as in SciPy. Norms within 1e-3 of one are normalised; signs are made
-        continuous in time.
+        Rotations R, scalar last as in SciPy. Norms within 1e-3 of one are normalised; signs are
+        made continuous in time.
     interpolation : {"smooth", "linear", "hold"}
         Between samples: cubic splines of the position and of the quaternion, which is then
         normalised; linear in position with SLERP in rotation; or the latest sample. Across a jump
-        (see `jumps`) and between two poses alone "smooth" is linear.
+        (see `jumps`) and between only two poses "smooth" is linear.
 
     Raises
     ------
     InputError
-        If shapes disagree, a value is not finite, time does not increase, or a quaternion is not
-        of unit norm; the first bad row is named, counting from 1.
+        If shapes disagree, a value is not finite, time does not increase, or a quaternion is not of
+        unit norm; the first bad row is named, counting from 1.
     """
 
     t_s: Array = key(converter=floats((None,), "t_s of the poses", finite=False))
@@ -89,12 +89,13 @@ class PoseSequence:
     def from_matrices(
         cls, t_s: ArrayLike, matrices: ArrayLike, interpolation: Interpolation = "smooth"
     ) -> PoseSequence:
-        """Poses from 4×4 matrices [[R, p], [0, 1]], (m, 4, 4) in metres, at the times `t_s` (m,).
+        """Return the poses of 4×4 matrices [[R, p], [0, 1]], (m, 4, 4) [m], at the times `t_s`
+        (m,).
 
         Raises
         ------
         InputError
-            If shapes disagree, or a matrix is no rigid motion; the first bad one is named.
+            If shapes disagree, or a matrix is no rigid motion; the first such matrix is named.
         """
         times = read_only_floats(t_s, (None,), "t_s of the poses", finite=False)
         motions = read_only_floats(matrices, (len(times), 4, 4), "matrices of the poses", False)
@@ -104,15 +105,20 @@ class PoseSequence:
         return cls(times, motions[:, :3, 3], quaternions, interpolation)
 
     def after(self, matrix: ArrayLike | PoseSequence) -> PoseSequence:
-        """Return the poses that move by a 4×4 matrix [[R, p], [0, 1]] first, then as these do.
+        """Return the composition of these poses with a constant rigid motion that is applied first.
 
-        Where these are poses U_t of a gripper and the matrix G says where the undeformed body is
-        in the gripper's frame, the result is the body's: x = U_t G X.
+        If these are poses U_t of a gripper and the matrix G places the undeformed body in the
+        gripper's frame (hand–eye transform), the result is the poses of the body: x = U_t G X.
+
+        Parameters
+        ----------
+        matrix : (4, 4) array or PoseSequence
+            [[R, p], [0, 1]] in metres; of a sequence the first pose is taken.
 
         Raises
         ------
         InputError
-            If the matrix, which may be one pose, is no rigid motion.
+            If the matrix is no rigid motion.
         """
         first = matrix
         if not isinstance(first, PoseSequence):
@@ -125,7 +131,7 @@ class PoseSequence:
         )
 
     def shifted(self, by_m: ArrayLike) -> PoseSequence:
-        """Return the poses with a constant (3,) added to their positions."""
+        """Return the poses with a constant (3,) [m] added to their positions."""
         return replace(self, positions_m=self.positions_m + np.asarray(by_m))
 
     def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
@@ -160,6 +166,8 @@ class PoseSequence:
         return self._linear_at(times)
 
     def _linear_at(self, times: Array) -> tuple[Array, Array]:
+        """Return rotations (k, 3, 3) and translations (k, 3) at times (k,), linearly interpolated.
+        """
         k = np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 2)
         fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
         step_m = self.positions_m[k + 1] - self.positions_m[k]
@@ -168,7 +176,8 @@ class PoseSequence:
         return rotations, self.positions_m[k] + fraction * step_m
 
     def carry(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Return where the undeformed points (k, 3) are carried at `t_s` (T,), as (T, k, 3)."""
+        """Return the positions (T, k, 3) [m] of undeformed points (k, 3) at the times `t_s` (T,).
+        """
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
         return np.einsum("tij,kj->tki", rotations, points) + translations[:, None, :]
@@ -182,23 +191,29 @@ class PoseSequence:
 
     @cached_property
     def _position_spline(self) -> PPoly:
+        """Spline of the positions (m, 3)."""
         return smooth_spline(self.t_s, self.positions_m)
 
     @cached_property
     def _quaternion_spline(self) -> PPoly:
         # Normalised it keeps its smoothness and its order, and no frame of reference is special.
+        """Spline of the quaternions (m, 4), to be normalised after evaluation."""
         return smooth_spline(self.t_s, self.quaternions_xyzw)
 
     @cached_property
     def _rotations(self) -> Rotation:
+        """Rotations of all samples."""
         return Rotation.from_quat(self.quaternions_xyzw)
 
     @cached_property
     def turns(self) -> Array:
-        """Rotation vector from each sample to the next, in the frame of the earlier one."""
+        """(m − 1, 3) rotation vector from each sample to the next, in the frame of the earlier one
+        [rad].
+        """
         return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
 
     def _require_covered(self, times: Array) -> None:
+        """Raise an `InputError` if a time is over half a sample outside the sequence."""
         first_step, last_step = np.diff(self.t_s)[[0, -1]]
         earliest = self.t_s[0] - max(0.5 * first_step, TIME_TOLERANCE_S)
         latest = self.t_s[-1] + max(0.5 * last_step, TIME_TOLERANCE_S)
@@ -216,8 +231,8 @@ def first_pose_fault(
 ) -> tuple[int, str] | None:
     """Return the index of the first unusable pose and what is wrong with it; None if all are fine.
 
-    Values that are not finite are looked for first, then times that do not increase, then
-    quaternions that are not of unit norm.
+    Values that are not finite are reported first, then times that do not increase, then quaternions
+    that are not of unit norm.
     """
     finite = np.isfinite(np.column_stack([t_s, positions_m, quaternions_xyzw])).all(axis=1)
     if not finite.all():
@@ -237,9 +252,10 @@ def first_pose_fault(
 
 
 def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
-    """Return the index of the first matrix that is no rigid motion, and why; None if all are.
+    """Return the index of the first of (m, 4, 4) matrices that is no rigid motion, and the reason.
 
-    SciPy would make any matrix orthonormal without a word.
+    None if all are rigid motions. This check is needed as SciPy silently orthonormalises any
+    matrix.
     """
     rotations = matrices[:, :3, :3]
     with np.errstate(invalid="ignore"):
@@ -265,7 +281,9 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
 
 
 def _unit_and_continuous(quaternions: Array) -> Array:
-    """Normalise, and flip signs so that neighbours lie in the same half of the sphere."""
+    """Normalise quaternions (m, 4) and choose their signs so that neighbours are in the same
+    hemisphere.
+    """
     unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     aligned = np.sum(unit[1:] * unit[:-1], axis=1) >= 0.0
     signs = np.cumprod(np.concatenate([[1.0], np.where(aligned, 1.0, -1.0)]))
@@ -278,7 +296,8 @@ def _unit_and_continuous(quaternions: Array) -> Array:
 
 
 def jumps(t_s: Array, values: Array) -> Index:
-    """Return the intervals in which values (m, k) jump, numbered by their first sample.
+    """Return the indices of the intervals in which values (m, k) jump; interval i begins at sample
+    i.
 
     A jump is a change that is more than 10 times as fast as those just before and just after.
     """
@@ -292,8 +311,8 @@ def jumps(t_s: Array, values: Array) -> Index:
 def smooth_spline(t_s: Array, values: Array) -> PPoly:
     """Return the cubic spline through values (m, k), m > 1, with two continuous derivatives.
 
-    Across a jump it is linear, and separate splines end on either side: one spline would
-    overshoot around it. Few samples make a parabola or a line.
+    Across a jump the spline is linear, with separate splines on either side, as one spline would
+    overshoot near the jump. Three samples make a parabola and two a line.
     """
     broken = jumps(t_s, values)
     coefficients = np.zeros((4, len(t_s) - 1, values.shape[1]))
@@ -313,22 +332,23 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
 def refuse_untold(
     poses: PoseSequence, t_s: Array, held_s: tuple[float, float], file: str | Path
 ) -> None:
-    """Refuse poses that leave open how a grasp moves while it holds.
+    """Raise an `InputError` if poses do not determine the motion of a grasp while it holds.
 
     Parameters
     ----------
     poses : PoseSequence
-    t_s : (T,) times of the recording's samples
+    t_s : (T,) array
+        Times of the recording's samples.
     held_s : (float, float)
         First and last time at which the grasp holds.
     file : str or Path
-        Where the poses are from.
+        File of the poses, for messages.
 
     Raises
     ------
     InputError
-        Of a single pose, of poses that are missing for more than a sample at an end, and of a
-        smooth motion that is sampled below 1 Hz.
+        For a single pose, for poses that are missing for more than a sample at either end, and for
+        a smooth motion that is sampled below 1 Hz.
     """
     first_s, last_s = max(t_s[0], held_s[0]), min(t_s[-1], held_s[1])
     lasts = f"the recording lasts from {first_s:.6g} s to {last_s:.6g} s"
@@ -359,7 +379,9 @@ def refuse_untold(
 
 
 def _typical_step_s(poses: PoseSequence, first_s: float, last_s: float) -> float:
-    """Median time from pose to pose within a span, of those between which the grasp moves."""
+    """Median time between consecutive poses of a span between which the grasp moves [s]; 0 if it
+    rests.
+    """
     shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
     turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)
     within = (poses.t_s[1:] > first_s) & (poses.t_s[:-1] < last_s)

@@ -1,4 +1,4 @@
-"""Marker files of any known format behind one function, and the tracks they hold."""
+"""Marker tracks from files of any known format, through one function."""
 
 from __future__ import annotations
 
@@ -118,7 +118,15 @@ def _read_tracks(path: str | Path, choose: Choose) -> RawTracks:
 
 
 def _choice(names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
-    """What picks the markers asked for from the labels in a file."""
+    """Return the function that picks the requested markers from the labels in a file.
+
+    Parameters
+    ----------
+    names : sequence of str or None
+        Names after renaming; None for all.
+    renamed : mapping of str to str
+        From labels in the file to names.
+    """
 
     def choose(labels: Sequence[str], aside: Collection[str] = ()) -> list[int]:
         _refuse_repeated(labels, "two markers are labelled")
@@ -146,18 +154,23 @@ def _choice(names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
 
 
 def _refuse_repeated(names: Sequence[str], message: str) -> None:
+    """Raise an `InputError` that begins with `message` if a name occurs twice."""
     for name, count in Counter(names).items():
         if count > 1:
             raise InputError(f"{message} '{name}'; expected names that differ")
 
 
 def _require_one_of(name: str, there: Sequence[str], what: str) -> None:
+    """Raise an `InputError` if a name is not among the names in the file."""
     if name not in there:
         hint = hint_at(name, there)
         raise InputError(f"no {what} '{name}'; the file has {', '.join(there)}{hint}")
 
 
 def _unit(raw: RawTracks, length_unit: str | None) -> str:
+    """Return the unit of length by the file or by the user; an `InputError` if they differ or both
+    lack.
+    """
     if length_unit and raw.unit and length_unit != raw.unit:
         raise InputError(
             f"length_unit is '{length_unit}', but {raw.unit_key} says '{raw.unit}'; expected the "
@@ -173,7 +186,7 @@ def _unit(raw: RawTracks, length_unit: str | None) -> str:
 
 
 def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
-    """Times of the frames: as in the file, else from the rate."""
+    """Return the times (T,) of the frames [s]: as in the file, else from the frame rate."""
     t_s, rates = raw.t_s, {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
     stated = {key: rate for key, rate in rates.items() if rate}
     if t_s is not None:
@@ -195,7 +208,10 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
 
 
 def _refuse_other_rate(t_s: Array, key: str, rate_hz: float) -> None:
-    """Lost frames spoil the mean step, and coarsely printed times the median: one must agree."""
+    """Raise an `InputError` if neither the mean nor the median time step agrees with a frame rate.
+
+    Lost frames change the mean step, and coarsely printed times the median: one of them must agree.
+    """
     if len(t_s) < 2:
         return
     steps = np.diff(t_s)
@@ -208,7 +224,10 @@ def _refuse_other_rate(t_s: Array, key: str, rate_hz: float) -> None:
 
 
 def _present(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
-    """Coordinates with NaN for every missing sample, and a sentence for markers with as many."""
+    """Return coordinates (T, M, 3) with NaN for missing samples, and notes on how many are missing.
+
+    Markers with the same losses share a note.
+    """
     x = raw.coordinates
     blank = np.asarray(np.isnan(x).any(axis=2))
     zero = np.asarray((x == 0.0).all(axis=2)) & raw.zeros_are_missing

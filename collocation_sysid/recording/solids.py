@@ -1,4 +1,4 @@
-"""Solids that a body may touch, by how far a point is outside them."""
+"""Rigid solids that a body may touch, each given by its signed distance."""
 
 from __future__ import annotations
 
@@ -22,33 +22,45 @@ TINY_M2 = 1e-24
 
 
 class Solid(ABC):
-    """A solid, in the frame of its obstacle: that of the world where the obstacle rests."""
+    """A rigid solid in the frame of its obstacle: the world's frame if the obstacle is at rest."""
 
     @abstractmethod
     def gap(self, point: ca.SX) -> ca.SX:
-        """How far outside a point (3,) is [m]; negative inside."""
+        """Signed distance of a point (3,) from the surface [m], as an expression; negative inside.
+        """
 
     @abstractmethod
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
-        """Polylines (k, 3) for pictures, of a plane about a point and so long."""
+        """Return polylines (k, 3) that draw the solid.
+
+        Parameters
+        ----------
+        about_m : (3,) array
+            Point near which an unbounded solid is drawn.
+        size_m : float
+            Length of the drawn part of an unbounded solid.
+        """
 
     @property
     def normal(self) -> Array:
-        """(3,) direction along which its place may be off."""
+        """(3,) unit vector along which the solid's position is uncertain."""
         return np.array([0.0, 0.0, 1.0])
 
     @property
     def flat(self) -> bool:
-        """Whether it may be tilted."""
+        """Whether a tilt of the solid may be estimated."""
         return False
 
     @property
     def middle_m(self) -> Array:
-        """(3,) about which."""
+        """(3,) point about which the solid is tilted [m]."""
         return np.zeros(3)
 
 
 def _unit(name: str) -> Any:
+    """Return a converter that normalises a vector (3,); it raises an `InputError` for a zero
+    vector.
+    """
     def made(value: Any) -> Array:
         vector = floats((3,), name)(value)
         length = float(np.linalg.norm(vector))
@@ -61,7 +73,7 @@ def _unit(name: str) -> Any:
 
 @stated
 class Plane(Solid):
-    """All that is behind a plane.
+    """The half-space behind a plane.
 
     Parameters
     ----------
@@ -76,23 +88,27 @@ class Plane(Solid):
 
     @property
     def flat(self) -> bool:
-        """It may be tilted."""
+        """Always true: a tilt of a plane may be estimated."""
         return True
 
     @property
     def middle_m(self) -> Array:
-        """Its point."""
+        """(3,) stated point of the plane [m]."""
         return self.point_m
 
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
-        """A square."""
+        """Return a square with edges of `size_m` about the point of the plane that is nearest to
+        `about_m`.
+        """
         middle = about_m - (about_m - self.point_m) @ self.normal * self.normal
         u, v = across(self.normal) * size_m / 2
         corners = [middle + a * u + b * v for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
         return [np.array(corners)]
 
     def gap(self, point: ca.SX) -> ca.SX:
-        """Along the normal."""
+        """Signed distance of a point (3,) from the plane along its normal [m]; negative behind the
+        plane.
+        """
         return ca.dot(ca.DM(self.normal), point - ca.DM(self.point_m))
 
 
@@ -110,15 +126,16 @@ class Sphere(Solid):
     centre_m: Array = key(Vector, converter=floats((3,), "centre_m"), default=(0.0,) * 3)
 
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
-        """Three circles."""
+        """Return three circles, one across each axis; both arguments are ignored."""
         return [_circle(self.centre_m, axis, self.radius_m) for axis in np.eye(3)]
 
     def gap(self, point: ca.SX) -> ca.SX:
-        """From its surface."""
+        """Signed distance of a point (3,) from the sphere [m]; negative inside."""
         return _length(point - ca.DM(self.centre_m)) - self.radius_m
 
 
 def _ends(value: Any) -> Array:
+    """Check the two ends (2, 3) of an axis; an `InputError` is raised if they coincide."""
     ends = floats((2, 3), "ends_m")(value)
     if (ends[0] == ends[1]).all():
         raise InputError("the ends of an axis are at the same place; expected two places")
@@ -127,20 +144,25 @@ def _ends(value: Any) -> Array:
 
 @stated
 class _Round(Solid):
-    """A solid about an axis between two ends."""
+    """A solid of revolution about an axis between two ends."""
 
     radius_m: float = key(Positive)
     ends_m: Array = key(tuple[Vector, Vector], converter=_ends)
 
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
-        """A circle at each end, and four lines between them."""
+        """Return a circle at each end and four lines between them; both arguments are ignored."""
         axis = np.diff(self.ends_m, axis=0)[0]
         first, last = (_circle(end, axis, self.radius_m) for end in self.ends_m)
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
     def _along(self, point: ca.SX) -> tuple[ca.SX, ca.SX, float]:
-        """How far along the axis from the middle, how far from it, and half of its length."""
+        """Return the cylindrical coordinates of a point (3,) and half of the length of the axis
+        [m].
+
+        The coordinates are the distance along the axis from its middle, and the distance from the
+        axis.
+        """
         first, last = self.ends_m
         half = float(np.linalg.norm(last - first)) / 2
         axis, away = ca.DM((last - first) / (2 * half)), point - ca.DM((first + last) / 2)
@@ -156,7 +178,7 @@ class Cylinder(_Round):
     ----------
     radius_m : float
     ends_m : (2, 3) array
-        Middles of both ends.
+        Centres of both ends.
     rounding_m : float
         Radius of its edges.
     """
@@ -164,7 +186,7 @@ class Cylinder(_Round):
     rounding_m: float = key(NotNegative, default=0.0)
 
     def gap(self, point: ca.SX) -> ca.SX:
-        """From its surface."""
+        """Signed distance of a point (3,) from the cylinder [m]; negative inside."""
         along, away, half = self._along(point)
         beyond = ca.vertcat(away - self.radius_m, ca.fabs(along) - half)
         return _of_corner(beyond + self.rounding_m) - self.rounding_m
@@ -172,7 +194,7 @@ class Cylinder(_Round):
 
 @stated
 class Capsule(_Round):
-    """A cylinder with half a ball at each end, such as a finger.
+    """A cylinder with a half-ball at each end, such as a finger.
 
     Parameters
     ----------
@@ -182,7 +204,7 @@ class Capsule(_Round):
     """
 
     def gap(self, point: ca.SX) -> ca.SX:
-        """From its surface."""
+        """Signed distance of a point (3,) from the capsule [m]; negative inside."""
         along, away, half = self._along(point)
         beyond = ca.fmax(ca.fabs(along) - half, 0)
         return _length(ca.vertcat(beyond, away)) - self.radius_m
@@ -209,44 +231,46 @@ class Cuboid(Solid):
 
     @property
     def flat(self) -> bool:
-        """It may be tilted."""
+        """Always true: a tilt of a box may be estimated."""
         return True
 
     @property
     def middle_m(self) -> Array:
-        """Half way between the corners."""
+        """(3,) centre of the box [m]."""
         return self.corners_m.mean(axis=0)
 
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
-        """Its edges."""
+        """Return the twelve edges; both arguments are ignored."""
         corners = np.array(list(product(*self.corners_m.T)))
         apart = (corners[:, None] != corners).sum(axis=2)
         return [corners[[i, j]] for i, j in np.argwhere(apart == 1) if i < j]
 
     def gap(self, point: ca.SX) -> ca.SX:
-        """From its surface."""
+        """Signed distance of a point (3,) from the box [m]; negative inside."""
         low, high = self.corners_m
         beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM((high - low) / 2)
         return _of_corner(beyond + self.rounding_m) - self.rounding_m
 
 
 def across(normal: Array) -> Array:
-    """(2, 3) axes that complete a direction to a basis."""
+    """Return two unit vectors (2, 3) orthogonal to a direction (3,) and to each other."""
     return np.linalg.svd(normal[None])[2][1:]
 
 
 def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
+    """Return a closed polyline (33, 3) of the circle about a centre (3,) across an axis (3,)."""
     angle = np.linspace(0, 2 * np.pi, 33)
     round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across(axis)
     return centre_m + radius_m * round_m
 
 
 def _length(vector: ca.SX) -> ca.SX:
+    """Euclidean norm with finite second derivatives at zero."""
     return ca.sqrt(ca.sumsqr(vector) + TINY_M2)
 
 
 def _of_corner(beyond: ca.SX) -> ca.SX:
-    """Distance from a corner, by how far a point is beyond each of its sides."""
+    """Signed distance from a convex corner, by the signed distances from each of its sides."""
     return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
 
 
@@ -260,18 +284,19 @@ else:
 
 
 class SolidSection(Section):
-    """The solid, by exactly one of these, in the frame of its poses: the body's without.
+    """The solid, by exactly one of these keys, in the frame of its poses; without poses in the
+    body's.
 
     Attributes
     ----------
     plane : PlaneSection, optional
-        All that is behind a plane: normal, point_m.
+        The half-space behind a plane: normal, point_m.
     sphere_m : SphereSection, optional
         A ball: radius_m, centre_m.
     cylinder_m : CylinderSection, optional
         A cylinder: radius_m, ends_m, rounding_m.
     capsule_m : CapsuleSection, optional
-        A cylinder with half a ball at each end: radius_m, ends_m.
+        A cylinder with a half-ball at each end: radius_m, ends_m.
     box_m : CuboidSection, optional
         A box: corners_m, rounding_m.
     """
@@ -298,11 +323,11 @@ KINDS: dict[str, type[Solid]] = {
 
 
 def name_of(solid: Solid) -> str:
-    """What files call its kind."""
+    """Key of a solid's kind in a problem file, such as "sphere_m"."""
     return next(name for name, kind in KINDS.items() if isinstance(solid, kind))
 
 
 def solid_of(section: SolidSection) -> Solid:
-    """What a table states."""
+    """Return the solid that a `SolidSection` states."""
     ((name, own),) = ((name, own) for name, own in section if own is not None)
     return KINDS[name](**stated_in(own, KINDS[name], name))
