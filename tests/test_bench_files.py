@@ -474,10 +474,11 @@ def test_one_table_of_two_recordings_is_not_simulated(tmp_path):
 def test_faces_are_found_without_any_length():
     mesh = box_mesh((0.02, 0.03, 0.04), (2, 2, 2), origin_m=(0.01, 0.0, -0.5))
     nodes = Nodes.corners(mesh)
-    for face, axis, place in (("top", 2, -0.46), ("bottom", 2, -0.5), ("side_x", 0, 0.01)):
-        chosen = mesh.points_m[Face(face).resolve(nodes)]
+    faces = (Face("top"), 2, -0.46, 9), (Face("bottom"), 2, -0.5, 9), (Face("side_x"), 0, 0.01, 3)
+    for face, axis, place, count in faces:
+        chosen = mesh.points_m[face.resolve(nodes)]
         np.testing.assert_allclose(chosen[:, axis], place)
-        assert len(chosen) == (3 if face == "side_x" else 9)
+        assert len(chosen) == count
     assert len(Face("side_x").resolve_faces(mesh)) == 8
     with pytest.raises(InputError, match="the face top selects nodes, and no cells"):
         Face("top").resolve_cells(mesh)
