@@ -44,8 +44,8 @@ class Failed(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of an isolated process.
+class ProcessLimits:
+    """ProcessLimits of an isolated process.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Limits:
         return WAITING_FACTOR * self.time_s
 
     @classmethod
-    def for_file(cls, path: str | Path) -> Limits:
+    def for_file(cls, path: str | Path) -> ProcessLimits:
         """Return what reading a file may take: some tens of times what readers mostly need."""
         size_mb = os.stat(path).st_size / 1e6
         return cls(
@@ -84,7 +84,7 @@ READING_MB_PER_MB = 60.0
 
 
 def computed_apart(
-    code: str, *words: str, limits: Limits | None = None, **given: ArrayLike
+    code: str, *words: str, limits: ProcessLimits | None = None, **given: ArrayLike
 ) -> dict[str, NDArray]:
     """Arrays that Python code makes in another process.
 
@@ -93,7 +93,7 @@ def computed_apart(
     code : str
         Reads the arrays `given` by name and the words in `sys.argv`, and leaves arrays in `found`.
     words : str
-    limits : Limits, optional
+    limits : ProcessLimits, optional
         None by default.
     given : arrays by name
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..apart import Failed, Limits, computed_apart
+from ..apart import Failed, ProcessLimits, computed_apart
 from ..errors import InputError
 
 # Zlib makes a file at most 1032 times smaller, so this takes up to 200 MB.
@@ -106,7 +106,7 @@ def read_content(path: str | Path) -> MeshContent:
         return _read_here(path)
     try:
         absolute = str(Path(path).resolve())
-        found = computed_apart(_WORKER, absolute, limits=Limits.for_file(path))
+        found = computed_apart(_WORKER, absolute, limits=ProcessLimits.for_file(path))
     except Failed as error:
         raise InputError(str(error)) from error
     head = json.loads(found["head"].tobytes())

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from ...apart import Failed, Limits, computed_apart
+from ...apart import Failed, ProcessLimits, computed_apart
 from ...errors import InputError
 from .tracks import Choose, RawTracks
 from .units import stated_unit
@@ -40,7 +40,9 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
         raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
     points_stated, frames_stated = _stated_counts(content)
     try:
-        read = computed_apart(_WORKER, str(Path(path).resolve()), limits=Limits.for_file(path))
+        read = computed_apart(
+            _WORKER, str(Path(path).resolve()), limits=ProcessLimits.for_file(path)
+        )
     except Failed as error:
         raise InputError(f"is a damaged C3D file: ezc3d says '{error}'") from error
     points = read.pop("points")  # (3, points, frames)
