@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -54,12 +54,14 @@ def contents_of(
         announce_reading({*_named_files(file, folder)}, say)
     with _in_table(path, "object"):
         with _lengths_checked(file.object):
-            if counts := _generated_counts(file.object):
-                require_feasible(_smallest_size(file, *counts, simulation=simulation), say)
+            generated = _generated_counts(file.object)
+            if counts := generated:
+                size = _smallest_size(file, *counts, simulation=simulation)
+                require_feasible(replace(size, substeps=1), say)
             mesh = _load_mesh(file.object, folder)
         counts = len(mesh.points_m), len(mesh.tetrahedra)
         size = _smallest_size(file, *counts, simulation=simulation)
-        require_feasible(size, None if _generated_counts(file.object) else say)
+        require_feasible(replace(size, substeps=1), None if generated else say)
         body = _load_body(completed(file.object, unknowns), mesh, code)
         body = body.with_free_densities(body.weighed_by(unknowns))
         odd = [oddity.sentence for oddity in oddities(body)]
