@@ -14,6 +14,7 @@ from html import escape as escape_html
 from io import StringIO
 from math import isfinite
 from pathlib import Path
+from urllib.parse import quote
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -21,11 +22,16 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from .console import PlainConsole
+from .errors import printable
 from .files import is_own
 from .tree import optional
 
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red", "strong": "bold", "quiet": "dim"}
-MARKS = {"strong": "**", "code": "`"}  # of Markdown
+# Markup of Markdown: anywhere in a text, at its beginning, and as the number of a list item.
+MARKUP = re.compile(r"[\\`*\[\]|~]|<(?=[A-Za-z/!?])|&(?=#?\w+;)|(?<![^\W_])_|_(?![^\W_])")
+MARKUP_AT_START = re.compile(r"^(?:#(?=#*(?:\s|$))|[-+](?=[-\s]|$)|[=>])")
+NUMBER_AT_START = re.compile(r"^(\d{1,9})(?=[.)](?:\s|$))")
+BACKTICKS = re.compile(r"`+")
 # Width of plain text [characters]: wide enough that no line is wrapped.
 WIDE = 200
 # Tables with more columns than this break their headings into two lines.
@@ -338,8 +344,8 @@ def as_html(part: Shown) -> str:
 
 
 def escape(text: str) -> str:
-    """Return a text with the characters escaped that have a meaning in HTML."""
-    return escape_html(text).replace("&#x27;", "&#39;")
+    """Return a text for HTML: markup is escaped, control characters become visible marks."""
+    return escape_html(printable(text)).replace("&#x27;", "&#39;")
 
 
 def _class(style: str) -> str:
@@ -384,26 +390,57 @@ def as_markdown(parts: Sequence[Shown]) -> str:
 def _markdown(part: Shown) -> str:
     match part:
         case str():
-            return part
+            return escape_markdown(part)
         case Line():
-            pieces = ((MARKS.get(span.style, ""), span.text) for span in part.spans)
-            return "".join(f"{mark}{text}{mark}" for mark, text in pieces)
+            return "".join(map(_markdown_span, part.spans))
         case Items():
-            return "\n".join(f"- {text}" for text in part.texts)
+            return "\n".join(f"- {escape_markdown(text)}" for text in part.texts)
         case Table():
             columns = range(len(part.heads) or max(map(len, part.rows), default=0))
             heads = part.heads or ("",) * len(columns)
             rule = tuple("---:" if part.is_number(k) else "---" for k in columns)
-            lines = (heads, rule, *part.rows)
-            escaped = (" | ".join(cell.replace("|", "\\|") for cell in line) for line in lines)
-            table = "\n".join(f"| {line} |" for line in escaped)
-            return f"## {part.title}\n\n{table}" if part.title else table
+            head, *rows = (map(escape_markdown, line) for line in (heads, *part.rows))
+            table = "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *rows))
+            return f"## {escape_markdown(part.title)}\n\n{table}" if part.title else table
         case Cards():
-            return "\n".join(f"- {what}: {value} ({beside})" for what, value, beside in part.items)
+            cards = (f"{what}: {value} ({beside})" for what, value, beside in part.items)
+            return "\n".join(f"- {escape_markdown(card)}" for card in cards)
         case Picture():
-            return f"![{part.caption}]({part.file.name})"
+            return f"![{escape_markdown(part.caption)}]({quote(part.file.name)})"
         case Listing():
-            return f"{part.title}:\n\n```\n{part.text}\n```"
+            fence = _longer_than_any("```", part.text)
+            return f"{escape_markdown(part.title)}:\n\n{fence}\n{printable(part.text)}\n{fence}"
         case Section():
-            title = f"{'#' * part.level} {part.title}" if part.title else ""
+            heading = f"{'#' * part.level} {escape_markdown(part.title)}"
+            title = heading if part.title else ""
             return "\n\n".join(filter(None, (title, *map(_markdown, part.parts))))
+
+
+def escape_markdown(text: str) -> str:
+    """Text as one line of Markdown that a reader shows as it is: no markup, HTML or links."""
+    line = MARKUP.sub(r"\\\g<0>", " ".join(printable(text).split()))
+    return NUMBER_AT_START.sub(r"\1\\", MARKUP_AT_START.sub(r"\\\g<0>", line))
+
+
+def _markdown_span(span: Span) -> str:
+    text = span.text.strip()
+    if not text or span.style not in ("strong", "code"):
+        return _around(span.text, escape_markdown(text))
+    if span.style == "strong":
+        return _around(span.text, f"**{escape_markdown(text)}**")
+    fence, pad = _longer_than_any("`", text), " " if "`" in text else ""
+    code = " ".join(printable(text).split())
+    return _around(span.text, f"{fence}{pad}{code}{pad}{fence}")
+
+
+def _around(text: str, shown: str) -> str:
+    """Keep the spaces with which a piece of a sentence begins and ends."""
+    before = " " if text[:1].isspace() else ""
+    after = " " if text[-1:].isspace() else ""
+    return f"{before}{shown}{after}"
+
+
+def _longer_than_any(fence: str, text: str) -> str:
+    """Return a fence of backticks that the text does not have."""
+    longest = max(map(len, BACKTICKS.findall(text)), default=0)
+    return fence if longest < len(fence) else "`" * (longest + 1)

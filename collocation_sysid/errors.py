@@ -20,11 +20,13 @@ def hint_at(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-# Marks in place of what would control a terminal or turn its text around.
+# Marks in place of what would control a terminal or turn its text around, and of what neither UTF-8
+# nor XML can hold.
 _MARKS = (
     {code: 0x2400 + code for code in range(0x20) if code not in (0x09, 0x0A)}
     | {0x7F: 0x2421}
     | dict.fromkeys((*range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)), 0xFFFD)
+    | dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), 0xFFFD)
 )
 # Longest message, and longest quotation of a file in it [characters].
 LONGEST = 1500
@@ -33,7 +35,7 @@ _ENDLESS_WORD = re.compile(r"(\S{60})\S{340,}")
 
 
 def printable(text: str) -> str:
-    """Return the text with visible marks in place of characters that control a terminal."""
+    """Return the text with visible marks for control characters and for those XML cannot hold."""
     return text.translate(_MARKS)
 
 

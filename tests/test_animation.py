@@ -19,6 +19,7 @@ from problem_files import TRUTH, run_command, settings, write_problem
 from results_small import a_result, value
 from scipy.spatial.transform import Rotation
 
+from collocation_sysid.display import escape
 from collocation_sysid.errors import InputError
 from collocation_sysid.result import animation
 from collocation_sysid.result.animation import (
@@ -29,7 +30,7 @@ from collocation_sysid.result.animation import (
     animate,
     film_samples,
 )
-from collocation_sysid.result.page import surface_strain
+from collocation_sysid.result.page import Colouring, surface_strain, write_page
 from collocation_sysid.result.replay import headline, read_run
 from collocation_sysid.result.style import GREEN
 from collocation_sysid.result.view import frame_files, view
@@ -217,6 +218,20 @@ def test_the_page_needs_nothing_else_and_holds_the_motion(run, tmp_path):
     assert strains.shape[1] == len(faces)
     assert strains.max() == 255
     assert strains[data["opening"]].mean() == strains.mean(axis=1).max() > 0
+
+
+def test_names_are_shown_on_the_page_and_fill_no_place_of_it(run, tmp_path):
+    _, (swing, _) = read_run(run)
+    name = "@DATA@ @HEADLINE@ </title><script><!-- \x1b"
+    quantity = Colouring.field("<!--<script>", surface_strain(swing, swing.positions_m))
+    page = write_page(replace(swing, name=name), tmp_path / "a.html", colouring=quantity)
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r"<title>(.*)</title>", text) == [escape(name)]
+    assert "@DATA@ @HEADLINE@" in text
+    assert "\x1b" not in text
+    assert "<!--" not in text
+    assert text.count("<script>") == 1
+    assert content(page)["quantity"] == "<!--<script>"
 
 
 def test_a_page_is_coloured_by_the_field_asked_for(run, tmp_path):

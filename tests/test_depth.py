@@ -251,6 +251,17 @@ def test_an_exr_image_is_read(tmp_path):
     np.testing.assert_allclose(read.images_m[0], image_m(), rtol=1e-6)
 
 
+def test_of_a_damaged_exr_image_only_the_refusal_is_said(tmp_path, capfd):
+    library, file = pytest.importorskip("OpenEXR"), tmp_path / "image.exr"
+    header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
+    with library.File(header, {"Z": image_m().astype(np.float32)}) as image:
+        image.write(str(file))
+    file.write_bytes(file.read_bytes()[:308])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_depth(file, None, 1.0)
+    assert capfd.readouterr() == ("", "")
+
+
 PROBLEM = """
 [object]
 mesh = "bar.vtu"

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+from pathlib import Path
 
 import pytest
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
 
 from collocation_sysid.console import PlainConsole
 from collocation_sysid.display import (
@@ -13,6 +16,7 @@ from collocation_sysid.display import (
     Items,
     Line,
     Listing,
+    Picture,
     Section,
     Shown,
     Span,
@@ -23,6 +27,7 @@ from collocation_sysid.display import (
     on_terminal,
     plain_text,
 )
+from collocation_sysid.errors import printable
 from collocation_sysid.tree import as_json, content, read
 
 NUMBERS = Table(
@@ -91,10 +96,70 @@ def test_a_page_escapes_texts_and_leads_to_names():
 def test_markdown_keeps_cells_apart():
     text = as_markdown([REPORT])
     assert text.startswith(
-        "# Foam & <silicone>\n\n**Verdict: check**, see why\n\n- E: 1500 Pa (±3)\n"
+        "# Foam & \\<silicone>\n\n**Verdict: check**, see why\n\n- E: 1500 Pa (±3)\n"
     )
     assert "## Estimates\n\n|  | value |  |\n| --- | ---: | --- |\n| E Pa | 1500 | a\\|b |" in text
     assert "## Notes\n\n- one\n- two\n\nThe file:\n\n```\na = 1\n```" in text
+
+
+HOSTILE = [
+    "<script>alert(1)</script>",
+    "[click](javascript:alert(1))",
+    "<javascript:alert(1)>",
+    "![x](http://elsewhere/x.png)",
+    "swing\n\n## Verdict: good\n\nall is well",
+    "# Verdict",
+    "[x]: javascript:alert(1)",
+    "- forged",
+    "3. forged",
+    "> forged",
+    "---",
+    "*a* _b_ __c__ **d** ~~e~~",
+    "`a` ``b``",
+    "a | b \\| c \\",
+    "&lt;b&gt; &#x26;",
+    "```\n# out\n```",
+    "    indented",
+    "<!-- hidden",
+    "\x1b[2J\x00\u202e",
+]
+
+
+def markdown_tokens(name: str) -> list[Token]:
+    """What a reader of Markdown finds where one text is everywhere in a description."""
+    parts = (
+        Line((Span(name, "strong"), Span(f" {name} ", "quiet"), Span(name, "code"))),
+        name,
+        Items((name, name)),
+        Cards(((name, name, name),)),
+        Table(name, (name, "b"), ((name, "1"), (name, "2"))),
+        Picture(Path(f"{name.replace('/', '')}.png"), name),
+        Listing(name, name),
+    )
+    reader = MarkdownIt().enable(["table", "strikethrough"])
+    found = reader.parse(as_markdown([Section(name, parts, level=1)]))
+    return [one for each in found for one in (each, *(each.children or ()))]
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_markdown_shows_names_as_they_are(name: str):
+    def structure(name: str) -> list[tuple[str, int]]:
+        tokens = markdown_tokens(name)
+        return [(each.type, each.level) for each in tokens if not each.type.startswith("text")]
+
+    assert structure(name) == structure("a name")
+    line = " ".join(printable(name).split())
+    texts = [
+        " ".join("".join(child.content for child in each.children or ()).split())
+        for each in markdown_tokens(name)
+        if each.type == "inline"
+    ]
+    assert texts[:3] == [line, f"{line} {line} {line}", line]
+    assert all(mark.isprintable() for text in texts for mark in text)
+
+
+def test_a_page_has_no_control_characters():
+    assert as_html(f"a{HOSTILE[-1]}") == "<p>a␛[2J␀\ufffd</p>\n"
 
 
 def test_json_has_what_was_described():

@@ -421,6 +421,36 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
         assert said in written
 
 
+HOSTILE = "a --- b --> \"<&'\x00\x1b[2J\x0c\ufffe\n"
+
+
+@pytest.mark.parametrize("to", ["mujoco", "febio", "calculix", "sofa", "newton", "usd"])
+def test_any_title_or_name_is_written_in_the_form_of_the_target(to: str, tmp_path: Path):
+    bar = box_mesh(BAR_M, DIVISIONS)
+    cells = np.arange(len(bar.tetrahedra))
+    names = ["a-²"] if to == "sofa" else ["a-²", "a_²"]  # nothing else may be in one
+    parts = np.array_split(cells, len(names))
+    regions = [Region(name, part) for name, part in zip(names, parts, strict=True)]
+    body = Body(bar, "neo-hookean", 900.0, regions=regions)
+    still = Grasp(nodes_where(body, 0, 0.0), PoseSequence.fixed())
+    t_s = times(8)
+    markers = vertex_markers(body, nodes_where(body, 0, BAR_M[0]), t_s)
+    wall = Obstacle(shape=Plane(point_m=(0.0, 0.0, -1.0)), name=HOSTILE)
+    experiment = Experiment(body, t_s, [still], markers, nuisance=IDEAL)
+    touching = experiment.with_obstacles([wall])
+    values = {f"{name}.{n}": v for name in names for n, v in {**MODULI, **OTHERS}.items()}
+    theta, words = body.theta(values), (HOSTILE, "good", (HOSTILE,))
+    identified = Identified(*words, {}, body, theta, experiment, None, touching)
+    folder = exported(identified, to, tmp_path)
+    for file in folder.iterdir():
+        text = file.read_text(encoding="utf-8")
+        assert all(mark.isprintable() or mark in "\n\t" for mark in text)
+        if file.suffix in (".xml", ".feb", ".scn"):
+            ElementTree.parse(file)
+        elif file.suffix == ".py":
+            compile(text, file, "exec")
+
+
 def test_a_pure_energy_is_exported_without_reserve(tmp_path):
     body = held_bar()
     for to in ("mujoco", "sofa"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import socket
 import sys
 from collections.abc import Callable
@@ -463,6 +464,33 @@ def test_joints_beyond_their_limits_are_refused(tmp_path: Path) -> None:
     log = bag(tmp_path / "trial", [of.joints(t, {"turn": 30.0, "slide": 0.1}) for t in T_S])
     (tmp_path / "arm.urdf").write_text(URDF)
     with pytest.raises(InputError, match=r"turn is at 30, beyond its limits -1.5 to 1.5 .*#deg"):
+        read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
+
+
+ENTITIES = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 10))
+
+
+@pytest.mark.parametrize(
+    "doctype",
+    [f'<!DOCTYPE x [<!ENTITY a0 "words">{ENTITIES}]>',
+     '<!DOCTYPE x [<!ENTITY a9 SYSTEM "file:///etc/passwd">]>'],
+    ids=["expanding", "external"],
+)  # fmt: skip
+def test_entities_of_a_robots_description_are_not_expanded(tmp_path: Path, doctype: str) -> None:
+    log = bag(tmp_path / "trial", [Messages().joints(t, {"turn": t}) for t in T_S])
+    urdf = f'{doctype}<robot name="arm"><link name="&a9;"/><link name="base"/></robot>'
+    (tmp_path / "arm.urdf").write_text(urdf)
+    with pytest.raises(InputError) as refused:
+        read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
+    assert "root:" not in str(refused.value)
+    assert "wordswords" not in str(refused.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes by name here")
+def test_a_pipe_as_a_robots_description_is_refused(tmp_path: Path) -> None:
+    log = bag(tmp_path / "trial", [Messages().joints(t, {"turn": t}) for t in T_S])
+    os.mkfifo(tmp_path / "arm.urdf")
+    with pytest.raises(InputError, match="is a pipe; expected a regular file"):
         read_poses(f"{log}#/joint_states#arm.urdf#base>tool")
 
 

@@ -72,6 +72,16 @@ def test_every_dependency_states_the_lowest_version():
         lowest(["numpy"])
 
 
+def test_all_extras_for_users_are_in_all():
+    extras = PROJECT["optional-dependencies"]
+    (everything,) = extras["all"]
+    listed = re.fullmatch(r"collocation-sysid\[(.*)\]", everything)
+    assert listed is not None
+    # `large` has a licence of its own; the others are for developers.
+    left_out = {"all", "large", "notebook", "test", "docs", "dev"}
+    assert {*listed[1].split(",")} == {*extras} - left_out
+
+
 def test_hosted_checks_run_targets_that_are_there():
     targets = re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE)
     workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()

@@ -1,4 +1,8 @@
-"""The NLP's functions, and its observer, as CasADi callbacks over the shared assembly."""
+"""CasADi callbacks that evaluate the NLP's functions and observe the iterations of a solver.
+
+Use `NlpFunctions` for functions with derivatives and `Monitor` for the history; `nlpsol` combines
+them.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +23,31 @@ HessianValues = Callable[[Array, float, Array, Array], None]
 
 
 class TimedFunction(ca.Callback):
-    """A CasADi function of (z, …) whose outputs are written straight into CasADi's memory.
+    """CasADi function whose outputs are written directly to CasADi's memory, with a timer.
 
-    CasADi would print exceptions and go on: they are put in `errors`, for `solve` to raise.
+    CasADi would print exceptions and continue. Instead they are appended to `errors`, from which
+    `nlpsol.solve` raises them, and all later evaluations fail.
+
+    Attributes
+    ----------
+    calls : int
+        Number of evaluations.
+    seconds : float
+        Time of the evaluations [s].
+
+    Parameters
+    ----------
+    name : str
+        Name of the function in CasADi.
+    inputs : list of Sparsity
+        Sparsity of each input.
+    outputs : list of Sparsity
+        Sparsity of each output.
+    evaluate : callable
+        Function of the input arrays and the output arrays, which it writes; an output is None if it
+        is not requested.
+    errors : list
+        Exceptions, shared by all functions of a solve.
     """
 
     def __init__(
@@ -40,21 +66,27 @@ class TimedFunction(ca.Callback):
         self.construct(name)
 
     def get_n_in(self) -> int:
+        """Return the number of inputs (CasADi's interface)."""
         return len(self._inputs)
 
     def get_n_out(self) -> int:
+        """Return the number of outputs (CasADi's interface)."""
         return len(self._outputs)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return the sparsity of input i, an index (CasADi's interface)."""
         return self._inputs[i]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Return the sparsity of output i, an index (CasADi's interface)."""
         return self._outputs[i]
 
     def has_eval_buffer(self) -> bool:
+        """Return true: outputs are written to CasADi's memory (CasADi's interface)."""
         return True
 
     def eval_buffer(self, arguments, results) -> int:
+        """Evaluate the function; return 0, or 1 if it fails (CasADi's interface)."""
         began = time.perf_counter()
         self.calls += 1
         if self._errors:
@@ -75,14 +107,18 @@ class TimedFunction(ca.Callback):
 
 
 class LagrangianGradient(TimedFunction):
-    """∇ of the Lagrangian, which solvers differentiate once more in a direction."""
+    """Gradient of the Lagrangian, with a directional derivative for solvers that need
+    Hessian products.
+    """
 
     hessian_product: Callable[[list[Array], list[Array | None]], None]
 
     def has_forward(self, nfwd: int) -> bool:
+        """Return whether CasADi may ask for this number of directional derivatives: only one."""
         return nfwd == 1
 
     def get_forward(self, nfwd, name, inames, onames, opts):
+        """Return the function of the directional derivative (CasADi's interface)."""
         inputs = [*self._inputs, *self._outputs, *self._inputs]
         self._forward = TimedFunction(
             name, inputs, self._outputs, self.hessian_product, self._errors
@@ -91,25 +127,26 @@ class LagrangianGradient(TimedFunction):
 
 
 class NlpFunctions:
-    """The NLP's functions as CasADi callbacks over the shared assembly.
+    """Functions of the NLP as CasADi callbacks.
 
-    Their inputs are z and an empty p, and where an output is one of the Lagrangian
-    w f + yᵀ g, also w and y. Outputs by name:
+    Inputs are z and an empty p, and for functions of the Lagrangian w f + yᵀ g also w and y.
+    Outputs by name:
 
     =================  =================================================
     f, g               objective and constraints
     grad_f, jac_g      their first derivatives
-    grad_l             ∇ of the Lagrangian, with its product with H
-    triu_hess, hess    H = ∇² of it, upper triangle or all
+    grad_l             gradient of the Lagrangian, with its product with H
+    triu_hess, hess    Hessian H of the Lagrangian, upper triangle or all
     =================  =================================================
 
     Parameters
     ----------
     collocation : Collocation
+        Program.
     hessian : callable
-        Writes the values of the upper triangle: (z, w, y, values).
+        Function (z, w, y, values) that writes the upper triangle of H to `values`.
     errors : list
-        Takes what goes wrong.
+        Exceptions of the callbacks are appended to it.
     """
 
     def __init__(
@@ -122,23 +159,32 @@ class NlpFunctions:
 
     @property
     def seconds(self) -> float:
-        """Time spent evaluating."""
+        """Time of all evaluations [s]."""
         return sum(function.seconds for function in self._functions)
 
     @property
     def calls(self) -> int:
-        """Evaluations of any of the functions."""
+        """Number of evaluations of all functions."""
         return sum(function.calls for function in self._functions)
 
     def function(self, name: str, *outputs: str) -> TimedFunction:
-        """A callback with the outputs named."""
+        """Return a new callback.
+
+        Parameters
+        ----------
+        name : str
+            Name of the function in CasADi.
+        outputs : str
+            Names of its outputs, see the class.
+        """
 
         def evaluate(inputs: list[Array], buffers: list[Array | None]) -> None:
-            wanted = zip(outputs, buffers, strict=True)
-            self._evaluate(inputs, {output: b for output, b in wanted if b is not None})
+            """Evaluate the requested outputs, which are those with memory."""
+            requests = zip(outputs, buffers, strict=True)
+            self._evaluate(inputs, {output: b for output, b in requests if b is not None})
 
-        of_lagrangian = any(output in ("grad_l", "triu_hess", "hess") for output in outputs)
-        inputs = self._inputs if of_lagrangian else self._inputs[:2]
+        needs_multipliers = any(output in ("grad_l", "triu_hess", "hess") for output in outputs)
+        inputs = self._inputs if needs_multipliers else self._inputs[:2]
         kind = LagrangianGradient if outputs == ("grad_l",) else TimedFunction
         sparsities = [self._sparsity(output) for output in outputs]
         made = kind(name, inputs, sparsities, evaluate, self.errors)
@@ -148,6 +194,7 @@ class NlpFunctions:
         return made
 
     def _evaluate(self, inputs: list[Array], wanted: dict[str, Array]) -> None:
+        """Write the requested outputs, arrays by name, at the inputs."""
         collocation, z = self.collocation, inputs[0]
         if "f" in wanted:
             wanted["f"][0] = collocation.objective(z)
@@ -171,7 +218,7 @@ class NlpFunctions:
             wanted["hess"][:] = self._upper(z, weight, multipliers)[self._full[1]]
 
     def _forward(self, inputs: list[Array], outputs: list[Array | None]) -> None:
-        """The directional derivative of grad_l, in the order of CasADi's forward functions."""
+        """Write the directional derivative of grad_l; the inputs are in CasADi's order."""
         z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = inputs
         (product,) = outputs
         if product is None:
@@ -188,31 +235,36 @@ class NlpFunctions:
             product += self.collocation.jacobian(z).T @ by_multipliers
 
     def _upper(self, z: Array, weight: float, multipliers: Array) -> Array:
+        """Return the values of the upper triangle of the Hessian."""
         values = np.empty(len(self.collocation.hessian_structure[1]))
         self._upper_values(z, weight, multipliers, values)
         return values
 
     def _weights(self, weight: Array, multipliers: Array) -> tuple[float, Array]:
-        """Return w and y; CasADi leaves out what is zero."""
+        """Return w and y; CasADi passes empty arrays for zeros."""
         if not len(multipliers):
             multipliers = np.zeros(self.collocation.constraints)
         return float(weight[0]) if len(weight) else 0.0, multipliers
 
     @cached_property
     def _inputs(self) -> list[ca.Sparsity]:
+        """Sparsity of z, p, w and y."""
         dense = ca.Sparsity.dense
         variables, rows = self.collocation.variables, self.collocation.constraints
         return [dense(variables, 1), ca.Sparsity(0, 1), dense(1, 1), dense(rows, 1)]
 
     @cached_property
     def _full(self) -> tuple[ca.Sparsity, NDArray[np.int64]]:
-        """Structure of both triangles, and where each value stands in the upper one."""
+        """Sparsity of the symmetric Hessian, and the index of each entry in the upper
+        triangle's values.
+        """
         upper = self._sparsity("triu_hess")
         numbered = ca.DM(upper, np.arange(1.0, upper.nnz() + 1))
-        both = ca.triu2symm(numbered)
-        return both.sparsity(), np.array(both.nonzeros(), dtype=np.int64) - 1
+        symmetric = ca.triu2symm(numbered)
+        return symmetric.sparsity(), np.array(symmetric.nonzeros(), dtype=np.int64) - 1
 
     def _sparsity(self, output: str) -> ca.Sparsity:
+        """Return the sparsity of an output, by name."""
         variables, rows = self.collocation.variables, self.collocation.constraints
         if output == "jac_g":
             return ca.Sparsity(rows, variables, *map(_ints, self.collocation.jacobian_structure))
@@ -225,11 +277,35 @@ class NlpFunctions:
 
 
 def _ints(values: NDArray[np.int64]) -> list[int]:
+    """Return a list of Python integers, as CasADi requires."""
     return values.tolist()
 
 
 class Monitor(ca.Callback):
-    """Follows the iterates: history, best point, and the wish to stop."""
+    """CasADi callback that is called after each iteration: history, best iterate, and requests to
+    stop.
+
+    Attributes
+    ----------
+    stop : bool
+        Set it to true to stop the solver after the iteration.
+    best : tuple of two arrays or None
+        Variables and multipliers with the least merit (objective plus largest constraint); None
+        before the first iteration.
+    seconds : float
+        Time of the calls [s].
+    lines : int
+        Number of calls.
+
+    Parameters
+    ----------
+    recorder : Recorder
+        Record of the solve; an entry is added to its history per call.
+    program : Collocation
+        Program that is solved, which may be condensed or have lifted variables.
+    errors : list
+        Exceptions; the solver is stopped once it contains one.
+    """
 
     def __init__(
         self, recorder: Recorder, program: Collocation, errors: list[BaseException]
@@ -244,12 +320,15 @@ class Monitor(ca.Callback):
         self.construct("monitor")
 
     def get_n_in(self) -> int:
+        """Return the number of inputs (CasADi's interface)."""
         return ca.nlpsol_n_out()
 
     def get_n_out(self) -> int:
+        """Return the number of outputs (CasADi's interface)."""
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return the sparsity of input i, an index (CasADi's interface)."""
         program = self.program
         sizes = {
             "x": program.variables,
@@ -261,6 +340,9 @@ class Monitor(ca.Callback):
         return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
 
     def eval(self, arguments):
+        """Record an iteration; return [1] if the solver should stop, else [0] (CasADi's
+        interface).
+        """
         began = time.perf_counter()
         if self.errors:
             return [1]
@@ -272,13 +354,14 @@ class Monitor(ca.Callback):
         return [1 if self.stop or self.recorder.late or self.errors else 0]
 
     def _follow(self, arguments) -> None:
+        """Update the best iterate and add an entry to the history."""
         z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
         # Objective and constraints are both of order one.
         merit = float(value[0] + np.abs(rows).max(initial=0.0))
         if merit < self._best_merit:
             self._best_merit, self.best = merit, (z, multipliers)
         recorder, loss = self.recorder, float(value[0]) / self.program.loss_scale
-        at = carried_over(z, self.program, recorder.collocation)
+        variables = carried_over(z, self.program, recorder.collocation)
         number = recorder.history[-1].number + 1 if recorder.history else 0
         self.lines += 1
-        recorder.line(number, at, loss)
+        recorder.line(number, variables, loss)

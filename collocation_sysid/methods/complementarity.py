@@ -1,8 +1,9 @@
-"""Contact as complementarity: what presses does not come near, and what is apart does not press.
+"""Contact as complementarity: 0 ≤ pressure ⟂ gap ≥ 0.
 
-Pressure times gap is brought down in a few solves, each from the one before, and the first from the
-answer with the contact's energy. Only faces that came within an edge's length of an obstacle there
-have pressures.
+The product of pressure and gap is decreased in a few solves, each from the previous solution; the
+first starts from the solution with the contact energy. Only faces that come within an edge length
+of an obstacle in that solution have pressures. Use `hardened` after a solve with the contact
+energy.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ Solve = Callable[[Collocation, Array], Solution]
 
 
 def require_smooth(obstacles: Iterable[Obstacle]) -> None:
-    """Refuse friction.
+    """Raise `InputError` if an obstacle has friction.
 
     Raises
     ------
     InputError
-        If an obstacle has some.
+        Names the obstacle and the alternatives.
     """
     for each in obstacles:
         if each.rubs:
@@ -47,49 +48,85 @@ def require_smooth(obstacles: Iterable[Obstacle]) -> None:
 
 
 def hardened(first: Solution, solve: Solve) -> Solution:
-    """The answer with contact as complementarity, from that with the contact's energy."""
-    near = {
+    """Return the solution with contact as complementarity.
+
+    Parameters
+    ----------
+    first : Solution
+        Solution with the contact energy.
+    solve : callable
+        Function that solves a collocation from variables of its form with lifted variables.
+
+    Returns
+    -------
+    Solution
+        Last solution; an earlier one if its solve did not converge.
+    """
+    obstacles_by_experiment = {
         segment.experiment.name: within_reach(segment.experiment, x.reshape(len(x), -1))
         for segment, x in zip(first.collocation.segments, first.positions_m, strict=True)
     }
-    found, relaxed = first, _relaxed(first.collocation, near, 0.0)
+    solution, relaxed = first, _relaxed(first.collocation, obstacles_by_experiment, 0.0)
     for share in RELAXED:
         # Its pressures are those of the solve before, not such as the smaller product asks for.
-        z = relaxed.made_explicit().pack(*found.collocation.unpack(found.z))
-        relaxed = _relaxed(first.collocation, near, share)
-        found = replace(solve(relaxed, z).after(found, ""), notes=first.notes)
-        if not found.status.converged:
+        z = relaxed.made_explicit().pack(*solution.collocation.unpack(solution.z))
+        relaxed = _relaxed(first.collocation, obstacles_by_experiment, share)
+        solution = replace(solve(relaxed, z).after(solution, ""), notes=first.notes)
+        if not solution.status.converged:
             break
     note = (
         f"contact as complementarity: {len(RELAXED)} solves after that with its energy bring "
         f"pressure times gap down to {share:g} κδ²"
     )
     # Multipliers that balance pressures which follow from gaps: the solver's leave its rounding.
-    return replace(found, given_multipliers=None, notes=(*found.notes, note))
+    return replace(solution, given_multipliers=None, notes=(*solution.notes, note))
 
 
 def within_reach(experiment: Experiment, x: Array) -> list[Obstacle]:
-    """Obstacles that touch no faces but those that came near in a motion x (T, 3n)."""
-    found, mesh = [], experiment.body.mesh
+    """Return the obstacles of an experiment, restricted to faces that come near in a motion.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with obstacles.
+    x : (T, 3n) array
+        Positions [m].
+
+    Returns
+    -------
+    list of Obstacle
+        One per obstacle; unchanged if no face comes within `REACH` edges.
+    """
+    obstacles, mesh = [], experiment.body.mesh
     for contact, obstacle in zip(contacts(experiment), experiment.obstacles, strict=True):
         surface = contact.contact.surface
         faces = mesh.surface[surface.faces]
         gaps = nearest(contact, x).reshape(-1, surface.a_face).min(axis=1)
-        if len(touched := np.unique(faces[gaps < REACH * surface.edge_m])):
-            obstacle = replace(obstacle, faces=Indices(mesh.file_index[touched].tolist()))
-        found.append(obstacle)
-    return found
+        if len(near_faces := np.unique(faces[gaps < REACH * surface.edge_m])):
+            obstacle = replace(obstacle, faces=Indices(mesh.file_index[near_faces].tolist()))
+        obstacles.append(obstacle)
+    return obstacles
 
 
 def with_energy(experiment: Experiment) -> Experiment:
-    """An experiment whose obstacles all have the contact's energy."""
+    """Return the experiment with the contact energy for all obstacles."""
     return experiment.with_obstacles([replace(o, relaxed=None) for o in experiment.obstacles])
 
 
 def _relaxed(
     collocation: Collocation, near: Mapping[str, list[Obstacle]], share: float
 ) -> Collocation:
-    """The program with obstacles that touch what is near, at a share of κδ²."""
+    """Return the program with relaxed complementarity.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Program.
+    near : mapping of str to list of Obstacle
+        Obstacles by experiment name; other experiments are unchanged.
+    share : float
+        Product of pressure and gap, in κδ² of each obstacle.
+    """
     experiments = [
         each.with_obstacles([replace(o, relaxed=share) for o in near[each.name]])
         if each.name in near

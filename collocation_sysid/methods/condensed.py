@@ -1,14 +1,18 @@
-"""The program as IPOPT gets it: fewer variables and rows, and a Hessian that joins less.
+"""Condensed program for IPOPT: fewer variables and constraints, and a sparser Hessian.
 
-Where the body may be off in its grasps, held dofs follow from φ. Here they are no variables, and
-the rows that hold them are none: derivatives go through them to φ, as columns. The optimum is that
-of the program given, and so are the multipliers: what balances the Lagrangian's slope by the dofs
-held is that of their rows.
+Where the pose of the body in its grasps is estimated, the positions of grasped nodes follow from φ.
+`Condensed` removes these variables and the constraints that prescribe them; derivatives with
+respect to them are added to the columns of φ by the chain rule. The optimum is that of the complete
+program, and so are the multipliers: those of the removed constraints balance the gradient with
+respect to the removed variables.
 
-An estimated clock reads between samples, so that the loss joins more timesteps than the equations
-of motion do. Steps need no such entries: summed over a recording, products of slopes are nearly
-the same a little earlier. So the Hessian has Gauss–Newton's as they are at the nearest whole
-sample, where a reading has one timestep, and all that residuals curve as it is.
+An estimated clock interpolates between samples, so that the loss couples more time steps than the
+equations of motion do. The Hessian omits these entries: summed over a recording, products of slopes
+hardly change within a fraction of a sample. It has the Gauss–Newton part at the nearest sample,
+where a measurement depends on one time step, and the curvature of the residuals as it is.
+
+Use `condensed` before a program is passed to a general NLP solver, and `whole_multipliers`
+afterwards.
 """
 
 from __future__ import annotations
@@ -28,16 +32,28 @@ from ..recording.nuisance import TIME
 
 
 def condensed(whole: Collocation) -> Collocation:
-    """The program without what follows from φ; itself where grasps and clocks are known."""
+    """Return the program without variables that follow from φ; itself if grasps and clocks
+    are known.
+    """
     if not any(s.nuisance.moves_grasps or len(s.nuisance.of_clock) for s in whole.segments):
         return whole
-    made = object.__new__(Condensed)  # has been checked
-    vars(made).update({f.name: getattr(whole, f.name) for f in fields(whole)}, whole=whole)
-    return made
+    program = object.__new__(Condensed)  # has been checked
+    vars(program).update({f.name: getattr(whole, f.name) for f in fields(whole)}, whole=whole)
+    return program
 
 
 def whole_multipliers(program: Collocation, z: Array, multipliers: Array) -> Array:
-    """Those of all rows of the program that was given to `condensed`, at an optimum."""
+    """Return the multipliers of all constraints of the complete program, at an optimum.
+
+    Parameters
+    ----------
+    program : Collocation
+        Program that was solved; if it is not condensed, `multipliers` are returned.
+    z : (variables,) array
+        Its variables.
+    multipliers : (constraints,) array
+        Its multipliers.
+    """
     if not isinstance(program, Condensed):
         return multipliers
     return program.whole_multipliers(z, 1.0, multipliers)
@@ -45,13 +61,18 @@ def whole_multipliers(program: Collocation, z: Array, multipliers: Array) -> Arr
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Held dofs of one experiment as functions of its φ.
+    """Grasped dofs of one experiment, as functions of its φ.
 
     Attributes
     ----------
     segment : Segment
-    variables, rows : (h,) places of the dofs in z, and of the rows that hold them in g
-    phi : (k,) places in z of the φ that move the body
+        Transcription of the experiment.
+    variables : (h,) array of int
+        Indices of the dofs in z of the complete program.
+    rows : (h,) array of int
+        Indices in g of the constraints that prescribe them.
+    phi : (k,) array of int
+        Indices in z of the φ that move the body in its grasps.
     """
 
     segment: Segment
@@ -61,7 +82,7 @@ class LeftOut:
 
     @classmethod
     def of(cls, segment: Segment, whole: Collocation) -> LeftOut:
-        """Those that have rows."""
+        """Return the dofs that are prescribed by constraints."""
         rows = np.flatnonzero(segment.grasp_rows)
         time, place = np.divmod(rows, segment.rows_per_time)
         dofs = (segment.dynamics.first_row + time) * segment.dofs + segment.row_dofs[place]
@@ -70,22 +91,29 @@ class LeftOut:
         return cls(segment, segment.first.x + dofs, segment.first.row + rows, phi)
 
     def at(self, phi: Array) -> tuple[Array, Array]:
-        """(h,) scaled positions, and their slopes (h, k)."""
-        segment, held = self.segment, self.segment.grasping.at(phi)
+        """Return the scaled positions (h,) and their derivatives (h, k) at φ of the experiment."""
+        segment, prescribed = self.segment, self.segment.grasping.at(phi)
         time, dof = np.divmod(self.variables - segment.first.x, segment.dofs)
-        here = time, np.searchsorted(held.dofs, dof)
-        return held.positions_m[here] / segment.length_m, held.by_phi[here] / segment.length_m
+        indices = time, np.searchsorted(prescribed.dofs, dof)
+        return prescribed.positions_m[indices] / segment.length_m, prescribed.by_phi[
+            indices
+        ] / segment.length_m
 
 
 @dataclass(frozen=True, eq=False)
 class HeldColumns:
-    """Some columns of a sparse matrix.
+    """Columns of a sparse matrix that belong to eliminated variables.
 
     Attributes
     ----------
-    entries : places of theirs among its values
-    rows : (r,) the rows that have any, and others
-    row, column : of each entry, counted among these
+    entries : array of int
+        Indices of the columns' entries among the values of the matrix.
+    rows : (r,) array of int
+        Row indices in which the columns have entries, and further rows.
+    row : array of int
+        Index in `rows` of each entry.
+    column : array of int
+        Index among the eliminated columns of each entry.
     """
 
     entries: Index
@@ -97,28 +125,52 @@ class HeldColumns:
     def of(
         cls, entries: Index, rows: Index, columns: Index, wanted: Index, further: Index
     ) -> HeldColumns:
-        """Those wanted, ascending, of all entries in rows and columns; with further rows."""
-        here = np.flatnonzero(np.isin(columns, wanted))
-        found = np.union1d(rows[here], further)
-        places = np.searchsorted(found, rows[here]), np.searchsorted(wanted, columns[here])
-        return cls(entries[here], found, *places)
+        """Select columns of a matrix.
+
+        Parameters
+        ----------
+        entries : (e,) array of int
+            Index of each entry among the values.
+        rows : (e,) array of int
+            Row of each entry.
+        columns : (e,) array of int
+            Column of each entry.
+        wanted : (h,) array of int
+            Columns to select, ascending.
+        further : array of int
+            Rows that are included even if they have no entries.
+        """
+        selected_entries = np.flatnonzero(np.isin(columns, wanted))
+        selected_rows = np.union1d(rows[selected_entries], further)
+        places = (
+            np.searchsorted(selected_rows, rows[selected_entries]),
+            np.searchsorted(wanted, columns[selected_entries]),
+        )
+        return cls(entries[selected_entries], selected_rows, *places)
 
     def times(self, values: Array, slopes: Array) -> Array:
-        """(r, k) their product with slopes (h, k)."""
+        """Return the product (r, k) of the columns with slopes (h, k), given all values of
+        the matrix.
+        """
         shape = (len(self.rows), len(slopes))
         return sp.csr_array((values[self.entries], (self.row, self.column)), shape=shape) @ slopes
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Entries of the smaller matrix, and where its values come from.
+    """Sparsity pattern of a condensed matrix, and the origin of its values.
 
     Attributes
     ----------
-    structure : column pointers and row indices
-    kept : which values of the larger matrix stay
-    places : where they are among its own, and then what comes through each experiment's held dofs
-    through : the larger matrix's columns of these
+    structure : tuple of two arrays of int
+        Column pointers and row indices.
+    kept : array of int
+        Indices of the complete matrix's values that remain.
+    places : sequence of arrays of int
+        Indices in the condensed values: first of the remaining values, then of the contributions by
+        each experiment's eliminated dofs.
+    through : sequence of HeldColumns
+        Columns of the complete matrix that give these contributions.
     """
 
     structure: tuple[Index, Index]
@@ -134,38 +186,52 @@ class Layout:
         pairs: Sequence[tuple[Index, Index]],
         through: Sequence[HeldColumns],
     ) -> Layout:
-        """The union of the rows and columns given, those kept first."""
+        """Return the union of several sets of entries.
+
+        Parameters
+        ----------
+        shape : (rows, columns)
+            Shape of the condensed matrix.
+        kept : array of int
+            Indices of the complete matrix's values that remain.
+        pairs : sequence of (rows, columns)
+            Entries: first those that remain, then those of `through`.
+        through : sequence of HeldColumns
+            Columns that give contributions.
+        """
         codes = [(column * shape[0] + row).ravel() for row, column in pairs]
-        found = np.unique(np.concatenate(codes))
-        indptr = np.searchsorted(found, np.arange(shape[1] + 1) * shape[0])
-        places = [np.searchsorted(found, each) for each in codes]
-        return cls((indptr, found % shape[0]), kept, places, through)
+        unique_codes = np.unique(np.concatenate(codes))
+        indptr = np.searchsorted(unique_codes, np.arange(shape[1] + 1) * shape[0])
+        places = [np.searchsorted(unique_codes, each) for each in codes]
+        return cls((indptr, unique_codes % shape[0]), kept, places, through)
 
 
 class Condensed(Collocation):
-    """A program whose held dofs follow from φ, with a Hessian that joins less.
+    """Program without the grasped dofs that follow from φ, and with a sparser Hessian.
+
+    It is made by `condensed`; its interface is that of `Collocation`.
 
     Attributes
     ----------
     whole : Collocation
-        As it is given.
+        Complete program.
     """
 
     whole: Collocation
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        """One of each experiment that is fitted."""
+        """Transcriptions of the fitted experiments."""
         return self.whole.segments
 
     @cached_property
     def left_out(self) -> tuple[LeftOut, ...]:
-        """What is neither variable nor row."""
+        """Eliminated dofs of each experiment whose pose in its grasps is estimated."""
         return tuple(LeftOut.of(s, self.whole) for s in self.segments if s.nuisance.moves_grasps)
 
     @cached_property
     def _kept(self) -> tuple[Index, Index]:
-        """Variables and rows that are left."""
+        """Indices of the variables and of the constraints that remain."""
         variables, rows = np.arange(self.whole.variables), np.arange(self.whole.constraints)
         for each in self.left_out:
             variables[each.variables] = rows[each.rows] = -1
@@ -173,7 +239,9 @@ class Condensed(Collocation):
 
     @cached_property
     def _numbers(self) -> tuple[Index, Index]:
-        """Of each variable and row its place among those left, −1 of the others."""
+        """Index of each variable and of each constraint among those that remain, −1 for the
+        others.
+        """
         sizes = self.whole.variables, self.whole.constraints
         numbers = np.full(sizes[0], -1), np.full(sizes[1], -1)
         for number, kept in zip(numbers, self._kept, strict=True):
@@ -192,109 +260,143 @@ class Condensed(Collocation):
 
     @property
     def kept_rows(self) -> Index:
-        """Rows of the program given that are rows here, too."""
+        """Indices of the complete program's constraints that remain."""
         return self._kept[1]
 
     @property
     def of_phi(self) -> slice:
-        """The nuisance parameters in z."""
+        """Slice of the nuisance parameters in z."""
         first = int(self._numbers[0][self.whole.of_phi.start])
         return slice(first, first + self.nphi)
 
     @property
     def remembers(self) -> bool:
-        """Whether ∂g/∂z has more than `jacobian` holds."""
+        """Whether ∂g/∂z has more entries than `jacobian` contains, because of internal
+        variables.
+        """
         return self.whole.remembers
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
-        """Variables z from parameters and positions, held dofs left out."""
+        """Return variables z (variables,) from parameters p and positions, without the
+        eliminated dofs.
+        """
         return self.whole.pack(p, positions)[self._kept[0]]
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
-        """Parameters p and positions."""
+        """Return parameters p and the positions (N, 3n) of each experiment [m]."""
         return self.whole.unpack(self.whole_variables(z))
 
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of z; equal for what is given."""
+        """Return lower and upper bounds (variables,) of z; they are equal for known variables."""
         lower, upper = self.whole.bounds()
         return lower[self._kept[0]], upper[self._kept[0]]
 
     def whole_variables(self, z: Array) -> Array:
-        """Those of the program given."""
-        found = np.empty(self.whole.variables)
-        found[self._kept[0]] = z
+        """Return the variables of the complete program from z."""
+        variables = np.empty(self.whole.variables)
+        variables[self._kept[0]] = z
         for each, (positions, _) in zip(self.left_out, self._held(z), strict=True):
-            found[each.variables] = positions
-        return found
+            variables[each.variables] = positions
+        return variables
 
     def whole_multipliers(self, z: Array, loss_weight: float, multipliers: Array) -> Array:
-        """Those of the program given, whose slopes by the held dofs they balance."""
-        at, found = self.whole_variables(z), np.zeros(self.whole.constraints)
-        found[self._kept[1]] = multipliers
-        slope = loss_weight * self.whole.gradient(at) + self.whole.jacobian(at).T @ found
+        """Return the multipliers of all constraints of the complete program.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Condensed variables.
+        loss_weight : float
+            Weight of the objective in the Lagrangian.
+        multipliers : (constraints,) array
+            Multipliers of the remaining constraints.
+        """
+        variables, complete = self.whole_variables(z), np.zeros(self.whole.constraints)
+        complete[self._kept[1]] = multipliers
+        slope = (
+            loss_weight * self.whole.gradient(variables)
+            + self.whole.jacobian(variables).T @ complete
+        )
         for each in self.left_out:
-            found[each.rows] = -slope[each.variables]
-        return found
+            complete[each.rows] = -slope[each.variables]
+        return complete
 
     def _held(self, z: Array) -> Iterator[tuple[Array, Array]]:
+        """Return positions and derivatives of the eliminated dofs of each experiment, see
+        `LeftOut.at`.
+        """
         p = self.parameters_of(z)
         return (each.at(p[each.segment.local.places]) for each in self.left_out)
 
     # Values -------------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """L divided by the number of measurements."""
+        """Return the loss L divided by the number of measurements."""
         return self.whole.objective(self.whole_variables(z))
 
     def gradient(self, z: Array) -> Array:
-        """∂objective/∂z."""
+        """Return ∂objective/∂z (variables,)."""
         slope = self.whole.gradient(self.whole_variables(z))
         for each, (_, by_phi) in zip(self.left_out, self._held(z), strict=True):
             slope[each.phi] += by_phi.T @ slope[each.variables]
         return slope[self._kept[0]]
 
     def constraint_values(self, z: Array) -> Array:
-        """g, scaled."""
+        """Return the scaled constraints g (constraints,)."""
         return self.whole.constraint_values(self.whole_variables(z))[self._kept[1]]
 
     # Matrices -----------------------------------------------------------------------------------
 
     @cached_property
     def _jacobian(self) -> Layout:
+        """Pattern of ∂g/∂z."""
         of_variable, of_row = self._numbers
         rows, columns = _entries(self.whole.jacobian_structure)
-        left = np.flatnonzero(of_row[rows] >= 0)
-        kept = left[of_variable[columns[left]] >= 0]
+        remaining = np.flatnonzero(of_row[rows] >= 0)
+        kept = remaining[of_variable[columns[remaining]] >= 0]
         pairs, through = [(of_row[rows[kept]], of_variable[columns[kept]])], []
         for each in self.left_out:
-            of_left = of_row[rows[left]], columns[left]
-            through.append(HeldColumns.of(left, *of_left, each.variables, np.zeros(0, dtype=int)))
+            remaining_entries = of_row[rows[remaining]], columns[remaining]
+            through.append(
+                HeldColumns.of(
+                    remaining, *remaining_entries, each.variables, np.zeros(0, dtype=int)
+                )
+            )
             pairs.append((through[-1].rows[:, None], of_variable[each.phi]))
         return Layout.of((self.constraints, self.variables), kept, pairs, through)
 
     @property
     def jacobian_structure(self) -> tuple[Index, Index]:
-        """Column pointers and row indices of ∂g/∂z by compressed columns."""
+        """Column pointers and row indices of ∂g/∂z, by compressed columns."""
         return self._jacobian.structure
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
-        """Constraints g and the values of ∂g/∂z, from one evaluation of the elements."""
+        """Return g and the values of ∂g/∂z from one evaluation of the elements.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        out : array, optional
+            Memory for the values of ∂g/∂z; it is overwritten.
+        """
         layout = self._jacobian
         values = np.empty(len(layout.structure[1])) if out is None else out
         values[:] = 0
-        rows, whole = self.whole.constraints_and_jacobian(self.whole_variables(z))
-        values[layout.places[0]] = whole[layout.kept]
+        rows, complete_values = self.whole.constraints_and_jacobian(self.whole_variables(z))
+        values[layout.places[0]] = complete_values[layout.kept]
         parts = zip(layout.places[1:], layout.through, self._held(z), strict=True)
         for places, through, (_, slopes) in parts:
-            values[places] += through.times(whole, slopes).ravel()
+            values[places] += through.times(complete_values, slopes).ravel()
         return rows[self._kept[1]], values
 
     @cached_property
     def _hessian(self) -> Layout:
+        """Pattern of the upper triangle of the Hessian."""
         number, _ = self._numbers
         rows, columns = _entries(self.whole.hessian_structure)
-        both = (number[rows] >= 0) & (number[columns] >= 0)
-        kept = np.flatnonzero(both & ~self._only_read_together(rows, columns))
+        are_kept = (number[rows] >= 0) & (number[columns] >= 0)
+        kept = np.flatnonzero(are_kept & ~self._only_read_together(rows, columns))
         pairs, through = [(number[rows[kept]], number[columns[kept]])], []
         # Of the lower triangle too, whose diagonal is that of the upper one.
         below = np.flatnonzero(rows != columns)
@@ -310,24 +412,28 @@ class Condensed(Collocation):
         return Layout.of((size, size), kept, pairs, through)
 
     def _only_read_together(self, rows: Index, columns: Index) -> NDArray[np.bool_]:
-        """Which entries join positions that no equation of motion joins."""
-        far = np.zeros(len(rows), dtype=bool)
+        """Return a mask (entries,) of positions that are coupled by the loss, but by no
+        equation of motion.
+        """
+        mask = np.zeros(len(rows), dtype=bool)
         for segment in self.segments:
             time = np.full(self.whole.variables, -1)
             time[segment.columns] = np.arange(segment.variables) // segment.dofs
             first, second = time[rows], time[columns]
-            apart = np.abs(first - second) > segment.dynamics.reach
-            far |= (first >= 0) & (second >= 0) & apart
-        return far
+            are_distant = np.abs(first - second) > segment.dynamics.reach
+            mask |= (first >= 0) & (second >= 0) & are_distant
+        return mask
 
     @property
     def hessian_structure(self) -> tuple[Index, Index]:
-        """The same of the upper triangle of ∇²_z (w L + yᵀ g)."""
+        """Column pointers and row indices of the upper triangle of ∇²_z (w L + yᵀ g)."""
         return self._hessian.structure
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Positions of the diagonal entries of q, and of x, in the values of the Hessian."""
+        """Indices, in the values of the Hessian, of the diagonal entries of q and of the
+        positions.
+        """
         places = np.full(len(self.whole.hessian_structure[1]), -1)
         places[self._hessian.kept] = self._hessian.places[0]
         of_q, of_x = (places[each] for each in self.whole.hessian_diagonals)
@@ -336,45 +442,61 @@ class Condensed(Collocation):
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
-        """Values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
+        """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        loss_weight : float
+            Weight of the objective.
+        multipliers : (constraints,) array or None
+            Multipliers; None gives the Gauss–Newton Hessian of the objective.
+        out : array, optional
+            Memory for the values; it is overwritten.
+        """
         layout, (number, _) = self._hessian, self._numbers
         values = np.empty(len(layout.structure[1])) if out is None else out
         values[:] = 0
         if multipliers is not None:
             multipliers = self.whole_multipliers(z, loss_weight, multipliers)
-        whole = self._whole_hessian(self.whole_variables(z), loss_weight, multipliers)
-        values[layout.places[0]] = whole[layout.kept]
+        complete_values = self._whole_hessian(self.whole_variables(z), loss_weight, multipliers)
+        values[layout.places[0]] = complete_values[layout.kept]
         parts = zip(self.left_out, layout.places[1:], layout.through, self._held(z), strict=True)
         for each, places, through, (_, slopes) in parts:
-            found = through.times(whole, slopes)
-            held, phi = (np.searchsorted(through.rows, a) for a in (each.variables, each.phi))
+            product = through.times(complete_values, slopes)
+            eliminated_rows, phi_rows = (
+                np.searchsorted(through.rows, a) for a in (each.variables, each.phi)
+            )
             # An entry of φ by φ comes twice, from either side; one of the diagonal once.
-            found[phi] += slopes.T @ found[held] / 2
-            found[phi, np.arange(len(phi))] *= 2
-            np.add.at(values, places, found[number[through.rows] >= 0].ravel())
+            product[phi_rows] += slopes.T @ product[eliminated_rows] / 2
+            product[phi_rows, np.arange(len(phi_rows))] *= 2
+            np.add.at(values, places, product[number[through.rows] >= 0].ravel())
         return values
 
     def _whole_hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> Array:
-        """Of the program given, with Gauss–Newton's product at the nearest sample."""
+        """Return the complete program's values, with the Gauss–Newton part at the nearest
+        whole sample.
+        """
         nearest, p = z.copy(), self.whole.parameters_of(z)
         for segment in self.segments:
             nuisance, places = segment.nuisance, segment.local.places
-            late = nuisance.places(TIME)
-            sample = segment.experiment.timestep_s / nuisance.scales[late]
-            samples = np.round(p[places[late]] / sample)
+            clock_places = nuisance.places(TIME)
+            sample = segment.experiment.timestep_s / nuisance.scales[clock_places]
+            samples = np.round(p[places[clock_places]] / sample)
             p[places[nuisance.of_clock]] = 0
-            p[places[late]] = samples * sample
+            p[places[clock_places]] = samples * sample
         nearest[self.whole.of_phi] = p[self.nq :]
         if np.array_equal(nearest, z):
             return self.whole.hessian_values(z, loss_weight, multipliers)
-        found = self.whole.hessian_values(nearest, loss_weight, None)
+        values = self.whole.hessian_values(nearest, loss_weight, None)
         if multipliers is not None:
-            found += self.whole.hessian_values(z, loss_weight, multipliers)
-            found -= self.whole.hessian_values(z, loss_weight, None)
-        return found
+            values += self.whole.hessian_values(z, loss_weight, multipliers)
+            values -= self.whole.hessian_values(z, loss_weight, None)
+        return values
 
 
 def _entries(structure: tuple[Index, Index]) -> tuple[Index, Index]:
-    """Row and column of each entry."""
+    """Return the row and the column of each entry of a matrix by compressed columns."""
     indptr, rows = structure
     return rows, np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))

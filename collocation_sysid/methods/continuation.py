@@ -1,9 +1,9 @@
 """Horizon continuation: any method, on growing parts of every recording.
 
-A long recording's loss has many local minima, of swings matched with the wrong period, and a wrong
-guess may not survive it as a simulation; a short one's has few. So the first samples are solved
-first, and every answer starts the next part: its parameters, and its positions continued by a
-simulation.
+The loss of a long recording has many local minima, in which oscillations are matched with the wrong
+period, and a simulation at a wrong guess may fail before its end; that of a short recording has
+few. So the first samples are solved first, and each solution starts the next part: its parameters,
+and its positions continued by a simulation.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class Continuation(Options):
     shares : tuple of float
         Shares of the samples solved one after another, ending with 1.
     stage : mapping or Method
-        What solves each: its `method`, "interior-point" by default, and options of that method by
-        name, as in the problem file; from Python any method.
+        Method that solves each part: its `method`, "interior-point" by default, and options of that
+        method by name, as in the problem file; from Python any method.
     """
 
     name: ClassVar[str] = "continuation"
@@ -67,29 +67,29 @@ class Continuation(Options):
 
     @cached_property
     def method(self) -> Method:
-        """What solves the stages.
+        """Method that solves the parts.
 
         Raises
         ------
         InputError
-            For an unknown method, or an option it does not have.
+            For an unknown method, or an option that it does not have.
         """
         if not isinstance(self.stage, Mapping):
             return self.stage
-        given = dict(self.stage)
-        name = given.pop("method", InteriorPoint.name)
+        options = dict(self.stage)
+        name = options.pop("method", InteriorPoint.name)
         if name not in STAGES:
             known = f"expected one of {', '.join(STAGES)}{hint_at(str(name), STAGES)}"
             raise InputError(f"found {name!r}; {known}", None, "stage.method")
-        return built(STAGES[name], given, "stage")
+        return built(STAGES[name], options, "stage")
 
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
-        """Solve the NLP, see `Method`; the first part starts from those rows of a start.
+        """Solve the NLP, see `Method`; the first part starts from the first rows of `start`.
 
-        Numbers and times of the history go on from stage to stage. A stage that was interrupted
-        or refused is the last; the notes tell what each found.
+        Numbers and times of the history continue from part to part. The solve ends with a part that
+        was interrupted or refused; the notes contain the result of each part.
         """
         climb = _Climb(self.method, Recorder(self.name, collocation, watch))
         if start is not None:
@@ -101,7 +101,15 @@ class Continuation(Options):
 
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
-    """The first samples of a recording, as many as wanted and needed to see anything."""
+    """Return the experiment with its first samples.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment.
+    count : int
+        Number of samples; it is increased to the first sample with a marker, or with a depth image.
+    """
     markers = experiment.markers
     stop = min(len(experiment.t_s), max(count, markers.first_seen + 1, 3))
     fewest = 1 if experiment.static else FEWEST
@@ -111,14 +119,25 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
 
 
 def first_part(collocation: Collocation, share: float) -> Collocation:
-    """The problem on a share of every experiment's samples."""
+    """Return the problem with the first share of every experiment's samples."""
     fitted = [segment.experiment for segment in collocation.segments]
     shorter = [first_samples(e, part_of(len(e.t_s), share)) for e in fitted]
     return replace(collocation, experiments=shorter)
 
 
 class _Climb:
-    """The state between stages: what is known, and what is to be reported."""
+    """State between the parts: known positions, the last solution, and counts.
+
+    Attributes
+    ----------
+    known : tuple or None
+        Parameters p and positions of each experiment as far as they were solved; None before the
+        first part.
+    last : Solution or None
+        Solution of the last part.
+    iterations, evaluations : int
+        Sums over all parts.
+    """
 
     def __init__(self, method: Method, recorder: Recorder) -> None:
         self.method, self.recorder = method, recorder
@@ -128,7 +147,7 @@ class _Climb:
         self.iterations = self.evaluations = 0
 
     def solve(self, share: float) -> bool:
-        """Solve one part; whether to go on."""
+        """Solve the first share of the samples; return whether to continue."""
         recorder = self.recorder
         part = recorder.collocation if share == 1 else first_part(recorder.collocation, share)
         start = None if self.known is None else _continued(part, *self.known)
@@ -136,15 +155,16 @@ class _Climb:
         elapsed_s = recorder.elapsed_s
 
         def follow(line: Iteration) -> None:
+            """Record an iteration with its number, time and share in the whole solve."""
             number, time_s = line.number + before, line.time_s + elapsed_s
             recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
 
-        found = self.method(part, follow, start)
-        self._learn(found, share)
-        return found.status not in (Status.INTERRUPTED, Status.REFUSED)
+        solution = self.method(part, follow, start)
+        self._learn(solution, share)
+        return solution.status not in (Status.INTERRUPTED, Status.REFUSED)
 
     def answer(self) -> Solution:
-        """The last stage's answer as one of the whole problem."""
+        """Return the solution of the last part as a solution of the complete problem."""
         assert self.last is not None
         assert self.known is not None
         last, recorder = self.last, self.recorder
@@ -156,6 +176,7 @@ class _Climb:
         return recorder.solution(last.status, last.message, z, multipliers, *counts)
 
     def _learn(self, found: Solution, share: float) -> None:
+        """Store the solution of a part, and add its counts, times and a note."""
         self.last, part = found, found.collocation
         self.known = part.unpack(found.z)
         self.iterations += found.iterations
@@ -170,7 +191,10 @@ class _Climb:
 
 
 def _continued(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
-    """Variables z from the first rows of positions: simulated on, or carried by the grasp."""
+    """Return variables z from the first rows of positions.
+
+    The missing rows are simulated or, if that fails, those of a rigid motion with the grasp.
+    """
     parts = collocation.parts_at(p, positions)
     known, _ = marched(collocation, p, [part.x[: part.segment.grid_rows] for part in parts])
     return completed(collocation, p, known)

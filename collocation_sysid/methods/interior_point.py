@@ -1,7 +1,8 @@
-"""Interior point: the whole NLP to IPOPT, with exact sparse derivatives from the assembly.
+"""Interior-point method: IPOPT solves the complete NLP with exact sparse derivatives.
 
-IPOPT starts from a coarse solution by reduced space, see `initial_point`, or from a simulation at
-the guess.
+IPOPT starts from a coarse solution by reduced space (`initial_point`) or from a simulation at the
+guess. Use it where reduced space fails, because no simulation at the guess succeeds, or for contact
+as complementarity.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from .solution import Solution, Status, Watch
 
 
 def _ipopt_value(value: Any) -> Any:
+    """Return an IPOPT option if it is text or a number; raise `ValueError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(
             f"found {str(value).lower()}; expected text or a number, as IPOPT's manual has it: its "
@@ -91,37 +93,39 @@ class InteriorPoint(Options):
     Attributes
     ----------
     hessian : {"exact", "gauss-newton", "limited-memory"}
-        Second derivatives of the Lagrangian: all of them once parameters move by less than
-        `warm_up`, those of the loss with readings that count as linear, or IPOPT's own.
+        Second derivatives of the Lagrangian: "exact" uses all of them once parameters change by
+        less than `warm_up`, "gauss-newton" those of the loss with linearised measurements, and
+        "limited-memory" IPOPT's own approximation.
     initial : {"reduced-space", "simulation"}
-        Where IPOPT starts: near the optimum, after a coarse solution of the same program by reduced
-        space, with multipliers of its adjoint; or at a simulation at the guess, or at the start
-        given, with multipliers zero. Where reduced space finds no motion, the latter is done too.
+        Where IPOPT starts. "reduced-space": near the optimum, after a coarse solution of the same
+        program by reduced space, with multipliers of its adjoint. "simulation": from a simulation
+        at the guess, or from the given start, with multipliers of zero; this is also the fallback
+        if reduced space finds no motion.
     warm_up : float
         While an iteration still changes a parameter by more than this share (or a nuisance
-        parameter, of its prior deviation), an exact Hessian is replaced by Gauss–Newton's with
-        Levenberg's damping, which keeps every parameter within about a factor of two a step and
-        eases off as steps shorten: far from the answer, what readings and equations of motion
-        curve at a large residual makes the full Hessian indefinite and the steps wild. 0 is exact
-        from the start.
+        parameter by more than this many prior deviations), the exact Hessian is replaced by that of
+        Gauss–Newton with Levenberg's damping. The damping limits a step to about a factor of two in
+        every parameter and decreases as steps become shorter. Far from the solution the residuals
+        are large, so that the full Hessian is indefinite and its steps are too long. 0 uses the
+        exact Hessian from the start.
     proximal : float
-        Added to the Hessian's diagonal at the positions, most of which is zero otherwise. It
-        changes the steps a little and the answer not at all, and spares the linear solver
-        factorisations that rounding spoils (wrong inertia).
+        Number that is added to the Hessian's diagonal at the positions, most of which is zero
+        otherwise. It changes the steps slightly, but not the solution, and avoids factorisations
+        that fail because of rounding (wrong inertia).
     contact : {"energy", "complementarity"}
-        What holds a body off obstacles: an energy that grows as it comes near, or pressures as
-        further variables with 0 ≤ pressure ⟂ gap ≥ 0, whose product is brought down in a few more
-        solves. Those take no friction.
+        Model of contact with obstacles: an energy that increases as the body comes near, or
+        pressures as further variables with 0 ≤ pressure ⟂ gap ≥ 0, whose product is decreased in a
+        few more solves. The latter does not support friction.
     linear_solver : str
-        IPOPT's linear solver; the wheel brings "mumps" and "spral".
+        IPOPT's linear solver; the wheel contains "mumps" and "spral".
     tolerance : float
         IPOPT's `tol` on the scaled optimality conditions.
     max_iterations : int
-        Iterations after which it ends.
+        Largest number of iterations.
     max_time_s : float
-        Seconds after which it ends.
+        Largest computing time in seconds.
     ipopt : mapping
-        Further IPOPT options by name; they win over the ones above.
+        Further IPOPT options by name; they override the ones above.
     """
 
     name: ClassVar[str] = "interior-point"
@@ -138,11 +142,12 @@ class InteriorPoint(Options):
     ipopt: Mapping[str, IpoptValue] = field(default_factory=dict)
 
     def require(self, experiments: Iterable[Experiment]) -> None:
-        """Refuse friction where contact is complementarity.
+        """Raise `InputError` if an obstacle has friction and contact is a complementarity.
 
         Raises
         ------
         InputError
+            Names the experiment and the obstacle.
         """
         if self.contact == "complementarity":
             for each in experiments:
@@ -157,21 +162,23 @@ class InteriorPoint(Options):
         Raises
         ------
         InputError
-            If IPOPT does not know an option.
+            If IPOPT does not know an option, or contact as complementarity meets friction.
         """
         experiments = [segment.experiment for segment in collocation.segments]
         self.require(experiments)
         is_hard = self.contact == "complementarity" and any(e.obstacles for e in experiments)
-        found = self._solved(collocation, watch, start)
-        if not is_hard or not found.status.converged:
-            return found
+        solution = self._solved(collocation, watch, start)
+        if not is_hard or not solution.status.converged:
+            return solution
         relaxed_method = replace(self, initial="simulation")
-        return hardened(found, lambda relaxed, z: relaxed_method._solved(relaxed, watch, z))
+        return hardened(solution, lambda relaxed, z: relaxed_method._solved(relaxed, watch, z))
 
     def _solved(
         self, collocation: Collocation, watch: Watch | None, start: Array | None
     ) -> Solution:
-        """The answer with contact as obstacles have it."""
+        """Return the solution with the contact law of each obstacle, without the
+        complementarity solves.
+        """
         recorder = Recorder(self.name, collocation, watch)
         if self.initial == "simulation":
             return self._by_ipopt(recorder, start)
@@ -198,11 +205,12 @@ class InteriorPoint(Options):
         Parameters
         ----------
         recorder : Recorder
-        start : (variables,) ndarray, optional
-            By default those of a simulation at the guess.
+            Record of the solve.
+        start : (variables,) array, optional
+            Initial variables; by default those of a simulation at the guess.
         initial : InitialPoint, optional
-            What `start` is from; where that is near the optimum, multipliers, barrier parameter and
-            Hessian are those of the last iterations.
+            Initial point to which `start` belongs. If it is near the optimum, the multipliers, the
+            barrier parameter and the Hessian are those of IPOPT's last iterations.
         """
         multipliers = None
         with recorder.stopwatch.building():
@@ -213,9 +221,10 @@ class InteriorPoint(Options):
             hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)
 
         def settings(functions: NlpFunctions) -> dict[str, Any]:
-            found = self._settings(functions, is_warm=is_warm)
-            left_s = max(SHORTEST_S, self.max_time_s - recorder.elapsed_s)
-            return {"ipopt.max_wall_time": left_s} | found
+            """Return the options of IPOPT with the time that remains."""
+            options = self._settings(functions, is_warm=is_warm)
+            remaining_s = max(SHORTEST_S, self.max_time_s - recorder.elapsed_s)
+            return {"ipopt.max_wall_time": remaining_s} | options
 
         solution = nlpsol.solve(
             recorder,
@@ -236,11 +245,12 @@ class InteriorPoint(Options):
         return replace(solution, notes=(*solution.notes, missing))
 
     def _settings(self, functions: NlpFunctions, *, is_warm: bool) -> dict[str, Any]:
-        """Return what CasADi is given, without IPOPT's time.
+        """Return the options for CasADi and IPOPT, except IPOPT's time limit.
 
         Parameters
         ----------
         functions : NlpFunctions
+            Functions of the program.
         is_warm : bool
             Whether IPOPT starts near the optimum, with multipliers.
         """
@@ -282,7 +292,9 @@ class InteriorPoint(Options):
 
 
 def _sharpness(collocation: Collocation) -> float:
-    """How much the objective curves at most by a scaled position, at least one."""
+    """Return the largest curvature of the objective with respect to a scaled position, at
+    least one.
+    """
     units = (
         segment.length_m / float(np.min(segment.experiment.markers.sigma_m))
         for segment in collocation.segments
@@ -292,7 +304,11 @@ def _sharpness(collocation: Collocation) -> float:
 
 
 class _DampedHessian:
-    """Hessian of the Lagrangian with the warm-up and proximal terms of the options."""
+    """Hessian of the Lagrangian with the warm-up and proximal terms of the options.
+
+    It depends on the sequence of calls: each call compares the parameters with those of the
+    previous call.
+    """
 
     def __init__(self, collocation: Collocation, options: InteriorPoint) -> None:
         self.collocation = collocation
@@ -302,23 +318,37 @@ class _DampedHessian:
         self._of_q, self._of_x = collocation.hessian_diagonals
 
     def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
-        """Write the values at z."""
-        settled = self._is_settled(self.collocation.parameters_of(z))
-        exact = self.options.hessian == "exact" and settled
-        self.collocation.hessian_values(z, weight, multipliers if exact else None, values)
+        """Write the upper triangle of the Hessian at z to `values`.
+
+        Parameters
+        ----------
+        z : (variables,) array
+            Variables.
+        weight : float
+            Weight of the objective.
+        multipliers : (constraints,) array
+            Multipliers.
+        values : array
+            Memory for the values; it is overwritten.
+        """
+        is_settled = self._is_settled(self.collocation.parameters_of(z))
+        is_exact = self.options.hessian == "exact" and is_settled
+        self.collocation.hessian_values(z, weight, multipliers if is_exact else None, values)
         values[self._of_x] += self.options.proximal
-        if not settled:
+        if not is_settled:
             # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
             largest = self.collocation.objective(z) / (2 * STEP_LIMIT**2)
             values[self._of_q] += weight * self._damping * largest
 
     def _is_settled(self, p: Array) -> bool:
-        """Whether the last step to p was short enough to end the warm-up, and not by damping."""
+        """Return whether the step to p was short, and not because of damping; update the
+        damping.
+        """
         steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p
         of_q = steps[: self.collocation.nq].max(initial=0.0)
-        settled = steps.max(initial=0.0) < self.options.warm_up and self._damping <= NO_DAMPING
+        is_short = steps.max(initial=0.0) < self.options.warm_up and self._damping <= NO_DAMPING
         if np.isfinite(of_q):
             change = np.clip((of_q / STEP_LIMIT) ** 2, *DAMPING_CHANGE)
             self._damping = min(1.0, self._damping * change)
-        return self.options.warm_up == 0 or bool(settled)
+        return self.options.warm_up == 0 or bool(is_short)

@@ -1,4 +1,4 @@
-"""A solve by one of the NLP solvers behind CasADi's `nlpsol`."""
+"""Solution of a program by an NLP solver of CasADi's `nlpsol`, interruptible by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -50,30 +50,35 @@ def solve(
     judged: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
     initial_multipliers: Multipliers | None = None,
 ) -> Solution:
-    """Solve the recorder's collocation; Ctrl-C ends it after the iteration, or after 2 s.
+    """Solve the recorder's collocation.
+
+    Ctrl-C stops the solver after the iteration, or after 2 s; a second one ends the process.
 
     Parameters
     ----------
     recorder : Recorder
+        Record of the solve, with the problem.
     program : Collocation
-        The recorder's as the solver gets it, see `explicit` and `condensed`.
-    start : (variables,) ndarray, optional
+        The problem in the form for the solver, with lifted variables or condensed.
+    start : (variables,) array, optional
+        Initial variables of the problem; a simulation at the guess by default.
     plugin : str
+        CasADi's name of the solver.
     hessian : callable
-        Writes second derivatives of the program, see `NlpFunctions`.
+        Function that writes the second derivatives, see `NlpFunctions`.
     settings : callable
-        The plugin's settings, given the functions.
+        Function of the `NlpFunctions` that returns the options of the plugin.
     statuses : mapping
-        Its words for how it ended in ours; a failure where one is not among them.
+        Status by the solver's return status; others mean a numerical failure.
     judged : callable
-        What to say of the status, variables and multipliers of the recorder's collocation.
+        Function of status, variables and multipliers of the problem that returns the final status.
     initial_multipliers : Multipliers, optional
         Initial multipliers of the program; zeros by default.
 
     Raises
     ------
     InputError
-        If it does not know a setting, with its own words.
+        If the solver does not know an option, with the solver's message.
     """
     collocation, watch = recorder.collocation, recorder.stopwatch
     errors: list[BaseException] = []
@@ -86,50 +91,59 @@ def solve(
         start = recorder.start(start)
         functions = NlpFunctions(program, hessian, errors)
         monitor = Monitor(recorder, program, errors)
-        given = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
-        solver = _nlpsol(plugin, functions, given)
-    began = carried_over(start, collocation, program)
-    z, multipliers, said, count = _run(
-        solver, program.bounds(), began, monitor, initial_multipliers
+        options = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
+        solver = _nlpsol(plugin, functions, options)
+    initial_variables = carried_over(start, collocation, program)
+    z, multipliers, return_status, count = _run(
+        solver, program.bounds(), initial_variables, monitor, initial_multipliers
     )
     if errors and not isinstance(errors[0], _LeftBehind):
         raise errors[0]
     watch.evaluations = earlier_evaluations_s + functions.seconds
     # What is neither set-up nor callback.
-    others_s = watch.build + watch.evaluations + monitor.seconds + unaccounted_s
-    watch.linear_algebra = max(earlier_linear_algebra_s, recorder.elapsed_s - others_s)
-    status = statuses.get(said, Status.NUMERICAL_FAILURE)
+    accounted_s = watch.build + watch.evaluations + monitor.seconds + unaccounted_s
+    watch.linear_algebra = max(earlier_linear_algebra_s, recorder.elapsed_s - accounted_s)
+    status = statuses.get(return_status, Status.NUMERICAL_FAILURE)
     if monitor.stop or (recorder.late and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
-        z, multipliers = monitor.best or (began, np.zeros(program.constraints))
+        z, multipliers = monitor.best or (initial_variables, np.zeros(program.constraints))
     # A solver that never began leaves its count as memory had it.
     iterations = 0 if status is Status.REFUSED else count or max(0, monitor.lines - 1)
-    of_rows = whole_multipliers(program, z, multipliers)[: collocation.constraints]
-    at = carried_over(z, program, collocation)
-    status = judged(status, at, of_rows)
-    message = f"{status.sentence} ({NAMES.get(plugin, plugin)}: {said})"
-    return recorder.solution(status, message, at, of_rows, iterations, functions.calls)
+    problem_multipliers = whole_multipliers(program, z, multipliers)[: collocation.constraints]
+    problem_variables = carried_over(z, program, collocation)
+    status = judged(status, problem_variables, problem_multipliers)
+    message = f"{status.sentence} ({NAMES.get(plugin, plugin)}: {return_status})"
+    return recorder.solution(
+        status, message, problem_variables, problem_multipliers, iterations, functions.calls
+    )
 
 
 def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
+    """Return CasADi's solver of a program.
+
+    Raises
+    ------
+    InputError
+        If the plugin cannot be set up, with the first line of its message.
+    """
     z = ca.MX.sym("z", functions.collocation.variables)
     value, rows = functions.nlp(z, ca.MX(0, 1))
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with redirect_stdout(said):  # where IPOPT says which setting it refuses
+        with redirect_stdout(output):  # where IPOPT says which setting it refuses
             return ca.nlpsol("solver", plugin, {"x": z, "f": value, "g": rows}, settings)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).strip().splitlines()]
         unknown = [line for line in lines if "Unknown option" in line]
-        reason = (said.getvalue().strip() or [*unknown, lines[-1]][0]).splitlines()[0]
+        reason = (output.getvalue().strip() or [*unknown, lines[-1]][0]).splitlines()[0]
         reason = re.sub(r"^\S+:\d+: | Check the option documentation\.$", "", reason)
         name = NAMES.get(plugin, plugin)
         raise InputError(f"{name} cannot be set up: {reason}", None, "solver") from error
 
 
 class _LeftBehind(Exception):
-    """The solver was given up; from now on its callbacks fail."""
+    """Exception of the callbacks of a solver that was abandoned on its thread."""
 
 
 def _run(
@@ -139,42 +153,53 @@ def _run(
     monitor: Monitor,
     multipliers: Multipliers | None,
 ) -> tuple[Array, Array, str, int]:
-    """Variables, multipliers, what the solver said, and its iterations."""
+    """Run a solver, on a thread of its own if this is the main thread.
+
+    Returns
+    -------
+    tuple
+        Variables, multipliers, return status of the solver, and number of iterations. Variables are
+        NaN and multipliers empty if the solver failed; the status is "left behind" if it was
+        abandoned.
+    """
     lower, upper = bounds
-    given = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
+    arguments = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
     if multipliers is not None:
-        given |= {"lam_g0": multipliers.constraints, "lam_x0": multipliers.bounds}
-    found: list[tuple[Array, Array, str, int]] = []
+        arguments |= {"lam_g0": multipliers.constraints, "lam_x0": multipliers.bounds}
+    results: list[tuple[Array, Array, str, int]] = []
 
     def search() -> None:
+        """Call the solver and append its result."""
         try:
-            answer = solver(**given)
+            answer = solver(**arguments)
             stats = solver.stats()
         except RuntimeError as error:  # of its own, or what a callback's failure makes of it
-            said = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
-            found.append((np.full(len(start), np.nan), np.zeros(0), said, 0))
+            message = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
+            results.append((np.full(len(start), np.nan), np.zeros(0), message, 0))
             return
         z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
         count = int(stats.get("iter_count") or 0)
-        found.append((z, multipliers, str(stats["return_status"]), count))
+        results.append((z, multipliers, str(stats["return_status"]), count))
 
     if threading.current_thread() is threading.main_thread():
         _on_a_thread(search, monitor)
     else:
         search()
-    return found[0] if found else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
+    return results[0] if results else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
 
 
 def _on_a_thread(search: Callable[[], None], monitor: Monitor) -> None:
-    """Let the main thread hear signals, which it does not within a factorisation of minutes."""
+    """Run a search on a thread, so that the main thread can handle signals during long
+    factorisations.
+    """
     thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
     with _interruptible(monitor):
         thread.start()
         try:
-            left_s = GRACE_S
-            while thread.is_alive() and left_s > 0:
+            remaining_s = GRACE_S
+            while thread.is_alive() and remaining_s > 0:
                 thread.join(LOOK_EVERY_S)
-                left_s -= LOOK_EVERY_S if monitor.stop else 0.0
+                remaining_s -= LOOK_EVERY_S if monitor.stop else 0.0
         finally:
             if thread.is_alive():
                 thread.name = LEFT
@@ -183,15 +208,17 @@ def _on_a_thread(search: Callable[[], None], monitor: Monitor) -> None:
 
 @contextmanager
 def _interruptible(monitor: Monitor) -> Iterator[None]:
-    """Let Ctrl-C ask for a stop at the end of the iteration; a second one ends the program.
+    """Context in which Ctrl-C asks the monitor to stop; a second Ctrl-C raises KeyboardInterrupt.
 
-    So does SIGTERM where it is heeded as Ctrl-C is.
+    SIGTERM is treated the same if its handler raises KeyboardInterrupt. The previous handlers are
+    restored at the end.
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     if not raises_interrupt(handlers[signal.SIGTERM]):
         del handlers[signal.SIGTERM]
 
     def request(number: int, _frame: object) -> None:
+        """Request a stop, and let the next signal interrupt the process."""
         monitor.stop = True
         signal.signal(number, signal.default_int_handler)
 

@@ -1,13 +1,14 @@
-"""Where a search starts without a guess: a scan of the stiffness, from stiff to soft.
+"""Start without a guess: a scan of the stiffness from stiff to soft.
 
-At each stiffness the free moduli take the values that they usually have beside each other, the
-other parameters without a guess theirs, and the first part of every recording is simulated and
-compared with all that was measured. A stiff body can always be simulated and moves as the grasp
-does; the softer it is, the more it sags and lags and the less force it gives, until it fits, and
-then falls apart. So the best start is found by simulations that are cheap, and the search begins on
-the right side of what can be simulated.
+At each stiffness the free moduli have values that are typical in relation to each other, and other
+parameters without a guess have typical values. The first part of every recording is simulated and
+compared with all measurements. A stiff body can always be simulated and moves rigidly with the
+grasp; a softer one sags more, follows later and needs less force, until it fits, and finally the
+simulation fails. So the best start is found by cheap simulations, and the search begins on the side
+where simulations succeed.
 
-The same scan is the rescue where a guess cannot be simulated, or fits worse than a rigid body.
+The same scan is used if a guess cannot be simulated, or fits worse than a rigid body. Use `started`
+before a method is called.
 """
 
 from __future__ import annotations
@@ -50,29 +51,31 @@ NO_GUESS = "no guess"
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What a scan of the stiffness found.
+    """Result of a scan of the stiffness.
 
     Attributes
     ----------
     reason : str
-        Why there was one.
-    young_pa : (k,) ndarray
-        Young's moduli that were tried, ascending; moduli with a guess, and those fixed, kept it.
-    misfit : (k,) ndarray
-        Root mean square of the residuals, of markers and wrenches, in standard deviations; NaN
-        where the body could not be simulated.
+        Reason for the scan, the beginning of `sentence`.
+    young_pa : (k,) array
+        Young's moduli that were tried, ascending [Pa]. Moduli with a guess, and fixed ones, kept
+        their values.
+    misfit : (k,) array
+        Root mean square of the residuals of all measurements, in standard deviations; NaN where the
+        body could not be simulated.
     best : int
-        Position of the one that was chosen.
+        Index of the modulus that was chosen.
     parameters : Parameters
-        With the guesses to start from.
+        Parameters with the guesses to start from.
     samples : int
-        How many first samples were compared, over all experiments.
+        Number of first samples that were compared, over all experiments.
     time_s : float
+        Computing time [s].
     starts : mapping of int to Parameters
-        By the position of a stiffness the guesses to start from, of the best and the others.
+        Parameters with guesses by the index of a modulus, for `best` and `others`.
     others : tuple of int
-        Positions of other stiffnesses that may lead to a better answer where there are local
-        minima: those next to the best, and other minima of the misfit, the least misfit first.
+        Indices of other moduli that may lead to a better solution where there are local minima:
+        those next to the best, and other minima of the misfit, in ascending order of the misfit.
     """
 
     reason: str
@@ -87,7 +90,7 @@ class Scan:
 
     @property
     def sentence(self) -> str:
-        """What was done, for people."""
+        """Summary of the scan for the user."""
         return (
             f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
             f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
@@ -95,26 +98,27 @@ class Scan:
 
 
 def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation, Scan | None]:
-    """The problem with a guess of every parameter, and the scan that found it, if there was one.
+    """Return the problem with a guess of every parameter, and the scan; None if there was no scan.
 
-    Guesses that are given stay, unless the body cannot be simulated with them or misses what was
-    measured by more than an undeformed one, and the scan finds better ones.
+    Given guesses are kept, unless the body cannot be simulated with them or fits worse than an
+    undeformed one, and the scan finds better ones.
 
     Parameters
     ----------
     collocation : Collocation
+        Problem.
     whole : bool
-        Whether the start must be simulable to the end of the recordings.
+        Whether the simulation at the start must reach the end of the recordings.
 
     Raises
     ------
     InputError
-        Where parameters have no guess and the body cannot be simulated at any stiffness.
+        If parameters have no guess and the body cannot be simulated at any stiffness.
     """
     unguessed = collocation.parameters.unguessed
     if any(is_modulus(name) for name in unguessed):
-        found = scan(collocation, whole=whole)
-        return replace(collocation, parameters=found.parameters), found
+        result = scan(collocation, whole=whole)
+        return replace(collocation, parameters=result.parameters), result
     if unguessed:
         usual = usual_parameters(collocation.parameters, STIFFEST_PA)
         collocation = replace(collocation, parameters=usual)
@@ -127,16 +131,26 @@ def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation,
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
         reason = "at the guess the measurements are missed by more than an undeformed body would"
-    found = rescue(collocation, reason, whole)
-    if found is None:
+    result = rescue(collocation, reason, whole)
+    if result is None:
         return collocation, None  # the method will tell what it needs
-    if failure is None and misfit <= found.misfit[found.best]:
+    if failure is None and misfit <= result.misfit[result.best]:
         return collocation, None
-    return replace(collocation, parameters=found.parameters), found
+    return replace(collocation, parameters=result.parameters), result
 
 
 def rescue(collocation: Collocation, reason: str, whole: bool = False) -> Scan | None:
-    """The scan without the guesses that are given; None where it finds nothing."""
+    """Return a scan without the given guesses; None if it finds no start.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem with guesses.
+    reason : str
+        Reason for the scan.
+    whole : bool
+        Whether the simulation at the start must reach the end of the recordings.
+    """
     if not _scannable(collocation):
         return None
     try:
@@ -146,35 +160,36 @@ def rescue(collocation: Collocation, reason: str, whole: bool = False) -> Scan |
 
 
 def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) -> Scan:
-    """Try stiffnesses from stiff to soft with the parameters that have no guess.
+    """Simulate the problem at stiffnesses from stiff to soft, and return the best as a start.
 
     Parameters
     ----------
     collocation : Collocation
+        Problem; parameters with a guess keep it.
     reason : str
-        Why; the sentence begins with it.
+        Reason for the scan, the beginning of `Scan.sentence`.
     whole : bool
-        Whether the start must be simulable to the end of the recordings.
+        Whether the simulation at the start must reach the end of the recordings.
 
     Raises
     ------
     InputError
-        Where the body cannot be simulated at any stiffness.
+        If the body cannot be simulated at any stiffness.
     """
     began = time.perf_counter()
     trial = _Trial(replace(collocation, parameters=_sized(collocation.parameters, 1.0)))
-    tried = _Tried(trial)
+    trials = _Tried(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
-    tried.walk([STIFFEST_PA * step**k for k in range(STEPS)])
-    if tried.at_end(softest=True):
-        tried.walk_on(min(tried.misfits), step)
-    if tried.at_end(softest=False):
-        tried.warm = None
-        tried.walk_on(max(tried.misfits), 1 / step)
-    young_pa = np.array(sorted(tried.misfits))
-    misfit = np.array([tried.misfits[young] for young in young_pa])
-    chosen = [young for young in _ranked(young_pa, misfit) if not whole or trial.runs(young)]
-    if not chosen:
+    trials.walk([STIFFEST_PA * step**k for k in range(STEPS)])
+    if trials.at_end(softest=True):
+        trials.walk_on(min(trials.misfits), step)
+    if trials.at_end(softest=False):
+        trials.warm = None
+        trials.walk_on(max(trials.misfits), 1 / step)
+    young_pa = np.array(sorted(trials.misfits))
+    misfit = np.array([trials.misfits[young] for young in young_pa])
+    candidates = [young for young in _ranked(young_pa, misfit) if not whole or trial.runs(young)]
+    if not candidates:
         raise InputError(
             f"no start was found: the body cannot be simulated at any of {len(young_pa)} "
             f"stiffnesses from E = {young_pa[-1]:.3g} to {young_pa[0]:.3g} Pa "
@@ -182,8 +197,8 @@ def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) 
             None,
             "parameters",
         )
-    best = int(np.flatnonzero(young_pa == chosen[0])[0])
-    start = usual_parameters(collocation.parameters, chosen[0])
+    best = int(np.flatnonzero(young_pa == candidates[0])[0])
+    start = usual_parameters(collocation.parameters, candidates[0])
     others = _other_starts(misfit, best) if not whole else ()
     starts = {k: usual_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
     return Scan(
@@ -200,35 +215,37 @@ def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) 
 
 
 def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
-    """Return positions of the next best starts, see `Scan.others`.
+    """Return indices of the next best starts, see `Scan.others`.
 
     Parameters
     ----------
     misfit : (k,) array
-        By ascending stiffness, NaN where the body cannot be simulated.
+        Misfit by ascending stiffness, NaN where the body cannot be simulated.
     best : int
-        Position of the stiffness that is chosen.
+        Index of the stiffness that is chosen.
     """
     known = np.where(np.isfinite(misfit), misfit, np.inf)
-    beside = np.concatenate([[np.inf], known, [np.inf]])
-    is_minimum = (known < beside[:-2]) & (known <= beside[2:])
+    padded = np.concatenate([[np.inf], known, [np.inf]])
+    is_minimum = (known < padded[:-2]) & (known <= padded[2:])
     candidates = {best - 1, best + 1, *np.flatnonzero(is_minimum).tolist()} - {best}
     possible = [k for k in candidates if 0 <= k < len(known) and known[k] <= ALIKE * known[best]]
     return tuple(sorted(possible, key=lambda k: known[k])[:MORE_STARTS])
 
 
 def usual_parameters(parameters: Parameters, young_pa: float) -> Parameters:
-    """Parameters whose missing guesses are what is usual at a stiffness, or their priors' means.
+    """Return parameters in which missing guesses are replaced by typical values at a Young's
+    modulus [Pa].
 
-    What is fixed or has a guess keeps it.
+    Parameters with a prior get its mean instead. Fixed parameters and those with a guess are kept.
     """
-    known = {i.name: i.guess for i in parameters.items if i.tied is None and i.guess is not None}
+    guesses = {i.name: i.guess for i in parameters.items if i.tied is None and i.guess is not None}
 
     def value(item: Parameter) -> float:
+        """Return the guess of a parameter, its prior mean, or a typical value within its bounds."""
         if item.guess is not None:
             return item.guess
         region, dot, _ = item.name.rpartition(".")
-        poisson = known.get(f"{region}{dot}poisson", known.get("poisson", 0.3))
+        poisson = guesses.get(f"{region}{dot}poisson", guesses.get("poisson", 0.3))
         usual = usual_value(item.name, young_pa, poisson)
         if item.prior is not None:
             usual = item.prior[0]
@@ -240,12 +257,14 @@ def usual_parameters(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def usual_constants(parameters: Parameters) -> dict[str, float]:
-    """Values by name: guesses, or what is usual of a soft body."""
+    """Return values by parameter name: guesses, or typical ones of a soft body (`SOFT_PA`)."""
     return usual_parameters(parameters, SOFT_PA).guesses
 
 
 def _ranked(young_pa: Array, misfit: Array) -> list[float]:
-    """Stiffnesses that could be simulated: the best, then those stiffer."""
+    """Return the moduli that could be simulated: the best, followed by stiffer ones; empty
+    if none could.
+    """
     if np.isnan(misfit).all():
         return []
     best = int(np.nanargmin(misfit))
@@ -253,7 +272,9 @@ def _ranked(young_pa: Array, misfit: Array) -> list[float]:
 
 
 def _sized(parameters: Parameters, young_pa: float) -> Parameters:
-    """The same parameters; linear ones of no known size change by what is usual of a modulus."""
+    """Return the parameters with a unit for linear ones without: a tenth of Young's modulus
+    [Pa].
+    """
     unit = young_pa / 10
     return Parameters(
         tuple(replace(i, unit=unit) if np.isnan(i.unit) else i for i in parameters.items)
@@ -261,16 +282,20 @@ def _sized(parameters: Parameters, young_pa: float) -> Parameters:
 
 
 def _scannable(collocation: Collocation) -> bool:
+    """Return whether a free modulus on a logarithmic scale exists."""
     free = collocation.parameters.free
     return any(is_modulus(item.name) and item.scale == "log" for item in free)
 
 
 def without_guesses(collocation: Collocation) -> Collocation:
-    """The problem without the guesses that the scan can do without."""
+    """Return the problem without the guesses of free parameters that a prior or a typical
+    value can replace.
+    """
 
     def forgotten(item: Parameter) -> Parameter:
-        known = item.prior is not None or usual_value(item.name, 1.0) is not None
-        return replace(item, guess=None) if known and item in free else item
+        """Return the parameter without its guess, if that can be replaced."""
+        is_replaceable = item.prior is not None or usual_value(item.name, 1.0) is not None
+        return replace(item, guess=None) if is_replaceable and item in free else item
 
     free = collocation.parameters.free
     items = tuple(map(forgotten, collocation.parameters.items))
@@ -278,9 +303,9 @@ def without_guesses(collocation: Collocation) -> Collocation:
 
 
 def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
-    """Root mean square of all residuals, in standard deviations, on the first rows.
+    """Return the root mean square of all residuals, in standard deviations, on the first rows.
 
-    Unknown places are where the first samples lie on the body.
+    Markers of unknown position are associated with the body at the first samples.
     """
     collocation, p = collocation.placed(p, positions)
     parts = collocation.parts_at(p, positions)
@@ -288,31 +313,41 @@ def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> f
 
 
 def _residuals(part: Part) -> Array:
-    """Those of all readings; of instruments with the tares, clocks and tools that suit best.
+    """Return the residuals of all measurements of one experiment, in standard deviations.
 
-    Nothing else tells these beforehand, and the residuals are nearly linear in them; what they are
-    in their deviations counts too.
+    Offsets, clocks and tool parameters of sensors have the values that fit best, because nothing
+    else determines them beforehand and the residuals are nearly linear in them; their priors are
+    included.
     """
-    found, slopes = [], []
-    still = part.sensing.still(part.x)
-    for reading, (residual, slope) in zip(part.segment.readings, still, strict=True):
+    residuals, slopes = [], []
+    predictions = part.sensing.still(part.x)
+    for reading, (residual, slope) in zip(part.segment.readings, predictions, strict=True):
         rough = reading.roughly(part.x, part.phi)
         if rough is not None:
-            found.append(rough)
+            residuals.append(rough)
             slopes.append(np.zeros((len(rough), slope.shape[-1])))
             continue
-        there = reading.there(len(part.looked[len(found)]))[: len(residual)]
-        found.append(residual[there])
-        slopes.append(slope[there] * reading.has_offsets)
-    residual, slope = np.concatenate(found), np.concatenate(slopes)
-    own = slope[:, slope.any(axis=0)]
-    priors = np.eye(own.shape[1])
-    residual, own = np.append(residual, np.zeros(len(priors))), np.concatenate([own, priors])
-    return residual - own @ np.linalg.lstsq(own, residual, rcond=None)[0] if own.size else residual
+        is_compared = reading.there(len(part.looked[len(residuals)]))[: len(residual)]
+        residuals.append(residual[is_compared])
+        slopes.append(slope[is_compared] * reading.has_offsets)
+    residual, slope = np.concatenate(residuals), np.concatenate(slopes)
+    offset_slopes = slope[:, slope.any(axis=0)]
+    priors = np.eye(offset_slopes.shape[1])
+    residual, offset_slopes = (
+        np.append(residual, np.zeros(len(priors))),
+        np.concatenate([offset_slopes, priors]),
+    )
+    return (
+        residual - offset_slopes @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
+        if offset_slopes.size
+        else residual
+    )
 
 
 def _samples(segment: Segment) -> int:
-    """How many first samples are compared: a part of all, and one of each kind of reading."""
+    """Return the number of first samples that are compared, with at least one of each
+    measurement.
+    """
     t_s, seen = segment.experiment.t_s, [segment.experiment.markers.first_seen]
     for reading in segment.readings[1:]:
         seen.append(int(np.searchsorted(t_s, reading.begins_s)) + reading.channel.late)
@@ -320,7 +355,19 @@ def _samples(segment: Segment) -> int:
 
 
 class _Trial:
-    """Simulates the first part of every recording."""
+    """Simulation of the first part of every recording, and its misfit.
+
+    Attributes
+    ----------
+    samples : list of int
+        Number of samples that are compared, by experiment.
+    rows : list of int
+        Number of grid rows that are compared, by experiment.
+    whole : list of int
+        Number of all grid rows, by experiment.
+    failure : SimulationError or None
+        Last failure; None before the first.
+    """
 
     def __init__(self, collocation: Collocation) -> None:
         self.collocation = collocation
@@ -333,15 +380,15 @@ class _Trial:
 
     @cached_property
     def rigid_misfit(self) -> float:
-        """Of the undeformed body, carried by the grasp."""
+        """Misfit of an undeformed body that moves with the grasp, in standard deviations."""
         positions = []
         for segment, rows in zip(self.collocation.segments, self.rows, strict=True):
-            at = segment.experiment.rigid_positions(segment.dynamics.t_s[:rows])
-            positions.append(at.reshape(rows, -1))
+            rigid_positions = segment.experiment.rigid_positions(segment.dynamics.t_s[:rows])
+            positions.append(rigid_positions.reshape(rows, -1))
         return _misfit(self.collocation, self.collocation.guess_p, positions)
 
     def guess(self, whole: bool) -> tuple[float, SimulationError | None]:
-        """The misfit of the guess, or why it cannot be simulated."""
+        """Return the misfit of the guess and None, or NaN and the failure of its simulation."""
         p = self.collocation.guess_p
         positions, failure = self._simulated(p, None, self.whole if whole else self.rows)
         if failure is not None:
@@ -349,7 +396,16 @@ class _Trial:
         return self._compared(p, positions), None
 
     def at(self, young_pa: float, warm: list[Array] | None) -> tuple[float, list[Array] | None]:
-        """The misfit at a stiffness, NaN where it cannot be simulated, and trajectories."""
+        """Return misfit and trajectories at a Young's modulus [Pa]; NaN and None if the simulation
+        fails.
+
+        Parameters
+        ----------
+        young_pa : float
+            Young's modulus [Pa].
+        warm : list of (N, 3n) array or None
+            Trajectories at another modulus, near which equilibria are searched.
+        """
         p = self._p(young_pa)
         positions, failure = self._simulated(p, warm, self.rows)
         if failure is not None:
@@ -358,20 +414,24 @@ class _Trial:
         return self._compared(p, positions), positions
 
     def runs(self, young_pa: float) -> bool:
-        """Whether the whole recordings can be simulated at a stiffness."""
+        """Return whether the complete recordings can be simulated at a Young's modulus [Pa]."""
         _, failure = self._simulated(self._p(young_pa), None, self.whole)
         self.failure = failure or self.failure
         return failure is None
 
     def key(self, young_pa: float) -> tuple[float, ...]:
-        """What tells stiffnesses apart: beyond all bounds they are the same."""
+        """Return the parameters at a Young's modulus; moduli beyond all bounds have the
+        same key.
+        """
         return tuple(self._p(young_pa).tolist())
 
     def _p(self, young_pa: float) -> Array:
+        """Return the parameters p (np,) at a Young's modulus [Pa]."""
         q = usual_parameters(self.collocation.parameters, young_pa).guess_q
         return np.concatenate([q, np.zeros(self.collocation.nphi)])
 
     def _compared(self, p: Array, positions: Sequence[Array]) -> float:
+        """Return the misfit of trajectories at p; NaN if it is not finite."""
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
         misfit = _misfit(self.collocation, p, first)
         return misfit if np.isfinite(misfit) else np.nan
@@ -379,11 +439,22 @@ class _Trial:
     def _simulated(
         self, p: Array, warm: list[Array] | None, rows: Sequence[int]
     ) -> tuple[list[Array], SimulationError | None]:
+        """Return trajectories of so many rows at p, and the first failure, see `marched`."""
         return marched(self.collocation, p, None, rows, LOOSE, near=warm)
 
 
 class _Tried:
-    """The stiffnesses tried so far, by Young's modulus."""
+    """Moduli that were tried so far, with their misfits.
+
+    Attributes
+    ----------
+    misfits : dict of float to float
+        Misfit by Young's modulus [Pa]; NaN where the simulation failed.
+    warm : list or None
+        Trajectories of the last simulation that succeeded.
+    lost : bool
+        Whether the scan ended before the softest modulus.
+    """
 
     def __init__(self, trial: _Trial) -> None:
         self.trial = trial
@@ -392,20 +463,31 @@ class _Tried:
         self.lost = False
 
     def walk(self, young_pa: Sequence[float]) -> None:
-        """Try from stiff to soft until the body is lost; those beyond all bounds are one."""
-        lost = 0
+        """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly.
+
+        Moduli that give the same parameters are tried once.
+        """
+        failures = 0
         first, *others = ([*same] for _, same in groupby(young_pa, self.trial.key))
         for young in (first[-1], *(same[0] for same in others)):
             misfit = self._try(young)
-            found = [m for m in self.misfits.values() if np.isfinite(m)]
-            is_lost = bool(found) and not misfit <= WORSE * min(found)
-            lost = lost + 1 if is_lost else 0
-            if lost == LOST:
+            finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
+            is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
+            failures = failures + 1 if is_failure else 0
+            if failures == LOST:
                 self.lost = True
                 return
 
     def walk_on(self, young_pa: float, factor: float) -> None:
-        """Go on beyond an end as long as it gets better."""
+        """Try moduli beyond an end of the range, as long as the misfit decreases.
+
+        Parameters
+        ----------
+        young_pa : float
+            Modulus at the end, which was tried [Pa].
+        factor : float
+            Ratio of successive moduli.
+        """
         best, beyond = self.misfits[young_pa], young_pa * factor
         while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
             if self.trial.key(beyond) == self.trial.key(beyond / factor):
@@ -416,14 +498,18 @@ class _Tried:
             best, beyond = misfit, beyond * factor
 
     def at_end(self, softest: bool) -> bool:
-        """Whether the best is at an end that was reached."""
-        known = {young: m for young, m in self.misfits.items() if np.isfinite(m)}
-        if not known or (softest and self.lost):
+        """Return whether the best modulus is the softest (or else the stiffest) that was tried.
+
+        False for the softest end if the scan ended before it.
+        """
+        finite_misfits = {young: m for young, m in self.misfits.items() if np.isfinite(m)}
+        if not finite_misfits or (softest and self.lost):
             return False
-        best = min(known, key=lambda young: known[young])
+        best = min(finite_misfits, key=lambda young: finite_misfits[young])
         return best == (min(self.misfits) if softest else max(self.misfits))
 
     def _try(self, young_pa: float) -> float:
+        """Simulate at a modulus, store the misfit, and return it."""
         misfit, warm = self.trial.at(young_pa, self.warm)
         self.warm = warm or self.warm
         self.misfits[young_pa] = misfit

@@ -1,4 +1,9 @@
-"""The search of the reduced-space method: trust region, acceptance, and the ladder of horizons."""
+"""Search of the reduced-space method: trust region, acceptance of trials, and increasing horizons.
+
+`SearchOptions` are the options that the user sets; `ReducedSearch` is the search itself. Where
+measurements are associated with the body at estimated positions (markers of unknown position, depth
+cameras), the search also updates the association.
+"""
 
 from __future__ import annotations
 
@@ -53,30 +58,34 @@ REREADINGS = 40
 
 @dataclass(frozen=True)
 class SearchOptions(Options):
-    """How parameters are searched for.
+    """Options of the search for parameters.
 
     Attributes
     ----------
     tolerance : float
         Largest last step of a parameter's logarithm.
     max_iterations : int
-        Sweeps over all rungs of the ladder; a rejected trial counts.
+        Largest number of sweeps, over all horizons; a rejected trial counts.
     trust : float
         First trust region: longest step of a parameter's logarithm.
     ladder : tuple of float
-        Shares of the recording solved one after another, ending with 1; a start needs none.
+        Shares of the recording solved one after another, ending with 1. Not used if the solve
+        starts from another run.
     rung_decrease : float
-        All rungs but the last end when a step promises to lower the loss by less than this share.
+        Each horizon but the last ends when a step promises to decrease the loss by less than this
+        share.
     rung_prior : float
-        On them a prior of this standard deviation of the logarithm holds each parameter near its
-        guess: a short horizon says nothing about some, and would let them run to their bounds.
+        Standard deviation of a prior of each parameter's logarithm around its guess, for all
+        horizons but the last. A short horizon does not determine all parameters, and without this
+        prior they would move to their bounds.
     hessian : {"gauss-newton", "exact"}
-        Once a step moves no parameter by more than 10 %, what Gauss–Newton leaves out is learned
-        from the steps, or computed exactly from the Lagrangian: a second sweep an iteration, for
-        large residuals. Before, both are Gauss–Newton.
+        Second derivatives of the loss. Both are Gauss–Newton until a step moves no parameter by
+        more than 10 %. Then "gauss-newton" approximates what Gauss–Newton neglects from the steps,
+        and "exact" computes it from the Lagrangian, which takes a second sweep per iteration and
+        helps with large residuals.
     factorisation : {"auto", "band", "sparse", "supernodal"}
-        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated
-        to cost least.
+        Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated to
+        cost least.
     """
 
     tolerance: Positive = 1e-8
@@ -90,7 +99,43 @@ class SearchOptions(Options):
 
 
 class ReducedSearch:
-    """The state of a solve: the best point, the trust region, and the budget."""
+    """State of a reduced-space search: best parameters and trajectories, trust region, number of
+    sweeps.
+
+    Attributes
+    ----------
+    p : (np,) array
+        Best parameters (q, φ).
+    x : list or None
+        Best trajectories, stored by the workers, see `trajectory.positions`; None before the first.
+    sweeps : int
+        Number of sweeps and simulations so far.
+    trust : float
+        Longest step, relative to `reach`.
+    reach : (np,) array
+        Change of each parameter that counts as a step of one.
+    seeing : bool
+        Whether an experiment has depth cameras.
+    indefinite : int
+        Time steps with an indefinite matrix at the best point.
+    most_seen : int
+        Largest number of measurements that were associated.
+    rereadings : int
+        Number of new associations so far.
+    edge_m, size_m : float
+        Mesh edge and body size [m].
+
+    Parameters
+    ----------
+    options : SearchOptions
+        Options.
+    recorder : Recorder
+        Record of the solve; its collocation is replaced when measurements are associated again.
+    start : (variables,) array, optional
+        Initial variables; None means the guess and simulations.
+    workers : Workers, optional
+        Where the experiments are processed; None means threads.
+    """
 
     def __init__(
         self,
@@ -128,18 +173,27 @@ class ReducedSearch:
     # The ladder -------------------------------------------------------------------------------
 
     def run(self) -> tuple[Status, str]:
-        """Solve the whole from the positions given, or rung after rung.
+        """Solve the complete problem from the given positions or, without any, on increasing
+        horizons.
+
+        Returns
+        -------
+        tuple of Status and str
+            Status and its sentence.
 
         Raises
         ------
         SimulationError
-            Where not even the rows that were reached help to reach more.
+            If the simulation cannot be extended even after a fit of the rows that were reached.
         """
         status = self._whole() or self._climb()
         return status, status.sentence
 
     def _whole(self) -> Status | None:
-        """Solve the whole where positions are given, unless they lead nowhere."""
+        """Solve the complete problem from the given positions.
+
+        Return None if there are none or the sweep fails; then the positions are discarded.
+        """
         if self.x is None:
             return None
         try:
@@ -150,7 +204,7 @@ class ReducedSearch:
             return None
 
     def _climb(self) -> Status:
-        """Solve rung after rung."""
+        """Solve one horizon after the other, and return the last status."""
         status = Status.CONVERGED
         for share in self.options.ladder:
             last = share == self.options.ladder[-1]
@@ -163,41 +217,62 @@ class ReducedSearch:
         return status
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:
+        """Return the problem on the first rows of each experiment, with a prior unless it
+        is the last.
+        """
         prior = None if last else self.options.rung_prior
         watch, choice = self.recorder.stopwatch, self.options.factorisation
         return Horizon(self.collocation, rows, prior, watch, choice, self.workers)
 
     def _reach(self, rung: Horizon) -> None:
-        """Extend the trajectories to a rung's length; where that fails, first solve what is."""
+        """Extend the trajectories to the length of a horizon.
+
+        If the simulation fails, the rows that were reached are fitted first, and then extended
+        again.
+
+        Raises
+        ------
+        SimulationError
+            If this does not reach further.
+        """
         furthest = 0
         while True:
-            known = self.x
-            reached, failure = rung.extend(self.p, known)
+            previous = self.x
+            reached, failure = rung.extend(self.p, previous)
             self.sweeps += 1
-            if failure is not None and known is not None:
+            if failure is not None and previous is not None:
                 # Rows that only nearly satisfy the equations may lead nowhere; simulated ones do.
-                afresh, failure_afresh = rung.extend(self.p)
+                restarted, restart_failure = rung.extend(self.p)
                 self.sweeps += 1
-                if sum(rung.lengths(afresh)) > sum(rung.lengths(reached)):
-                    reached, failure = afresh, failure_afresh
+                if sum(rung.lengths(restarted)) > sum(rung.lengths(reached)):
+                    reached, failure = restarted, restart_failure
             if failure is None:
                 self.x = reached
-                self._place(rung, first=known is None)
+                self._place(rung, first=previous is None)
                 return
             rows = rung.lengths(reached)
             fewest = min(FEWEST, *rung.rows)
-            nothing = known is None and min(rows) < fewest
-            if nothing or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
+            is_unstarted = previous is None and min(rows) < fewest
+            if is_unstarted or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
                 raise failure
             furthest = sum(rows)
             self.x = reached
-            self._place(rung, first=known is None)
+            self._place(rung, first=previous is None)
             self._descend(self._horizon(rows, last=False), last=False)
 
     # One rung ---------------------------------------------------------------------------------
 
     def _descend(self, rung: Horizon, last: bool) -> Status:
-        """Gauss–Newton steps on one rung until they promise no more."""
+        """Take Gauss–Newton steps on one horizon until convergence, and return the status.
+
+        Parameters
+        ----------
+        rung : Horizon
+            Problem on the first rows.
+        last : bool
+            Whether it is the complete problem, so that the tolerance applies instead of
+            `rung_decrease`.
+        """
         assert self.x is not None
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.widest)
@@ -208,30 +283,32 @@ class ReducedSearch:
             step = self._step(point, curvature)
             length = self._length(step)
             # A step that the trust region cuts short says nothing about the distance to go.
-            whole = length < 0.99 * self.trust
-            short = whole and length <= tolerance
-            if short and point.feasibility_m <= FEASIBLE * self.size_m:
+            is_full_step = length < 0.99 * self.trust
+            is_short = is_full_step and length <= tolerance
+            if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
             rate = min(1.0, length / previous)
-            if last and whole and length * rate <= SAFETY * tolerance:
-                final = rung.moved(point, step)
-                seen = rung.seen(point.p + step, final)
-                if self._are_feasible(seen):
-                    self._record(point.p + step, final, point.predicted_loss(step), seen)
+            if last and is_full_step and length * rate <= SAFETY * tolerance:
+                final_positions = rung.moved(point, step)
+                summaries = rung.seen(point.p + step, final_positions)
+                if self._are_feasible(summaries):
+                    self._record(
+                        point.p + step, final_positions, point.predicted_loss(step), summaries
+                    )
                     return Status.CONVERGED
-            promised = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
-            if not last and promised < self.options.rung_decrease:
+            predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
+            if not last and predicted_share < self.options.rung_decrease:
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
             trial = self._try(rung, point, step)
-            better = trial is not None and self._is_better(point, step, trial)
-            if trial is not None and better and self._is_seen_better(rung, point, trial):
+            is_better = trial is not None and self._is_better(point, step, trial)
+            if trial is not None and is_better and self._is_seen_better(rung, point, trial):
                 if last and length <= LOCAL:
                     curvature = self._curvature(curvature, point, trial)
                 point, rejections, previous = self._accepted(rung, trial), 0, length
                 continue
-            if short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
+            if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
             if self.seeing and length <= SEEN:
                 return Status.CONVERGED  # what is seen changes by more than such a step gains
@@ -243,16 +320,19 @@ class ReducedSearch:
                 point = self._refined(rung, point)
 
     def _curvature(self, curvature: Array, before: Iterate, after: Iterate) -> Array:
-        """What Gauss–Newton leaves out at `after`, the secant's or the exact."""
+        """Return what Gauss–Newton neglects of the Hessian (np, np) at `after`,
+        approximated or exact.
+        """
         if self.options.hessian == "exact":
             return exact_curvature(self.collocation, after, self.recorder.stopwatch)
         return updated(curvature, before, after)
 
     def _length(self, step: Array) -> float:
-        """Largest step of a parameter, in what a trust region of one allows it."""
+        """Return the largest change of a parameter relative to `reach`."""
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _step(self, point: Iterate, curvature: Array) -> Array:
+        """Return the step (np,) that minimises the model within bounds and trust region."""
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
@@ -260,6 +340,7 @@ class ReducedSearch:
         return with_curvature(point.fit, curvature).best(low, high)
 
     def _try(self, rung: Horizon, point: Iterate, step: Array) -> Iterate | None:
+        """Sweep after a step from `point`; None if that fails or is not finite."""
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
@@ -269,7 +350,7 @@ class ReducedSearch:
         return trial if trial.finite else None
 
     def _is_better(self, point: Iterate, step: Array, trial: Iterate) -> bool:
-        """Judge a trial, and widen or narrow the trust region after it."""
+        """Return whether a trial is accepted, and adapt the trust region if it is."""
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
         if trial.feasibility_m > max(CONTRACTION * trial.moved_m, SMALL_STRAIN * self.edge_m):
@@ -285,10 +366,11 @@ class ReducedSearch:
         return True
 
     def _refined(self, rung: Horizon, point: Iterate) -> Iterate:
-        """The point after its feasibility step, or with a simulated trajectory.
+        """Return the point after its feasibility step or, if that does not converge, with a
+        simulation.
 
-        The loss of the projected trajectory is then exact to a higher order: trials that were
-        judged against too low a loss get another chance.
+        The loss of the projected trajectory is then accurate to a higher order, so that trials are
+        no longer compared with a loss that is too low.
         """
         refined = self._try(rung, point, np.zeros(len(point.p)))
         if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
@@ -296,19 +378,21 @@ class ReducedSearch:
         return self._accepted(rung, refined)
 
     def _restored(self, rung: Horizon, point: Iterate) -> Iterate:
-        """The point with a simulated trajectory, where that exists."""
+        """Return the point with a simulated trajectory, or unchanged if the simulation fails."""
         self.sweeps += 1
         x, failure = rung.extend(point.p, near=point)
         if failure is not None:
             return point
         try:
-            restored = rung.evaluate(point.p, x)
+            resimulated = rung.evaluate(point.p, x)
         except SimulationError:
             return point
-        return self._accepted(rung, restored) if restored.finite else point
+        return self._accepted(rung, resimulated) if resimulated.finite else point
 
     def _are_feasible(self, seen: list[Seen]) -> bool:
-        """Whether trajectories satisfy the equations of motion well within the tolerance."""
+        """Return whether the residuals of the equations of motion are much smaller than the
+        tolerance.
+        """
         return all(
             each.violation_n <= FEASIBLE_FORCE * segment.force_n
             for each, segment in zip(seen, self.collocation.segments, strict=True)
@@ -317,7 +401,16 @@ class ReducedSearch:
     # Where recordings are read ----------------------------------------------------------------
 
     def _place(self, rung: Horizon, first: bool) -> None:
-        """Start unknown places where the first samples lie on what was simulated first."""
+        """Associate markers and cameras of unknown position, from the first rows of the
+        trajectories.
+
+        Parameters
+        ----------
+        rung : Horizon
+            Problem, which is updated.
+        first : bool
+            Whether these are the first trajectories of the search.
+        """
         if (first or not self.placed) and self.x is not None:
             counts = [segment.rows_to_place for segment in self.collocation.segments]
             if any(counts):
@@ -327,16 +420,23 @@ class ReducedSearch:
                 self._read_in(rung, *self.collocation.placed(self.p, rows))
 
     def _read_in(self, rung: Horizon, collocation: Collocation, p: Array) -> None:
+        """Use another collocation of the same problem in the search, the recorder and the
+        horizon.
+        """
         self.collocation = self.recorder.collocation = collocation
         rung.read_in(collocation)
         self.lower, self.upper = collocation.bounds_p
         self.p = p
 
     def _follow(self, rung: Horizon, point: Iterate) -> Iterate:
-        """The point read where its estimates are."""
+        """Return the point with measurements associated at its estimates; unchanged if they are the
+        same.
+
+        The association is not updated after `REREADINGS` updates.
+        """
         trial, collocation, after = self.looked
-        known = trial is point
-        if known:
+        is_camera_trial = trial is point
+        if is_camera_trial:
             p = after.p
         else:
             counts = [segment.rows_to_follow for segment in self.collocation.segments]
@@ -346,12 +446,13 @@ class ReducedSearch:
             return point
         self.rereadings += 1
         self._read_in(rung, collocation, p)
-        return after if known else rung.reread(p, point)
+        return after if is_camera_trial else rung.reread(p, point)
 
     def _is_seen_better(self, rung: Horizon, point: Iterate, trial: Iterate) -> bool:
-        """Whether it is better where depth cameras look anew, too.
+        """Return whether a trial is still acceptable with depth points associated at its estimates.
 
-        What points belonged to may be another part of the surface there, or nothing any more.
+        A depth point may then belong to another part of the surface, or to none. True without depth
+        cameras; false if the association may not be updated any more.
         """
         before = self.collocation
         if not self.seeing:
@@ -362,20 +463,24 @@ class ReducedSearch:
         after = self._follow(rung, trial)
         self.rereadings -= self.collocation is not before
         self.looked = trial, self.collocation, after
-        seen = self.collocation.measurements
-        each, before_each = after.loss / max(1, seen), point.loss / max(1, before.measurements)
+        measurements = self.collocation.measurements
+        each, before_each = (
+            after.loss / max(1, measurements),
+            point.loss / max(1, before.measurements),
+        )
         self._read_in(rung, before, point.p)
-        return seen >= STILL_SEEN * self.most_seen and each <= AS_NEAR * before_each
+        return measurements >= STILL_SEEN * self.most_seen and each <= AS_NEAR * before_each
 
     def _accepted(self, rung: Horizon, point: Iterate) -> Iterate:
+        """Make a point the best so far, associate its measurements, record it, and return it."""
         self.point = point = self._follow(rung, point)
         self.indefinite = sum(report.indefinite for report in point.reports)
-        seen = [report.seen for report in point.reports]
-        self._record(point.p, point.trajectories, point.loss, seen)
+        summaries = [report.seen for report in point.reports]
+        self._record(point.p, point.trajectories, point.loss, summaries)
         return point
 
     def _record(self, p: Array, x: list[Any], loss: float, seen: list[Seen]) -> None:
-        """Make it the answer so far."""
+        """Store parameters and trajectories as the best so far, and add them to the history."""
         self.p, self.x = p, x
         squares_m2 = sum(each.squares_m2 for each in seen)
         rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in seen))))

@@ -1,7 +1,8 @@
-"""Where the experiments of a search are: in this process, or on the workers of a cluster.
+"""Executors for the experiments of a search: threads of this process, or workers of a Dask cluster.
 
-What is done for each experiment stays where it was done, as a value here or as a dask future on a
-worker, until it is fetched. Should a worker be lost, dask does again on another what led to it.
+Results for each experiment stay where they were computed, as values in this process or as Dask
+futures on a worker, until they are fetched. If a worker is lost, Dask repeats its computations on
+another.
 """
 
 from __future__ import annotations
@@ -36,27 +37,46 @@ KEPT_BYTES = {-1: 64 * 2**20, -3: 32 * 2**20}
 
 
 class Workers(Protocol):
-    """Who works on the experiments. What is kept is a list, with an entry of each."""
+    """Protocol of executors, which apply functions to experiments.
+
+    Stored values are lists with one entry per experiment, of a type that only the executor knows.
+    """
 
     def hold(self, collocation: Collocation) -> list[Any]:
-        """Keep the segments."""
+        """Store the transcriptions of a problem, and return them as stored values."""
         ...
 
     def each(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
-        """Keep ``run(…)`` of every experiment; entries of columns may be what is kept."""
+        """Apply a function to every experiment, and return the results as stored values.
+
+        Parameters
+        ----------
+        run : callable
+            Function of one entry of each column.
+        columns : sequence
+            Arguments, one entry per experiment each; entries may be stored values.
+        """
         ...
 
     def fetch(self, kept: Sequence[Any]) -> list[Any]:
-        """What is kept; raises what it raised."""
+        """Return stored values as values in this process; raise the exception of a function
+        that failed.
+        """
         ...
 
     def notes(self) -> list[str]:
-        """What the user should know of them."""
+        """Return remarks for the user, for example on lost workers."""
         ...
 
 
 class Here:
-    """Threads of this process, see `side_by_side`."""
+    """Executor with threads of this process, see `side_by_side`.
+
+    Parameters
+    ----------
+    threads : int
+        Number of threads.
+    """
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -79,16 +99,17 @@ class Here:
 
 
 class OnCluster:
-    """Workers of a dask cluster, each experiment on one of them.
+    """Executor with the workers of a Dask cluster; each experiment stays on one of them.
 
     Parameters
     ----------
     client : distributed.Client
+        Client of the scheduler.
 
     Raises
     ------
     InputError
-        If there are no workers, or they have not this version of the package.
+        If there are no workers, or they have another version of the package.
     """
 
     def __init__(self, client: Any) -> None:
@@ -98,7 +119,7 @@ class OnCluster:
         self._first = _require_package(client)
 
     def hold(self, collocation: Collocation) -> list[Any]:
-        """See `Workers`; bodies and experiments are sent once."""
+        """See `Workers`; each body and experiment is sent only once."""
         segments = collocation.segments
         with self._unless_lost():
             known = all(segment.experiment in self._sent for segment in segments)
@@ -114,13 +135,13 @@ class OnCluster:
             return [self._submit(home, run, *row) for home, *row in rows]
 
     def fetch(self, kept: Sequence[Any]) -> list[Any]:
-        """See `Workers`.
+        """Return stored values as values in this process, see `Workers`.
 
         Raises
         ------
         Ended
-            If the scheduler or all workers are gone, or an experiment ends those that it is
-            given to.
+            If the scheduler or all workers are lost, or an experiment terminates every worker that
+            processes it.
         """
         with self._unless_lost():
             return [self._result(future) for future in kept]
@@ -128,11 +149,12 @@ class OnCluster:
     def notes(self) -> list[str]:
         """See `Workers`."""
         with self._unless_lost():
-            gone = self._first - self.client.nthreads().keys()
-        said = f"{len(gone)} of {len(self._first)} workers were lost on the way: "
-        return [f"{said}what they had was done again on others"] if gone else []
+            lost_workers = self._first - self.client.nthreads().keys()
+        said = f"{len(lost_workers)} of {len(self._first)} workers were lost on the way: "
+        return [f"{said}what they had was done again on others"] if lost_workers else []
 
     def _result(self, future: Any) -> Any:
+        """Return the result of a future, and check from time to time that workers exist."""
         while True:
             try:
                 return future.result(timeout=LOOK_EVERY_S)
@@ -141,19 +163,26 @@ class OnCluster:
 
     @contextmanager
     def _unless_lost(self) -> Iterator[None]:
-        """End the search where the cluster is gone."""
+        """Context that raises `Ended` instead of Dask's exceptions if the cluster is lost."""
         dask = distributed()
         try:
             yield
         except dask.scheduler.KilledWorker as error:
             raise _lost("A recording ended every worker that had it: mind their memory.") from error
         except (Exception, dask.client.CancelledError) as error:
-            cut = isinstance(error, (OSError, dask.client.CancelledError))
-            if isinstance(error, Ended) or (self.client.status == "running" and not cut):
+            is_disconnected = isinstance(error, (OSError, dask.client.CancelledError))
+            if isinstance(error, Ended) or (
+                self.client.status == "running" and not is_disconnected
+            ):
                 raise
             raise _lost("Its scheduler answers no more.") from error
 
     def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
+        """Return a future of a function on a worker; Dask may choose another worker if that is
+        lost.
+
+        Keys begin with the function's name, from which Dask estimates the duration of a task.
+        """
         # By the name of the function dask knows how long such tasks take.
         key = f"{run.__name__}-{secrets.token_hex(16)}"
         return self.client.submit(
@@ -161,7 +190,10 @@ class OnCluster:
         )
 
     def _segment(self, segment: Segment, home: str) -> Any:
+        """Return a future of a transcription on a worker."""
+
         def once(thing: T, make: Callable[[T], Any]) -> Any:
+            """Return the future of an object, which is made at the first call."""
             if thing not in self._sent:
                 self._sent[thing] = make(thing)
             return self._sent[thing]
@@ -184,12 +216,12 @@ class OnCluster:
 
 @contextmanager
 def workers_of(scheduler: str | None) -> Iterator[OnCluster | None]:
-    """The workers of the scheduler at an address; None where there is none.
+    """Context with an executor on the scheduler at an address; None if the address is None.
 
     Raises
     ------
     InputError
-        As `connected` and `OnCluster` do.
+        If the connection fails or the workers do not fit, see `connected` and `OnCluster`.
     """
     if scheduler is None:
         yield None
@@ -199,7 +231,10 @@ def workers_of(scheduler: str | None) -> Iterator[OnCluster | None]:
 
 
 def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
-    """The worker of each experiment: the costliest first, each to the thread with least to do."""
+    """Return the worker address of each experiment.
+
+    The experiment with the highest cost is assigned first, each to the thread with the least work.
+    """
     _require_some(threads)
     slots = [(address, k) for address, count in threads.items() for k in range(count)]
     loads, homes = dict.fromkeys(slots, 0), [""] * len(costs)
@@ -211,8 +246,10 @@ def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
 
 def _require_package(client: Any) -> set[str]:
-    """The workers; those without this version are refused."""
-    ours = version("collocation-sysid")
+    """Return the addresses of the workers; raise `InputError` for those without this
+    package version.
+    """
+    own_version = version("collocation-sysid")
     try:
         versions = client.run(_version, on_error="return")
     except (Exception, distributed().client.CancelledError) as error:
@@ -222,24 +259,27 @@ def _require_package(client: Any) -> set[str]:
         ) from error
     if not versions:
         raise _refusal("the scheduler has no workers; start some, as with dask worker ADDRESS")
-    for address, theirs in versions.items():
-        if theirs != ours:
+    for address, worker_version in versions.items():
+        if worker_version != own_version:
             raise _refusal(
-                f"found {theirs!r} on the worker {address}; expected collocation-sysid {ours}"
+                f"found {worker_version!r} on the worker {address}; expected collocation-sysid {own_version}"
             )
     return set(versions)
 
 
 def _refusal(message: str) -> InputError:
+    """Return an error that refers to the option --scheduler."""
     return InputError(message, None, "--scheduler")
 
 
 def _require_some(threads: dict[str, int]) -> None:
+    """Raise `Ended` if no worker is left."""
     if not threads:
         raise _lost("No worker is left.")
 
 
 def _lost(why: str) -> Ended:
+    """Return the exception that ends the search because the cluster is lost."""
     return Ended(Status.CLUSTER_LOST, f"{Status.CLUSTER_LOST.sentence} {why}")
 
 
@@ -247,21 +287,22 @@ def _lost(why: str) -> Ended:
 
 
 def _version() -> str:
+    """Return the version of this package; workers run this function."""
     return version("collocation-sysid")
 
 
 def _done(run: Callable[..., T], *arguments: Any) -> T:
-    """``run(*arguments)`` on a worker's thread."""
+    """Return `run(*arguments)`, computed on a worker's thread without further threads."""
     _keep_freed()
     return alone(run, *arguments)
 
 
 @cache
 def _keep_freed() -> None:
-    """Let this process keep the memory of arrays that come and go.
+    """Let the C library keep freed memory of this process for later arrays.
 
-    dask's nannies set MALLOC_TRIM_THRESHOLD_, by which glibc gives every freed array back to the
-    system, and never learns not to: a sweep then waits for its pages to come again.
+    Dask's nannies set MALLOC_TRIM_THRESHOLD_, so that glibc returns every freed array to the
+    system; each sweep would then wait for new memory pages. No effect with other C libraries.
     """
     if mallopt := getattr(ctypes.pythonapi, "mallopt", None):  # glibc's only
         for option, size in KEPT_BYTES.items():
@@ -269,11 +310,14 @@ def _keep_freed() -> None:
 
 
 def _itself(thing: T) -> T:
+    """Return the argument; workers run it to store an object."""
     return thing
 
 
 def _bare(thing: T, body: Body | None = None) -> T:
-    """The fields of an experiment or a chart, with another body, or none for the way."""
+    """Return a copy of an experiment or an association with another body; None removes it
+    for transfer.
+    """
     stated = {field.name: getattr(thing, field.name) for field in fields(thing)}  # pyright: ignore[reportArgumentType]
     other = object.__new__(type(thing))
     vars(other).update(stated | {"body": body})
@@ -281,8 +325,12 @@ def _bare(thing: T, body: Body | None = None) -> T:
 
 
 def _with_body(experiment: Experiment, body: Body) -> Experiment:
+    """Return the experiment with its body; workers run this function."""
     return _bare(experiment, body)
 
 
 def _segment_of(experiment: Experiment, chart: Chart, rest: dict[str, Any]) -> Segment:
+    """Return a transcription from its experiment, its association without body, and its
+    other arguments.
+    """
     return Segment(experiment, chart=_bare(chart, experiment.body), **rest)

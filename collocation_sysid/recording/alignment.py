@@ -1,4 +1,4 @@
-"""One clock for an experiment: poses and markers on the same evenly spaced times."""
+"""Poses and markers of an experiment on one evenly spaced time grid."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _FEWEST_SAMPLES = 3
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """Poses and markers on one clock.
+    """Poses and markers on one time grid.
 
     Attributes
     ----------
     t_s : (T,) array
-        The grid, evenly spaced.
+        The grid, evenly spaced unless the experiment is static.
     poses : tuple of PoseSequence
-        One for each that was given.
+        Poses of each grasp.
     table : MarkerTable
         Markers on the grid.
     notes : tuple of str
@@ -54,9 +54,9 @@ def align(
 
     Without `resample_hz` the grid is the markers' own time and no measurement is changed. With it,
     markers are interpolated to that rate, linearly and only between two present neighbours. Poses
-    keep their samples: where these are at the grid's times to the rounding of either file, they
-    are moved onto it, else the motion between them, `PoseSequence.interpolation`, gives the poses
-    there. A single pose goes with any time.
+    keep their samples: if these agree with the grid up to the rounding of either file, they are
+    moved onto it; otherwise `PoseSequence.interpolation` gives the poses at the grid. A single pose
+    goes with any time.
 
     Parameters
     ----------
@@ -67,14 +67,14 @@ def align(
     window_s : (float, float), optional
         Samples before the first or after the second time are cut.
     resample_hz : float, optional
-        Rate of the new grid, which starts at the first sample left.
+        Rate of the new grid, which starts at the first sample that is kept.
     every : int
         Use every n-th sample of the markers.
     held_s : sequence of (float, float), optional
-        First and last time at which each grasp holds; its poses need not go beyond. Throughout by
-        default.
+        First and last time at which each grasp holds; its poses need not cover other times. The
+        whole recording by default.
     static : bool
-        The grid is the markers' own time, however it is spaced, and one sample is enough.
+        Whether the grid is the markers' own time, however it is spaced, and one sample is enough.
 
     Raises
     ------
@@ -114,7 +114,14 @@ def _shared(
     held_s: Sequence[tuple[float, float]],
     fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
-    """The markers at times that have a pose in every grasp that holds then."""
+    """Return the markers at times for which every grasp that holds has a pose, and notes on the
+    cuts.
+
+    Raises
+    ------
+    InputError
+        If fewer than `fewest` samples remain.
+    """
     t_s = table.t_s
     kept = np.ones(len(t_s), dtype=bool)
     moving = [(p, held) for p, held in zip(poses, held_s, strict=True) if len(p.t_s) > 1]
@@ -150,6 +157,7 @@ def _shared(
 
 
 def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
+    """Return the samples within a window; an `InputError` if there are none."""
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
     slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
@@ -163,6 +171,7 @@ def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
 
 
 def _grid(t_s: Array, rate_hz: float) -> Array:
+    """Return evenly spaced times at a rate [Hz] from the first time on, within the given times."""
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
     count = int(np.floor((t_s[-1] - t_s[0]) * rate_hz + _SAME_TIME_STEPS)) + 1
@@ -175,7 +184,9 @@ def _grid(t_s: Array, rate_hz: float) -> Array:
 
 
 def _between_neighbours(table: MarkerTable, grid: Array) -> Array:
-    """Marker positions on the grid; NaN beside a missing sample or in a gap of the time."""
+    """Return marker positions on the grid; NaN beside a missing sample or within a gap of the
+    times.
+    """
     t_s, x = table.t_s, table.positions_m
     k = np.clip(np.searchsorted(t_s, grid, side="right") - 1, 0, len(t_s) - 2)
     step_s = t_s[k + 1] - t_s[k]
@@ -189,9 +200,17 @@ def _between_neighbours(table: MarkerTable, grid: Array) -> Array:
 
 
 def _matched(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
-    """Poses of the time of the markers, with their samples moved onto the grid.
+    """Return poses whose samples at the marker times are moved onto the grid.
 
-    None if there is not one at each marker time within their span.
+    None if a marker time within the span of the poses has no pose.
+
+    Parameters
+    ----------
+    poses : PoseSequence
+    t_s : (T,) array
+        Marker times as recorded.
+    grid : (T,) array
+        The same times without rounding.
     """
     if len(poses.t_s) == 1:
         return poses
@@ -216,13 +235,15 @@ def _matched(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | Non
 
 
 def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
-    """How far a pose may be from a marker time and still be of that time."""
+    """Return the largest time difference at which a pose and a marker sample count as simultaneous
+    [s].
+    """
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
     return STEP_TOLERANCE * step_s + 0.5 * (rounding_s(t_s) + rounding_s(poses.t_s))
 
 
 def _interpolated(poses: PoseSequence, grid: Array) -> str:
-    """What to say of poses that have no sample at each grid time."""
+    """Return a note on poses that were interpolated to the grid, without its subject."""
     how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
     at = f"{_rate_hz(grid):.6g} Hz {_span(grid)}" if len(grid) > 1 else _span(grid)
     told = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
@@ -239,6 +260,9 @@ def _interpolated(poses: PoseSequence, grid: Array) -> str:
 
 
 def _jumping(poses: PoseSequence, grid: Array) -> list[str]:
+    """Return a note on jumps of smooth poses within the grid, without its subject; empty if
+    none.
+    """
     if poses.interpolation != "smooth":
         return []
     at_s = poses.jumps_s[(poses.jumps_s >= grid[0]) & (poses.jumps_s < grid[-1])]
@@ -249,8 +273,10 @@ def _jumping(poses: PoseSequence, grid: Array) -> list[str]:
 
 
 def _rate_hz(t_s: Array) -> float:
+    """Mean sample rate of times (T,), T > 1."""
     return (len(t_s) - 1) / float(t_s[-1] - t_s[0])
 
 
 def _span(t_s: Array) -> str:
+    """First and last of some times as text."""
     return f"from {t_s[0]:.9g} s to {t_s[-1]:.9g} s"

@@ -1,4 +1,4 @@
-"""Sample times: whether they are evenly spaced, and how far printing has rounded them."""
+"""Sample times: checks of even spacing, and rounding in files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PRINTED_DECIMALS = range(10)
 def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = None) -> float:
     """Return the time between samples, which must be the same throughout.
 
-    Steps may differ by 1 %, and by what rounding to the decimals in the file explains.
+    Steps may differ by 1 %, and by the rounding of times to the decimals in the file.
 
     Parameters
     ----------
@@ -37,7 +37,8 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
     Raises
     ------
     InputError
-        If there are fewer than two samples, or the spacing jumps; the row is named, from 1.
+        If there are fewer than two samples, or the spacing is uneven; the row is named, counting
+        from 1.
     """
     times = np.asarray(t_s, dtype=np.float64)
     if times.ndim != 1 or len(times) < 2:
@@ -62,7 +63,9 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
 
 
 def first_time_fault(t_s: Array) -> tuple[int, str] | None:
-    """Return the index of the first time that does not follow the one before, and say so."""
+    """Return the index of the first time that does not exceed its predecessor, and a message; else
+    None.
+    """
     faulty = np.flatnonzero(~(np.diff(t_s) > SHORTEST_S))
     if not faulty.size:
         return None
@@ -71,7 +74,7 @@ def first_time_fault(t_s: Array) -> tuple[int, str] | None:
 
 
 def even_times_s(t_s: Array) -> Array:
-    """Return as many exactly even times between the same first and last time."""
+    """Return evenly spaced times with the same first and last time and number as `t_s`."""
     return np.linspace(t_s[0], t_s[-1], len(t_s))
 
 
@@ -91,9 +94,10 @@ def rounding_s(t_s: Array) -> float:
 
 
 def unrounded_s(t_s: Array) -> Array:
-    """Return even times where rounding to the printed decimals explains all unevenness.
+    """Return evenly spaced times if rounding to the printed decimals explains all unevenness of
+    `t_s`.
 
-    Other times are returned as they are.
+    Other times are returned unchanged.
     """
     even = even_times_s(t_s)
     return even if np.abs(t_s - even).max() <= rounding_s(t_s) else t_s

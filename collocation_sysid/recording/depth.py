@@ -1,7 +1,7 @@
-"""What a depth camera or a scanner sees of a body: points of its surface, nothing labelled.
+"""Depth cameras and scanners: images or clouds of unlabelled points of a body's surface.
 
-A point is where a camera has it, in the camera's frame: x to the right, y downwards, z along the
-optical axis. Images are turned into points as they are taken; a cloud is points already.
+Points are in the camera's frame: x to the right, y downwards, z along the optical axis. Images are
+converted to points when they are read; clouds are points already.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ Background = Literal["auto", "empty", "unknown"]
 
 
 def _poses(poses: Any) -> PoseSequence:
+    """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
     if not isinstance(poses, PoseSequence):
         raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
     return poses
@@ -51,18 +52,19 @@ class DepthCamera:
     ----------
     matrix : (3, 3) array, optional
         Pinhole camera: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels. A cloud needs none; with it
-        a bias and a scale of the depth are estimated, and what faces away is left out.
+        a bias and a scale of the depth are estimated, and surfaces that face away are left out.
     distortion : sequence of up to five numbers
-        k1, k2, p1, p2, k3 of Brown and Conrady.
+        k1, k2, p1, p2, k3 of the model of Brown and Conrady.
     pose : (4, 4) array
-        From the camera's frame to the world, or, with poses, to what these move (hand to eye).
+        From the camera's frame to the world, or, with `poses`, to the frame that these move
+        (hand–eye transform).
     poses : PoseSequence, optional
-        How what carries the camera moves; at rest by default.
+        Motion of the frame that carries the camera; at rest by default.
 
     Raises
     ------
     InputError
-        If the matrix is not that of a pinhole, or the pose not rigid.
+        If the matrix is not that of a pinhole camera, or the pose is no rigid motion.
     """
 
     matrix: Any = key(tuple[Vector, Vector, Vector] | None, converter=as_given, default=None)
@@ -96,7 +98,9 @@ class DepthCamera:
             vars(self)["matrix"] = matrix
 
     def motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Rotations (S, 3, 3) and translations (S, 3) [m] from its frame to the world."""
+        """Return rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
+        world.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         turn, at = self.pose[:3, :3], self.pose[:3, 3]
         if self.poses is None:
@@ -105,7 +109,10 @@ class DepthCamera:
         return rotations @ turn, rotations @ at + translations
 
     def rays(self, pixels: Array) -> Array:
-        """Points (P, 3) at the depth one that pixels (P, 2), u and v, are seen at."""
+        """Return the points (P, 3) at depth z = 1 that appear at the pixels (P, 2), u and v.
+
+        Distortion is inverted by a fixed-point iteration.
+        """
         seen = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T
         k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
         plain = seen[:, :2].copy()
@@ -119,9 +126,10 @@ class DepthCamera:
         return np.column_stack([plain, np.ones(len(plain))])
 
     def distorted_pixels(self, points_m: Array) -> Array:
-        """Pixels (P, 2), u and v, of points (P, 3) of the camera's frame, through its lens.
+        """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, with
+        distortion.
 
-        The inverse of `rays`. Points must be in front of the camera, z > 0.
+        This is the inverse of `rays`. Points must be in front of the camera, z > 0.
         """
         x, y = (points_m[:, :2] / points_m[:, 2:]).T
         k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
@@ -137,12 +145,15 @@ class DepthCamera:
         return (self.matrix @ bent)[:2].T
 
     def pixels(self, points_m: Array) -> Array:
-        """Where (P, 2) points (P, 3) of its frame are seen, without distortion."""
+        """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, without
+        distortion.
+        """
         projected = points_m @ self.matrix.T
         return projected[:, :2] / projected[:, 2:]
 
 
 def _faces(faces: Any) -> Selection:
+    """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(f"faces of a depth camera is {faces!r}; expected a selection")
     return faces
@@ -150,37 +161,40 @@ def _faces(faces: Any) -> Selection:
 
 @stated
 class Depth:
-    """Depth images or clouds of points of a body, one for each of its times.
+    """Depth images, or clouds of points of a body, of one camera, one for each sample time.
 
     Parameters
     ----------
     name : str
     t_s : (S,) array
-        Times, ascending, within those of the experiment, at whatever rate.
+        Sample times, ascending, within those of the experiment, at any rate.
     clouds : sequence of (P, 3) or (P, 6) arrays
         Points in the camera's frame, with normals of the surface behind them where these are known;
-        NaN where missing. One without points is a dropout. `Depth.of_images` makes them of images.
+        NaN where missing. An empty cloud is a dropout. `Depth.of_images` makes clouds from images.
     sigma_m : float
         Standard deviation of the noise along the normal of the surface.
     camera : DepthCamera
     spacing_m : float
-        Points are thinned to about this distance: neighbouring pixels are not independent.
+        Points are thinned to about this distance, as the noise of neighbouring pixels is
+        correlated.
     gate_m : float
-        Farther from the surface a point is of something else.
+        Points farther than this from the surface are taken to belong to something else and are left
+        out.
     faces : Selection, optional
-        Faces that may be seen: those with all corners there. All by default.
+        Faces that may be visible: those whose corners are all selected. All by default.
     background : {"auto", "empty", "unknown"}
-        What a pixel without a depth shows. "empty": nothing, so that the body cannot be there.
-        "unknown": anything, as where the sensor gets no echo from dark or steep surfaces. "auto":
-        "empty" in images where hardly any pixel shows something far behind the body, "unknown"
-        else. A measured depth well behind the body shows in either case that the body is not there.
+        Meaning of a pixel without a depth. "empty": nothing is there, so that the body cannot be
+        there. "unknown": anything may be there, as where the sensor gets no echo from dark or steep
+        surfaces. "auto": "empty" in images where hardly any pixel shows something far behind the
+        body, otherwise "unknown". A measured depth well behind the body shows in either case that
+        the body is not there.
     outline_sigma_px : float
-        Standard deviation [pixels] of the distance between the body's outline and the edge of what
-        an image shows of the body, at points of the outline that are `spacing_m` apart. Rounding to
+        Standard deviation [pixels] of the distance between the body's outline and the edge of its
+        silhouette in an image, at points of the outline that are `spacing_m` apart. Rounding to
         pixels alone gives 0.3.
     images_m : sequence of (rows, columns) arrays or None
-        The depth images that the clouds were made from, NaN or 0 without depth, one for each time;
-        None where the outline of the body is not compared with that sample. Empty for clouds, whose
+        Depth images that the clouds were made from, NaN or 0 without depth, one for each time; None
+        where the outline of the body is not compared with that sample. Empty for clouds, whose
         outlines are unknown.
 
     Raises
@@ -219,13 +233,19 @@ class Depth:
         vars(self).update(t_s=times, clouds=clouds, images_m=self._checked_images(len(times)))
 
     def _checked_images(self, count: int) -> tuple[Array | None, ...]:
-        """`images_m`, single precision, NaN without depth; one of so many times, or none at all.
+        """Return `images_m` in single precision, with NaN for pixels without depth; empty if there
+        are none.
+
+        Parameters
+        ----------
+        count : int
+            Number of sample times.
 
         Raises
         ------
         InputError
-            If there are as many neither as times nor as none, one is not an image, or the camera
-            has no matrix.
+            If the number of images is neither zero nor `count`, one is not two-dimensional, or the
+            camera has no matrix.
         """
         where = f"the depth camera '{self.name}'"
         if not len(self.images_m):
@@ -259,7 +279,11 @@ class Depth:
         t_s: ArrayLike = (0.0,),
         **options: Any,
     ) -> Depth:
-        """Those of depth images (S, rows, columns) or (rows, columns), see `points_of`."""
+        """Return the measurements of depth images (S, rows, columns) or (rows, columns), see
+        `points_of`.
+
+        At most `MOST_OUTLINED` of the images are stored, for the outlines of the body.
+        """
         images = np.asarray(images_m, dtype=float)
         images = images[None] if images.ndim == 2 else images
         clouds = [points_of(image, camera) for image in images]
@@ -268,7 +292,11 @@ class Depth:
         return cls(name, t_s, clouds, sigma_m, camera, **options)
 
     def _thinned(self, cloud: Array) -> Array:
-        """(P, 3) or (P, 6) the point nearest to the middle of each cube of a grid."""
+        """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of
+        `spacing_m`.
+
+        Of the points in a cube the one nearest to its centre across the optical axis is kept.
+        """
         if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
             raise InputError(
                 f"a cloud of the depth camera '{self.name}' has the shape {cloud.shape}; expected "
@@ -289,16 +317,16 @@ class Depth:
 
     @property
     def times(self) -> Array:
-        """(S,)."""
+        """(S,) sample times [s]."""
         return cast(Array, self.t_s)
 
     @property
     def points_m(self) -> list[Array]:
-        """(P, 3) of each sample, in the camera's frame."""
+        """Points (P, 3) of each sample in the camera's frame [m], without normals."""
         return [cloud[:, :3] for cloud in self.clouds]
 
     def until(self, end_s: float) -> Depth | None:
-        """The same up to some time; None without points there."""
+        """Return the samples up to the time `end_s`; None if these have no point."""
         count = int(np.searchsorted(self.times, end_s, side="right"))
         if not any(map(len, self.clouds[:count])):
             return None
@@ -307,18 +335,37 @@ class Depth:
 
     @property
     def first(self) -> int:
-        """The first sample that has points."""
+        """Index of the first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
 
 
 def outlined_samples(count: int) -> set[int]:
-    """Indices of so many samples whose images are kept for their outlines, evenly spread."""
+    """Return the indices of the samples, of `count`, whose images are stored for their outlines.
+
+    At most `MOST_OUTLINED`, evenly spread.
+    """
     return set(np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINED)).astype(int)).tolist())
 
 
 def begun(depths: Sequence[Depth], t_s: Array, count: int, fewest: int) -> tuple[int, list[Depth]]:
-    """How many of some samples, as many as wanted at least, have a few first images of each camera
-    with points among them; and the images until then.
+    """Return how many first samples of an experiment include points of every depth camera.
+
+    Parameters
+    ----------
+    depths : sequence of Depth
+    t_s : (T,) array
+        Times of the experiment.
+    count : int
+        Least number of samples.
+    fewest : int
+        Least number of images of each camera, as far as it has so many.
+
+    Returns
+    -------
+    count : int
+        Number of first samples of the experiment.
+    depths : list of Depth
+        Images until then, of the cameras that have points by then.
     """
     for depth in depths:
         last_s = depth.times[min(max(fewest - 1, depth.first), len(depth.times) - 1)]
@@ -329,10 +376,15 @@ def begun(depths: Sequence[Depth], t_s: Array, count: int, fewest: int) -> tuple
 
 
 def points_of(image_m: Array, camera: DepthCamera) -> Array:
-    """Points (P, 3) of a depth image (rows, columns) [m]; zero and NaN are no depth.
+    """Return the points (P, 3) [m] of a depth image (rows, columns) [m]; zero and NaN are no depth.
 
-    Pixels at the edge of something, beside a jump of the depth or a pixel that has none, are left
-    out: they see two things at once.
+    Pixels beside a jump of the depth, beside a pixel without depth or at the border of the image
+    are left out, as they may mix two surfaces.
+
+    Raises
+    ------
+    InputError
+        If the camera has no matrix.
     """
     if camera.matrix is None:
         raise InputError("a depth image needs the matrix of its camera; a cloud does without")
@@ -347,9 +399,21 @@ def points_of(image_m: Array, camera: DepthCamera) -> Array:
 
 
 def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array) -> Array:
-    """A depth image (rows, columns) [m] of triangles (F, 3, 3) in the camera's frame, NaN beyond.
+    """Render a depth image [m] of opaque triangles.
 
-    Of pixels that see several the nearest counts. Lenses are ideal.
+    Parameters
+    ----------
+    camera : DepthCamera
+        Its distortion is ignored.
+    shape : (int, int)
+        Rows and columns.
+    triangles_m : (F, 3, 3) array
+        Corners in the camera's frame; triangles that reach behind the camera are left out.
+
+    Returns
+    -------
+    (rows, columns) array
+        Depth of the nearest triangle, NaN where there is none.
     """
     image = np.full(shape, np.inf)
     for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:

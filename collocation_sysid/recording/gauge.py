@@ -1,4 +1,6 @@
-"""A reading of one's own: what an instrument on the body or at a grasp says, as an expression."""
+"""Custom sensors: instruments whose reading is an expression of body points or of a grasp's
+force.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,17 @@ from .wrench import Frame
 
 @dataclass(frozen=True)
 class Look:
-    """What a reading may look at, at the time of a sample, as expressions of CasADi.
+    """Quantities that a custom sensor may measure, as CasADi expressions at the time of a sample.
 
     Attributes
     ----------
-    t_s : of the sample
-    position_m, velocity_m_s, acceleration_m_s2 : (3, P) of its points
-    force_n, torque_nm : (3,) that its grasp gives the body, in its frame and about the origin there
+    t_s : expression
+        Time of the sample.
+    position_m, velocity_m_s, acceleration_m_s2 : (3, P) expressions
+        Of the sensor's points; None for a sensor at a grasp.
+    force_n, torque_nm : (3,) expressions
+        Force and torque that the grasp exerts on the body, in the sensor's frame and about its
+        origin; None for a sensor on points.
     """
 
     t_s: Any
@@ -55,40 +61,40 @@ _GRASP = Key(
 
 @stated
 class Gauge:
-    """An instrument whose reading is an expression of a few points of the body, or of a grasp.
+    """A custom sensor: its reading is an expression of a few points of the body, or of a grasp.
 
     Parameters
     ----------
     name : str
     expression : callable
-        ``expression(at, **unknowns) -> numbers``, of `Look` and of the instrument's unknowns, in
-        CasADi operations; one number, or a column of m.
+        ``expression(at, **unknowns) -> numbers``, of `Look` and of the sensor's unknowns, in CasADi
+        operations; one number, or a column of m.
     t_s : (S,) array
-        Times of its samples, ascending, within those of the experiment, at whatever rate.
+        Sample times, ascending, within those of the experiment, at any rate.
     values : (S,) or (S, m) array, or None
-        What it said; NaN where missing. None before it is simulated.
+        Measured values; NaN where missing. None before they are simulated.
     sigma : float
         Standard deviation of the noise of each number, in its unit.
     points_m : (P, 3) array, optional
-        Places [x, y, z] on the undeformed body that it looks at.
+        Places [x, y, z] on the undeformed body whose motion the sensor measures.
     unknowns : mapping of name to float
-        Standard deviation of each of its unknowns, about zero, by the argument's name.
+        Prior standard deviation of each unknown of the sensor, about zero, by the argument's name.
     grasp : int, optional
-        In place of points the number of the grasp, counted from 1, whose force and torque it looks
-        at; obstacles count behind the grasps.
+        In place of points: the index of the grasp, counted from 0 in Python and from 1 in problem
+        files, whose force and torque the sensor measures; obstacles count after the grasps.
     frame : {"grasp", "world"}
-        Axes and origin of these: those of the undeformed body as the grasp carries it, or the
-        poses' world.
+        Axes and origin of force and torque: those of the undeformed body as the grasp carries it,
+        or the poses' world.
     columns : sequence of str, optional
-        Columns of the numbers, in their order; all besides t_s by default.
+        Columns of the numbers in the file, in their order; all besides t_s by default.
     unit : str
         Unit of the numbers, for the terminal, reports and figures.
 
     Raises
     ------
     InputError
-        If shapes disagree, time does not increase, nothing is measured, a deviation is not above
-        zero, or the expression cannot be evaluated or is not smooth at rest.
+        If shapes disagree, time does not increase, nothing is measured, a standard deviation is not
+        above zero, or the expression cannot be evaluated or is not smooth at rest.
     """
 
     called: ClassVar[str] = "reading"
@@ -122,7 +128,7 @@ class Gauge:
         vars(self).update(values=self._checked_values(count), columns=tuple(self.columns or names))
 
     def _checked_values(self, count: int) -> Array:
-        """(S, m)."""
+        """Return the values (S, m), zeros if none were given; `count` is m by the expression."""
         where, samples = f"the reading '{self.name}'", len(self.times)
         if self.values is None:
             return read_only_floats(np.zeros((samples, count)), (None, None), where)
@@ -145,28 +151,38 @@ class Gauge:
 
     @property
     def times(self) -> Array:
-        """(S,)."""
+        """(S,) sample times [s]."""
         return np.asarray(self.t_s)
 
     @property
     def measured(self) -> Array:
-        """(S, m)."""
+        """(S, m) measured values; NaN where missing."""
         return np.asarray(self.values)
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """(S, m) numbers that are there."""
+        """(S, m) whether each value is measured."""
         return np.isfinite(self.measured)
 
     # The expression ---------------------------------------------------------------------------
 
     def read(self, t_s: ca.SX, looked: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
-        """Its numbers (m,).
+        """Evaluate the expression of the sensor.
 
         Parameters
         ----------
-        looked : position, velocity and acceleration (3, P), or force and torque (3,)
-        unknowns : in their order
+        t_s : SX
+            Time of the sample.
+        looked : sequence of SX
+            Position, velocity and acceleration (3, P) of its points, or force and torque (3,) of
+            its grasp.
+        unknowns : sequence of SX
+            Values of the sensor's unknowns, in the order of `unknowns`.
+
+        Returns
+        -------
+        (m,) SX
+            Predicted numbers.
         """
         names = OF_POINTS if self.grasp is None else OF_GRASP
         at = Look(t_s, **dict(zip(names, looked, strict=True)))
@@ -174,7 +190,14 @@ class Gauge:
         return ca.vec(ca.SX(ca.vertcat(*read) if isinstance(read, (list, tuple)) else read))
 
     def _checked_count(self) -> int:
-        """How many numbers it reads; refused where these or their slopes are none at rest."""
+        """Return the number m of values of the expression, after evaluating it and its Jacobian at
+        rest.
+
+        Raises
+        ------
+        InputError
+            If the expression cannot be evaluated, or it or its Jacobian is not finite at rest.
+        """
         points = np.asarray(self.points_m).T
         still = np.zeros_like(points), np.zeros_like(points)
         rest = [points, *still] if self.grasp is None else [np.ones(3), np.ones(3)]

@@ -1,4 +1,4 @@
-"""How the robot holds the body: grasped nodes, and the rigid motion that carries them."""
+"""Grasps: nodes with prescribed displacements, and the rigid motion that prescribes them."""
 
 from __future__ import annotations
 
@@ -32,37 +32,38 @@ Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 @stated
 class Grasp:
-    """Nodes held by the robot, and the motion that carries them.
+    """Nodes held by the robot, and the rigid motion that carries them.
 
-    Node numbers are kept sorted and without repeats. An experiment looks a selection up, and takes
-    matrices as the poses at its times.
+    Node numbers are stored sorted and without repeats. An experiment replaces a selection by the
+    nodes of its body, and matrices by poses at its times.
 
     Parameters
     ----------
     nodes : (h,) int array or Selection
-        Selection: a table of box_m, ball_m, face or indices, or the name of a point array or
-        physical group.
+        Selection: a table of box_m, ball_m or indices, or the name of a point array or physical
+        group.
     poses : PoseSequence or (T, 4, 4) array
-        Where they are held.
+        Rigid motion that carries the nodes.
     from_s : float
-        First time at which it holds.
+        First time at which it holds; from the start by default.
     until_s : float
-        Last time at which it holds; at the start's, the body is let go from its equilibrium in this
-        grasp.
+        Last time at which it holds; if this is the first sample time, the body is released from its
+        equilibrium in this grasp. To the end by default.
     sigma_m : float, optional
-        Standard deviation of the noise in each position of poses; judged by how rough they are
-        where it is not given.
+        Standard deviation of the noise in each position of the poses; estimated from their
+        roughness where it is not given.
     sigma_rad : float, optional
         Standard deviation of the noise in each rotation, about each axis [rad]; likewise.
     selection : Selection, optional
-        What selected the nodes, where something did: on a finer mesh it selects others.
+        The selection that the nodes come from; None for node numbers. On a finer mesh it is
+        evaluated again.
     axes : str
         Axes of the world along which it holds; the nodes slide along the others.
     zero : str
-        Along which axes the zero of the poses is known no better than the experiment's `nuisance`
-        says, as that of a test bench's crosshead; along none by default.
+        Axes along which the zero of the poses is uncertain, as that of a test bench's crosshead,
+        with the standard deviation in the experiment's `nuisance`; none by default.
     wrench : Wrench, optional
-        What it was measured to give the body.
+        Measured force and torque that it exerts on the body.
     """
 
     nodes: Index = key(Nodes, converter=some_nodes("the grasp"), read=selection)
@@ -80,6 +81,9 @@ class Grasp:
         self._begin()
 
     def _begin(self) -> None:
+        """Check the times and the axes of the zero, and store a selection of nodes in
+        `selection`.
+        """
         if not self.from_s <= self.until_s:
             raise InputError(
                 f"a grasp holds from {self.from_s:g} s until {self.until_s:g} s; expected "
@@ -93,11 +97,15 @@ class Grasp:
             vars(self)["selection"] = self.nodes
 
     def on(self, body: Body, t_s: Array) -> Grasp:
-        """The same grasp with the nodes of a body, and matrices as the poses at `t_s`."""
+        """Return the grasp with the selected nodes of a body, and matrices as poses at `t_s`
+        (T,).
+        """
         return self._with_nodes(on_body(self.nodes, body), t_s)
 
     def _with_nodes(self, nodes: Index, t_s: Array) -> Self:
-        """The same with other nodes, and matrices as the poses at `t_s`."""
+        """Return the grasp with these nodes, and matrices as poses at `t_s`; itself if nothing
+        changes.
+        """
         poses = self.poses
         if not isinstance(poses, PoseSequence):
             poses = PoseSequence.from_matrices(t_s, poses)
@@ -106,33 +114,40 @@ class Grasp:
 
     @cached_property
     def columns(self) -> Index:
-        """(a,) its axes as numbers."""
+        """(a,) indices of the prescribed axes: 0, 1, 2 for x, y, z."""
         return np.array(["xyz".index(axis) for axis in self.axes])
 
     @cached_property
     def dofs(self) -> Index:
-        """(h a,) the dofs that it holds, ascending."""
+        """(h a,) dofs (3 · node + axis) with prescribed displacements, ascending."""
         return (3 * self.nodes[:, None] + self.columns).ravel()
 
     def holds(self, t_s: ArrayLike) -> NDArray[np.bool_]:
-        """Return whether the nodes are held at the times `t_s` (T,)."""
+        """Return whether the nodes are held at the times `t_s` (T,), as (T,) bool."""
         times = np.asarray(t_s, dtype=np.float64)
         return (times >= self.from_s - TIME_TOLERANCE_S) & (
             times <= self.until_s + TIME_TOLERANCE_S
         )
 
     def carry(self, nodes_m: Array, t_s: ArrayLike) -> Array:
-        """Return where the body's nodes (n, 3) that it holds are at `t_s` (T,), (T, h, 3)."""
+        """Return the positions (T, h, 3) [m] of the grasped nodes at the times `t_s` (T,).
+
+        Parameters
+        ----------
+        nodes_m : (n, 3) array
+            All nodes of the undeformed body.
+        t_s : (T,) array
+        """
         return self.poses.carry(nodes_m[self.nodes], t_s)
 
 
 def held_nodes(grasps: Sequence[Grasp]) -> Index:
-    """Return all nodes that are grasped at some time along some axis, sorted."""
+    """Return all nodes that are held at some time along some axis, sorted."""
     return np.unique(held_dofs(grasps) // 3)
 
 
 def held_dofs(grasps: Sequence[Grasp]) -> Index:
-    """Return all dofs, 3 node + axis, that are grasped at some time, sorted.
+    """Return all dofs (3 · node + axis) that are held at some time, sorted.
 
     Raises
     ------
@@ -155,12 +170,15 @@ def held_dofs(grasps: Sequence[Grasp]) -> Index:
 
 
 def free_motions(points_m: Array, held: NDArray[np.bool_]) -> list[str]:
-    """Rigid motions that holding these coordinates leaves free, in words.
+    """Return the rigid motions that these prescribed coordinates leave free, in words; empty if
+    none.
 
     Parameters
     ----------
     points_m : (n, 3)
+        Node positions.
     held : (n, 3) bool
+        Whether each coordinate is prescribed.
     """
     if not held.any():
         return ["move and turn as a whole"]
@@ -183,13 +201,15 @@ def free_motions(points_m: Array, held: NDArray[np.bool_]) -> list[str]:
 
 
 def _null(matrix: Array) -> Array:
-    """(k, n) orthonormal vectors v with matrix @ v = 0."""
+    """Return an orthonormal basis (k, n) of the null space of a matrix (m, n)."""
     _, values, directions = np.linalg.svd(matrix)
     return directions[int((values > HELD).sum()) :]
 
 
 def _plain(vectors: Array) -> Iterator[Array]:
-    """An orthonormal basis of what vectors (k, 3) span, along the axes where that is possible."""
+    """Yield an orthonormal basis of the span of vectors (k, 3), along coordinate axes where
+    possible.
+    """
     _, values, directions = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
     space = directions[values > HELD]
     while len(space):
@@ -201,6 +221,9 @@ def _plain(vectors: Array) -> Iterator[Array]:
 
 
 def _named(direction: Array) -> str:
+    """Return the name of a coordinate axis, or the components of another direction (3,), as
+    text.
+    """
     axis = int(np.abs(direction).argmax())
     if abs(direction[axis]) > 1 - 1e-6:
         return "xyz"[axis]

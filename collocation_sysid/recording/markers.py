@@ -1,4 +1,4 @@
-"""Tracked points on the body: what was measured, and how it follows from the node positions."""
+"""Tracked markers: their measured positions, and their prediction from node positions."""
 
 from __future__ import annotations
 
@@ -53,26 +53,28 @@ class Markers:
     names : sequence of str, optional
         M distinct names; m1, m2, … by default.
     places_m : (M, 3) array, optional
-        Where the markers sit on the undeformed body; the experiment makes the placement of it.
-        NaN where that is not known: the first sample tells where to start, and the place is
-        estimated with a prior as wide as the body. So are all without places and placement.
+        Places of the markers on the undeformed body, from which the experiment makes the placement.
+        NaN where a place is not known: the estimate then starts from the first sample, with a prior
+        as wide as the body. The same holds for all markers without places and placement.
     placement : Placement, optional
         Weights of the nodes, one row per marker, in place of `places_m`.
     places_sigma_m : (M,) array or float, optional
-        Standard deviation of the places given, zero for exact ones; that of the experiment's
+        Standard deviation of the given places, zero for exact ones; that of the experiment's
         nuisance by default.
     on_surface : bool
-        Places that are estimated stay on the surface: two coordinates in place of three.
+        Whether estimated places stay on the surface: two coordinates in place of three.
+    located : (M,) bool array, optional
+        Whether a place is given; derived from `places_m` by default.
     attach : {"auto", "vertex", "embedded"}
         See `place_markers`.
     max_distance_m : float, optional
-        Farthest a marker may be from the body; the mean edge length by default.
+        Largest distance of a marker from the body; the mean edge length by default.
 
     Raises
     ------
     InputError
-        If shapes disagree, names repeat, a sigma is not positive, or both places and placement
-        are given.
+        If shapes disagree, names repeat, a sigma is not positive, or both places and placement are
+        given.
     """
 
     t_s: Array = key(converter=floats((None,), "t_s of the markers"))
@@ -107,7 +109,7 @@ class Markers:
         self._find_places(m)
 
     def _find_places(self, m: int) -> None:
-        """Check what is said of the places of m markers."""
+        """Check the places of the m markers and store them with `located`."""
         places_m, placement, known = self.places_m, self.placement, self.located
         if places_m is not None and placement is not None:
             raise InputError(
@@ -136,14 +138,15 @@ class Markers:
         return f"Markers({', '.join(shown)}: {self.samples} samples{gaps})"
 
     def on(self, body: Body, carried_back: CarriedBack | None = None) -> Markers:
-        """The same markers with their placement on a body.
+        """Return the markers with their placement on a body.
 
         Parameters
         ----------
         body : Body
         carried_back : callable, optional
-            From points (M, 3) and times (M,) to where they would be on the undeformed body, if a
-            grasp carried it rigidly. Markers whose place is not known start from there.
+            Maps points (M, 3) at times (M,) to their places on the undeformed body if a grasp
+            carried it rigidly. Estimates of unknown places start there; without it, at the first
+            sample.
 
         Raises
         ------
@@ -173,17 +176,21 @@ class Markers:
 
     @classmethod
     def none(cls, t_s: ArrayLike) -> Markers:
-        """No markers at the times `t_s` (T,), of an experiment that measures something else."""
+        """Return an empty set of markers at the times `t_s` (T,), for an experiment without
+        markers.
+        """
         return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), 1.0)
 
     @property
     def first_seen(self) -> int:
-        """The first sample in which a marker is seen; the first of all where none is."""
+        """Index of the first sample in which a marker is seen; 0 if none is."""
         return int(self.present.any(axis=1).argmax())
 
     @cached_property
     def first_samples(self) -> tuple[Array, Array]:
-        """(M, 3) first present sample of every marker, NaN where there is none, and its time."""
+        """First present sample of every marker (M, 3) [m], NaN if there is none, and its time (M,)
+        [s].
+        """
         rows = self.present.argmax(axis=0)
         return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]
 
@@ -203,7 +210,7 @@ class Markers:
         return int(self.present.sum())
 
     def observe(self, node_positions_m: ArrayLike) -> Array:
-        """Return marker positions (..., M, 3) for node positions (..., n, 3)."""
+        """Return predicted marker positions (..., M, 3) from node positions (..., n, 3)."""
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         around = nodes_m[..., self.placement.nodes, :]
         return np.einsum("mk,...mkd->...md", self.placement.weights, around)

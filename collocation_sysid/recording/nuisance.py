@@ -1,7 +1,7 @@
-"""What else is not known exactly about one recording, and how well it is known.
+"""Nuisance parameters: unknowns of a single recording, which are estimated with a prior.
 
-`ROWS` is all there is to say of each: the fields of `Nuisance`, the keys of the problem file,
-limits, tables and texts follow from it.
+`ROWS` declares each kind once: the fields of `Nuisance`, the keys of the problem file, limits,
+tables and texts follow from it.
 """
 
 from __future__ import annotations
@@ -47,57 +47,60 @@ SHOWN |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
 
 @dataclass(frozen=True)
 class NuisanceRow:
-    """Something that may not be known exactly of a recording; its prior is normal about zero.
+    """A kind of nuisance parameter of a recording; its values have normal priors with mean zero.
 
-    A recording has its values by components (markers, grasps, …) and axes. Rows of a user's own say
-    what they make of a marker's reading, or of its time, and go into `Nuisance(own=[…])`.
+    A recording has one value for each component (marker, grasp, …) and axis. Custom kinds state
+    what they do to a marker's predicted position (`reading`) or to its time (`clock`), and go into
+    `Nuisance(own=[…])`.
 
     Attributes
     ----------
     name : str
-        Field of `Nuisance`, or of a user's own choice.
+        Field of `Nuisance`; free choice for a custom kind.
     unit : str
-        Of its values: "m", "s", "rad", …
+        Unit of the values: "m", "s", "rad", …
     sigma : float or None
         Standard deviation of the prior; None where it is not estimated by default.
     said : str
-        What it is, for documentation.
+        Description, for documentation.
     label : str
-        The same for tables of results, with {which} component and {axis}; the name by default.
+        Name in tables of results, with {which} for the component and {axis}; the name by default.
     key : str
-        Of [experiment.nuisance] in the problem file.
+        Key of [experiment.nuisance] in the problem file.
     beside : float or None
-        The deviation where the key's table has other priors only.
+        Standard deviation if the key's table states other priors only.
     of : str
-        What there is one of: the recording, or each marker, grasp, …; the first two of one's own.
+        Component that has values of its own: the recording, or each marker, grasp, …; "recording"
+        or "marker" for a custom kind.
     axes : str
-        Names of the components of a vector, apart by blanks; one number without.
+        Names of the components of a vector, separated by blanks; empty for a single number.
     changes : tuple of str
-        What in the model depends on it.
+        Parts of the model that depend on the values.
     applies : callable
-        Of an experiment: whether there is such a thing in it.
+        ``applies(experiment)``, whether the experiment has such parameters.
     low, high : float
-        Limits, in deviations.
+        Limits, in prior standard deviations.
     reach : float
-        Deviations that a step may move it.
+        Largest change in a step of the solver, in prior standard deviations.
     step : callable, optional
-        Of an experiment: what a step may move it, in its unit.
+        ``step(experiment)``, largest change in a step of the solver, in `unit`.
     told : str
-        What the terminal says, with {size}, {way} and {which}.
+        Sentence in the terminal, with {size}, {way} and {which}.
     by : {"length", "worst", "each"}
-        It says the longest vector, the value farthest from its prior, or each.
+        Values that the terminal shows: the longest vector, the value farthest from its prior, or
+        each value.
     same : callable
-        Of an experiment: what must be the same in recordings that share it, by its name.
+        ``same(experiment)``, what must agree in recordings that share the values, by its name.
     reading : callable, optional
-        ``reading(y, values, t_s, data) -> y``, what it makes of a marker's reading y (3,) [m], an
-        expression of CasADi: of its values (one, or as many as axes), the time, and of the
-        recording `data.pivot_m`, the middle of the undeformed body in its first pose,
-        `data.gravity_m_s2`, `data.interval_s` and `data.duration_s`.
+        ``reading(y, values, t_s, data) -> y``, the corrected position of a marker from its
+        predicted position y (3,) [m], as CasADi expressions. `values` are one or as many as `axes`,
+        `t_s` is the time, and `data` has `pivot_m`, the middle of the undeformed body in its first
+        pose, `gravity_m_s2`, `interval_s` and `duration_s` of the recording.
     clock : callable, optional
-        ``clock(values, t_s, data)``, how much later than at t_s a marker was seen [s]; samples are
-        read up to two away.
+        ``clock(values, t_s, data)``, by how much later than `t_s` a marker was seen [s]; samples up
+        to two away are interpolated.
     considered : float, optional
-        Its deviation in the budget of the error bars, where it is not estimated.
+        Standard deviation in the uncertainty budget where the parameter is not estimated.
     """
 
     name: str
@@ -130,75 +133,97 @@ class NuisanceRow:
 
     @property
     def prior(self) -> str:
-        """Key of the deviation in the problem file."""
+        """Key of the prior standard deviation in the problem file, with its unit, such as
+        "prior_m".
+        """
         unit = {"1": "", "σ": "_sigmas", "1/m²": "_1_m2"}.get(self.unit, f"_{self.unit.lower()}")
         return f"prior{unit}"
 
     @property
     def usual(self) -> str:
-        """The default deviation in a unit for people."""
+        """Default standard deviation as text in a readable unit, such as "5 ms"."""
         size, unit = in_unit_for_people(self.sigma or 0.0, self.unit)
         return f"{size:.4g}{unit}"
 
 
 def rotation(turn: ca.SX) -> ca.SX:
-    """Rotation matrix of Cayley's parameters `turn` / 2; smooth and rational."""
+    """Return the rotation matrix (3, 3) of Cayley parameters turn / 2, a rational function.
+
+    Its angle is that of the rotation vector `turn` (3,) [rad] up to third order.
+    """
     half = ca.skew(turn / 2)
     return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(turn) / 4) * (half + half @ half)
 
 
 def in_unit_for_people(value: float, unit: str) -> tuple[float, str]:
-    """A value, and its unit as it stands behind it: millimetres, milliseconds, degrees, …"""
+    """Return a value in a readable unit (mm, ms, °, …), and that unit as it is printed behind the
+    value.
+    """
     factor, shown = SHOWN.get(unit, (1.0, f" {unit}"))
     return factor * value, shown
 
 
 def _turned(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+    """Rotate a marker's predicted position y (3,) by `values` (3,) [rad] about the pivot."""
     pivot = ca.DM(data.pivot_m)
     return rotation(values) @ (y - pivot) + pivot
 
 
 def _shifted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+    """Shift a marker's predicted position y (3,) by `values` (3,) [m]."""
     return y + values
 
 
 def _distorted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+    """Apply radial distortion of first order, with the coefficient `values` [1/m²], about the
+    pivot.
+    """
     away = y - ca.DM(data.pivot_m)
     return y + values * ca.sumsqr(away) * away
 
 
 def _seen(experiment: Any) -> bool:
+    """Return whether the experiment has markers."""
     return bool(experiment.markers.names)
 
 
 def _is_seen(experiment: Any) -> bool:
+    """Return whether the experiment has depth cameras."""
     return bool(experiment.depths)
 
 
 def _has_outlines(experiment: Any) -> bool:
+    """Return whether a depth camera of the experiment has images, with outlines to compare."""
     return any(len(depth.images_m) for depth in experiment.depths)
 
 
 def _viewed(experiment: Any) -> dict[str, Any]:
+    """Return what must agree in recordings that share the pose of their depth cameras."""
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
     return {"body": id(experiment.body), "pose of its cameras": places}
 
 
 def _moves(experiment: Any) -> bool:
+    """Return whether the experiment is a motion."""
     return not experiment.static
 
 
 def _seen_in_grasp(experiment: Any) -> bool:
     # Nothing but what markers see tells how the body is off in its grasp, and a start that is
     # given tells where it is.
+    """Return whether markers determine the position of the body in its grasp (hand–eye
+    transform).
+    """
     return bool(experiment.gripping) and _seen(experiment) and experiment.start == "equilibrium"
 
 
 def _edges(experiment: Any) -> float:
+    """Return how far a marker's place may move in a step of the solver [m]."""
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
 
 def _grasped(experiment: Any) -> dict[str, Any]:
+    """Return what must agree in recordings that share the hand–eye transform."""
     nodes = {int(node) for grasp in experiment.gripping for node in grasp.nodes}
     return {"body": id(experiment.body), "nodes in its grasps": nodes}
 
@@ -354,7 +379,7 @@ GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
 
 
 class _Deviations:
-    """What `Nuisance` does with its fields."""
+    """Checks and look-ups of `Nuisance`, whose fields are made from the table `ROWS`."""
 
     scope: Mapping[str, str]
     own: Sequence[NuisanceRow]
@@ -377,22 +402,24 @@ class _Deviations:
 
     @property
     def rows(self) -> tuple[NuisanceRow, ...]:
-        """All that may be estimated."""
+        """All kinds of nuisance parameters that may be estimated: `ROWS`, then custom ones."""
         return (*ROWS, *self.own)
 
     def sigma(self, row: NuisanceRow) -> float | None:
-        """Standard deviation of a row's prior; None where it is not estimated."""
+        """Standard deviation of a kind's prior; None where it is not estimated."""
         return row.sigma if row in self.own else getattr(self, row.name)
 
     @classmethod
     def none(cls, **deviations: Any) -> Nuisance:
-        """Nothing is estimated but what is named."""
+        """Return a `Nuisance` that estimates only the fields given here, with their standard
+        deviations.
+        """
         nothing: dict[str, Any] = {row.name: None for row in ROWS}
         return Nuisance(**(nothing | deviations))
 
 
 def _require_own(row: NuisanceRow) -> None:
-    """Refuse a row of a user's own that does not say what it does."""
+    """Raise an `InputError` if a custom kind has another component, no prior, or no effect."""
     if row.of not in ("recording", "marker"):
         raise InputError(f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'")
     if row.sigma is None:
@@ -421,7 +448,7 @@ if TYPE_CHECKING:
 
     @dataclass(frozen=True, init=False)
     class Nuisance(_Deviations):
-        """Made from the table."""
+        """Type stub of the class that is made from `ROWS` below: one field for each kind."""
 
         def __init__(self, **deviations: Any) -> None: ...
         def __getattr__(self, name: str) -> float | None: ...

@@ -1,7 +1,7 @@
-"""Where markers sit on the body: fixed weights on the nodes of one element each.
+"""Attachment of markers to the body: fixed weights of the nodes of one element each.
 
-A marker outside the body belongs to the tetrahedron nearest to it, whose shape functions are
-extrapolated to the marker; the distance bridged is reported and limited.
+A marker outside the body is attached to the nearest tetrahedron, whose shape functions are
+extrapolated to the marker; the distance between them is reported and limited.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _EMBEDDING_ITERATIONS = 30
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Markers as fixed linear combinations of node positions.
+    """Attachment of markers as fixed linear combinations of node positions.
 
     Parameters
     ----------
     nodes : (M, npe) int array
         Nodes each marker depends on; no repeats within a row.
     weights : (M, npe) array
-        Their weights; each row sums to one.
+        Weights of these nodes; each row sums to one.
     distance_m : (M,) array
-        Distance bridged: from the marker to the surface if it was outside the body, to the node
-        if it was attached to a vertex, otherwise 0.
+        Distance of the marker: from the surface if it was outside the body, from the node if it was
+        attached to a vertex, otherwise 0.
     node_count : int
         Number of nodes of the body.
     """
@@ -76,16 +76,17 @@ def place_markers(
     points_m : (M, 3) array
         Marker positions.
     node_positions_m : (n, 3) array
-        Node positions at that moment.
+        Node positions of the body in the same configuration.
     body : Body
         Provides `mesh`, `cells` and `element`.
     attach : {"auto", "vertex", "embedded"}
-        "vertex": the nearest node. "embedded": the tetrahedron holding the marker, or nearest to
-        it. "auto": the nearest node if within 5 % of the mean edge length, else embedded.
+        "vertex": the nearest node. "embedded": the tetrahedron that contains the marker, or is
+        nearest to it. "auto": the nearest node if within 5 % of the mean edge length, else
+        embedded.
     max_distance_m : float, optional
-        Largest distance that may be bridged; by default the mean edge length.
+        Largest distance between marker and body; by default the mean edge length.
     names : sequence of str, optional
-        Marker names for messages.
+        Marker names for messages; indices by default.
 
     Raises
     ------
@@ -131,7 +132,14 @@ def place_markers(
 
 
 class Shape:
-    """The body in one configuration, prepared for locating points."""
+    """A body in one configuration, prepared for locating points in it.
+
+    Parameters
+    ----------
+    nodes_m : (n, 3) array
+        Node positions.
+    body : Body
+    """
 
     def __init__(self, nodes_m: Array, body: Body) -> None:
         self.nodes_m = nodes_m
@@ -144,17 +152,25 @@ class Shape:
         self.triangles = nodes_m[body.mesh.surface]
 
     def vertex(self, node: int) -> tuple[Index, Array]:
-        """Nodes and weights of a marker on a node: an element around it, all weight on the node."""
+        """Return nodes (npe,) and weights (npe,) of a marker on a node: those of an element with
+        that node.
+        """
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
 
     def embed(self, point: Array) -> tuple[Index, Array, float]:
-        """Nodes, weights and distance to the surface of a marker inside or outside the body."""
+        """Return nodes (npe,), weights (npe,) and the distance from the surface [m] of a point
+        (3,).
+
+        The distance is 0 inside the body.
+        """
         cell, distance = self.cell_of(point)
         return self.body.cells[cell], self._weights(point, cell), distance
 
     def cell_of(self, point: Array) -> tuple[int, float]:
-        """The element that holds a point (3,), or is nearest to it, and the distance between."""
+        """Return the element that contains a point (3,), or is nearest to it, and its
+        distance [m].
+        """
         depth = self.barycentric(point, slice(None)).min(axis=1)
         cell = int(np.argmax(depth))
         if depth[cell] >= -_INSIDE_TOLERANCE:
@@ -166,7 +182,9 @@ class Shape:
         return int(nearest[np.argmax(depth[nearest])]), distance
 
     def nearest(self, point: Array) -> tuple[Index, Array]:
-        """Nodes and weights of the point of the body that is nearest to a point (3,)."""
+        """Return nodes (npe,) and weights (npe,) of the point of the body that is nearest to a
+        point (3,).
+        """
         nodes, weights, distance = self.embed(point)
         if distance == 0.0:
             return nodes, weights
@@ -174,27 +192,33 @@ class Shape:
         return nodes, weights
 
     def on_surface(self, point: Array) -> tuple[Array, Array]:
-        """The nearest point of the surface, and two directions (3, 2) in its face."""
+        """Return the nearest point (3,) of the surface, and two unit tangents (3, 2) of its
+        face.
+        """
         nearest = nearest_on(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
         sides = self.triangles[face, 1:] - self.triangles[face, 0]
         return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
-        """Barycentric coordinates (k, 4) of points (k, 3), or of one (3,), in cells (k,)."""
+        """Return barycentric coordinates (k, 4) of points (k, 3), or of one (3,), in the cells
+        (k,).
+        """
         rest = np.einsum("ei,eij->ej", points - self.origin[cells], self.inverse[cells])
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
 
     def gradients(self, cells: Index) -> Array:
-        """Their derivatives (k, 4, 3) by the point."""
+        """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point, in the
+        cells (k,).
+        """
         rest = np.asarray(np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64)
         return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
     def _weights(self, point: Array, cell: int) -> Array:
-        """Shape functions at the point.
+        """Return the shape functions (npe,) of an element at a point (3,).
 
-        The corners' barycentric coordinates are exact for straight sides. Where deformation has
-        curved a quadratic element they are corrected until the element maps them to the point.
+        Barycentric coordinates of the corners are exact for straight edges. In a quadratic element
+        with curved edges they are corrected iteratively until the element maps them to the point.
         """
         one = np.array([cell])
         local = self.barycentric(point, one)
@@ -211,7 +235,9 @@ class Shape:
 
 
 def nearest_on(point: Array, triangles: Array) -> Array:
-    """The points of triangles (F, 3, 3), each (F, 3), nearest to a point (3,), or to (F, 3)."""
+    """Return the nearest point of each triangle (F, 3, 3) to a point (3,), or to (F, 3), as
+    (F, 3).
+    """
     point = point[..., None, :]
     ends = np.roll(triangles, -1, axis=1)
     sides, away = ends - triangles, point - triangles

@@ -1,4 +1,4 @@
-"""The measured wrench of a grasp: the force and the torque that it gives the body."""
+"""Measured wrench of a grasp: the force and the torque that the grasp exerts on the body."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ UNITS = ("N",) * 3 + ("N m",) * 3
 
 
 def _six(values: ArrayLike) -> Array:
-    """Forces with torques, that are missing where there are forces alone."""
+    """Return values (S, 3) of forces with three more columns of NaN for torques; others
+    unchanged.
+    """
     rows = np.array(values, dtype=float)
     forces_alone = rows.ndim == 2 and rows.shape[1] == 3
     return np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows
@@ -30,24 +32,24 @@ def _six(values: ArrayLike) -> Array:
 
 @stated
 class Wrench:
-    """What a sensor says of the force and torque that a grasp gives the body.
+    """Force and torque that a grasp exerts on the body, as measured by a sensor.
 
     Parameters
     ----------
     t_s : (S,) array
-        Times of its samples, at whatever rate, on the clock of the grasps.
+        Sample times, at any rate, on the clock of the grasps.
     values : (S, 3) or (S, 6) array
         fx, fy, fz [N], and tx, ty, tz [N m]; NaN where missing.
     sigma_n : float
         Standard deviation of the noise of each force [N].
     sigma_nm : float, optional
-        Standard deviation of the noise of each torque [N m]; needed with any.
+        Standard deviation of the noise of each torque [N m]; needed if torques are measured.
     frame : {"world", "grasp"}
         Axes of the components: those of the poses' world, or "grasp" for those of the undeformed
         body as the grasp carries it.
     point_m : (3,) array
-        Point [x, y, z] of the torque: fixed in the world, or on the undeformed body and moving
-        along.
+        Point [x, y, z] of the torque: fixed in the world, or, in the frame "grasp", on the
+        undeformed body and carried by the grasp.
     symmetry : int
         Number of equal parts of the specimen that share the load, 4 where a quarter is modelled.
         Values and sigmas are those of the modelled part; results are reported for the specimen.
@@ -93,21 +95,21 @@ class Wrench:
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """(S, 6) components that are there."""
+        """(S, 6) whether each component is measured at each sample."""
         return np.isfinite(self.values)
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(6,) components that are measured at some time."""
+        """(6,) whether each component is measured at any sample."""
         return np.asarray(self.present.any(axis=0))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the components that are measured."""
+        """Names of the measured components, such as "fz"."""
         return tuple(COMPONENTS[k] for k in np.flatnonzero(self.measured))
 
     @property
     def sigmas(self) -> Array:
-        """(6,) standard deviations; those of what is not measured are one."""
+        """(6,) standard deviations [N, N m]; those of torques are 1 if none is stated."""
         torque = 1.0 if self.sigma_nm is None else self.sigma_nm
         return np.repeat([self.sigma_n, torque], 3)

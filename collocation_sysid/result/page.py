@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -16,6 +16,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from ..arrays import Array
+from ..display import escape
 from ..files import write_whole
 from .pictures.camera import Camera
 from .replay import Replay
@@ -80,13 +81,15 @@ def write_page(
         What colours the body, and which trajectories; the strain of all by default.
     """
     template = files("collocation_sysid.result").joinpath("page.html").read_text(encoding="utf-8")
-    # What would end the script early cannot be in JSON's strings.
     content = _content(replay, colouring or Colouring.strain(replay))
-    texts = {"@TITLE@": replay.name, "@HEADLINE@": headline}
-    page = template
-    for place, text in texts.items():
-        page = page.replace(place, html.escape(text))
-    page = page.replace("@DATA@", json.dumps(content).replace("</", "<\\/"))
+    texts = {
+        "TITLE": escape(replay.name),
+        "HEADLINE": escape(headline),
+        # Neither </script> nor <!-- may stand in a script.
+        "DATA": json.dumps(content).replace("<", "\\u003c"),
+    }
+    # In one pass, so that a name which looks like a place is not filled in.
+    page = re.sub("@(TITLE|HEADLINE|DATA)@", lambda place: texts[place[1]], template)
     write_whole(file, page)
     return Path(file)
 

@@ -81,5 +81,6 @@ def as_file(report: Section, file: Path) -> str:
 def as_page(report: Section) -> str:
     """One web page with its pictures inside."""
     page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
+    # A text cannot hold these places, since "<" is escaped.
     page = page.replace("<!--TITLE-->", escape(report.title))
     return page.replace("<!--BODY-->", as_html(report))

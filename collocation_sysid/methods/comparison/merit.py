@@ -1,10 +1,11 @@
-"""The merit function of the penalty and augmented-Lagrangian methods.
+"""Merit function of the penalty and augmented-Lagrangian methods.
 
     m(z) = L(z) + yᵀ g(z) + ρ/2 ‖g(z)‖²,   ∇m = ∇L + Jᵀ (y + ρ g),
 
-with loss and rows in the scaling of the NLP and y = 0 for a penalty. Grasped nodes are variables
-too, tied by rows of their own; variables whose bounds are equal, such as a given start, are not.
-So is what bodies with memory carry, and wrenches, see `explicit`.
+with loss and constraints in the scaling of the NLP and y = 0 for a penalty. Positions of grasped
+nodes, history variables of materials with memory and measured wrenches are variables with
+constraints of their own (see `program.explicit`). Variables with equal bounds, such as a given
+start, are constant.
 """
 
 from __future__ import annotations
@@ -20,21 +21,30 @@ from ...program.stopwatch import Stopwatch
 
 
 class Unconstrained:
-    """A collocation NLP whose grasps are rows, not bounds, and how it answers for the given one.
+    """Collocation in which prescribed displacements are constraints, and its relation to the given
+    one.
+
+    Attributes
+    ----------
+    given : Collocation
+        Given problem.
+    nlp : Collocation
+        Problem with constraints for prescribed displacements, and with lifted variables.
+    lower, upper : (variables,) array
+        Bounds.
+    free : (variables,) array of bool
+        Variables that are not constant.
+    bounded : (k,) array of int
+        Indices of the free parameters q and φ, which may have bounds.
+    evaluations : int
+        Number of evaluations of the constraints so far.
 
     Parameters
     ----------
     collocation : Collocation
-        As given, with either kind of grasps.
+        Given problem, with prescribed displacements as bounds or constraints.
     stopwatch : Stopwatch, optional
-
-    Attributes
-    ----------
-    nlp : Collocation
-        With explicit grasps, memory and wrenches.
-    lower, upper : (variables,) bounds
-    free : (variables,) bool, what is not given
-    bounded : (k,) positions of the free variables p that may have bounds: q and φ
+        Stopwatch that measures evaluations.
     """
 
     def __init__(self, collocation: Collocation, stopwatch: Stopwatch | None = None) -> None:
@@ -57,20 +67,22 @@ class Unconstrained:
         self.bounded: Index = np.flatnonzero(of_p & self.free)
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
-        """Constraints g and ∂g/∂z; the matrix is overwritten by the next call."""
+        """Return g (constraints,) and ∂g/∂z; the matrix is overwritten by the next call."""
         self.evaluations += 1
         with self.stopwatch.evaluating():
             rows, _ = self.nlp.constraints_and_jacobian(z, self._entries)
         return rows, self._jacobian
 
     def constraint_values(self, z: Array) -> Array:
-        """Constraints g, scaled."""
+        """Return the scaled constraints g (constraints,)."""
         self.evaluations += 1
         with self.stopwatch.evaluating():
             return self.nlp.constraint_values(z)
 
     def is_upright(self, z: Array) -> bool:
-        """Whether no element is inverted where the equations of motion are evaluated."""
+        """Return whether z is finite and no element is inverted where the equations of
+        motion are evaluated.
+        """
         if not np.isfinite(z).all():
             return False
         with self.stopwatch.evaluating():
@@ -81,7 +93,7 @@ class Unconstrained:
         return True
 
     def projected(self, z: Array, slope: Array) -> Array:
-        """A gradient without what is given, or pushes against a bound."""
+        """Return a gradient (variables,) with zeros for constant variables and at active bounds."""
         slope = np.where(self.free, slope, 0.0)
         slope[(z <= self.lower) & (slope > 0)] = 0
         slope[(z >= self.upper) & (slope < 0)] = 0
@@ -90,18 +102,21 @@ class Unconstrained:
     # Answering for the collocation given ------------------------------------------------------
 
     def began(self, z: Array) -> Array:
-        """Variables from those of the given collocation."""
+        """Return variables from those of the given problem."""
         return carried_over(z, self.given, self.nlp)
 
     def answer(self, z: Array) -> Array:
-        """Variables of the given collocation, all held nodes exactly where their grasps are."""
-        moved = [part.segment.grasped(part.x, part.phi) for part in self.nlp.parts(z)]
-        there = self.nlp.pack(self.nlp.parameters_of(z), moved)
-        there[~self.free] = z[~self.free]
-        return carried_over(there if self.is_upright(there) else z, self.nlp, self.given)
+        """Return variables of the given problem, with grasped nodes at their prescribed positions.
+
+        They are not moved to the prescribed positions if that would invert elements.
+        """
+        positions = [part.segment.grasped(part.x, part.phi) for part in self.nlp.parts(z)]
+        prescribed = self.nlp.pack(self.nlp.parameters_of(z), positions)
+        prescribed[~self.free] = z[~self.free]
+        return carried_over(prescribed if self.is_upright(prescribed) else z, self.nlp, self.given)
 
     def multipliers(self, explicit: Array) -> Array:
-        """Multipliers of the given collocation's rows from those of all rows."""
+        """Return multipliers of the given problem from those of all constraints (constraints,)."""
         pairs = zip(self.given.segments, self.nlp.segments, strict=True)
         rows = ((given, s, explicit[s.rows]) for given, s in pairs)
         return np.concatenate(
@@ -116,13 +131,16 @@ class Unconstrained:
 
 @dataclass(frozen=True, eq=False)
 class Merit:
-    """m for one ρ and y.
+    """Merit function m for one ρ and y.
 
     Attributes
     ----------
     problem : Unconstrained
+        Problem.
     rho : float
-    multipliers : (constraints,) y
+        Penalty parameter ρ.
+    multipliers : (constraints,) array
+        Multipliers y.
     """
 
     problem: Unconstrained
@@ -130,29 +148,32 @@ class Merit:
     multipliers: Array
 
     def value(self, z: Array) -> float:
-        """m(z); infinite where an element is inverted."""
+        """Return m(z); infinite if an element is inverted."""
         if not self.problem.is_upright(z):
             return np.inf
         return self.value_of(z, self.problem.constraint_values(z))
 
     def value_and_gradient(self, z: Array) -> tuple[float, Array]:
-        """m(z) and ∇m (variables,), which is zero for what is given."""
+        """Return m(z) and ∇m (variables,), which is zero for constant variables.
+
+        If an element is inverted, m is infinite and ∇m NaN.
+        """
         if not self.problem.is_upright(z):
             return np.inf, np.full(len(z), np.nan)
         rows, jacobian = self.problem.constraints_and_jacobian(z)
         return self.value_of(z, rows), self.gradient(z, rows, jacobian)
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
-        """∇m from g and J at z."""
+        """Return ∇m (variables,) from g and J at z."""
         slope = self.problem.nlp.gradient(z) + jacobian.T @ self.estimate(rows)
         return np.where(self.problem.free, slope, 0.0)
 
     def estimate(self, rows: Array) -> Array:
-        """Multipliers y + ρ g that make the Lagrangian stationary where m is."""
+        """Return the multipliers y + ρ g, with which the Lagrangian is stationary where m is."""
         return self.multipliers + self.rho * rows
 
     def value_of(self, z: Array, rows: Array) -> float:
-        """The value m from g at z."""
-        pull = float(self.multipliers @ rows + self.rho / 2 * (rows @ rows))
-        value = self.problem.nlp.objective(z) + pull
+        """Return m from g at z; infinite if it is not finite."""
+        penalty = float(self.multipliers @ rows + self.rho / 2 * (rows @ rows))
+        value = self.problem.nlp.objective(z) + penalty
         return value if np.isfinite(value) else np.inf

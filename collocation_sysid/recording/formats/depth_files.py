@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path, PurePosixPath
@@ -208,15 +210,34 @@ def _npz(path: Path) -> DepthFile:
     return DepthFile([] if clouded else samples, samples if clouded else [], *known)
 
 
+@contextmanager
+def _standard_error_silenced() -> Iterator[None]:
+    """Discard what compiled code writes to the standard error of this process."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # it is closed
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
 def _exr(path: Path) -> Array:
     try:
-        made = import_module("OpenEXR").File(str(path))
+        library = import_module("OpenEXR")
     except ImportError as missing:
         raise InputError(
             "needs the package OpenEXR, which is not installed: pip install "
             "'collocation-sysid[exr]', or convert it to .npz"
         ) from missing
-    channels: Mapping[str, Any] = made.channels()
+    # What the library writes on both streams it also raises.
+    with redirect_stdout(None), _standard_error_silenced():
+        channels: Mapping[str, Any] = library.File(str(path)).channels()
     names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [*channels]
     return np.asarray(channels[names[0]].pixels, dtype=float)
 

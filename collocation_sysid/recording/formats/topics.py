@@ -18,6 +18,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, hint_at
+from ...files import require_regular
 from .depth_messages import depth_in, is_camera
 from .logs import Address, Log, opened, require_packages, require_topic
 
@@ -399,6 +400,7 @@ def _of_joints(columns: list[str], values: Array, address: Address, unit: str | 
     from pytransform3d.urdf import UrdfTransformManager
 
     assert address.robot is not None
+    require_regular(address.robot)
     if address.frames is None:
         raise InputError(f"expected two frames behind {address.robot.name}, as in #base>tool")
     robot = UrdfTransformManager(check=False)

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,7 +20,7 @@ from ...program.modes import natural_modes
 from ...recording import Grasp, Solid
 from .identified import Identified
 from .solids import Primitive, grown
-from .target import Comparison, Exported, Holds, heading, linear_cells, numbers
+from .target import Comparison, Exported, Holds, attribute, heading, linear_cells, numbers
 
 MODEL = "body.xml"
 # Before, a first frequency was 10 % (3.3 to 3.8, 3.17) to 33 % (3.10, 3.12) too high.
@@ -73,7 +72,7 @@ def export(body: Identified) -> Exported:
         )
     step_s = _step_s(body)
     x = heading(body, limits, "<!-- ", " -->")
-    x += f"<mujoco model={quoteattr(body.title or 'body')}>\n"
+    x += f"<mujoco model={attribute(body.title or 'body')}>\n"
     gravity = numbers(body.experiment.gravity_m_s2)
     x += f'<option timestep="{step_s!r}" gravity="{gravity}" jacobian="sparse"/>\n'
     x += f"<worldbody>\n{_grasps(body)}{_obstacles(body, step_s)}{_nodes(body)}</worldbody>\n"
@@ -112,7 +111,7 @@ def _obstacles(body: Identified, step_s: float) -> str:
         rubs, geom = float(each.friction), _geom(grown(each.shape, -skin))
         lines += (
             f'<body name="obstacle{k}" mocap="true" pos="{numbers(position)}" '
-            f'quat="{numbers(turn)}"><geom name={quoteattr(each.name)} {geom} '
+            f'quat="{numbers(turn)}"><geom name={attribute(each.name)} {geom} '
             f'priority="1" condim="{3 if rubs else 1}" friction="{rubs!r} 0 0" '
             f'solref="{2 * step_s!r} 1"/></body>\n'
         )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from ...arrays import Array, Index
+from ...errors import printable
 from ...fem.refinement import split_in_eight
 from ...model.forces import Forces
 from ...program.rest import rest_state
@@ -243,4 +246,10 @@ def heading(body: Identified, limits: Iterable[str], start: str, end: str = "") 
             f"gamma_m = {region.gamma_m_1_s:.6g} 1/s"
         )
     # No line may end the comment itself.
-    return "".join(f"{start}{' '.join(line.split()).replace('--', '- -')}{end}\n" for line in lines)
+    texts = (re.sub("-(?=-)", "- ", " ".join(printable(line).split())) for line in lines)
+    return "".join(f"{start}{text}{end}\n" for text in texts)
+
+
+def attribute(text: str) -> str:
+    """Return a name as a quoted attribute of XML, with marks in place of control characters."""
+    return quoteattr(printable(text))

@@ -7,6 +7,7 @@ Poisson's ratio, density and masses, and no damping, which stands in attributes 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...arrays import Array, Index
-from ...errors import InputError
+from ...errors import InputError, printable
 from ...recording import Grasp, Obstacle
 from .identified import Identified, IdentifiedRegion
 from .solids import OneContact, Primitive, walls
@@ -145,12 +146,14 @@ def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
     _token(pxr, prim, "physics:masses:elementType", "tetrahedron")
     held = prim.CreateAttribute(f"{OWN}:graspedPoints", number.IntArray)
     held.Set(np.flatnonzero(body.grasped).astype(np.int32))
-    materials = [_material(pxr, stage, region) for region in body.regions]
+    names = _prim_names([region.name for region in body.regions])
+    pairs = zip(body.regions, names, strict=True)
+    materials = [_material(pxr, stage, region, name) for region, name in pairs]
     _bind(pxr, prim, materials[int(np.argmax([len(each) for each in cells]))])
     firsts = np.cumsum([0, *map(len, cells)])
     for k, material in enumerate(materials if len(cells) > 1 else ()):
         numbers = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
-        told = _named(body.regions[k].name), pxr.UsdGeom.Tokens.tetrahedron, numbers, "materialBind"
+        told = names[k], pxr.UsdGeom.Tokens.tetrahedron, numbers, "materialBind"
         _bind(pxr, pxr.UsdGeom.Subset.CreateGeomSubset(mesh, *told).GetPrim(), material)
 
 
@@ -162,8 +165,8 @@ def _masses_kg(body: Identified, cells: list[Index]) -> Array:
     return np.concatenate([region.density_kg_m3 * volume for region, volume in pairs])
 
 
-def _material(pxr: Any, stage: Any, region: IdentifiedRegion) -> Any:
-    material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{_named(region.name)}")
+def _material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
+    material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
     told = {
@@ -254,7 +257,7 @@ def _obstacle(pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: Identif
     if shape.kind in ("cylinder", "capsule"):
         solid.CreateHeightAttr(2 * float(shape.size_m[1]))
     pxr.UsdPhysics.CollisionAPI.Apply(solid.GetPrim())
-    solid.GetPrim().SetDisplayName(obstacle.name)
+    solid.GetPrim().SetDisplayName(printable(obstacle.name))
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{path.rpartition('/')[2]}")
     rubbing = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     for attribute in (rubbing.CreateStaticFrictionAttr, rubbing.CreateDynamicFrictionAttr):
@@ -262,10 +265,16 @@ def _obstacle(pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: Identif
     _bind(pxr, solid.GetPrim(), material)
 
 
-def _named(name: str) -> str:
-    """A name that USD takes."""
-    text = re.sub(r"\W", "_", name)
-    return text if re.match(r"[A-Za-z_]", text) else f"_{text}"
+def _prim_names(names: Sequence[str]) -> list[str]:
+    """Return names that USD takes, a different one for each."""
+    found: list[str] = []
+    for name in names:
+        text = re.sub(r"[^A-Za-z0-9_]", "_", name)
+        text = text if re.match(r"[A-Za-z_]", text) else f"_{text}"
+        while text in found:
+            text += "_"
+        found.append(text)
+    return found
 
 
 def verify(body: Identified, folder: Path) -> list[Comparison]:
