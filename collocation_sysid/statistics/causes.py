@@ -5,8 +5,7 @@ the one that fits worst: it is fitted again without each mistake, and the factor
 falls is the cause's strength. Of gravity's directions the body's modes choose the one that is
 tried.
 
-A measured wrench is compared with the one that a fit to the markers alone has, which a wrong wrench
-has not bent. Tares are allowed for by their priors.
+Measured wrenches have causes of their own, see `wrench_causes`.
 """
 
 from __future__ import annotations
@@ -22,16 +21,13 @@ from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..program.any_stiffness import Described
-from ..program.channel import Forced
-from ..program.collocation import Collocation, Part
-from ..program.wrench import WrenchReading, without_sensors
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
-from ..recording.wrench import Frame, Wrench
 from .hypothesis import Hypothesis, Trial, clock, ranked
 from .modal import ModalComparison, doubts, gravity_mistakes
 from .plausible import against_the_load
+from .wrench_causes import wrench_causes
 
 # Residuals up to so many standard deviations are noise: they need no cause.
 NOISE = 1.15
@@ -274,120 +270,3 @@ def _misfit(experiment: Experiment, read: Array) -> float:
     """Root mean square of the residuals in standard deviations."""
     scaled = _residual(experiment, read) / experiment.markers.sigma_m[:, None]
     return root_mean(scaled[experiment.markers.present] ** 2)
-
-
-# Residuals up to so many standard deviations need no cause; what is right leaves so much less.
-MISFIT = 1.3
-# Clocks may be off by this share of a recording.
-LATEST, SHIFTS = 0.25, 60
-# What forces, and torques, are written in by mistake.
-UNITS = (
-    (
-        "forces",
-        {"kilograms-force": 9.80665, "millinewtons": 1e-3, "pounds-force": 4.4482216},
-        slice(0, 3),
-    ),
-    ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, slice(3, 6)),
-)
-
-
-def wrench_causes(solution: Solution) -> list[Hypothesis]:
-    """What is likely described wrongly of the wrenches; empty where they fit."""
-    if not any(map(_missed, solution.parts)):
-        return []
-    found = []
-    for part in _from_markers(solution.collocation):
-        forced = part.motion.forced
-        for sensor in part.segment.sensors:
-            found += _of_sensor(part, sensor, forced)
-    return found
-
-
-def _missed(part: Part) -> bool:
-    # They are behind the markers.
-    pairs = zip(part.segment.sensors, part.looked[1:], strict=False)
-    return any(
-        float(np.sum(sensor.residuals(looked, part.phi) ** 2)) > MISFIT**2 * sensor.present.sum()
-        for sensor, looked in pairs
-    )
-
-
-def _from_markers(collocation: Collocation) -> list[Part]:
-    """Every experiment with markers where these alone have it; none where that cannot be found."""
-    seen = [s for s in collocation.segments if s.experiment.markers.samples]
-    if not seen:
-        return []
-    blind = [without_sensors(segment.experiment) for segment in seen]
-    try:
-        alone = replace(collocation, experiments=blind)
-        solution = ReducedSpace(max_iterations=MOST_SWEEPS)(alone)
-    except (InputError, SimulationError):
-        return []
-    found = []
-    for segment, part in zip(seen, solution.parts, strict=True):
-        known = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
-        phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
-        found.append(Part(segment, part.q, phi, part.x))
-    return found
-
-
-def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> Iterator[Hypothesis]:
-    def left(without: tuple[Wrench, float]) -> float:
-        return _wrench_misfit(part, sensor.told(without[0]), forced, without[1])
-
-    tare = part.segment.experiment.nuisance.tare or 0.0
-    misfit, of = left((sensor.wrench, tare)), f"the wrench of '{part.segment.experiment.name}'"
-    if misfit > MISFIT:
-        yield from Trial(misfit, left, BETTER, least=1.0).of(
-            _wrench_mistakes(of, sensor.wrench, tare, _weighs(part))
-        )
-
-
-def _weighs(part: Part) -> bool:
-    """Whether markers alone tell how large forces are: by densities, or loads, that are known."""
-    segment = part.segment
-    return not segment.body.mass_slopes or without_sensors(segment.experiment).knows_a_force
-
-
-def _wrench_misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: float) -> float:
-    """RMS of the residuals in standard deviations, tares of so many sigmas allowed for."""
-    nuisance = part.segment.nuisance
-    read = sensor.of_forced(forced, np.zeros(nuisance.size))
-    # Sigmas are those of what is measured, whatever a trial makes of it.
-    apart = (read - sensor.wrench.values) / sensor.wrench.sigmas
-    there = np.isfinite(apart)
-    if not there.any():
-        return np.inf
-    counts, sums = there.sum(axis=0), np.nansum(apart, axis=0)
-    held = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
-    offsets = sums / np.maximum(counts + held, 1e-12)
-    return float(np.sqrt(np.nanmean((apart - offsets) ** 2)))
-
-
-def _wrench_mistakes(of: str, wrench: Wrench, tare: float, weighs: bool) -> Iterator[Hypothesis]:
-    """Each undone: the wrench, and how many sigmas its tare may have."""
-    opposite = replace(wrench, values=-wrench.values)
-    yield Hypothesis("wrench-sign", of, without=(opposite, tare))
-    other: Frame = "grasp" if wrench.frame == "world" else "world"
-    turned = replace(wrench, frame=other)
-    yield Hypothesis("wrench-frame", of, {"other": other}, (turned, tare))
-    for what, units, columns in UNITS if weighs else ():
-        for unit, factor in units.items():
-            data = {"what": what, "unit": unit, "factor": factor}
-            yield Hypothesis("wrench-unit", of, data, (_scaled(wrench, columns, factor), tare))
-    span_s = LATEST * float(np.ptp(wrench.t_s))
-    for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
-        data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
-        shifted = replace(wrench, t_s=wrench.t_s + shift_s)
-        yield Hypothesis("wrench-clock", of, data, (shifted, tare))
-    yield Hypothesis("wrench-tare", of, without=(wrench, np.inf))
-
-
-def _scaled(wrench: Wrench, columns: slice, factor: float) -> Wrench:
-    """With components in another unit, and their noise, which is no smaller than stated."""
-    values: Array = np.array(wrench.values)
-    values[:, columns] *= factor
-    sigma = "sigma_n" if columns.start == 0 else "sigma_nm"
-    stated = getattr(wrench, sigma)
-    larger = None if stated is None else stated * max(1.0, factor)
-    return replace(wrench, values=values, **{sigma: larger})
