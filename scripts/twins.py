@@ -71,7 +71,7 @@ def twin(
     return Problem([with_markers(experiment, tracks + noise)], GUESS)
 
 
-WRENCH_N, WRENCH_NM = 2e-3, 1e-4
+WRENCH_N, WRENCH_NM = 5e-4, 5e-5
 
 
 def sensing_twin(name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES) -> Problem:

@@ -16,7 +16,14 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.recording import Experiment, Grasp, PoseSequence, Wrench
+from collocation_sysid.recording import (
+    Experiment,
+    Grasp,
+    Obstacle,
+    Plane,
+    PoseSequence,
+    Wrench,
+)
 
 Rng = np.random.Generator
 Change = Callable[[Experiment, Rng], Experiment]
@@ -246,7 +253,7 @@ FAULTS = {
 }
 
 
-# Tracks and bodies that no grasped body has --------------------------------------------------------
+# Tracks and bodies that no grasped body has ------------------------------------------------------
 
 
 def with_track_axes(order: tuple[int, ...], signs: tuple[int, ...] = (1, 1, 1)) -> Change:
@@ -357,7 +364,28 @@ WRENCH_FAULTS = {
     "wrench: 0.1 s late": Fault(wrenches(lambda w: replace(w, t_s=w.t_s + 0.1)), ("wrench-clock",)),
     "wrench: other frame": Fault(wrenches(in_other_frame), ("wrench-frame",)),
     "wrench: point off by 50 mm": Fault(
-        wrenches(lambda w: replace(w, point_m=w.point_m + [0.05, 0.0, 0.0])), ("wrench-point",)
+        wrenches(lambda w: replace(w, point_m=w.point_m + np.array([0.05, 0, 0]))),
+        ("wrench-point",),
     ),
     "wrench: tared with the body": Fault(wrenches(tared), ("wrench-tare",)),
+}
+
+
+# Obstacles ----------------------------------------------------------------------------------------
+
+
+def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
+    """Every obstacle changed."""
+    return lambda e, rng: e.with_obstacles([change(each) for each in e.obstacles])
+
+
+def reversed_normal(obstacle: Obstacle) -> Obstacle:
+    """A plane on the other side of which the body is."""
+    assert isinstance(obstacle.shape, Plane)
+    return replace(obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal))
+
+
+OBSTACLE_FAULTS = {
+    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ("obstacle-normal",)),
+    "obstacle: load reversed": Fault(wrench_times(-1, -1), ("sign", "wrench-sign")),
 }

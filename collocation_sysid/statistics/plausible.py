@@ -24,6 +24,8 @@ from ..fem.body import Body
 from ..fem.moduli import engineering
 from ..program.any_stiffness import carrying
 from ..recording.experiment import Experiment
+from ..recording.grasp import Grasp
+from ..recording.obstacle import Obstacle
 from .hypothesis import Hypothesis
 
 DENSITIES_KG_M3 = (10.0, 25_000.0)
@@ -90,6 +92,8 @@ def _outside(value: float, limits: tuple[float, float]) -> float:
 # Of load and displacement; noise and hysteresis leave it above zero.
 AGAINST = -0.8
 FEWEST_SAMPLES = 3
+# Loads of an obstacle below this share of the largest may be those of no contact.
+TOUCHING = 0.05
 
 
 def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -101,10 +105,13 @@ def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
         if grasp.wrench is None:
             continue
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
-        for axis in grasp.zero:
+        for axis in grasp.zero or _pushing_axis(grasp, shifts_m):
             along = "xyz".index(axis)
             moved_m, load_n = shifts_m[:, along], grasp.wrench.values[:, along]
             there = np.isfinite(load_n)
+            if isinstance(grasp, Obstacle):
+                # Before it touches, loads are noise.
+                there &= np.abs(load_n) > TOUCHING * np.nanmax(np.abs(load_n), initial=0.0)
             if there.sum() < FEWEST_SAMPLES or not (
                 np.ptp(moved_m[there]) and np.ptp(load_n[there])
             ):
@@ -114,6 +121,15 @@ def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
                 data = {"axis": axis, "grasp": k, "correlation": together}
                 strength = 1 / (1 + together + 1e-3)
                 yield Hypothesis("sign", f"'{experiment.name}'", data, strength=strength)
+
+
+def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
+    """Return the world's axis along which an obstacle moves; none where its force has others."""
+    moved_m = np.ptp(shifts_m, axis=0)
+    pushes = isinstance(grasp, Obstacle) and grasp.wrench is not None
+    if not pushes or not moved_m.any() or grasp.wrench.frame != "world":
+        return ""
+    return "xyz"[int(moved_m.argmax())]
 
 
 # A step is so many times what else happens between samples.

@@ -50,10 +50,12 @@ UNITS = (
     ),
     ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
 )
+# Offsets of so many standard deviations of the tare's prior are no tare of a zeroed sensor.
+FAR_TARE = 3.0
 # A calibration is good to this share, and a point to this distance; less gives no concern.
 SAME_GAIN, SAME_POINT_M = 0.05, 0.005
 # Mistakes with numbers to fit, or with many variants, must fit so many times better than others.
-FITTED, ONE_OF_MANY = 1.1, 1.05
+FITTED, ONE_OF_MANY = 1.5, 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +170,22 @@ class _OneSensor:
         misfit = self.misfit(self.given)
         if misfit > MISFIT:
             yield from Trial(misfit, self.misfit, BETTER, least=1.0).of(self._mistakes())
+        else:
+            yield from self._large_tare()
+
+    def _large_tare(self) -> Iterator[Hypothesis]:
+        """Yield that the offset which a fit needs is far beyond the prior of the tare."""
+        tare = self.given.tare
+        if not tare:
+            return
+        measured, predicted = self._scaled_by_sigma(_Trial(self.given.wrench, 0.0))
+        factor = 1.0 if self.scale_known else _slope(measured, predicted)
+        apart = measured - factor * predicted
+        there = np.isfinite(apart).any(axis=0)
+        largest = np.abs(np.nanmean(apart[:, there], axis=0)).max() / tare if there.any() else 0.0
+        if largest > FAR_TARE:
+            of = f"the wrench of '{self.part.segment.experiment.name}'"
+            yield Hypothesis("wrench-tare", of, strength=float(largest / FAR_TARE))
 
     def misfit(self, trial: _Trial) -> float:
         """Return the root mean square of the residuals in standard deviations."""
