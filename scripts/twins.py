@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,7 +13,7 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Grasp, Markers, PoseSequence
+from collocation_sysid.recording import Experiment, Grasp, Markers, PoseSequence, Wrench
 
 NOISE_M = 5e-4
 SAMPLES, STEP_S = 60, 0.01
@@ -68,3 +69,23 @@ def twin(
     tracks = simulate(experiment, truth, integrator).markers_m
     noise = rng.normal(scale=NOISE_M, size=tracks.shape)
     return Problem([with_markers(experiment, tracks + noise)], GUESS)
+
+
+WRENCH_N, WRENCH_NM = 5e-4, 5e-5
+
+
+def sensing_twin(name: str, truth: dict[str, float], seed: int, samples: int = SAMPLES) -> Problem:
+    """The same with a sensor at the grasp, in its frame and about a point above the body."""
+    given = twin(name, truth, seed, samples)
+    (experiment,) = given.experiments
+    (grasp,) = experiment.grasps
+    point_m = (0.01, 0.02, BODIES[name][0][2] + 0.03)
+    zero = np.zeros((samples, 6))
+    sensor = Wrench(experiment.t_s, zero, WRENCH_N, WRENCH_NM, frame="grasp", point_m=point_m)
+    sensed = replace(experiment, grasps=[replace(grasp, wrench=sensor)])
+    (values,) = simulate(sensed, truth, "newmark").wrenches
+    noise = np.random.default_rng(seed).normal(
+        scale=np.repeat([WRENCH_N, WRENCH_NM], 3), size=values.shape
+    )
+    felt = replace(sensor, values=values + noise)
+    return replace(given, experiments=[replace(experiment, grasps=[replace(grasp, wrench=felt)])])

@@ -16,7 +16,14 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.recording import Experiment, Grasp, PoseSequence
+from collocation_sysid.recording import (
+    Experiment,
+    Grasp,
+    Obstacle,
+    Plane,
+    PoseSequence,
+    Wrench,
+)
 
 Rng = np.random.Generator
 Change = Callable[[Experiment, Rng], Experiment]
@@ -243,4 +250,142 @@ FAULTS = {
     "grasp one layer deeper": Fault(held_deeper, ("grasp-layer",)),
     "pose jumps": Fault(jumping, ("pose-jump",)),
     "marker slips": Fault(slipping, ("marker-slip",)),
+}
+
+
+# Tracks and bodies that no grasped body has ------------------------------------------------------
+
+
+def with_track_axes(order: tuple[int, ...], signs: tuple[int, ...] = (1, 1, 1)) -> Change:
+    """Tracks with their axes exchanged or reversed."""
+    return lambda e, rng: with_markers(e, np.array(signs) * e.markers.positions_m[..., list(order)])
+
+
+def constant(poses: PoseSequence) -> PoseSequence:
+    """The first pose throughout."""
+    first = slice(0, 1)
+    return replace(
+        poses,
+        positions_m=np.repeat(poses.positions_m[first], len(poses.t_s), axis=0),
+        quaternions_xyzw=np.repeat(poses.quaternions_xyzw[first], len(poses.t_s), axis=0),
+    )
+
+
+def restarting(experiment: Experiment, rng: Rng) -> Experiment:
+    """Tracks of a simulation that grows without bound, fails, and is reset to its first state."""
+    tracks = np.array(experiment.markers.positions_m)
+    k = int(rng.integers(len(tracks) // 2, 3 * len(tracks) // 4))
+    growth = 0.002 * 2.0 ** np.arange(6)
+    tracks[k : k + 6] += growth[:, None, None] * np.where(np.arange(6) % 2, 1, -1)[:, None, None]
+    tracks[k + 6 : k + 8] = np.nan
+    tracks[k + 8 :] = tracks[: len(tracks) - k - 8]
+    return with_markers(experiment, tracks)
+
+
+def torn(experiment: Experiment, rng: Rng) -> Experiment:
+    """A mesh whose lower elements share no nodes with the others."""
+    body, cells = experiment.body, np.array(experiment.body.mesh.tetrahedra)
+    points_m = np.array(body.mesh.points_m)
+    heights_m = points_m[cells].mean(axis=1)[:, 2]
+    low = heights_m < np.median(heights_m)
+    shared = np.intersect1d(cells[low], cells[~low])
+    copies = np.arange(len(points_m))
+    copies[shared] = len(points_m) + np.arange(len(shared))
+    cells[low] = copies[cells[low]]
+    mesh = TetMesh(np.vstack([points_m, points_m[shared]]), cells)
+    other = Body(
+        mesh,
+        body.parts[0].material,
+        density_kg_m3=body.mass_kg / body.mesh.volume_m3,
+        element=body.element.name,
+        damping=body.parts[0].damping,
+    )
+    places_m = experiment.markers.observe(body.nodes_m)
+    markers = replace(
+        experiment.markers, placement=None, located=None, places_m=places_m, attach="embedded"
+    )
+    return replace(experiment, body=other, markers=markers)
+
+
+TRACK_FAULTS = {
+    "markers: y and z exchanged": Fault(with_track_axes((0, 2, 1)), ("markers-axes",)),
+    "markers: mirrored in x": Fault(with_track_axes((0, 1, 2), (-1, 1, 1)), ("markers-axes",)),
+    "markers: turned by 90 deg": Fault(
+        with_track_axes((1, 0, 2), (-1, 1, 1)), ("markers-axes", "camera-frame")
+    ),
+    "poses constant": Fault(lambda e, rng: _with_poses(e, constant), ("poses-constant",)),
+    "simulation reset after NaN": Fault(restarting, ("markers-jump", "unlike")),
+    "mesh in two parts": Fault(torn, ("mesh-parts",)),
+}
+
+
+# Wrenches -----------------------------------------------------------------------------------------
+
+
+def wrenches(change: Callable[[Wrench], Wrench]) -> Change:
+    """Every measured wrench changed."""
+
+    def changed(experiment: Experiment, rng: Rng) -> Experiment:
+        grasps = [
+            grasp if grasp.wrench is None else replace(grasp, wrench=change(grasp.wrench))
+            for grasp in experiment.grasps
+        ]
+        return replace(experiment, grasps=grasps)
+
+    return changed
+
+
+def wrench_times(force: float, torque: float) -> Change:
+    """Forces and torques multiplied."""
+    factors = np.repeat([force, torque], 3)
+    return wrenches(lambda w: replace(w, values=factors * w.values))
+
+
+def tared(wrench: Wrench) -> Wrench:
+    """Zeroed with the body in hand."""
+    return replace(wrench, values=wrench.values - wrench.values[:5].mean(axis=0))
+
+
+def in_other_frame(wrench: Wrench) -> Wrench:
+    """Stated in the world's axes if in the grasp's, and the reverse."""
+    return replace(wrench, frame="world" if wrench.frame == "grasp" else "grasp")
+
+
+GRAM_FORCE_N = 9.80665e-3
+WRENCH_FAULTS = {
+    "wrench: sign": Fault(wrench_times(-1, -1), ("wrench-sign",)),
+    "wrench: force alone reversed": Fault(wrench_times(-1, 1), ("wrench-sign",)),
+    "wrench: y and z exchanged": Fault(
+        wrenches(lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]])), ("wrench-axes",)
+    ),
+    "wrench: torques in N mm": Fault(wrench_times(1, 1e3), ("wrench-unit",)),
+    "wrench: forces in gram-force": Fault(wrench_times(1 / GRAM_FORCE_N, 1), ("wrench-unit",)),
+    "wrench: gain 20 % too large": Fault(wrench_times(1.2, 1.2), ("wrench-gain",)),
+    "wrench: 0.1 s late": Fault(wrenches(lambda w: replace(w, t_s=w.t_s + 0.1)), ("wrench-clock",)),
+    "wrench: other frame": Fault(wrenches(in_other_frame), ("wrench-frame",)),
+    "wrench: point off by 50 mm": Fault(
+        wrenches(lambda w: replace(w, point_m=w.point_m + np.array([0.05, 0, 0]))),
+        ("wrench-point",),
+    ),
+    "wrench: tared with the body": Fault(wrenches(tared), ("wrench-tare",)),
+}
+
+
+# Obstacles ----------------------------------------------------------------------------------------
+
+
+def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
+    """Every obstacle changed."""
+    return lambda e, rng: e.with_obstacles([change(each) for each in e.obstacles])
+
+
+def reversed_normal(obstacle: Obstacle) -> Obstacle:
+    """A plane on the other side of which the body is."""
+    assert isinstance(obstacle.shape, Plane)
+    return replace(obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal))
+
+
+OBSTACLE_FAULTS = {
+    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ("obstacle-normal",)),
+    "obstacle: load reversed": Fault(wrench_times(-1, -1), ("sign", "wrench-sign")),
 }

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from problems_small import GUESS
-from test_wrench_fit import swung
+from test_wrench_fit import UNKNOWN, swung
 
 from collocation_sysid.methods.reduced_space import ReducedSpace
+from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.recording import Wrench
+from collocation_sysid.recording import Nuisance, Wrench
+from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.causes import likely_causes
+from collocation_sysid.statistics.hypothesis import ranked
+from collocation_sysid.statistics.trust import cause_concerns
+from collocation_sysid.statistics.wrench_causes import wrench_mistakes
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from wrong_twins import WRENCH_FAULTS
 
 
 def changed(change: Callable[[Wrench], Wrench]) -> Collocation:
@@ -35,6 +45,8 @@ MISTAKES = {
     "wrench-frame": lambda w: replace(w, frame="world"),
     "wrench-unit": in_kilograms,
     "wrench-clock": lambda w: replace(w, t_s=w.t_s + 0.04),
+    "wrench-axes": lambda w: replace(w, values=w.values[:, [0, 2, 1, 3, 5, 4]]),
+    "wrench-sign/part": lambda w: replace(w, values=w.values * [-1, -1, -1, 1, 1, 1]),
 }
 
 
@@ -43,9 +55,49 @@ MISTAKES = {
 def test_a_mistake_is_the_likeliest_cause(cause: str, change: Callable[[Wrench], Wrench]):
     collocation = changed(change)
     found = likely_causes(ReducedSpace()(collocation), budget=0)
-    assert found[0].cause == cause
-    assert found[0].strength > 2
+    assert found[0].code == cause
+    assert cause_concerns(found)[0].grade == "doubtful"
 
 
 def test_a_wrench_that_fits_has_no_cause():
     assert not likely_causes(ReducedSpace()(changed(lambda w: w)), budget=0)
+
+
+# Before solving -----------------------------------------------------------------------------------
+
+
+def sensed(fault: str | None, seed: int = 0) -> Problem:
+    """The swung cube with a sensor and a mistake of its wrench."""
+    right = Problem([swung(seed)], UNKNOWN)
+    return right if fault is None else WRENCH_FAULTS[fault](right, np.random.default_rng(0))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", WRENCH_FAULTS)
+def test_a_mistake_is_named_before_solving(fault: str):
+    found = ranked(wrench_mistakes(sensed(fault).collocation()))
+    assert found, fault
+    assert found[0].cause in WRENCH_FAULTS[fault].causes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_right_wrench_is_not_doubted_before_solving(seed: int):
+    assert not wrench_mistakes(sensed(None, seed).collocation())
+
+
+@pytest.mark.long
+def test_a_large_tare_is_named_although_its_prior_can_follow_it():
+    experiment = swung(nuisance=Nuisance())
+    (grasp,) = experiment.grasps
+    assert grasp.wrench is not None
+    offset = replace(grasp.wrench, values=grasp.wrench.values + 40 * grasp.wrench.sigmas)
+    given = replace(experiment, grasps=[replace(grasp, wrench=offset)])
+    (cause,) = wrench_mistakes(Collocation([given], GUESS))
+    assert cause.cause == "wrench-tare"
+
+
+@pytest.mark.long
+def test_check_lists_a_wrong_wrench():
+    findings = check_problem(sensed("wrench: force alone reversed"))
+    assert "its forces fit with the other sign" in findings.warnings[0]

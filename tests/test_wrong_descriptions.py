@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from problem_files import both, replace_text, run_command
-from problems_small import box
+from problems_small import GUESS, TRUTH, box, released_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
@@ -20,16 +20,17 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.recording import Grasp
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp
 from collocation_sysid.runs.check import description_causes
 from collocation_sysid.runs.check.body import hold_concerns, holds_of
 from collocation_sysid.statistics.causes import likely_causes
 from collocation_sysid.statistics.plausible import odd_material, oddities, steps
+from collocation_sysid.statistics.trust import cause_concerns
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from twins import BODIES, SOFT, STIFF, twin
-from wrong_twins import FAULTS
+from wrong_twins import FAULTS, OBSTACLE_FAULTS, TRACK_FAULTS
 
 BEFORE = [
     "poses in mm",
@@ -79,6 +80,67 @@ def test_a_wrong_description_is_named_before_solving(name: str, fault: str, rng)
     assert causes, fault
     assert causes[0].cause in FAULTS[fault].causes
     assert causes[0].strength > 2
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("fault", TRACK_FAULTS)
+def test_tracks_that_no_grasped_body_has_are_named_before_solving(name: str, fault: str, rng):
+    causes = description_causes(TRACK_FAULTS[fault](soft(name), rng))
+    assert causes, fault
+    assert causes[0].cause in TRACK_FAULTS[fault].causes
+
+
+def test_the_order_and_signs_of_the_tracks_axes_are_stated(rng):
+    exchanged = TRACK_FAULTS["markers: y and z exchanged"](soft("block"), rng)
+    assert (
+        "fit with (x, z, y) in the place of (x, y, z)" in description_causes(exchanged)[0].sentence
+    )
+
+
+def test_a_body_held_still_after_it_is_let_go_undeformed_may_swing():
+    tracks = simulate(released_cube(20), TRUTH, "newmark").markers_m
+    given = Problem([with_markers(released_cube(20), tracks)], GUESS)
+    assert description_causes(given) == ()
+
+
+def test_an_unstable_simulation_is_named_after_solving(rng):
+    reset = TRACK_FAULTS["simulation reset after NaN"](soft("bar"), rng)
+    answer = run(reset)
+    assert answer.trust.verdict == "doubtful"
+    assert "do not move like a grasped body" in answer.trust.reasons[0]
+
+
+# Obstacles ----------------------------------------------------------------------------------------
+
+
+def shipped(name: str) -> Problem:
+    return Problem.read(Path(__file__).parents[1] / "problems" / name / "problem.toml")
+
+
+@pytest.mark.parametrize("name", ["laid_block", "poked_block"])
+def test_obstacles_that_are_right_are_not_doubted(name: str):
+    assert description_causes(shipped(name)) == ()
+
+
+def test_an_obstacle_that_contains_the_body_has_its_normal_reversed(rng):
+    reversed_plate = OBSTACLE_FAULTS["obstacle: normal reversed"](shipped("laid_block"), rng)
+    assert description_causes(reversed_plate)[0].cause == "obstacle-normal"
+
+
+@pytest.mark.parametrize("zero", ["z", ""])
+def test_the_load_of_an_indentation_that_pulls_is_named(zero: str, rng):
+    """Whether the tip moves by a displacement or by poses."""
+    given = shipped("poked_block")
+    right = replace(given, experiments=[with_zero(given.experiments[0], zero)])
+    assert description_causes(right) == ()
+    wrong = OBSTACLE_FAULTS["obstacle: load reversed"](right, rng)
+    (cause,) = description_causes(wrong)
+    assert cause.cause == "sign"
+    assert cause_concerns([cause])[0].grade == "doubtful"
+
+
+def with_zero(experiment: Experiment, zero: str) -> Experiment:
+    return experiment.with_obstacles([replace(each, zero=zero) for each in experiment.obstacles])
 
 
 @pytest.mark.parametrize("name", BODIES)

@@ -141,9 +141,9 @@ def write_tetrahedra(
     """Write a mesh, in metres, to any format that meshio knows by the file's extension."""
     import meshio  # slow to import
 
-    of_points: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
-    of_cells: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
-    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], of_points, of_cells)
+    point_data: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
+    cell_data: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
+    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data, cell_data)
     with _one_error(path, "written"):
         meshio.write(path, mesh)
 
@@ -155,7 +155,15 @@ def _numbers(values: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _reading(path: str | Path) -> Iterator[MeshContent]:
-    """Content of a file; what fails while it is evaluated is reported as damage of the file."""
+    """Context that gives the content of a file.
+
+    Errors in the body of the context are reported as damage of the file.
+
+    Raises
+    ------
+    InputError
+        If the file does not exist, is not a regular file, or cannot be read.
+    """
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
     require_regular(path)
@@ -169,12 +177,19 @@ def _reading(path: str | Path) -> Iterator[MeshContent]:
 
 @contextlib.contextmanager
 def _one_error(path: str | Path, done: str) -> Iterator[None]:
-    """Turn whatever fails on a bad file into one InputError, and print nothing."""
-    said = io.StringIO()
+    """Context that turns any failure on an invalid file into one `InputError`, and prints nothing.
+
+    Parameters
+    ----------
+    path : str or Path
+    done : {"read", "written"}
+        What is done with the file, for the message.
+    """
+    captured = io.StringIO()
     try:
         with (
-            contextlib.redirect_stdout(said),
-            contextlib.redirect_stderr(said),
+            contextlib.redirect_stdout(captured),
+            contextlib.redirect_stderr(captured),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
@@ -184,11 +199,20 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise
-        reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
+        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
         raise _refusal(done, reason, path) from error
 
 
 def _refusal(done: str, reason: str, path: str | Path) -> InputError:
+    """Return the error for a file that cannot be read or written as a mesh.
+
+    Parameters
+    ----------
+    done : {"read", "written"}
+        What is done with the file.
+    reason : str
+    path : str or Path
+    """
     return InputError(
         f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, "
         ".mesh and .inp are known, told by the file's ending",
@@ -228,14 +252,16 @@ def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
     if not tags:
         return {}
     names = {tuple(map(int, key)): name for name, key in (data.field_data or {}).items()}
-    found: dict[tuple[int, int], list[np.ndarray]] = {}
+    masks: dict[tuple[int, int], list[np.ndarray]] = {}
     for dimension in range(4):
-        here = [np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)]
-        for tag in np.unique(np.concatenate(here)):
+        tags_of_dimension = [
+            np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)
+        ]
+        for tag in np.unique(np.concatenate(tags_of_dimension)):
             if tag > 0:
-                found[int(tag), dimension] = [block == tag for block in here]
-    nameless = Counter(tag for tag, dimension in found if (tag, dimension) not in names)
-    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in found.items()}
+                masks[int(tag), dimension] = [block == tag for block in tags_of_dimension]
+    nameless = Counter(tag for tag, dimension in masks if (tag, dimension) not in names)
+    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in masks.items()}
 
 
 def _called(tag: int, dimension: int, ambiguous: bool) -> str:
@@ -258,26 +284,30 @@ def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np
     All-false masks are omitted.
     """
     tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
-    kept = {}
+    selected = {}
     for name, per_block in arrays.items():
-        parts = [np.asarray(p) for p, wanted in zip(per_block, tetrahedra, strict=True) if wanted]
-        whole = np.concatenate(parts)
-        if whole.dtype != bool or whole.any():
-            kept[name] = whole
-    return kept
+        parts = [
+            np.asarray(p)
+            for p, is_selected in zip(per_block, tetrahedra, strict=True)
+            if is_selected
+        ]
+        values = np.concatenate(parts)
+        if values.dtype != bool or values.any():
+            selected[name] = values
+    return selected
 
 
 def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
     """Return the corners of the triangles on which arrays given block by block are 1."""
     blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
-    found = {}
+    sets = {}
     for name, per_block in arrays.items():
         masks = [np.asarray(per_block[k]) for k in blocks]
         if masks and all(m.ndim == 1 and np.isin(m, (0, 1)).all() for m in masks):
             chosen = [data.cells[k].data[m == 1, :3] for k, m in zip(blocks, masks, strict=True)]
             if any(map(len, chosen)):
-                found[name] = np.concatenate(chosen)
-    return found
+                sets[name] = np.concatenate(chosen)
+    return sets
 
 
 def _cell_counts(data: MeshContent) -> Counter[str]:

@@ -1,8 +1,8 @@
-"""Contents of mesh and point files as meshio reads them, in an isolated process.
+"""Contents of mesh and point files as read by meshio, in an isolated process.
 
-On damaged files some readers of meshio do not terminate, or take memory without end. Small .vtu
-files, the format that this package writes, are read in this process: the time and memory that their
-reader takes are bounded by the size of the file.
+Use `read_content`. On damaged files some readers of meshio do not terminate, or allocate memory
+without limit. Small .vtu files, the format that this package writes, are read in this process: time
+and memory of their reader are bounded by the size of the file.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 from ..apart import Failed, ProcessLimits, computed_apart
 from ..errors import InputError
 
-# Zlib makes a file at most 1032 times smaller, so this takes up to 200 MB.
+# Largest file that is read in this process [bytes]. Zlib compresses at most 1032-fold, so that the
+# content takes up to 200 MB.
 SMALL_BYTES = 200_000
-# Letters of what meshio prints that are quoted.
+# Largest number of characters of meshio's output that a message quotes.
 LONGEST_REASON = 300
 
-# Everything that meshio reads as arrays, and its names, as JSON, in one of them.
+# Program of the isolated process. It returns all data as arrays, and their names as JSON in a
+# further array.
 _WORKER = """
 import contextlib, io, json, warnings
 said = io.StringIO()
@@ -64,7 +66,17 @@ except (Exception, SystemExit) as error:
 
 @dataclass(frozen=True)
 class CellBlock:
-    """Cells of one type; `dim` is their dimension, and `data` (n, nodes per cell) their nodes."""
+    """Cells of one type.
+
+    Attributes
+    ----------
+    type : str
+        Name of the type in meshio.
+    dim : int
+        Dimension of the cells.
+    data : (n, nodes per cell) array
+        Node indices.
+    """
 
     type: str
     dim: int
@@ -73,7 +85,7 @@ class CellBlock:
 
 @dataclass(frozen=True)
 class MeshContent:
-    """What a file holds, with the names and forms of meshio.
+    """Content of a mesh or point file, with the names and forms of meshio.
 
     Attributes
     ----------
@@ -94,38 +106,40 @@ class MeshContent:
 
 
 def read_content(path: str | Path) -> MeshContent:
-    """Read a mesh or point file; its format is told by its ending.
+    """Read a mesh or point file, whose format follows from its extension.
 
     Raises
     ------
     InputError
-        With the reason, if meshio cannot read it or takes too much time or memory. The path is not
-        named.
+        With the reason, without the path, if meshio cannot read the file or exceeds the limits of
+        time or memory.
     """
     if _is_harmless(Path(path)):
         return _read_here(path)
     try:
         absolute = str(Path(path).resolve())
-        found = computed_apart(_WORKER, absolute, limits=ProcessLimits.for_file(path))
+        arrays = computed_apart(_WORKER, absolute, limits=ProcessLimits.for_file(path))
     except Failed as error:
         raise InputError(str(error)) from error
-    head = json.loads(found["head"].tobytes())
+    head = json.loads(arrays["head"].tobytes())
     return MeshContent(
-        points=found["points"],
-        cells=[CellBlock(kind, dim, found[key]) for kind, dim, key in head["cells"]],
-        point_data={name: found[key] for name, key in head["point_data"]},
-        field_data={name: found[key] for name, key in head["field_data"]},
-        point_sets={name: found[key] for name, key in head["point_sets"]},
-        cell_data={name: [found[key] for key in keys] for name, keys in head["cell_data"]},
+        points=arrays["points"],
+        cells=[CellBlock(kind, dim, arrays[key]) for kind, dim, key in head["cells"]],
+        point_data={name: arrays[key] for name, key in head["point_data"]},
+        field_data={name: arrays[key] for name, key in head["field_data"]},
+        point_sets={name: arrays[key] for name, key in head["point_sets"]},
+        cell_data={name: [arrays[key] for key in keys] for name, keys in head["cell_data"]},
         cell_sets={
-            name: [None if key is None else found[key] for key in keys]
+            name: [None if key is None else arrays[key] for key in keys]
             for name, keys in head["cell_sets"]
         },
     )
 
 
 def _is_harmless(path: Path) -> bool:
-    """Whether a file is a small .vtu without what could take more than its size promises."""
+    """Return whether a file is a small .vtu without parts that could exceed its size when
+    decoded.
+    """
     if path.suffix.lower() != ".vtu" or path.stat().st_size > SMALL_BYTES:
         return False
     content = path.read_bytes()
@@ -134,19 +148,20 @@ def _is_harmless(path: Path) -> bool:
 
 
 def _read_here(path: str | Path) -> MeshContent:
+    """Return the content of a file read in this process."""
     import meshio  # slow to import
 
-    said = io.StringIO()
+    captured = io.StringIO()
     try:
         with (
-            contextlib.redirect_stdout(said),
-            contextlib.redirect_stderr(said),
+            contextlib.redirect_stdout(captured),
+            contextlib.redirect_stderr(captured),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
             mesh: Any = meshio.read(path)
     except (Exception, SystemExit) as error:
-        reason = " ".join(said.getvalue().split()) or f"{type(error).__name__}: {error}"
+        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
         raise InputError(reason[:LONGEST_REASON]) from error
     return MeshContent(
         points=np.asarray(mesh.points),

@@ -19,7 +19,8 @@ from .mesh import Nodes, TetMesh
 # Tolerance in diagonals of the body: nodes on a box's face must not be lost by rounding.
 ROUND_OFF = 1e-9
 OF_CELLS = "cells, by their centres"
-# Of the body's diagonal: nodes of a file in single precision on one plane are this close to it.
+# Tolerance of a plane in diagonals of the body: nodes of a file in single precision on one plane
+# are this close to it.
 FACE_TOLERANCE = 1e-6
 FaceName = Literal["top", "bottom", "side_x", "side_y"]
 
@@ -126,14 +127,15 @@ class Ball(_Within):
 
 @dataclass(frozen=True)
 class Face(_Within):
-    """The nodes on an end or a plane side of the body; no length needs to be stated.
+    """Selection of the nodes on an end or a plane side of the body, without stating a length.
 
     Parameters
     ----------
     name : {"top", "bottom", "side_x", "side_y"}
-        The nodes with the highest or the lowest z of the body; or those with its lowest x or y, as
-        in a plane of symmetry, that are neither on the top nor on the bottom, so that a grasp of
-        the side goes with grasps of these. As a selection of faces a side has its edges.
+        "top" and "bottom": the nodes with the highest and the lowest z of the body. "side_x" and
+        "side_y": those with its lowest x or y, as in a plane of symmetry, that are neither on the
+        top nor on the bottom, so that grasps of a side and of an end can be combined. As a
+        selection of faces a side includes its edges.
     """
 
     name: FaceName
@@ -150,18 +152,13 @@ class Face(_Within):
         return _chosen(mask, nodes.mesh, str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Refuse: a face of the body holds no cell.
-
-        Raises
-        ------
-        InputError
-        """
+        """Raise an `InputError`: a face of the body contains no cells."""
         raise InputError(
             f"{self} selects nodes, and no cells; expected box_m, ball_m, indices or name"
         )
 
     def _holds(self, points_m: np.ndarray) -> np.ndarray:
-        """Whether points are in the plane through the one that is farthest out, (n,) bool."""
+        """Return the mask (n,) of the points in the plane through the outermost point."""
         axis, sign = {"top": (2, -1), "bottom": (2, 1), "side_x": (0, 1), "side_y": (1, 1)}[
             self.name
         ]

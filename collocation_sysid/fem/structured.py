@@ -63,7 +63,7 @@ def cylinder_of_edge(
 
 
 def counts_of_box(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
-    """Return the numbers of nodes and elements that `box_of_edge` makes, without making them.
+    """Return the numbers of nodes and elements of `box_of_edge` without creating the mesh.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def counts_of_box(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
 def counts_of_cylinder(
     diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
 ) -> tuple[int, int]:
-    """Return the approximate numbers of nodes and elements of `cylinder_of_edge`.
+    """Return the approximate numbers of nodes and elements of `cylinder_of_edge`, without the mesh.
 
     Raises
     ------

@@ -298,9 +298,16 @@ class LiveSweep:
     @property
     def state(self) -> State:
         """Copy of the state on which the next row depends."""
-        arrays = self.x.copy(), self.force.copy(), self.given.copy()
-        felt = self.felt.copy()
-        return State(self.row, self.end, *arrays, felt, self.forward.last, tuple(self.read))
+        return State(
+            row=self.row,
+            end=self.end,
+            x=self.x.copy(),
+            force=self.force.copy(),
+            given=self.given.copy(),
+            felt=self.felt.copy(),
+            memory=self.forward.last,
+            read=tuple(self.read),
+        )
 
     # Rows -------------------------------------------------------------------------------------
 
@@ -445,13 +452,25 @@ class LiveSweep:
             row = self._row(t)
             before = forward.last
             row_columns = np.zeros(forward.shape)
-            derivatives = at.by_position[k], at.by_velocity[k]
-            skew_derivatives = at.by_position_skew[k], at.by_velocity_skew[k]
-            matrix = row.block(*derivatives, solver.pattern), row.skew_block(*skew_derivatives)
+            by_position = at.by_position[k]
+            by_velocity = at.by_velocity[k]
+            by_position_skew = at.by_position_skew[k]
+            by_velocity_skew = at.by_velocity_skew[k]
+            block = row.block(by_position, by_velocity, solver.pattern)
+            skew_block = row.skew_block(by_position_skew, by_velocity_skew)
             solved.append(row_columns)
             try:
-                factor = solver.factoriser.factorise(*matrix, self.model.room)
-                step = Step(t, row, at.force[k], *derivatives, factor, *skew_derivatives)
+                factor = solver.factoriser.factorise(block, skew_block, self.model.room)
+                step = Step(
+                    t,
+                    row,
+                    at.force[k],
+                    by_position,
+                    by_velocity,
+                    factor,
+                    by_position_skew,
+                    by_velocity_skew,
+                )
                 forward.advance(step, right, force, row_columns)
             except np.linalg.LinAlgError:
                 return solved, np.nan

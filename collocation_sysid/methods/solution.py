@@ -64,7 +64,8 @@ _SENTENCES = {
     Status.TIME_LIMIT: "Stopped at the time limit.",
     Status.INFEASIBLE: "The equations of motion could not be satisfied from this start; check "
     "grasp, mass and units, or start from another guess.",
-    Status.STALLED: "The steps became too small to make progress; check scaling and guess.",
+    Status.STALLED: "The steps became too small to make progress; look at the likely causes, "
+    "and at the guess where one is given.",
     Status.DIVERGED: "The iterates grew without bound; check units and bounds.",
     Status.NUMERICAL_FAILURE: "A step could not be computed or a function was not finite; another "
     "guess or linear solver may help.",

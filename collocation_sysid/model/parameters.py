@@ -63,7 +63,7 @@ class Unknown:
     typical: Positive | None = None
 
 
-# What the table of a parameter may hold in a problem file.
+# Keys of the table of a parameter in a problem file.
 KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
 
 

@@ -5,8 +5,7 @@ The tests of `modal` cost little. The others change the experiment that fits wor
 again with each mistake corrected, and the factor by which its misfit decreases is the strength of
 the hypothesis. Of the directions of gravity, the natural modes choose the one that is refitted.
 
-A measured wrench is compared with the prediction of a fit to the markers alone, which a wrong
-wrench has not distorted. Tares are allowed for by their priors.
+Hypotheses about measured wrenches are in `wrench_causes`.
 """
 
 from __future__ import annotations
@@ -22,16 +21,13 @@ from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..program.any_stiffness import Described
-from ..program.channel import Forced
-from ..program.collocation import Collocation, Part
-from ..program.wrench import WrenchReading, without_sensors
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
-from ..recording.wrench import Frame, Wrench
 from .hypothesis import Hypothesis, Trial, clock, ranked
 from .modal import ModalComparison, doubts, gravity_mistakes
 from .plausible import against_the_load
+from .wrench_causes import wrench_causes
 
 # RMS residual in standard deviations up to which there is nothing to explain.
 NOISE = 1.15
@@ -311,132 +307,3 @@ def _misfit(experiment: Experiment, read: Array) -> float:
     """Return the root mean square of the residuals in standard deviations."""
     scaled = _residual(experiment, read) / experiment.markers.sigma_m[:, None]
     return root_mean(scaled[experiment.markers.present] ** 2)
-
-
-# RMS residual of a wrench in standard deviations that needs an explanation; a correct description
-# must leave less.
-MISFIT = 1.3
-# Largest clock shift that is tried, over the length of the recording.
-LATEST = 0.25
-# Number of intervals of the clock shifts that are tried.
-SHIFTS = 60
-# Wrong units of forces and of torques that are tried, with their factors.
-UNITS = (
-    (
-        "forces",
-        {"kilograms-force": 9.80665, "millinewtons": 1e-3, "pounds-force": 4.4482216},
-        slice(0, 3),
-    ),
-    ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, slice(3, 6)),
-)
-
-
-def wrench_causes(solution: Solution) -> list[Hypothesis]:
-    """Return hypotheses about wrongly described wrenches; empty if they fit."""
-    if not any(map(_missed, solution.parts)):
-        return []
-    hypotheses = []
-    for part in _from_markers(solution.collocation):
-        forced = part.motion.forced
-        for sensor in part.segment.sensors:
-            hypotheses += _of_sensor(part, sensor, forced)
-    return hypotheses
-
-
-def _missed(part: Part) -> bool:
-    """Whether the residuals of a wrench exceed the noise."""
-    # They are behind the markers.
-    pairs = zip(part.segment.sensors, part.looked[1:], strict=False)
-    return any(
-        float(np.sum(sensor.residuals(looked, part.phi) ** 2)) > MISFIT**2 * sensor.present.sum()
-        for sensor, looked in pairs
-    )
-
-
-def _from_markers(collocation: Collocation) -> list[Part]:
-    """Return every experiment with markers, fitted without wrenches; empty if the fit fails."""
-    with_markers = [s for s in collocation.segments if s.experiment.markers.samples]
-    if not with_markers:
-        return []
-    without_wrenches = [without_sensors(segment.experiment) for segment in with_markers]
-    try:
-        alone = replace(collocation, experiments=without_wrenches)
-        solution = ReducedSpace(max_iterations=MOST_SWEEPS)(alone)
-    except (InputError, SimulationError):
-        return []
-    parts = []
-    for segment, part in zip(with_markers, solution.parts, strict=True):
-        known = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
-        phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
-        parts.append(Part(segment, part.q, phi, part.x))
-    return parts
-
-
-def _of_sensor(part: Part, sensor: WrenchReading, forced: Forced) -> Iterator[Hypothesis]:
-    """Yield the hypotheses for one wrench sensor that decrease its misfit."""
-
-    def left(without: tuple[Wrench, float]) -> float:
-        return _wrench_misfit(part, sensor.told(without[0]), forced, without[1])
-
-    tare = part.segment.experiment.nuisance.tare or 0.0
-    misfit = left((sensor.wrench, tare))
-    of = f"the wrench of '{part.segment.experiment.name}'"
-    if misfit > MISFIT:
-        yield from Trial(misfit, left, BETTER, least=1.0).of(
-            _wrench_mistakes(of, sensor.wrench, tare, _weighs(part))
-        )
-
-
-def _weighs(part: Part) -> bool:
-    """Whether markers alone determine forces, because densities or loads are known."""
-    segment = part.segment
-    return not segment.body.mass_slopes or without_sensors(segment.experiment).knows_a_force
-
-
-def _wrench_misfit(part: Part, sensor: WrenchReading, forced: Forced, tare: float) -> float:
-    """Return the RMS of a wrench's residuals in standard deviations, allowing for tares
-    with a prior of `tare` sigmas.
-    """
-    nuisance = part.segment.nuisance
-    predicted = sensor.of_forced(forced, np.zeros(nuisance.size))
-    # Sigmas are those of what is measured, whatever a trial makes of it.
-    deviations = (predicted - sensor.wrench.values) / sensor.wrench.sigmas
-    is_measured = np.isfinite(deviations)
-    if not is_measured.any():
-        return np.inf
-    counts = is_measured.sum(axis=0)
-    sums = np.nansum(deviations, axis=0)
-    prior_weight = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
-    offsets = sums / np.maximum(counts + prior_weight, 1e-12)
-    return float(np.sqrt(np.nanmean((deviations - offsets) ** 2)))
-
-
-def _wrench_mistakes(of: str, wrench: Wrench, tare: float, weighs: bool) -> Iterator[Hypothesis]:
-    """Yield hypotheses of a wrong wrench; `without` is the corrected wrench and the prior
-    of its tare in sigmas.
-    """
-    opposite = replace(wrench, values=-wrench.values)
-    yield Hypothesis("wrench-sign", of, without=(opposite, tare))
-    other: Frame = "grasp" if wrench.frame == "world" else "world"
-    turned = replace(wrench, frame=other)
-    yield Hypothesis("wrench-frame", of, {"other": other}, (turned, tare))
-    for what, units, columns in UNITS if weighs else ():
-        for unit, factor in units.items():
-            data = {"what": what, "unit": unit, "factor": factor}
-            yield Hypothesis("wrench-unit", of, data, (_scaled(wrench, columns, factor), tare))
-    span_s = LATEST * float(np.ptp(wrench.t_s))
-    for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
-        data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
-        shifted = replace(wrench, t_s=wrench.t_s + shift_s)
-        yield Hypothesis("wrench-clock", of, data, (shifted, tare))
-    yield Hypothesis("wrench-tare", of, without=(wrench, np.inf))
-
-
-def _scaled(wrench: Wrench, columns: slice, factor: float) -> Wrench:
-    """Return the wrench with some components in another unit; its noise is not decreased."""
-    values: Array = np.array(wrench.values)
-    values[:, columns] *= factor
-    sigma = "sigma_n" if columns.start == 0 else "sigma_nm"
-    stated = getattr(wrench, sigma)
-    larger = None if stated is None else stated * max(1.0, factor)
-    return replace(wrench, values=values, **{sigma: larger})

@@ -104,14 +104,43 @@ TOPICS: Mapping[str, Topic] = {
             "others do not: give it markers.weights = 0, or end window_s before",
             "pose-jump": "the poses jump by {by_mm:.2g} mm at t = {t_s:.4g} s and the markers do "
             "not: repair the poses there, or end window_s before",
+            "markers-jump": "all markers jump together, by {by_mm:.3g} mm at t = {t_s:.4g} s, and "
+            "the poses do not: the tracks do not move like a grasped body; a simulation that fails "
+            "and restarts, or two recordings in one file, look so: end window_s before",
+            "markers-axes": "the markers fit with ({axes}) in the place of (x, y, z): the axes of "
+            "their file are exchanged or reversed; reorder its columns, or turn the tracks",
+            "poses-constant": "the markers move by {by_mm:.3g} mm, but the poses are constant and "
+            "nothing else drives the body, which starts at rest: check the file and the columns of "
+            "grasp.poses, and whether they are those of this recording",
+            "unlike": "the tracks do not move like a grasped body: whatever its stiffness, they "
+            "are {by_mm:.3g} mm (RMS) from where the grasp carries the markers, on a body of "
+            "{size_mm:.3g} mm, and no single usual mistake explains it; check frames, poses and "
+            "labels, and that a simulation that made them was stable",
+            "mesh-parts": "the mesh is in {parts} parts that no element joins, and no grasp holds "
+            "{loose} of them, the largest of {nodes} nodes: merge nodes that lie on each other, or "
+            "leave loose parts out of the mesh",
+            "obstacle-normal": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
+            "body at the first time, and with its normal reversed none of it: its normal points "
+            "out of the solid, to the side of the body",
+            "obstacle-place": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
+            "body at the first time: check its place, size, unit and the sign of its motion",
             "sign": "along {axis} grasp {grasp} and the force that it gives go opposite ways "
             "(correlation {correlation:.2f}), as if the body gave work: one of both signs is "
             "wrong; set sign = -1 of its displacement or of its wrench",
             "wrench-sign": "all of it fits with the other sign: it is what the body gives the "
             "grasp; change its sign",
+            "wrench-sign/part": "its {what} fit with the other sign, the rest does not: change "
+            "the sign of these columns",
+            "wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in the place "
+            "of (x, y, z), forces and torques alike; reorder the columns, or turn the sensor's "
+            "axes",
+            "wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
+            "the sensor, and the density or mass of the body",
+            "wrench-point": "its torques are about a point {by_mm:.3g} mm from point_m: they fit "
+            "with point_m = {point}",
             "wrench-frame": 'it is in the frame of the {other}: set frame = "{other}"',
             "wrench-unit": "its {what} seem to be in {unit}: multiply by {factor:g}",
-            "wrench-clock": "it was measured about {by_ms:.2g} ms {when} than its times say: its "
+            "wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times say: its "
             "clock is not that of the poses",
             "camera": "only {percent:.0f} % of the surface have points within {within_mm:.3g} mm: "
             "check camera.pose, that it is of a frame with x to the right, y down, z forward, and "

@@ -19,8 +19,9 @@ from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..program.any_stiffness import Described, Sway, later
 from ..recording.experiment import Experiment
+from .axes import OTHER_AXES
 from .hypothesis import Hypothesis, Trial, clock, ranked
-from .plausible import against_the_load, exchanges, steps
+from .plausible import against_the_load, exchanges, steps, undriven_motion
 
 # Factor by which the misfit must decrease.
 FAR_BETTER = 2.0
@@ -36,6 +37,10 @@ LAGS_S = np.concatenate([-np.arange(15, 0, -1), np.arange(1, 16)]) * 0.01
 LONGEST_LAG = 0.3
 # Alternations between the best stiffness and the best rigid motion.
 REFITS = 3
+# Many variants are tried of one mistake: each must fit so many times better than others.
+ONE_OF_MANY = 1.05
+# Of the body's diagonal: equilibria may deform it so far, and no grasped body is so far off.
+DEFORMED, FAR_OFF = 0.1, 0.3
 
 
 def doubts(
@@ -52,11 +57,39 @@ def doubts(
     huber : float, optional
         Threshold of Huber's loss; None means a quadratic loss.
     """
-    if experiment.static or not experiment.markers.names:
+    if not experiment.markers.names:
         return ranked(against_the_load(experiment))
+    if experiment.static:
+        return ranked([*against_the_load(experiment), *_rigid_axes(experiment)])
     comparison = ModalComparison.of(experiment, constants)
-    tried = () if comparison is None else comparison.doubts()
-    return ranked([*tried, *exchanges(experiment, huber), *steps(experiment)])
+    tried = _rigid_axes(experiment) if comparison is None else comparison.doubts()
+    found = [*tried, *exchanges(experiment, huber), *steps(experiment)]
+    found += undriven_motion(experiment)
+    if comparison is not None and not found and not experiment.obstacles:
+        found += comparison.unlike()
+    return ranked(found)
+
+
+def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield other axes of the tracks that bring them far nearer to the undeformed body."""
+    markers, body = experiment.markers, experiment.body
+    places_m = markers.observe(experiment.rigid_positions(experiment.t_s))
+    size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
+
+    def left(tracks_m: Array) -> float:
+        apart_m = np.linalg.norm(tracks_m - places_m, axis=2)
+        return float(np.hypot(np.nanmedian(apart_m), DEFORMED * size_m))
+
+    if markers.samples:
+        trial = Trial(left(markers.positions_m), left, FAR_BETTER)
+        yield from trial.of(_axes(f"'{experiment.name}'", markers.positions_m))
+
+
+def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
+    """Yield tracks (T, M, 3) with their axes in every other order and of either sign."""
+    for axes, (order, signs) in OTHER_AXES.items():
+        turned = np.array(signs) * tracks_m[..., list(order)]
+        yield Hypothesis("markers-axes", name, {"axes": axes}, turned, ONE_OF_MANY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +145,25 @@ class ModalComparison:
         trial = Trial(self.misfit_m(self.given), self.misfit_m, FAR_BETTER)
         yield from trial.of([*mistakes(self.given), *self._other_frames(), *self._other_clock()])
         yield from self._other_names()
+        yield from self._other_axes()
+
+    def unlike(self) -> Iterator[Hypothesis]:
+        """Yield that the tracks are far from where any stiffness has them, if they are."""
+        misfit_m, size_m = self.misfit_m(self.given), self.sway.size_m
+        strength = misfit_m / (FAR_OFF * size_m)
+        if strength > 1:
+            data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
+            yield Hypothesis("unlike", self.given.name, data, strength=strength)
+
+    def _other_axes(self) -> Iterator[Hypothesis]:
+        predicted = self.sway.predicted(self.given)
+
+        def left(tracks_m: Array) -> float:
+            turned = replace(self.given, tracks_m=tracks_m)
+            return float(self._misfits_m(turned, predicted).min())
+
+        given_m = self.given.tracks_m
+        yield from Trial(left(given_m), left, FAR_BETTER).of(_axes(self.given.name, given_m))
 
     def _misfits_m(self, described: Described, predicted: Array) -> Array:
         """Return the misfit (S,) of each prediction: root mean square distance of the best

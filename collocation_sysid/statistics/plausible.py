@@ -25,6 +25,8 @@ from ..fem.body import Body
 from ..fem.moduli import engineering
 from ..program.any_stiffness import carrying
 from ..recording.experiment import Experiment
+from ..recording.grasp import Grasp
+from ..recording.obstacle import Obstacle
 from .hypothesis import Hypothesis
 
 # Densities of soft objects [kg/m³].
@@ -108,6 +110,8 @@ def _outside(value: float, limits: tuple[float, float]) -> float:
 AGAINST = -0.8
 # Fewest samples for this correlation.
 FEWEST_SAMPLES = 3
+# Loads of an obstacle below this share of the largest may be those of no contact.
+TOUCHING = 0.05
 
 
 def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -120,11 +124,14 @@ def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
         if grasp.wrench is None:
             continue
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
-        for axis in grasp.zero:
+        for axis in grasp.zero or _pushing_axis(grasp, shifts_m):
             along = "xyz".index(axis)
             displacement_m = shifts_m[:, along]
             load_n = grasp.wrench.values[:, along]
             is_measured = np.isfinite(load_n)
+            if isinstance(grasp, Obstacle):
+                # Before contact the load is noise.
+                is_measured &= np.abs(load_n) > TOUCHING * np.nanmax(np.abs(load_n), initial=0.0)
             if is_measured.sum() < FEWEST_SAMPLES or not (
                 np.ptp(displacement_m[is_measured]) and np.ptp(load_n[is_measured])
             ):
@@ -134,6 +141,15 @@ def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
                 data = {"axis": axis, "grasp": k, "correlation": correlation}
                 strength = 1 / (1 + correlation + 1e-3)
                 yield Hypothesis("sign", f"'{experiment.name}'", data, strength=strength)
+
+
+def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
+    """Return the world axis along which an obstacle moves most; "" if its force has other axes."""
+    moved_m = np.ptp(shifts_m, axis=0)
+    pushes = isinstance(grasp, Obstacle) and grasp.wrench is not None
+    if not pushes or not moved_m.any() or grasp.wrench.frame != "world":
+        return ""
+    return "xyz"[int(moved_m.argmax())]
 
 
 # Size of a step over usual changes between samples.
@@ -149,8 +165,57 @@ def steps(experiment: Experiment) -> Iterator[Hypothesis]:
     if len(experiment.markers.positions_m) < FEWEST:
         return
     if (grasp := carrying(experiment)) is not None:
-        yield from _jump(experiment, grasp.poses.carry(_corners(experiment), experiment.t_s))
+        carried_m = grasp.poses.carry(_corners(experiment), experiment.t_s)
+        yield from _jump(experiment, carried_m)
+        yield from _common_jump(experiment, carried_m)
     yield from _slips(experiment)
+
+
+def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesis]:
+    """Yield a step of all markers together that the poses do not have."""
+    tracks_m, sigma_m = experiment.markers.positions_m, experiment.markers.sigma_m
+    complete = np.isfinite(tracks_m).all(axis=(1, 2))
+    # A gap hides a step: samples around it are taken as neighbours.
+    rows = np.flatnonzero(complete)
+    if len(rows) < FEWEST:
+        return
+    sizes = step_sizes(tracks_m[rows]).min(axis=1)
+    k = int(sizes.argmax())
+    carried = step_sizes(carried_m[rows]).max(axis=1)[k]
+    usual_m = max(_lively(sizes), float(carried), 2 * float(np.median(sigma_m)))
+    yield from _sudden("markers-jump", experiment, int(rows[k]), float(sizes[k]), usual_m)
+
+
+# Of the body's diagonal and of the noise: markers that move less may be still.
+STILL_OF_SIZE, STILL_SIGMAS = 0.01, 6.0
+
+
+def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield that markers move on a body that starts at rest and that nothing moves."""
+    t_s, grasps = experiment.t_s, experiment.grasps
+    if experiment.start != "equilibrium" or experiment.actuators or experiment.obstacles:
+        return
+    held = (grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps)
+    motions = [part for grasp in grasps for part in grasp.poses.at(t_s)]
+    loads = [experiment.node_forces_n(t_s), experiment.tied_mass_kg(t_s)]
+    if not grasps or not all(held) or any(_changes(each) for each in (*motions, *loads)):
+        return
+    markers, size_m = experiment.markers, float(np.ptp(experiment.body.nodes_m, axis=0).max())
+    there = markers.present.sum(axis=0) >= FEWEST_SAMPLES
+    if not there.any():
+        return
+    tracks_m = markers.positions_m[:, there]
+    moved_m = np.sqrt(np.nanmean(np.nanvar(tracks_m, axis=0).sum(axis=1)))
+    still_m = STILL_OF_SIZE * size_m + STILL_SIGMAS * float(np.median(markers.sigma_m))
+    if moved_m > still_m:
+        data = {"by_mm": 1e3 * moved_m}
+        of = f"'{experiment.name}'"
+        yield Hypothesis("poses-constant", of, data, strength=float(moved_m / still_m))
+
+
+def _changes(values: Array) -> bool:
+    """Return whether any row of values (T, …) differs from the first."""
+    return bool(np.ptp(values, axis=0).max(initial=0.0) > 1e-9)
 
 
 def _corners(experiment: Experiment) -> Array:

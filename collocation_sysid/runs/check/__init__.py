@@ -24,9 +24,11 @@ from ...statistics.concern import Concern
 from ...statistics.hypothesis import Hypothesis, ranked
 from ...statistics.modal import doubts
 from ...statistics.numerical import MOST_SUBSTEPS
+from ...statistics.placement_causes import placement_mistakes
 from ...statistics.plausible import oddities
 from ...statistics.scale import scale_concerns, stillness_concerns
 from ...statistics.trust import contact_concerns, stability_concerns, turn_concerns
+from ...statistics.wrench_causes import CHECKED_SAMPLES, wrench_mistakes
 from ...tree import content
 from .body import BodyFinding, ElementShape, Hold, body_finding, hold_concerns, holds_of
 from .cost import Cost, cost_concerns, cost_notes, costs, nonzeros
@@ -52,6 +54,8 @@ __all__ = [
 
 # A simulation of the whole recordings that takes longer than this is left out unless asked for.
 PATIENCE_S = 10.0
+# A fit of the first samples to the markers takes about as long as so many simulations of them.
+FIT_SIMULATIONS = 15.0
 # Agreement with fourth-order central differences that rounding allows.
 AGREEMENT = 1e-6
 GUESSED = ", at the guess"
@@ -212,6 +216,17 @@ def check_problem(
         say(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
         simulated, (z, start_notes) = collocation, initial_variables(collocation)
     say("looking at modes and at the description")
+    causes = description_causes(problem)
+    fit_s = FIT_SIMULATIONS * whole_s * min(1.0, CHECKED_SAMPLES / _rows(collocation))
+    sensed = any(e.wrenches and e.markers.samples for e in problem.experiments)
+    if sensed and not causes and (full or fit_s <= PATIENCE_S):
+        say("comparing the wrenches with what the markers predict")
+        causes = ranked(wrench_mistakes(collocation))
+    elif sensed and not causes:
+        notes.append(
+            "the wrenches were not compared with what the markers predict: it would take about "
+            f"{fit_s:.2g} s; check --full does it"
+        )
     findings = Findings(
         **_measured(problem, simulated, z),
         timesteps=_rows(collocation),
@@ -220,7 +235,7 @@ def check_problem(
         **program,
         jacobian_error=jacobian_error,
         hessian_error=hessian_error,
-        causes=description_causes(problem),
+        causes=causes,
     )
     # Nothing is said of contact by a body that was only carried.
     touching = () if start_notes else _contacts(simulated, z, whole=simulated is not first)
@@ -349,4 +364,5 @@ def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:
     odd = (oddity for body in problem.bodies for oddity in oddities(body))
     doubtful = (cause for e in problem.experiments for cause in doubts(e, constants, problem.huber))
     blind = (cause for e in problem.experiments for cause in camera_mistakes(e))
-    return (*odd, *ranked((*blind, *doubtful)))
+    placed = (cause for e in problem.experiments for cause in placement_mistakes(e))
+    return (*odd, *ranked((*placed, *blind, *doubtful)))

@@ -1,0 +1,322 @@
+"""Misspecification hypotheses for measured wrenches: signs, axes, units, frames, points, clocks.
+
+A measured wrench is compared with the reaction of a fit to the markers alone, which a wrong wrench
+cannot distort. Every usual mistake is undone in turn. Tares are allowed for by their priors. Where
+neither a density nor a load is known, the predicted wrench is known up to one positive factor,
+which is then estimated in each comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import InputError, SimulationError
+from ..methods.continuation import first_samples
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution
+from ..program.channel import Forced
+from ..program.collocation import Collocation, Part
+from ..program.segment import Segment
+from ..program.wrench import WrenchReading, without_sensors
+from ..recording.wrench import Frame, Wrench
+from .axes import OTHER_AXES
+from .hypothesis import Hypothesis, Trial
+
+# Residuals up to so many standard deviations need no cause; what is right leaves so much less.
+MISFIT, BETTER = 1.3, 1.5
+# The prediction is of no use where the markers themselves are fitted worse than this, in sigmas.
+MARKERS_MISFIT = 3.0
+MOST_SWEEPS = 40
+# Of the fit before a solve: the samples, its sweeps and its tolerance.
+CHECKED_SAMPLES, CHECKED_SWEEPS, CHECKED_TOLERANCE = 100, 15, 1e-2
+# Clocks may be off by this share of a recording.
+LATEST, SHIFTS = 0.25, 60
+FORCES, TORQUES, BOTH = slice(0, 3), slice(3, 6), slice(0, 6)
+# What forces, and torques, are written in by mistake.
+UNITS = (
+    (
+        "forces",
+        {
+            "kilograms-force": 9.80665,
+            "grams-force": 9.80665e-3,
+            "millinewtons": 1e-3,
+            "pounds-force": 4.4482216,
+        },
+        FORCES,
+    ),
+    ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
+)
+# Offsets of so many standard deviations of the tare's prior are no tare of a zeroed sensor.
+FAR_TARE = 3.0
+# A calibration is good to this share, and a point to this distance; less gives no concern.
+SAME_GAIN, SAME_POINT_M = 0.05, 0.005
+# Mistakes with numbers to fit, or with many variants, must fit so many times better than others.
+FITTED, ONE_OF_MANY = 1.5, 1.05
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A description of a wrench under trial.
+
+    Attributes
+    ----------
+    wrench : Wrench
+        The samples as they would be without the mistake.
+    tare : float
+        Standard deviation of each tare, in standard deviations of the noise; inf for a free tare.
+    """
+
+    wrench: Wrench
+    tare: float
+
+
+def wrench_causes(solution: Solution) -> list[Hypothesis]:
+    """Return what is likely described wrongly of the wrenches after a fit; empty where they fit."""
+    if not any(map(_misses, solution.parts)):
+        return []
+    seen = [s for s in solution.collocation.segments if s.experiment.markers.samples]
+    return _of_parts(
+        _from_markers(solution.collocation, seen, ReducedSpace(max_iterations=MOST_SWEEPS))
+    )
+
+
+def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
+    """Return what is likely described wrongly of the wrenches before any solve.
+
+    The first samples of the experiments with markers and wrenches are fitted by their markers
+    alone. Nothing is said where that fit does not explain the markers.
+    """
+    seen = [s for s in collocation.segments if s.sensors and s.experiment.markers.samples]
+    shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in seen]
+    if not shorter:
+        return []
+    beginning = replace(collocation, experiments=shorter)
+    method = ReducedSpace(max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE)
+    parts = _from_markers(beginning, beginning.segments, method)
+    return _of_parts([part for part in parts if _markers_misfit(part) < MARKERS_MISFIT])
+
+
+def _misses(part: Part) -> bool:
+    # They are behind the markers.
+    pairs = zip(part.segment.sensors, part.looked[1:], strict=False)
+    return any(
+        float(np.sum(sensor.residuals(looked, part.phi) ** 2)) > MISFIT**2 * sensor.present.sum()
+        for sensor, looked in pairs
+    )
+
+
+def _markers_misfit(part: Part) -> float:
+    """Root mean square of the markers' residuals in standard deviations."""
+    residuals = part.segment.markers.residuals(part.looked[0], part.phi)
+    return float(
+        np.sqrt(np.sum(residuals**2) / max(1, 3 * part.segment.experiment.markers.samples))
+    )
+
+
+def _from_markers(
+    collocation: Collocation, seen: Sequence[Segment], method: ReducedSpace
+) -> list[Part]:
+    """Return the experiments as their markers alone have them; none where there is no such fit."""
+    if not seen:
+        return []
+    blind = [without_sensors(segment.experiment) for segment in seen]
+    try:
+        solution = method(replace(collocation, experiments=blind))
+    except (InputError, SimulationError):
+        return []
+    solution.unless_interrupted()
+    found = []
+    for segment, part in zip(seen, solution.parts, strict=True):
+        known = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
+        phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
+        found.append(Part(segment, part.q, phi, part.x))
+    return found
+
+
+def _of_parts(parts: Sequence[Part]) -> list[Hypothesis]:
+    found: list[Hypothesis] = []
+    for part in parts:
+        forced = part.motion.forced
+        for sensor in part.segment.sensors:
+            found += _OneSensor(part, sensor, forced).causes()
+    return found
+
+
+class _OneSensor:
+    """The comparison of one sensor with the reaction that is predicted from the markers.
+
+    Attributes
+    ----------
+    scale_known : bool
+        Whether densities or loads determine how large the predicted reaction is.
+    """
+
+    scale_known: bool
+
+    def __init__(self, part: Part, sensor: WrenchReading, forced: Forced) -> None:
+        segment = part.segment
+        self.part, self.sensor, self.forced = part, sensor, forced
+        blind = without_sensors(segment.experiment)
+        self.scale_known = not segment.body.mass_slopes or blind.knows_a_force
+        self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
+        self.given = _Trial(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
+
+    def causes(self) -> Iterator[Hypothesis]:
+        """Yield the mistakes without which the wrench fits far better."""
+        misfit = self.misfit(self.given)
+        if misfit > MISFIT:
+            yield from Trial(misfit, self.misfit, BETTER, least=1.0).of(self._mistakes())
+        else:
+            yield from self._large_tare()
+
+    def _large_tare(self) -> Iterator[Hypothesis]:
+        """Yield that the offset which a fit needs is far beyond the prior of the tare."""
+        tare = self.given.tare
+        if not tare:
+            return
+        measured, predicted = self._scaled_by_sigma(_Trial(self.given.wrench, 0.0))
+        factor = 1.0 if self.scale_known else _slope(measured, predicted)
+        apart = measured - factor * predicted
+        there = np.isfinite(apart).any(axis=0)
+        largest = np.abs(np.nanmean(apart[:, there], axis=0)).max() / tare if there.any() else 0.0
+        if largest > FAR_TARE:
+            of = f"the wrench of '{self.part.segment.experiment.name}'"
+            yield Hypothesis("wrench-tare", of, strength=float(largest / FAR_TARE))
+
+    def misfit(self, trial: _Trial) -> float:
+        """Return the root mean square of the residuals in standard deviations."""
+        measured, predicted = self._scaled_by_sigma(trial)
+        if not np.isfinite(measured).any():
+            return np.inf
+        factor = 1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
+        return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
+
+    def _scaled_by_sigma(self, trial: _Trial) -> tuple[Array, Array]:
+        """Return samples and prediction (S, 6) in sigmas, without tares; NaN in the same places."""
+        wrench, sigmas = trial.wrench, trial.wrench.sigmas
+        predicted = np.where(wrench.present, self._predicted(wrench), np.nan) / sigmas
+        measured = np.where(np.isfinite(predicted), wrench.values / sigmas, np.nan)
+        return _without_tare(measured, trial.tare), _without_tare(predicted, trial.tare)
+
+    def _predicted(self, wrench: Wrench) -> Array:
+        """Return the predicted wrench (S, 6) at the times, in the frame and about the point."""
+        at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
+        if at not in self._known:
+            phi = np.zeros(self.part.segment.nuisance.size)
+            self._known[at] = self.sensor.told(wrench).of_forced(self.forced, phi)
+        return self._known[at]
+
+    def _gain(self, columns: slice) -> float:
+        """Return the positive factor by which the samples in some columns fit best; NaN if none."""
+        measured, predicted = self._scaled_by_sigma(self.given)
+        slope = _slope(measured[:, columns], predicted[:, columns])
+        # A common factor cannot be told where the scale is unknown, that of one kind can.
+        if not self.scale_known:
+            others = np.delete(np.arange(6), np.arange(6)[columns])
+            slope /= _slope(measured[:, others], predicted[:, others]) if len(others) else np.nan
+        return 1 / slope if slope > 0 else np.nan
+
+    def _point_shift_m(self) -> Array:
+        """Return the shift (3,) of the torques' point with which they fit best; zero if unknown.
+
+        About a point farther by d, a torque is smaller by d × f.
+        """
+        measured, predicted = self._scaled_by_sigma(self.given)
+        if not np.isfinite(measured[:, TORQUES]).any():
+            return np.zeros(3)
+        factor = 1.0
+        if (
+            not self.scale_known
+            and not (factor := _slope(measured[:, FORCES], predicted[:, FORCES])) > 0
+        ):
+            return np.zeros(3)
+        wrench = self.given.wrench
+        forces = self._predicted(wrench)[:, FORCES]
+        by_shift = np.cross(forces[:, None], np.eye(3)[None]) / wrench.sigmas[3]  # (S, shift, 3)
+        by_shift = np.where(np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan)
+        slopes = np.stack(
+            [_without_tare(by_shift[:, k], self.given.tare) for k in range(3)], axis=2
+        )
+        apart = (measured - factor * predicted)[:, TORQUES]
+        there = np.isfinite(apart)
+        return np.linalg.lstsq(factor * slopes[there], apart[there], rcond=1e-6)[0]
+
+    def _mistakes(self) -> Iterator[Hypothesis]:
+        """Yield each usual mistake with the description that undoes it."""
+        of, wrench = f"the wrench of '{self.part.segment.experiment.name}'", self.given.wrench
+
+        def hypothesis(code: str, without: Wrench, handicap: float = 1.0, **data) -> Hypothesis:
+            return Hypothesis(code, of, data, replace(self.given, wrench=without), handicap)
+
+        values = np.array(wrench.values)
+        yield hypothesis("wrench-sign", replace(wrench, values=-values))
+        for what, columns in (("forces", FORCES), ("torques", TORQUES)):
+            if wrench.measured[columns].any():
+                yield hypothesis("wrench-sign/part", _multiplied(wrench, columns, -1.0), what=what)
+        other: Frame = "grasp" if wrench.frame == "world" else "world"
+        yield hypothesis("wrench-frame", replace(wrench, frame=other), other=other)
+        for axes, (order, signs) in OTHER_AXES.items():
+            if len({*signs}) == 1 and order == (0, 1, 2):
+                continue  # a matter of the sign
+            turned = np.tile(signs, 2) * values[:, [*order, *(3 + k for k in order)]]
+            without = replace(wrench, values=turned)
+            yield hypothesis("wrench-axes", without, ONE_OF_MANY, axes=axes)
+        for what, units, columns in UNITS:
+            for unit, factor in units.items() if wrench.measured[columns].any() else ():
+                without = _multiplied(wrench, columns, factor)
+                yield hypothesis("wrench-unit", without, what=what, unit=unit, factor=factor)
+        for what, columns in (
+            ("forces and torques", BOTH),
+            ("forces", FORCES),
+            ("torques", TORQUES),
+        ):
+            factor = self._gain(columns)
+            if factor > 0 and abs(factor - 1) > SAME_GAIN:
+                data = {"what": what, "factor": factor}
+                yield hypothesis(
+                    "wrench-gain", _multiplied(wrench, columns, factor), FITTED, **data
+                )
+        shift_m = self._point_shift_m()
+        if np.linalg.norm(shift_m) > SAME_POINT_M:
+            point_m = wrench.point_m + shift_m
+            data = {
+                "by_mm": 1e3 * np.linalg.norm(shift_m),
+                "point": str(np.round(point_m, 3).tolist()),
+            }
+            yield hypothesis("wrench-point", replace(wrench, point_m=point_m), FITTED, **data)
+        span_s = LATEST * float(np.ptp(wrench.t_s))
+        for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
+            data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
+            yield hypothesis("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
+        yield Hypothesis("wrench-tare", of, without=replace(self.given, tare=np.inf))
+
+
+def _without_tare(values: Array, tare: float) -> Array:
+    """Return columns (S, c) in sigmas without offsets that a tare of so many sigmas explains."""
+    there = np.isfinite(values)
+    held = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
+    return values - np.nansum(values, axis=0) / np.maximum(there.sum(axis=0) + held, 1e-12)
+
+
+def _slope(measured: Array, predicted: Array) -> float:
+    """Return the factor of the prediction that is nearest to the samples."""
+    square = float(np.nansum(predicted**2))
+    return float(np.nansum(measured * predicted)) / square if square else np.nan
+
+
+def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
+    """Return the wrench with other columns, and their noise, which is no smaller than stated."""
+    values: Array = np.array(wrench.values)
+    values[:, columns] *= factor
+    larger = max(1.0, abs(factor))
+    of_forces, of_torques = columns.start == 0, columns.stop == 6
+    return replace(
+        wrench,
+        values=values,
+        sigma_n=wrench.sigma_n * (larger if of_forces else 1.0),
+        sigma_nm=wrench.sigma_nm and wrench.sigma_nm * (larger if of_torques else 1.0),
+    )
