@@ -1,4 +1,13 @@
-"""The command line: results on stdout, progress and messages on stderr.
+"""Command line of the package: results on stdout, progress and messages on stderr.
+
+Each command is a function in one of the modules `FAMILIES`: `problems` (solve, simulate, check),
+`runs`
+(refine, export, plot, report, animate, view), `studies` (compare, sweep), `designs` (design),
+`streams`
+(live, replay) and `texts` (methods, schema, explain, topics, new). `options` makes command-line
+options
+from dataclasses, `common` has exit codes and output, and `markdown` shows documentation on a
+terminal.
 
 Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 2 bad input,
 130 interrupted.
@@ -29,26 +38,31 @@ FAMILIES = ("problems", "studies", "designs", "runs", "streams", "texts")
 
 @cache
 def _written() -> dict[str, tuple[str, str]]:
-    """Module of each command and what it does, as they are written."""
-    told = {}
+    """Return the module and the first help line of each command, read from the source without
+    importing.
+    """
+    commands = {}
     for family in FAMILIES:
         text = Path(__file__).with_name(f"{family}.py").read_text(encoding="utf-8")
         for each in ast.parse(text).body:
             if isinstance(each, ast.FunctionDef) and each.decorator_list:
-                said = (ast.get_docstring(each) or "").partition("\n")[0]
-                told[each.name] = f"{__name__}.{family}", said
-    return told
+                summary = (ast.get_docstring(each) or "").partition("\n")[0]
+                commands[each.name] = f"{__name__}.{family}", summary
+    return commands
 
 
 class Commands(TyperGroup):
-    """The commands; only the one that is asked for is imported, all of them take seconds."""
+    """Group of commands that imports only the module of the requested command.
+
+    Importing all of them would take seconds.
+    """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Their names."""
+        """Return the names of all commands."""
         return [*_written()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """One of them, or None."""
+        """Return the command called `cmd_name`, or None if there is none; imports its module."""
         if cmd_name not in _written():
             return None
         with errors.status("starting"):  # on a terminal only; it takes a second
@@ -58,18 +72,18 @@ class Commands(TyperGroup):
         return get_command_from_info(info, **how)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name and the command that the arguments begin with, and the others.
+        """Return the name and the command that the arguments begin with, and the other arguments.
 
-        A name that is none is refused with the command that was probably meant.
+        An unknown name ends the program with a message that suggests a similar command.
         """
         if args and args[0] not in _written() and not ctx.resilient_parsing:
             ctx.fail(f"No such command {args[0]!r}{hint_at(args[0], _written()) or '.'}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line on each."""
+        """Write a line on each command into the help."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, said) for name, (_, said) in _written().items()])
+            formatter.write_dl([(name, summary) for name, (_, summary) in _written().items()])
 
 
 app = typer.Typer(
@@ -89,6 +103,7 @@ app = typer.Typer(
 
 
 def _version(wanted: bool) -> None:
+    """Print the version and exit, if the option was given."""
     if wanted:
         from importlib.metadata import version
 
@@ -107,12 +122,12 @@ def _root(
 
 @cache
 def _commands() -> Callable[..., Any]:
-    """The commands; to read their options takes longer than a refusal."""
+    """Return the callable that parses the arguments and runs a command; made when first needed."""
     return get_command(app)
 
 
 def main() -> None:
-    """Entry point: turns errors into one message and an exit code."""
+    """Run the command line: errors become one message and an exit code."""
     try:
         _run()
     except KeyboardInterrupt:  # before or after the command itself
@@ -122,6 +137,7 @@ def main() -> None:
 
 
 def _run() -> None:
+    """Run the command of the arguments; exit with a message for bad input or a failure."""
     restore = heed_interrupts()
     # That it builds its cache of fonts, or where, is no news to who solves a problem.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
@@ -139,5 +155,6 @@ def _run() -> None:
 
 
 def _refuse(kind: str, error: Exception, code: int) -> NoReturn:
+    """Print an error after the word `kind`, and exit with `code`."""
     errors.print(Text(f"{kind}: ", style="red").append(str(error), style="default"), soft_wrap=True)
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""How the commands speak: exit codes, errors, results."""
+"""Output of the commands: exit codes, error console, results on stdout."""
 
 from __future__ import annotations
 
@@ -14,21 +14,27 @@ from ..display import Shown, on_terminal, plain_text
 
 errors = PlainConsole(stderr=True)
 
-EXIT_NOT_CONVERGED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
-# Width of what others read, in columns: more than any line has.
+EXIT_NOT_CONVERGED = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+# Width of the output in columns if it is not a terminal: no line is longer.
 UNBROKEN = 100_000
 EXIT_DOUBTFUL = EXIT_NOT_CONVERGED
 
 
 def interrupted(kept: str) -> typer.Exit:
-    """Say what is kept and how to go on; the exit to raise."""
+    """Print what is kept after an interrupt and the command that continues; return the exit to
+    raise.
+    """
     again = shlex.join(["collocation-sysid", *sys.argv[1:]])
     errors.print(Text(f"interrupted: {kept}; go on with: {again}"), soft_wrap=True)
     return typer.Exit(EXIT_INTERRUPTED)
 
 
 def show(content: Shown | Iterable[Shown]) -> None:
-    """Print on stdout: on a terminal wrapped between words, elsewhere each line and row whole."""
+    """Print on stdout: wrapped between words on a terminal, elsewhere each line and table row
+    unbroken.
+    """
     console = PlainConsole()
     if console.is_terminal:
         console.print(on_terminal(content), crop=False)

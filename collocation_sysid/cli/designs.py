@@ -1,4 +1,4 @@
-"""The command that designs a motion."""
+"""The command `design`, which finds the motion that makes the error bars smallest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Markdown on a terminal, with code that can be copied."""
+"""Markdown on a terminal, with code blocks that can be copied."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ class UnbrokenCode(CodeBlock):
 
 
 class TerminalPage(Markdown):
-    """Markdown whose text is wrapped to the terminal and whose code is not."""
+    """Markdown document whose text is wrapped to the terminal and whose code is not."""
 
     elements = {**Markdown.elements, "fence": UnbrokenCode, "code_block": UnbrokenCode}  # noqa: RUF012

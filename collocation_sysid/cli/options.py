@@ -1,9 +1,10 @@
-"""Commands made from dataclasses: an option is a field, and stands nowhere else.
+"""Commands made from dataclasses of options; an option is declared once, as a field.
 
-What it is stands under "Attributes" in the docstring, as of the options of a method. In place of
-its type may stand how it is written: names other than the field's, as -v, and what help shows for
-its value, as FILE. Options that several commands share are annotated with both instead. Own options
-are told before those of the bases.
+The help text of an option is in the section "Attributes" of its class, as for the options of a
+method. There, in place of the type, names of the option other than the field's can be given, such
+as
+-v, and the placeholder that help shows for the value, such as FILE. Options that several commands
+share are annotated with both instead. Help lists the options of a class before those of its bases.
 """
 
 from __future__ import annotations
@@ -63,7 +64,15 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 
 
 def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]], Any]:
-    """A function of a dataclass of options becomes a command, with examples below its help."""
+    """Return a decorator that registers a function of a dataclass of options as a command.
+
+    Parameters
+    ----------
+    group : Typer
+        Group of commands, to which the command is added.
+    *shown : str
+        Examples of arguments, shown below the help.
+    """
 
     def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
         (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
@@ -72,7 +81,8 @@ def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]]
         def called(**values: Any) -> None:
             function(_built(kind, values))
 
-        called.__name__, called.__doc__ = function.__name__, function.__doc__
+        called.__name__ = function.__name__
+        called.__doc__ = function.__doc__
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         called.__annotations__ = {each.name: each.annotation for each in parameters}
         lines = "".join(f"\n  collocation-sysid {each}" for each in shown)
@@ -83,8 +93,11 @@ def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]]
 
 
 def _parameters(kind: type) -> Iterator[inspect.Parameter]:
-    """What typer makes options of; a field that is a dataclass of options has several."""
-    said = attributes(kind)
+    """Yield the parameters of a command, from which typer makes its options.
+
+    A field that is itself a dataclass of options yields one parameter for each of its fields.
+    """
+    documented = attributes(kind)
     for name, default, hint, marks in _typed_fields(kind):
         if is_dataclass(hint):
             yield from _parameters(hint)  # type: ignore[arg-type]
@@ -92,7 +105,7 @@ def _parameters(kind: type) -> Iterator[inspect.Parameter]:
         infos = (copy(mark) for mark in marks if isinstance(mark, ParameterInfo))
         info = next(infos, None) or typer.Option()
         if info.help is None:
-            written, info.help = said[name]
+            written, info.help = documented[name]
             info.metavar = next(
                 (w for w in written.split() if w[0].isupper() or w[0].isdigit()), None
             )
@@ -107,7 +120,17 @@ def _parameters(kind: type) -> Iterator[inspect.Parameter]:
 
 
 def _names(field: str, default: Any, written: str) -> list[str]:
-    """How an option is given; what is off by default can only be put on."""
+    """Return the names of an option on the command line.
+
+    Parameters
+    ----------
+    field : str
+        Name of the field.
+    default : object
+        Default value; an option that is on by default gets a name to switch it off.
+    written : str
+        Type of the field in the docstring, which may contain names that begin with "-".
+    """
     option = field.strip("_").replace("_", "-")
     names = [word for word in written.split() if word.startswith("-")]
     if not any(word.startswith("--") for word in names):
@@ -116,12 +139,18 @@ def _names(field: str, default: Any, written: str) -> list[str]:
 
 
 def _built(kind: type[T], values: Mapping[str, Any]) -> T:
-    """The options from their values by name, those of fields that are options themselves too.
+    """Return the options of a command from their values by name.
+
+    Parameters
+    ----------
+    kind : type
+        Dataclass of options; fields that are dataclasses of options are made from the same values.
+    values : mapping of name to value
 
     Raises
     ------
     InputError
-        Naming an option as it is given.
+        Naming the option as it is written on the command line.
     """
     content = {
         name: _built(hint, values) if is_dataclass(hint) else values[name]  # type: ignore[arg-type]
@@ -140,7 +169,10 @@ def _built(kind: type[T], values: Mapping[str, Any]) -> T:
 
 @cache
 def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
-    """Name, default, type and annotations of each field, those of a class before its bases'."""
+    """Return name, default, type and annotations of each field, those of a class before its bases'.
+
+    A type that allows None is replaced by the type without None.
+    """
     hints = get_type_hints(kind, include_extras=True)
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
     order = (name for base in kind.__mro__ for name in inspect.get_annotations(base))
@@ -159,14 +191,19 @@ def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
 
 @dataclass(frozen=True, kw_only=True)
 class OfProblem:
-    """A problem's file, as the command line changes it."""
+    """Options that name a problem file and change its keys."""
 
     problem: ProblemPath
     set_: Overrides = None
     allow_code: AllowCode = False
 
     def read(self, simulation: bool = False) -> Problem:
-        """The problem."""
+        """Read the problem file with the changes of the command line.
+
+        Notes are printed on stderr unless the command is quiet. With `simulation`, measurements may
+        be
+        missing.
+        """
         with errors.status(f"reading {self.problem}"):
             from ..problem import Problem
 
@@ -181,7 +218,7 @@ class OfProblem:
 
 @dataclass(frozen=True, kw_only=True)
 class OfRun:
-    """A run that was made.
+    """Options that name a run folder.
 
     Attributes
     ----------
@@ -194,13 +231,13 @@ class OfRun:
 
 @dataclass(frozen=True, kw_only=True)
 class Told(Options):
-    """How a result and what leads to it are told."""
+    """Options for the form of the result and of the progress."""
 
     as_json: AsJson = False
     quiet: Quiet = False
 
     def tell(self, answer: Any, shown: Shown | Iterable[Shown]) -> None:
-        """Print the answer as JSON, or else what is shown of it."""
+        """Print the result as JSON if requested, or else its tables and lines `shown`."""
         if self.as_json:
             typer.echo(as_json(answer))
         else:

@@ -1,4 +1,4 @@
-"""Commands that take a problem: solve it, simulate it, check it."""
+"""Commands that take a problem: solve, simulate and check."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class Solve(OfProblem, Told):
     strict : bool
         Exit code 1 if the verdict is doubtful.
     budget : bool
-        Show what the variance of each estimate is made of.
+        Show the contributions to the variance of each estimate.
     probe : bool
-        Look harder: refit parts of the data, and with each assumption freed.
+        Deeper check: refit subsets of the data, and relax each assumption.
     pictures : bool
         Draw pictures into the run folder; the command plot draws them later.
     """
@@ -97,8 +97,15 @@ def solve(options: Solve) -> None:
     require_replaceable(folder)
     with ExitStack() as until_shown:
         with Progress(errors, problem, options.verbose, options.quiet) as progress:
-            how = options.method, progress.iteration, progress.say, options.start
-            finished = run(problem, *how, scheduler=options.scheduler, probe=options.probe)
+            finished = run(
+                problem,
+                options.method,
+                progress.iteration,
+                progress.say,
+                options.start,
+                scheduler=options.scheduler,
+                probe=options.probe,
+            )
             until_shown.enter_context(INTERRUPTS.deferred())
             progress.say("writing the run folder")
             finished.save(folder, pictures=False)
@@ -120,7 +127,10 @@ def solve(options: Solve) -> None:
 
 
 def _drawn(finished: Run, folder: Path, options: Solve) -> Result:
-    """Draw the pictures; after an interrupt return the result without their time."""
+    """Draw the pictures of a run, and return its result with the time that they took.
+
+    After an interrupt the result without that time is returned, and a message says how to go on.
+    """
     from ..result.progress import Progress
 
     try:
@@ -177,7 +187,10 @@ def simulate(options: Simulate) -> None:
 
 
 def _draw_instability(error: SimulationError, folder: Path) -> None:
-    """Write a picture of the mode in which the body loses its stability into the folder."""
+    """Write a picture of the mode in which the body loses its stability into the folder.
+
+    `error` has such a mode.
+    """
     from ..result.pictures.instability import instability_picture
     from ..result.style import RESOLUTION_DPI
 
@@ -234,7 +247,10 @@ def check(options: Check) -> None:
 
 
 def _overlay(problem: Problem, folder: Path) -> None:
-    """Draw what depth cameras see, and the body."""
+    """Write a picture of each depth camera's first image with the undeformed body into the folder.
+
+    Nothing is written without depth cameras.
+    """
     if not any(experiment.depths for experiment in problem.experiments):
         return
     from ..result.seen import save_overlays

@@ -1,4 +1,4 @@
-"""Commands about a run that was made."""
+"""Commands that take a run folder: refine, export, plot, report, animate and view."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ class Refine(OfRun, Told):
 
 @command(commands, "refine runs/swing", "refine runs/swing --levels 3")
 def refine(options: Refine) -> None:
-    """Solve again with half the step and a finer mesh: the numerical error.
+    """Solve again with half the step and a finer mesh, to measure the discretisation error.
 
-    Each starts from the run's answer. The folder gets refinement.json, and result.json gets the
-    numerical error of each parameter, with an interval for noise and discretisation. After an
-    interruption the same command goes on where it stopped.
+    Each solve starts from the run's answer. The folder gets refinement.json, and result.json gets
+    the
+    discretisation error of each parameter, with corrected values and combined intervals. After an
+    interruption the same command continues where it stopped.
     """
     from ..result.refined import refine_run
     from ..result.run_sections import refinement_table, verdict_of
@@ -51,8 +52,8 @@ def refine(options: Refine) -> None:
         refinement, result = refine_run(options.run_folder, options.levels, options.allow_code, say)
     except KeyboardInterrupt:
         raise interrupted(f"what was solved is kept in {options.run_folder}") from None
-    told = {**content(refinement), "trust": result.trust}
-    options.tell(told, [refinement_table(result), verdict_of(result.trust)])
+    report = {**content(refinement), "trust": result.trust}
+    options.tell(report, [refinement_table(result), verdict_of(result.trust)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,13 +99,13 @@ def export(options: Export) -> None:
     exported = export_run(body, options.to, folder)
     compared = verify_export(body, options.to, folder) if options.verify else []
     if options.as_json:
-        told = {
+        report = {
             "folder": str(folder),
             "warnings": body.warnings,
             "not_expressed": exported.limits,
             "verified": [{**asdict(each), "relative": each.relative} for each in compared],
         }
-        typer.echo(as_json(told))
+        typer.echo(as_json(report))
         return
     show(f"warning: {each}" for each in body.warnings)
     show(f"not expressed: {each}" for each in exported.limits)
@@ -115,7 +116,7 @@ def export(options: Export) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Plot(OfRun):
-    """Options of `plot`."""
+    """Options of `plot`, all of which are shared."""
 
     out: Out = None
     quiet: Quiet = False
@@ -160,7 +161,8 @@ def report(options: Report) -> None:
     from ..result.report import as_file, comparison_report
     from ..result.run_sections import run_report
 
-    folder, file = options.folder, options.to or options.folder / "report.html"
+    folder = options.folder
+    file = options.to or options.folder / "report.html"
     study = (folder / "summary.json").is_file()
     page = comparison_report(folder) if study else run_report(folder)
     require_possible(file.parent)
@@ -177,7 +179,7 @@ class Animate(OfRun):
     to : FILE
         A .gif, or an .mp4, which needs ffmpeg.
     fps : float
-        Frames a second.
+        Frames per second.
     slow : float
         How many times slower than in reality.
     """
@@ -199,9 +201,15 @@ def animate(options: Animate) -> None:
     require_possible(options.run_folder if options.to is None else options.to.parent)
     bar = Progress(console=errors, transient=True)
     task = bar.add_task("filming", total=1.0)
-    how = options.run_folder, options.to, options.fps, options.slow, options.experiment
     with bar if errors.is_terminal and not options.quiet else nullcontext():
-        file = film(*how, lambda share: bar.update(task, completed=share))
+        file = film(
+            options.run_folder,
+            options.to,
+            fps=options.fps,
+            slow=options.slow,
+            experiment=options.experiment,
+            progress=lambda share: bar.update(task, completed=share),
+        )
     typer.echo(file)
 
 
@@ -224,14 +232,16 @@ class View(OfRun):
 
 @command(commands, "view runs/swing", "view runs/swing --html swing.html")
 def view(options: View) -> None:
-    """Look at a run in 3-D.
+    """Show a run in 3-D.
 
-    In a window, which needs pyvista, or as a web page, which needs nothing.
+    It opens a window, which needs pyvista, or writes a web page, which needs nothing.
     """
     from ..result.view import FIELD, export_page
     from ..result.view import view as opened
 
-    run, html, field = options.run_folder, options.html, options.field
+    run = options.run_folder
+    html = options.html
+    field = options.field
     if html is None:
         opened(run, field or FIELD, options.experiment)
         return

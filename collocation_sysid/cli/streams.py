@@ -1,4 +1,4 @@
-"""Commands that identify while frames arrive."""
+"""Commands that estimate while frames arrive: live and replay."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Estimating(Options):
     allow_code: AllowCode = False
 
     def estimator(self, recording: Path) -> Estimator:
-        """Of the problem of a file, or of a run's folder."""
+        """Return the estimator for a problem file or a run folder, with these options."""
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
         problem = problem_in(recording, self.set_ or (), self.allow_code)
         return Estimator(problem, LiveOptions(budget_s, self.window_s))
@@ -85,9 +85,11 @@ def live(options: Live) -> None:
         errors.print(f"listening on UDP port {port} of this machine")
 
     if options.udp is None:
-        lines, source = as_text(sys.stdin.buffer), "standard input"
+        lines = as_text(sys.stdin.buffer)
+        source = "standard input"
     else:
-        lines, source = datagrams(options.udp, opened), f"UDP port {options.udp}"
+        lines = datagrams(options.udp, opened)
+        source = f"UDP port {options.udp}"
     reader = FrameReader(
         estimator.model.moved_grasps + 1,
         estimator.names,
@@ -146,7 +148,8 @@ def replay(options: Replay) -> None:
     from ..live.sources import as_json as json_line
     from ..live.sources import collected_before, paced, recorded
 
-    rate, film = options.rate, options.film
+    rate = options.rate
+    film = options.film
     if film is not None:
         require_possible(film.parent)
         view.require_film(film)

@@ -1,4 +1,4 @@
-"""Commands that run many problems side by side."""
+"""Commands that run many problems: compare and sweep."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ commands = typer.Typer()
 
 @dataclass(frozen=True, kw_only=True)
 class Many(OfProblem, Told):
-    """Options of commands that do many runs.
+    """Options of commands with many runs.
 
     Attributes
     ----------
@@ -111,15 +111,29 @@ def compare(options: Compare) -> None:
         )
     free = [item.name for item in problem.parameters.free]
     truth = read_truth(options.truth or (), problem.parameters.names, free)
-    yardstick, changes = Yardstick(truth, options.within), (options.set_ or (), options.starts)
-    planned = plan_comparison(problem, methods, *changes, truth, options.allow_code)
+    yardstick = Yardstick(truth, options.within)
+    planned = plan_comparison(
+        problem,
+        methods,
+        options.set_ or (),
+        options.starts,
+        truth,
+        options.allow_code,
+    )
     _study("compare", options, planned, yardstick)
 
 
 def _planned_models(
     options: Compare, problem: Problem, methods: Sequence[str]
 ) -> Sequence[PlannedRun]:
-    """Return the runs that compare models: laws and branches, of a region, or whole files."""
+    """Return the runs that compare models: materials, damping laws, branches, or other problem
+    files.
+
+    Raises
+    ------
+    InputError
+        For more than one method, or a model that the problem cannot have.
+    """
     if len(methods) > 1:
         raise InputError(
             f"found {', '.join(methods)}; expected one method to compare models by, or methods "
@@ -168,7 +182,8 @@ class SweepOptions(Many):
 def sweep(options: SweepOptions) -> None:
     """Solve for every combination of values of some keys."""
     method = parse_methods(options.method, "--method")[0] if options.method else None
-    over, overrides = parse_over(options.over), options.set_ or ()
+    over = parse_over(options.over)
+    overrides = options.set_ or ()
     planned = plan_sweep(options.problem, over, overrides, method, options.allow_code)
     # A missing file would fail every run.
     Problem.read(options.problem, planned[0].overrides, options.allow_code)
@@ -178,7 +193,22 @@ def sweep(options: SweepOptions) -> None:
 def _study(
     kind: str, options: Many, planned: Sequence[PlannedRun], yardstick: Yardstick | None = None
 ) -> None:
-    """Do the runs that are left, write the tables and plots, and print them."""
+    """Execute the runs that are not finished, write tables and plots, and print the tables.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the study, for its folder and title.
+    options : Many
+    planned : sequence of PlannedRun
+    yardstick : Yardstick, optional
+        True parameters and tolerance for the success of a run.
+
+    Raises
+    ------
+    typer.Exit
+        After an interrupt, with a message; finished runs are kept.
+    """
     from ..plan.progress import StudyProgress
     from ..plan.study_page import (
         load_report,
@@ -190,7 +220,8 @@ def _study(
 
     name = run_name(options.problem)
     folder = options.out or Path("runs") / f"{name}-{kind}"
-    store, limits = RunStore(folder / "runs"), options.limits
+    store = RunStore(folder / "runs")
+    limits = options.limits
     finished = [run.key for run in planned if store.finished(run.key, limits.time_limit_s)]
     if options.dry_run:
         if options.as_json:
@@ -200,15 +231,16 @@ def _study(
             show(plan_table(planned, finished))
         return
     require_possible(folder)
-    left, ended = [run for run in planned if run.key not in finished], True
+    remaining = [run for run in planned if run.key not in finished]
+    is_complete = True
     try:
-        with StudyProgress(errors, left, len(planned), options.quiet) as progress:
-            run_all(left, store, limits, progress.done)
+        with StudyProgress(errors, remaining, len(planned), options.quiet) as progress:
+            run_all(remaining, store, limits, progress.done)
     except KeyboardInterrupt:
-        ended = False
+        is_complete = False
     report = load_report(f"{kind.capitalize()}: {name}", kind, planned, store, yardstick)
     if report.records:
         write_report(report, folder)
-    if not ended:
+    if not is_complete:
         raise interrupted(f"{len(report.records)} of {len(planned)} runs are kept in {folder}")
     options.tell(report_json(report), study_tables(report, folder))

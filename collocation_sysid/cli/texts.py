@@ -1,4 +1,4 @@
-"""Commands that tell what there is, and begin a problem."""
+"""Commands that show documentation and contents, and that begin a problem."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KINDS = {"number": "number", "integer": "whole number", "string": "text", "objec
 
 
 class Kind(StrEnum):
-    """What a new problem is of."""
+    """Kinds of a new problem's simulated recording."""
 
     COMPRESSION = "compression"
     TENSION = "tension"
@@ -172,7 +172,8 @@ def new(options: New) -> None:
     """Write a commented problem file to start from."""
     from ..problem.beginning import begin
 
-    folder, kind = Path(options.name), options.kind
+    folder = Path(options.name)
+    kind = options.kind
     file, *data = begin(folder, kind and kind.value)
     typer.echo(file)
     for each in data:
@@ -185,14 +186,14 @@ def new(options: New) -> None:
 
 
 def _methods_table() -> Table:
-    """The methods by name, with a line on each."""
+    """Return the table of the methods, with a line on each."""
     from ..methods import METHODS, summary
 
     return Table("", ("method", ""), tuple((name, summary(name)) for name in METHODS), texts=1)
 
 
 def _options_table(method: str) -> list[Shown]:
-    """A method's options: defaults, what they can be, and what they do."""
+    """Return the description of a method's options: defaults, allowed values and meaning."""
     from ..methods import options_schema, summary
     from ..problem.solver_schema import heading
 
@@ -204,6 +205,7 @@ def _options_table(method: str) -> list[Shown]:
 
 
 def _default(option: Mapping[str, Any]) -> str:
+    """Return the default of an option as text."""
     default = option["default"]
     items = default if isinstance(default, tuple) else [default]
     text = ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in items)
@@ -211,7 +213,7 @@ def _default(option: Mapping[str, Any]) -> str:
 
 
 def _values(option: Mapping[str, Any]) -> str:
-    """What an option can be, from its JSON schema."""
+    """Return the allowed values of an option in words, from its JSON schema."""
     if "enum" in option:
         return ", ".join(option["enum"])
     if option["type"] == "array":

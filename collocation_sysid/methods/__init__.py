@@ -2,7 +2,7 @@
 
 `METHODS` maps every name of a method (key `method` of the table `[solver]`) to its class.
 
-Methods
+Solvers
     `reduced_space` eliminates the motion by the equations of motion and searches only for the
     parameters; `search` is its trust region, `curvature` its second derivatives, `horizon` and
     `trajectory` its linearised problem, and `workers` runs it in threads or on a Dask cluster.
@@ -68,7 +68,8 @@ def options_schema(method: str) -> dict[str, Any]:
         Name of a method, a key of `METHODS`.
     """
     kind = METHODS[method]
-    defaults, descriptions = kind(), documented(kind)
+    defaults = kind()
+    descriptions = documented(kind)
     options = TypeAdapter(kind).json_schema()["properties"]
     for name, option in options.items():
         del option["title"]

@@ -59,7 +59,9 @@ class TimedFunction(ca.Callback):
         errors: list[BaseException],
     ) -> None:
         ca.Callback.__init__(self)
-        self._inputs, self._outputs, self._evaluate = inputs, outputs, evaluate
+        self._inputs = inputs
+        self._outputs = outputs
+        self._evaluate = evaluate
         self._errors = errors
         self.calls = 0
         self.seconds = 0.0
@@ -152,7 +154,8 @@ class NlpFunctions:
     def __init__(
         self, collocation: Collocation, hessian: HessianValues, errors: list[BaseException]
     ) -> None:
-        self.collocation, self.errors = collocation, errors
+        self.collocation = collocation
+        self.errors = errors
         self._upper_values = hessian
         self._functions: list[TimedFunction] = []
         self.nlp = self.function("nlp", "f", "g")
@@ -195,7 +198,8 @@ class NlpFunctions:
 
     def _evaluate(self, inputs: list[Array], wanted: dict[str, Array]) -> None:
         """Write the requested outputs, arrays by name, at the inputs."""
-        collocation, z = self.collocation, inputs[0]
+        collocation = self.collocation
+        z = inputs[0]
         if "f" in wanted:
             wanted["f"][0] = collocation.objective(z)
         if "grad_f" in wanted:
@@ -250,7 +254,8 @@ class NlpFunctions:
     def _inputs(self) -> list[ca.Sparsity]:
         """Sparsity of z, p, w and y."""
         dense = ca.Sparsity.dense
-        variables, rows = self.collocation.variables, self.collocation.constraints
+        variables = self.collocation.variables
+        rows = self.collocation.constraints
         return [dense(variables, 1), ca.Sparsity(0, 1), dense(1, 1), dense(rows, 1)]
 
     @cached_property
@@ -265,7 +270,8 @@ class NlpFunctions:
 
     def _sparsity(self, output: str) -> ca.Sparsity:
         """Return the sparsity of an output, by name."""
-        variables, rows = self.collocation.variables, self.collocation.constraints
+        variables = self.collocation.variables
+        rows = self.collocation.constraints
         if output == "jac_g":
             return ca.Sparsity(rows, variables, *map(_ints, self.collocation.jacobian_structure))
         if output == "triu_hess":
@@ -311,7 +317,9 @@ class Monitor(ca.Callback):
         self, recorder: Recorder, program: Collocation, errors: list[BaseException]
     ) -> None:
         ca.Callback.__init__(self)
-        self.recorder, self.program, self.errors = recorder, program, errors
+        self.recorder = recorder
+        self.program = program
+        self.errors = errors
         self.stop = False
         self.best: tuple[Array, Array] | None = None
         self.seconds = 0.0
@@ -359,8 +367,10 @@ class Monitor(ca.Callback):
         # Objective and constraints are both of order one.
         merit = float(value[0] + np.abs(rows).max(initial=0.0))
         if merit < self._best_merit:
-            self._best_merit, self.best = merit, (z, multipliers)
-        recorder, loss = self.recorder, float(value[0]) / self.program.loss_scale
+            self._best_merit = merit
+            self.best = (z, multipliers)
+        recorder = self.recorder
+        loss = float(value[0]) / self.program.loss_scale
         variables = carried_over(z, self.program, recorder.collocation)
         number = recorder.history[-1].number + 1 if recorder.history else 0
         self.lines += 1

@@ -66,7 +66,8 @@ def hardened(first: Solution, solve: Solve) -> Solution:
         segment.experiment.name: within_reach(segment.experiment, x.reshape(len(x), -1))
         for segment, x in zip(first.collocation.segments, first.positions_m, strict=True)
     }
-    solution, relaxed = first, _relaxed(first.collocation, obstacles_by_experiment, 0.0)
+    solution = first
+    relaxed = _relaxed(first.collocation, obstacles_by_experiment, 0.0)
     for share in RELAXED:
         # Its pressures are those of the solve before, not such as the smaller product asks for.
         z = relaxed.made_explicit().pack(*solution.collocation.unpack(solution.z))
@@ -97,7 +98,8 @@ def within_reach(experiment: Experiment, x: Array) -> list[Obstacle]:
     list of Obstacle
         One per obstacle; unchanged if no face comes within `REACH` edges.
     """
-    obstacles, mesh = [], experiment.body.mesh
+    obstacles = []
+    mesh = experiment.body.mesh
     for contact, obstacle in zip(contacts(experiment), experiment.obstacles, strict=True):
         surface = contact.contact.surface
         faces = mesh.surface[surface.faces]

@@ -92,7 +92,8 @@ class LeftOut:
 
     def at(self, phi: Array) -> tuple[Array, Array]:
         """Return the scaled positions (h,) and their derivatives (h, k) at φ of the experiment."""
-        segment, prescribed = self.segment, self.segment.grasping.at(phi)
+        segment = self.segment
+        prescribed = self.segment.grasping.at(phi)
         time, dof = np.divmod(self.variables - segment.first.x, segment.dofs)
         indices = time, np.searchsorted(prescribed.dofs, dof)
         return prescribed.positions_m[indices] / segment.length_m, prescribed.by_phi[
@@ -142,14 +143,15 @@ class HeldColumns:
         """
         selected_entries = np.flatnonzero(np.isin(columns, wanted))
         selected_rows = np.union1d(rows[selected_entries], further)
-        places = (
-            np.searchsorted(selected_rows, rows[selected_entries]),
-            np.searchsorted(wanted, columns[selected_entries]),
+        return cls(
+            entries[selected_entries],
+            selected_rows,
+            row=np.searchsorted(selected_rows, rows[selected_entries]),
+            column=np.searchsorted(wanted, columns[selected_entries]),
         )
-        return cls(entries[selected_entries], selected_rows, *places)
 
     def times(self, values: Array, slopes: Array) -> Array:
-        """Return the product (r, k) of the columns with slopes (h, k), given all values of
+        """Return the product (r, k) of the columns with slopes (h, k), from all values of
         the matrix.
         """
         shape = (len(self.rows), len(slopes))
@@ -232,7 +234,8 @@ class Condensed(Collocation):
     @cached_property
     def _kept(self) -> tuple[Index, Index]:
         """Indices of the variables and of the constraints that remain."""
-        variables, rows = np.arange(self.whole.variables), np.arange(self.whole.constraints)
+        variables = np.arange(self.whole.variables)
+        rows = np.arange(self.whole.constraints)
         for each in self.left_out:
             variables[each.variables] = rows[each.rows] = -1
         return variables[variables >= 0], rows[rows >= 0]
@@ -311,7 +314,8 @@ class Condensed(Collocation):
         multipliers : (constraints,) array
             Multipliers of the remaining constraints.
         """
-        variables, complete = self.whole_variables(z), np.zeros(self.whole.constraints)
+        variables = self.whole_variables(z)
+        complete = np.zeros(self.whole.constraints)
         complete[self._kept[1]] = multipliers
         slope = (
             loss_weight * self.whole.gradient(variables)
@@ -354,12 +358,16 @@ class Condensed(Collocation):
         rows, columns = _entries(self.whole.jacobian_structure)
         remaining = np.flatnonzero(of_row[rows] >= 0)
         kept = remaining[of_variable[columns[remaining]] >= 0]
-        pairs, through = [(of_row[rows[kept]], of_variable[columns[kept]])], []
+        pairs = [(of_row[rows[kept]], of_variable[columns[kept]])]
+        through = []
         for each in self.left_out:
-            remaining_entries = of_row[rows[remaining]], columns[remaining]
             through.append(
                 HeldColumns.of(
-                    remaining, *remaining_entries, each.variables, np.zeros(0, dtype=int)
+                    remaining,
+                    rows=of_row[rows[remaining]],
+                    columns=columns[remaining],
+                    wanted=each.variables,
+                    further=np.zeros(0, dtype=int),
                 )
             )
             pairs.append((through[-1].rows[:, None], of_variable[each.phi]))
@@ -397,7 +405,8 @@ class Condensed(Collocation):
         rows, columns = _entries(self.whole.hessian_structure)
         are_kept = (number[rows] >= 0) & (number[columns] >= 0)
         kept = np.flatnonzero(are_kept & ~self._only_read_together(rows, columns))
-        pairs, through = [(number[rows[kept]], number[columns[kept]])], []
+        pairs = [(number[rows[kept]], number[columns[kept]])]
+        through = []
         # Of the lower triangle too, whose diagonal is that of the upper one.
         below = np.flatnonzero(rows != columns)
         entries = np.concatenate([np.arange(len(rows)), below])
@@ -406,7 +415,8 @@ class Condensed(Collocation):
         for each in self.left_out:
             own = np.concatenate([each.variables, each.phi])
             through.append(HeldColumns.of(entries, row, column, each.variables, own))
-            i, j = number[through[-1].rows[:, None]], number[each.phi]
+            i = number[through[-1].rows[:, None]]
+            j = number[each.phi]
             pairs.append((np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0]))
         size = self.variables
         return Layout.of((size, size), kept, pairs, through)
@@ -419,7 +429,8 @@ class Condensed(Collocation):
         for segment in self.segments:
             time = np.full(self.whole.variables, -1)
             time[segment.columns] = np.arange(segment.variables) // segment.dofs
-            first, second = time[rows], time[columns]
+            first = time[rows]
+            second = time[columns]
             are_distant = np.abs(first - second) > segment.dynamics.reach
             mask |= (first >= 0) & (second >= 0) & are_distant
         return mask
@@ -455,7 +466,8 @@ class Condensed(Collocation):
         out : array, optional
             Memory for the values; it is overwritten.
         """
-        layout, (number, _) = self._hessian, self._numbers
+        layout = self._hessian
+        number, _ = self._numbers
         values = np.empty(len(layout.structure[1])) if out is None else out
         values[:] = 0
         if multipliers is not None:
@@ -478,9 +490,11 @@ class Condensed(Collocation):
         """Return the complete program's values, with the Gauss–Newton part at the nearest
         whole sample.
         """
-        nearest, p = z.copy(), self.whole.parameters_of(z)
+        nearest = z.copy()
+        p = self.whole.parameters_of(z)
         for segment in self.segments:
-            nuisance, places = segment.nuisance, segment.local.places
+            nuisance = segment.nuisance
+            places = segment.local.places
             clock_places = nuisance.places(TIME)
             sample = segment.experiment.timestep_s / nuisance.scales[clock_places]
             samples = np.round(p[places[clock_places]] / sample)

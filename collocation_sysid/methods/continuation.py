@@ -140,7 +140,8 @@ class _Climb:
     """
 
     def __init__(self, method: Method, recorder: Recorder) -> None:
-        self.method, self.recorder = method, recorder
+        self.method = method
+        self.recorder = recorder
         # Parameters p, and positions as far as they were solved.
         self.known: tuple[Array, list[Array]] | None = None
         self.last: Solution | None = None
@@ -156,7 +157,8 @@ class _Climb:
 
         def follow(line: Iteration) -> None:
             """Record an iteration with its number, time and share in the whole solve."""
-            number, time_s = line.number + before, line.time_s + elapsed_s
+            number = line.number + before
+            time_s = line.time_s + elapsed_s
             recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
 
         solution = self.method(part, follow, start)
@@ -167,17 +169,27 @@ class _Climb:
         """Return the solution of the last part as a solution of the complete problem."""
         assert self.last is not None
         assert self.known is not None
-        last, recorder = self.last, self.recorder
-        z, multipliers = last.z, last.given_multipliers
+        last = self.last
+        recorder = self.recorder
+        z = last.z
+        multipliers = last.given_multipliers
         if last.collocation is not recorder.collocation:
-            z, multipliers = _continued(recorder.collocation, *self.known), None
+            z = _continued(recorder.collocation, *self.known)
+            multipliers = None
         recorder.notes += last.notes
-        counts = self.iterations, self.evaluations
-        return recorder.solution(last.status, last.message, z, multipliers, *counts)
+        return recorder.solution(
+            last.status,
+            last.message,
+            z=z,
+            multipliers=multipliers,
+            iterations=self.iterations,
+            evaluations=self.evaluations,
+        )
 
     def _learn(self, found: Solution, share: float) -> None:
         """Store the solution of a part, and add its counts, times and a note."""
-        self.last, part = found, found.collocation
+        self.last = found
+        part = found.collocation
         self.known = part.unpack(found.z)
         self.iterations += found.iterations
         self.evaluations += found.evaluations

@@ -67,7 +67,8 @@ def with_curvature(fit: LeastSquares, b: Array) -> LeastSquares:
     b : (np, np) array
         B, symmetric.
     """
-    triangle, right = fit.slope[: len(b)], fit.residual[: len(b)]
+    triangle = fit.slope[: len(b)]
+    right = fit.residual[: len(b)]
     if not b.any() or np.abs(np.diag(triangle)).min() < 1e-12 * np.abs(triangle).max():
         return fit
     half = solve_triangular(triangle, b, trans=1)

@@ -123,12 +123,16 @@ class Horizon:
         self.workers = workers or Here(collocation.threads)
         self.read_in(collocation)
         with self.stopwatch.building():
-            options = self._all(None), self._all(factorisation)
-            self.solvers = self.workers.each(Sweep, self.segments, self.rows, *options)
+            stopwatches = self._all(None)
+            factorisations = self._all(factorisation)
+            self.solvers = self.workers.each(
+                Sweep, self.segments, self.rows, stopwatches, factorisations
+            )
 
     def read_in(self, collocation: Collocation) -> None:
         """Use another collocation of the same problem, with measurements associated differently."""
-        self.collocation, self.segments = collocation, self.workers.hold(collocation)
+        self.collocation = collocation
+        self.segments = self.workers.hold(collocation)
 
     def evaluate(self, p: Array, x: Sequence[Any], known: Iterate | None = None) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x.
@@ -190,11 +194,15 @@ class Horizon:
         columns : sequence
             Further arguments, one entry per experiment each.
         """
-        common = self.segments, self._all(self.collocation.huber), self._own(p)
-        trajectories = self.workers.each(run, self.solvers, *common, *columns)
+        thresholds = self._all(self.collocation.huber)
+        trajectories = self.workers.each(
+            run, self.solvers, self.segments, thresholds, self._own(p), *columns
+        )
         reports: list[SweepReport] = self.workers.fetch(self.workers.each(_report, trajectories))
-        nq, places = self.collocation.nq, self.collocation.places
-        fit, crossed = LeastSquares.none(len(p)), np.zeros(len(p))
+        nq = self.collocation.nq
+        places = self.collocation.places
+        fit = LeastSquares.none(len(p))
+        crossed = np.zeros(len(p))
         for report, own in zip(reports, places, strict=True):
             self.stopwatch.add(*report.spent)
             fit = fit.joined(report.fit, own)
@@ -229,9 +237,11 @@ class Horizon:
         tuple of list of Reached and SimulationError or None
             Trajectories, stored by the workers, and the first failure; None if all are complete.
         """
-        known, guesses = x or self._all(None), near.trajectories if near else self._all(None)
-        common = self.solvers, self.segments, self._own(p)
-        results = self.workers.each(reached, *common, known, guesses)
+        known = x or self._all(None)
+        guesses = near.trajectories if near else self._all(None)
+        results = self.workers.each(
+            reached, self.solvers, self.segments, self._own(p), known, guesses
+        )
         failures = []
         for failure, spent in self.workers.fetch(self.workers.each(_end, results)):
             self.stopwatch.add(*spent)

@@ -135,7 +135,8 @@ def adjoint_multipliers(
     variables = carried_over(z, collocation, complete_program)
     constraints = np.zeros(complete_program.constraints)
     constraints[: len(of_motion)] = of_motion
-    gradient, jacobian = complete_program.gradient(variables), complete_program.jacobian(variables)
+    gradient = complete_program.gradient(variables)
+    jacobian = complete_program.jacobian(variables)
     if added := complete_program.added():
         # As many rows as variables: their multipliers follow from those of all other rows.
         slope = gradient + jacobian.T @ constraints
@@ -144,7 +145,8 @@ def adjoint_multipliers(
     if isinstance(program, Condensed):
         constraints = constraints[program.kept_rows]
         variables = carried_over(z, collocation, program)
-        gradient, jacobian = program.gradient(variables), program.jacobian(variables)
+        gradient = program.gradient(variables)
+        jacobian = program.jacobian(variables)
     lower, upper = program.bounds()
     bounded = (lower < upper) & (np.isfinite(lower) | np.isfinite(upper))
     bounds = np.where(bounded, -(gradient + jacobian.T @ constraints), 0.0)

@@ -82,8 +82,10 @@ WARM_PUSH = 1e-9
 WARM_BARRIER = 0.1
 # Time that IPOPT is given at least, in which it begins and ends at once [s].
 SHORTEST_S = 1e-9
-# By how much a step may change the damping, and the share from which on it is as good as none.
-DAMPING_CHANGE, NO_DAMPING = (0.1, 10.0), 1e-2
+# Smallest and largest factor by which one step changes the damping.
+DAMPING_CHANGE = (0.1, 10.0)
+# Share of the initial damping that is considered negligible.
+NO_DAMPING = 1e-2
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,9 @@ class InteriorPoint(Options):
     Attributes
     ----------
     hessian : {"exact", "gauss-newton", "limited-memory"}
-        Second derivatives of the Lagrangian: "exact" uses all of them once parameters change by
-        less than `warm_up`, "gauss-newton" those of the loss with linearised measurements, and
-        "limited-memory" IPOPT's own approximation.
+        Second derivatives of the Lagrangian: all of them once parameters move by less than
+        `warm_up` ("exact"), those of the loss with linearised measurements ("gauss-newton"), or
+        IPOPT's own approximation ("limited-memory").
     initial : {"reduced-space", "simulation"}
         Where IPOPT starts. "reduced-space": near the optimum, after a coarse solution of the same
         program by reduced space, with multipliers of its adjoint. "simulation": from a simulation
@@ -189,8 +191,14 @@ class InteriorPoint(Options):
         recorder.notes.append(initial.note)
         if coarse.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
             recorder.collocation = coarse.collocation
-            end = coarse.status, coarse.status.sentence, coarse.z, coarse.given_multipliers
-            return recorder.solution(*end, 0, coarse.evaluations)
+            return recorder.solution(
+                coarse.status,
+                coarse.status.sentence,
+                z=coarse.z,
+                multipliers=coarse.given_multipliers,
+                iterations=0,
+                evaluations=coarse.evaluations,
+            )
         if not initial.is_usable:
             return self._by_ipopt(recorder, start)
         recorder.collocation = coarse.collocation

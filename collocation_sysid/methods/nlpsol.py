@@ -29,8 +29,10 @@ NAMES = {"ipopt": "IPOPT"}
 
 Settings = Callable[[NlpFunctions], Mapping[str, Any]]
 
-# How long a solver may take to end by itself, and how often that is looked at.
-GRACE_S, LOOK_EVERY_S = 2.0, 0.05
+# Time in which a solver may end by itself after Ctrl-C [s].
+GRACE_S = 2.0
+# Interval at which that is checked [s].
+LOOK_EVERY_S = 0.05
 _COMMON = {
     "print_time": False,
     "error_on_fail": False,
@@ -80,7 +82,8 @@ def solve(
     InputError
         If the solver does not know an option, with the solver's message.
     """
-    collocation, watch = recorder.collocation, recorder.stopwatch
+    collocation = recorder.collocation
+    watch = recorder.stopwatch
     errors: list[BaseException] = []
     earlier_evaluations_s = watch.evaluations
     earlier_linear_algebra_s = watch.linear_algebra
@@ -177,7 +180,8 @@ def _run(
             message = str(error).strip().splitlines()[-1].split(": ", 1)[-1]
             results.append((np.full(len(start), np.nan), np.zeros(0), message, 0))
             return
-        z, multipliers = answer["x"].full().ravel(), answer["lam_g"].full().ravel()
+        z = answer["x"].full().ravel()
+        multipliers = answer["lam_g"].full().ravel()
         count = int(stats.get("iter_count") or 0)
         results.append((z, multipliers, str(stats["return_status"]), count))
 

@@ -30,7 +30,8 @@ class Ended(Exception):
 
     def __init__(self, status: Status, message: str = "") -> None:
         super().__init__(message)
-        self.status, self.message = status, message or status.sentence
+        self.status = status
+        self.message = message or status.sentence
 
 
 class Recorder:
@@ -67,7 +68,9 @@ class Recorder:
         max_time_s: float = np.inf,
     ) -> None:
         self.began = time.perf_counter()
-        self.method, self.collocation, self.watch = method, collocation, watch
+        self.method = method
+        self.collocation = collocation
+        self.watch = watch
         self.max_time_s = max_time_s
         self.history: list[Iteration] = []
         self.notes: list[str] = []

@@ -98,7 +98,8 @@ class ReducedSpace(SearchOptions):
             trajectories = search.x and workers.fetch(workers.each(positions, search.x))
             recorder.notes += workers.notes()
         except Ended as lost:
-            status, message = lost.status, lost.message
+            status = lost.status
+            message = lost.message
             trajectories, _ = marched(collocation, search.p)
         z = completed(collocation, search.p, trajectories)
         rows = [segment.grid_rows for segment in collocation.segments]
@@ -162,7 +163,7 @@ def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) 
             are_markers = noise_key == "sigma_m"
             notes.append(
                 f"the {measurements} are missed by {misfit:.3g} of their standard deviations"
-                f"{size if are_markers else ''}: {noise_key}, the model or the recording is off, or a "
-                "better fit lies elsewhere; another guess may tell"
+                f"{size if are_markers else ''}: {noise_key}, the model or the recording is off, "
+                "or a better fit lies elsewhere; another guess may tell"
             )
     return notes

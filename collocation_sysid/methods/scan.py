@@ -31,20 +31,28 @@ from ..program.segment import Segment
 from .options import SHARES, part_of
 from .start import marched
 
-# Young's moduli that are tried, those beyond where the best is at an end, and the most of these.
-STIFFEST_PA, SOFTEST_PA, STEPS = 1e7, 1e2, 15
+# Largest Young's modulus of the scan [Pa].
+STIFFEST_PA = 1e7
+# Smallest Young's modulus of the scan [Pa].
+SOFTEST_PA = 1e2
+# Number of moduli in the scan, equally spaced on a logarithmic scale.
+STEPS = 15
+# Largest and smallest modulus when the scan continues beyond an end [Pa].
 LIMITS_PA = 1e10, 1.0
-# Of a body that nothing is known of.
+# Typical Young's modulus of a soft body, where nothing is known [Pa].
 SOFT_PA = 1e4
-# What is simulated for a comparison need not be exact.
+# Tolerance of simulations that are only compared.
 LOOSE = NewtonOptions(tolerance=1e-4)
-# The scan ends after this many stiffnesses in a row that fail or fit this much worse than the best.
-LOST, WORSE = 2, 3.0
-# Beyond an end a stiffness is tried as long as the last one fitted better by this share.
+# Number of failures in a row that end the scan.
+LOST = 2
+# Misfit over the best one that counts as a failure.
+WORSE = 3.0
+# The scan continues beyond an end as long as the misfit decreases by this share.
 BETTER = 0.01
-# Other starts that are followed where there are local minima, and by which factor their misfit may
-# be larger than the best: each costs a solve, and the right one was next to the best in all twins.
+# Number of other starts where there are local minima: each costs a solve, and the right one was
+# next to the best in all twins.
 MORE_STARTS = 2
+# Largest misfit of another start over the best one.
 ALIKE = 4.0
 NO_GUESS = "no guess"
 
@@ -319,7 +327,8 @@ def _residuals(part: Part) -> Array:
     else determines them beforehand and the residuals are nearly linear in them; their priors are
     included.
     """
-    residuals, slopes = [], []
+    residuals = []
+    slopes = []
     predictions = part.sensing.still(part.x)
     for reading, (residual, slope) in zip(part.segment.readings, predictions, strict=True):
         rough = reading.roughly(part.x, part.phi)
@@ -330,13 +339,12 @@ def _residuals(part: Part) -> Array:
         is_compared = reading.there(len(part.looked[len(residuals)]))[: len(residual)]
         residuals.append(residual[is_compared])
         slopes.append(slope[is_compared] * reading.has_offsets)
-    residual, slope = np.concatenate(residuals), np.concatenate(slopes)
+    residual = np.concatenate(residuals)
+    slope = np.concatenate(slopes)
     offset_slopes = slope[:, slope.any(axis=0)]
     priors = np.eye(offset_slopes.shape[1])
-    residual, offset_slopes = (
-        np.append(residual, np.zeros(len(priors))),
-        np.concatenate([offset_slopes, priors]),
-    )
+    residual = np.append(residual, np.zeros(len(priors)))
+    offset_slopes = np.concatenate([offset_slopes, priors])
     return (
         residual - offset_slopes @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
         if offset_slopes.size
@@ -348,7 +356,8 @@ def _samples(segment: Segment) -> int:
     """Return the number of first samples that are compared, with at least one of each
     measurement.
     """
-    t_s, seen = segment.experiment.t_s, [segment.experiment.markers.first_seen]
+    t_s = segment.experiment.t_s
+    seen = [segment.experiment.markers.first_seen]
     for reading in segment.readings[1:]:
         seen.append(int(np.searchsorted(t_s, reading.begins_s)) + reading.channel.late)
     return min(len(t_s), max(part_of(len(t_s), SHARES[0]), max(seen) + 1))
@@ -371,7 +380,9 @@ class _Trial:
 
     def __init__(self, collocation: Collocation) -> None:
         self.collocation = collocation
-        self.samples, self.rows, self.whole = [], [], []
+        self.samples = []
+        self.rows = []
+        self.whole = []
         for segment in collocation.segments:
             self.samples.append(_samples(segment))
             self.rows.append((self.samples[-1] - 1) * segment.substeps + 1)
@@ -488,14 +499,16 @@ class _Tried:
         factor : float
             Ratio of successive moduli.
         """
-        best, beyond = self.misfits[young_pa], young_pa * factor
+        best = self.misfits[young_pa]
+        beyond = young_pa * factor
         while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
             if self.trial.key(beyond) == self.trial.key(beyond / factor):
                 return
             misfit = self._try(beyond)
             if not misfit < (1 - BETTER) * best:
                 return
-            best, beyond = misfit, beyond * factor
+            best = misfit
+            beyond = beyond * factor
 
     def at_end(self, softest: bool) -> bool:
         """Return whether the best modulus is the softest (or else the stiffest) that was tried.

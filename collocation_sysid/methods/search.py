@@ -27,32 +27,42 @@ if TYPE_CHECKING:
     from ..program.collocation import Collocation
     from .workers import Workers
 
-# A trial's infeasibility may be this share of its step's length, or this share of an edge of
-# the mesh: the strain it causes is then small enough for Newton's next step to remove it.
-CONTRACTION, SMALL_STRAIN = 0.5, 0.1
-# Share of the predicted decrease a trial must reach.
+# Largest infeasibility of a trial over the length of its step.
+CONTRACTION = 0.5
+# Largest infeasibility of a trial over an edge of the mesh: the strain that it causes is then
+# small enough for Newton's next step to remove it. One of both limits is sufficient.
+SMALL_STRAIN = 0.1
+# Smallest share of the predicted decrease that a trial must reach.
 DECREASE = 1e-3
-# Shorter than this over the body's size, feasibility is at rounding; shorter than the second,
-# it is where steps no longer change the parameters and it does not decrease any more.
-FEASIBLE, NEARLY_FEASIBLE = 1e-12, 1e-8
-# Longer than this over the body's size, it is refined before steps are judged too harshly.
+# Infeasibility over the body's size that is due to rounding.
+FEASIBLE = 1e-12
+# Infeasibility over the body's size at which a search ends if steps no longer change the
+# parameters and the infeasibility no longer decreases.
+NEARLY_FEASIBLE = 1e-8
+# Infeasibility over the body's size above which a point is made feasible after a first rejection.
 INFEASIBLE = 1e-6
-# A rejected step is tried again at this share of its length, down to the shortest.
-SHRINK, SMALLEST_TRUST = 0.25, 1e-10
-# The last step is taken without another sweep when its error, judged by the rate at which steps
-# shrink, is this share of the tolerance, and no equation is violated by more than this in the
-# scaling of the NLP.
-SAFETY, FEASIBLE_FORCE = 0.3, 1e-10
-# The trust region is never wider, nor where there are depth cameras.
-WIDEST, SEEING = 4.0, 0.25
-# With these, shorter steps that make nothing better are the last.
+# Length of the next trial over that of a rejected step.
+SHRINK = 0.25
+# Shortest step: shorter ones end the search as stalled.
+SMALLEST_TRUST = 1e-10
+# The last step is accepted without another sweep if its error, estimated from the rate at which
+# steps become shorter, is below this share of the tolerance.
+SAFETY = 0.3
+# Largest residual of the equations of motion after that step, in the scaling of the NLP.
+FEASIBLE_FORCE = 1e-10
+# Largest trust region.
+WIDEST = 4.0
+# Largest trust region with depth cameras, whose associations are valid only nearby.
+SEEING = 0.25
+# With depth cameras, a rejected step shorter than this ends the search.
 SEEN = 1e-3
-# A step may lose so few of the points that were seen, and points may be so much farther off by what
-# looking anew changes.
-STILL_SEEN, AS_NEAR = 0.97, 1.01
-# Steps shorter than this tell about the curvature at the answer.
+# Smallest share of the associated depth points that a step must keep.
+STILL_SEEN = 0.97
+# Largest increase of the mean loss of a depth point by a new association.
+AS_NEAR = 1.01
+# Largest step from which the curvature at the solution is learned.
 LOCAL = 0.1
-# Estimates of places may change the elements they are read in so often.
+# Largest number of new associations of the measurements.
 REREADINGS = 40
 
 
@@ -79,10 +89,10 @@ class SearchOptions(Options):
         horizons but the last. A short horizon does not determine all parameters, and without this
         prior they would move to their bounds.
     hessian : {"gauss-newton", "exact"}
-        Second derivatives of the loss. Both are Gauss–Newton until a step moves no parameter by
-        more than 10 %. Then "gauss-newton" approximates what Gauss–Newton neglects from the steps,
-        and "exact" computes it from the Lagrangian, which takes a second sweep per iteration and
-        helps with large residuals.
+        Once a step moves no parameter by more than 10 %, "gauss-newton" approximates what
+        Gauss–Newton neglects from the steps, and "exact" computes it from the Lagrangian, which
+        takes a second sweep per iteration and helps with large residuals. Before, both are
+        Gauss–Newton.
     factorisation : {"auto", "band", "sparse", "supernodal"}
         Banded Cholesky, SuperLU, supernodal Cholesky (extra `large`), or whichever is estimated to
         cost least.
@@ -144,7 +154,8 @@ class ReducedSearch:
         start: Array | None,
         workers: Workers | None = None,
     ) -> None:
-        self.options, self.recorder = options, recorder
+        self.options = options
+        self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
         # Points that depth cameras see belong to what is near: they tell of no long step.
@@ -153,7 +164,9 @@ class ReducedSearch:
         self.trust = min(options.trust, self.widest)
         self.indefinite = 0
         self.lower, self.upper = collocation.bounds_p
-        self.rereadings, self.most_seen, self.placed = 0, 0, True
+        self.rereadings = 0
+        self.most_seen = 0
+        self.placed = True
         self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
         # Kept by the workers, see `trajectory.positions`.
@@ -221,7 +234,8 @@ class ReducedSearch:
         is the last.
         """
         prior = None if last else self.options.rung_prior
-        watch, choice = self.recorder.stopwatch, self.options.factorisation
+        watch = self.recorder.stopwatch
+        choice = self.options.factorisation
         return Horizon(self.collocation, rows, prior, watch, choice, self.workers)
 
     def _reach(self, rung: Horizon) -> None:
@@ -245,7 +259,8 @@ class ReducedSearch:
                 restarted, restart_failure = rung.extend(self.p)
                 self.sweeps += 1
                 if sum(rung.lengths(restarted)) > sum(rung.lengths(reached)):
-                    reached, failure = restarted, restart_failure
+                    reached = restarted
+                    failure = restart_failure
             if failure is None:
                 self.x = reached
                 self._place(rung, first=previous is None)
@@ -277,7 +292,8 @@ class ReducedSearch:
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.widest)
         point = self._accepted(rung, rung.evaluate(self.p, self.x, self.point))
-        rejections, curvature = 0, np.zeros((len(point.p), len(point.p)))
+        rejections = 0
+        curvature = np.zeros((len(point.p), len(point.p)))
         previous = np.inf
         while True:
             step = self._step(point, curvature)
@@ -306,7 +322,9 @@ class ReducedSearch:
             if trial is not None and is_better and self._is_seen_better(rung, point, trial):
                 if last and length <= LOCAL:
                     curvature = self._curvature(curvature, point, trial)
-                point, rejections, previous = self._accepted(rung, trial), 0, length
+                point = self._accepted(rung, trial)
+                rejections = 0
+                previous = length
                 continue
             if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
@@ -336,7 +354,8 @@ class ReducedSearch:
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
-        low, high = np.minimum(low, 0.0) - 1e-15, np.maximum(high, 0.0) + 1e-15
+        low = np.minimum(low, 0.0) - 1e-15
+        high = np.maximum(high, 0.0) + 1e-15
         return with_curvature(point.fit, curvature).best(low, high)
 
     def _try(self, rung: Horizon, point: Iterate, step: Array) -> Iterate | None:
@@ -464,10 +483,8 @@ class ReducedSearch:
         self.rereadings -= self.collocation is not before
         self.looked = trial, self.collocation, after
         measurements = self.collocation.measurements
-        each, before_each = (
-            after.loss / max(1, measurements),
-            point.loss / max(1, before.measurements),
-        )
+        each = after.loss / max(1, measurements)
+        before_each = point.loss / max(1, before.measurements)
         self._read_in(rung, before, point.p)
         return measurements >= STILL_SEEN * self.most_seen and each <= AS_NEAR * before_each
 
@@ -481,7 +498,8 @@ class ReducedSearch:
 
     def _record(self, p: Array, x: list[Any], loss: float, seen: list[Seen]) -> None:
         """Store parameters and trajectories as the best so far, and add them to the history."""
-        self.p, self.x = p, x
+        self.p = p
+        self.x = x
         squares_m2 = sum(each.squares_m2 for each in seen)
         rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in seen))))
         violation_n = max(each.violation_n for each in seen)

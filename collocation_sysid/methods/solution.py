@@ -293,7 +293,8 @@ class Solution:
         found: dict[str, float] = {}
         known: list[str] = []
         for part in self.parts:
-            nuisance, readings = part.segment.nuisance, part.segment.experiment.readings
+            nuisance = part.segment.nuisance
+            readings = part.segment.experiment.readings
             values = (part.phi * nuisance.scales).tolist()
             for entry, full, value in zip(nuisance.entries, nuisance.names, values, strict=True):
                 known.append(full)
@@ -448,12 +449,14 @@ def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
 
     All experiments have equal weight. None means that no experiment measured the component.
     """
-    squares, counts = np.zeros(2), np.zeros(2)
+    squares = np.zeros(2)
+    counts = np.zeros(2)
     for segment in solution.collocation.segments:
         components = solution.wrench_rms.get(segment.experiment.name, (None, None))
         for k, value in enumerate(components):
             if value is not None:
-                squares[k], counts[k] = squares[k] + value**2, counts[k] + 1
+                squares[k] = squares[k] + value**2
+                counts[k] = counts[k] + 1
     force, torque = (
         float(np.sqrt(square / count)) if count else None
         for square, count in zip(squares, counts, strict=True)
@@ -538,5 +541,6 @@ def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
     """
     slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
     for part in collocation.parts(slope):
-        segment, grasped = part.segment, part.segment.grasp_rows
+        segment = part.segment
+        grasped = part.segment.grasp_rows
         multipliers[segment.rows][grasped] = -segment.of_rows(part.x)[grasped] / segment.length_m

@@ -31,9 +31,11 @@ def placed_at_guess(collocation: Collocation) -> Collocation:
     """
     if not any(segment.rows_to_place for segment in collocation.segments):
         return collocation
-    p, positions = collocation.guess_p, []
+    p = collocation.guess_p
+    positions = []
     for segment in collocation.segments:
-        experiment, theta = segment.experiment, segment.constants.theta(p[: segment.nq])
+        experiment = segment.experiment
+        theta = segment.constants.theta(p[: segment.nq])
         try:
             first = Forces.of(experiment, experiment.t_s[:1], theta)
             x, _ = start_state(experiment, first, Solver(experiment))
@@ -51,7 +53,8 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
     start.
     """
     p = collocation.guess_p
-    positions, notes = [], []
+    positions = []
+    notes = []
     for segment in collocation.segments:
         theta = segment.constants.theta(p[: segment.nq])
         try:
@@ -186,7 +189,8 @@ def carried_rigidly(segment: Segment, theta: Array) -> Array:
     Grasped nodes have their prescribed positions. The initial shape is the initial equilibrium at
     constants `theta` (k,) or, if that fails, the undeformed shape.
     """
-    experiment, t_s = segment.experiment, segment.dynamics.t_s
+    experiment = segment.experiment
+    t_s = segment.dynamics.t_s
     try:
         first = Forces.of(experiment, t_s[:1], theta)
         x0, _ = start_state(experiment, first, Solver(experiment))

@@ -231,7 +231,8 @@ def tried(
         If a time step is singular or not finite.
     """
     part = _part(segment, p, moved(segment, before, step))
-    dynamics, x = part.setting.dynamics, part.x
+    dynamics = part.setting.dynamics
+    x = part.x
     if dynamics.static:
         equilibria, failure = march_on(
             segment.experiment,

@@ -205,7 +205,8 @@ class OnCluster:
             return self._submit(home, _itself, given)
 
         def whole(given: Segment) -> Any:
-            sent, chart = once(given.experiment, experiment), _bare(given.chart)
+            sent = once(given.experiment, experiment)
+            chart = _bare(given.chart)
             rest = {
                 n: v for n, v in given.__getstate__().items() if n not in ("experiment", "chart")
             }
@@ -237,7 +238,8 @@ def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
     """
     _require_some(threads)
     slots = [(address, k) for address, count in threads.items() for k in range(count)]
-    loads, homes = dict.fromkeys(slots, 0), [""] * len(costs)
+    loads = dict.fromkeys(slots, 0)
+    homes = [""] * len(costs)
     for number in sorted(range(len(costs)), key=lambda k: -costs[k]):
         slot = min(loads, key=lambda slot: (loads[slot], slot[1]))
         loads[slot] += costs[number]
@@ -262,7 +264,8 @@ def _require_package(client: Any) -> set[str]:
     for address, worker_version in versions.items():
         if worker_version != own_version:
             raise _refusal(
-                f"found {worker_version!r} on the worker {address}; expected collocation-sysid {own_version}"
+                f"found {worker_version!r} on the worker {address}; expected collocation-sysid "
+                f"{own_version}"
             )
     return set(versions)
 

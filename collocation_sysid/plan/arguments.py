@@ -1,4 +1,4 @@
-"""What the command line of a study says: methods, the truth, and the values to sweep over."""
+"""Command-line arguments of studies: methods, true values, and the values of swept keys."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 
 def each_once(text: str) -> tuple[str, ...]:
-    """What stands between commas, in its order."""
+    """Return the items of text separated by commas, each once, in their order."""
     return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
 
 
 def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
-    """Names of methods separated by commas, in their order, each once.
+    """Return names of methods from text separated by commas, each once.
 
     Raises
     ------
     InputError
-        For an unknown name, with the one that was probably meant.
+        For an unknown name, with the most similar known one.
     """
     names = each_once(text)
     if not names:
@@ -46,20 +46,22 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
 def read_truth(
     sources: Sequence[str], known: Sequence[str], needed: Sequence[str]
 ) -> dict[str, float]:
-    """True values of the parameters, by name.
+    """Return the true values of parameters, by name.
 
     Parameters
     ----------
     sources : sequence of str
-        TOML files, or "name=value" separated by commas; later ones win.
-    known, needed : sequences of str
-        All parameters of the problem, and those that are estimated.
+        TOML files, or "name=value" separated by commas; later ones override earlier ones.
+    known : sequence of str
+        Names of all parameters of the problem.
+    needed : sequence of str
+        Names of those that are estimated.
 
     Raises
     ------
     InputError
-        For a file that cannot be read, a name the problem has not, a value that is no positive
-        number, and when a needed one is missing.
+        For a file that cannot be read, an unknown name, a value that is no positive number, or a
+        missing value of an estimated parameter.
     """
     truth: dict[str, float] = {}
     for item in sources:
@@ -77,6 +79,7 @@ def read_truth(
 
 
 def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
+    """Return the file, None for text, and its values by name."""
     if "=" in item:
         pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
@@ -100,6 +103,7 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
 
 
 def _positive(name: str, value: Any, source: Path | None) -> float:
+    """Return a value as a positive number; raise `InputError` otherwise."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -114,16 +118,17 @@ def _positive(name: str, value: Any, source: Path | None) -> float:
 
 
 def parse_over(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Values of each swept key, as `--set` takes them.
+    """Return the values of each swept key, as text for `--set`.
 
     Parameters
     ----------
-    texts : sequence of "key=a,b,c" or "key=first:last:count" or "key=first:last:log:count"
+    texts : sequence of str
+        "key=a,b,c", "key=first:last:count" or "key=first:last:log:count".
 
     Raises
     ------
     InputError
-        Quoting the text that cannot be read.
+        Quotes the text that cannot be read.
     """
     over: dict[str, tuple[str, ...]] = {}
     for text in texts:
@@ -146,12 +151,16 @@ def parse_over(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def require_few(count: int, option: str, what: str) -> None:
-    """Refuse a study of more runs than anyone means.
+    """Raise `InputError` if a study has more than `MOST_RUNS` runs.
 
-    Raises
-    ------
-    InputError
-        Naming the option and both numbers.
+    Parameters
+    ----------
+    count : int
+        Number of runs.
+    option : str
+        Command-line option that the message refers to.
+    what : str
+        What is counted, for the message.
     """
     if count > MOST_RUNS:
         number = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
@@ -159,9 +168,11 @@ def require_few(count: int, option: str, what: str) -> None:
 
 
 def _range(key: str, text: str) -> Iterable[str]:
+    """Return the values of a range "first:last:count" or "first:last:log:count" as text."""
     first, *middle, count = text.split(":")
     try:
-        low, high = float(first), float(middle[0])
+        low = float(first)
+        high = float(middle[0])
         number = int(count)
         spacing = middle[1] if len(middle) == 2 else "linear"
         if len(middle) > 2 or number < 1 or not np.isfinite([low, high, high - low]).all():
@@ -189,8 +200,10 @@ def _range(key: str, text: str) -> Iterable[str]:
 
 
 def _items(text: str) -> list[str]:
-    """Split at the commas that are outside brackets, braces and quotes."""
-    items, depth, quote = [""], 0, ""
+    """Split text at the commas that are outside brackets, braces and quotes."""
+    items = [""]
+    depth = 0
+    quote = ""
     for letter in text:
         if quote:
             quote = "" if letter == quote else quote

@@ -1,21 +1,21 @@
-"""Which model to use: what each predicts of recordings it has not seen, and Akaike's criterion.
+"""Choice of a model: prediction of held-out recordings, and Akaike's criterion.
 
-Prediction counts. Models miss the same samples, with the same noise, so their misses are compared
-block by block in time; how much the difference scatters between blocks, and the logarithm of the
-ratio between recordings, tells how sure it is (Diebold & Mariano 1995, with means of batches). The
-model with the fewest parameters that predicts as well as the best, within one standard error, is
-taken.
+The prediction decides. All models are compared at the same samples, with the same noise, so their
+squared errors are compared block by block in time; the standard error follows from the scatter of
+the difference between blocks, and of the logarithmic ratio between recordings (Diebold & Mariano
+1995, with means of batches). Of the models that predict as well as the best, within one standard
+error, the one with the fewest parameters is chosen.
 
-Of a single recording the last third is held out: its samples are taken away, and the simulation
-with what the rest tells goes on into it. Otherwise each recording is left out in turn, and
-simulated with what the others tell, its own nuisance parameters fitted. What is compared are the
-markers, and the forces where there are none.
+Of a single recording the last third is held out: its samples are removed, and the simulation with
+the estimates from the rest continues into it. Otherwise each recording is left out in turn and
+simulated with the estimates from the others, with its own nuisance parameters fitted. Markers are
+compared, or forces if there are no markers.
 
-Akaike's criterion is −2 ln L + 2k. Of n independent normal errors of unknown variance −2 ln L is
-n ln(RSS/n), up to what all models of the same data share. Residuals of a model that misses
-something are not independent: ten samples that err alike are worth one. n is then the number of
-independent ones that are worth as much: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along time, and
-channels by (tr Σ)²/tr Σ² across, with the ρ and Σ of `autocorrelation`.
+Akaike's criterion is −2 ln L + 2k. For n independent normal errors of unknown variance −2 ln L is n
+ln(RSS/n), up to a constant that all models of the same data share. Residuals of an imperfect model
+are not independent: ten samples with the same error count as one. n is therefore the equivalent
+number of independent samples: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along time, and observables by
+(tr Σ)²/tr Σ² across, with the ρ and Σ of `autocorrelation`.
 """
 
 from __future__ import annotations
@@ -52,16 +52,33 @@ from .process import Record
 from .study import PlannedRun, recordings
 from .table import Row
 
-# Predictions nearer than this, as a logarithm, are alike whatever the scatter.
+# Predictions closer than this, as a logarithm, are considered equal.
 ALIKE = 0.01
-# ΔAIC beyond which a model has hardly any support, and below which it has as much (Burnham &
-# Anderson 2002, section 2.6); and standard errors of a prediction.
-NO_SUPPORT, SUPPORT = 10.0, 2.0
-SURE, LIKELY = 2.0, 1.0
+# ΔAIC beyond which a model has hardly any support (Burnham & Anderson 2002, section 2.6).
+NO_SUPPORT = 10.0
+# ΔAIC below which it has substantial support.
+SUPPORT = 2.0
+# Standard errors by which predictions differ for certain.
+SURE = 2.0
+# Standard errors by which predictions probably differ.
+LIKELY = 1.0
 
 
 def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> list[Row]:
-    """One row for each model, in their order; None where there is no number."""
+    """Return one row for each model, in their order.
+
+    Parameters
+    ----------
+    planned : sequence of PlannedRun
+        Runs of a comparison of models.
+    records : mapping of str to Record
+        Finished runs by key.
+
+    Returns
+    -------
+    list of Row
+        Values are None if they are not known.
+    """
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
         fit = (records.get(run.key) or {}).get("model") or {}
@@ -76,30 +93,32 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
 
 
 def _row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Of a model's fits, to all recordings and to all but each."""
-    whole = fits.get("", {})
+    """Return the row of a model from its fits by held-out recording; "" is the fit to all."""
+    complete_fit = fits.get("", {})
     predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
-    evidence, free = whole.get("evidence"), whole.get("free")
+    evidence = complete_fit.get("evidence")
+    free = complete_fit.get("free")
     unit = next((each["unit"] for each in predictions.values() if each), "m")
     return {
         "model": label,
-        "status": whole.get("status", "missing"),
-        "converged": bool(whole.get("converged")),
+        "status": complete_fit.get("status", "missing"),
+        "converged": bool(complete_fit.get("converged")),
         "free": None if free is None else len(free),
         "unit": unit,
-        "rms": (whole.get("rms") or {}).get(unit),
+        "rms": (complete_fit.get("rms") or {}).get(unit),
         "held_out_rms": _pooled([*predictions.values()]),
         "predictions": {name: each.get("rms") for name, each in predictions.items()},
         "blocks": {name: each.get("blocks") for name, each in predictions.items()},
         "failures": {n: fits[n]["failure"] for n in predictions if fits[n].get("failure")},
         "evidence": evidence,
-        "parameters": whole.get("parameters") or {},
-        "budget": whole.get("budget") or {},
+        "parameters": complete_fit.get("parameters") or {},
+        "budget": complete_fit.get("budget") or {},
         "total_s": sum(each.get("time_s") or 0.0 for each in fits.values()),
     }
 
 
 def _pooled(predictions: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the RMS over all predictions; None if one is missing or their units differ."""
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
     if len({each["unit"] for each in predictions}) > 1:
@@ -109,7 +128,9 @@ def _pooled(predictions: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def _add_criterion(rows: Sequence[Row]) -> None:
-    """ΔAIC, with as many independent measurements as the best fit's errors are worth."""
+    """Add ΔAIC to the rows, in place, with the equivalent number of measurements of the
+    best fit.
+    """
     known = [row for row in rows if row["converged"] and row["evidence"]]
     evidences = [Evidence(**row["evidence"]) for row in known]
     best = min(evidences, key=lambda e: e.misfit, default=None)
@@ -122,7 +143,9 @@ def _add_criterion(rows: Sequence[Row]) -> None:
 
 
 def _add_ratios(rows: Sequence[Row]) -> None:
-    """The logarithm of how many times worse than the best each predicts, and its standard error."""
+    """Add to each row, in place, the logarithmic ratio of its RMS to the best one, with its
+    standard error.
+    """
     best = _best_prediction(rows)
     for row in rows:
         row["log_ratio"] = row["log_ratio_error"] = None
@@ -135,25 +158,32 @@ def _add_ratios(rows: Sequence[Row]) -> None:
 
 
 def _error(row: Row, best: Row, logs: Sequence[float]) -> float:
-    """Standard error of the logarithm, from blocks in time or from recordings if that is more."""
+    """Return the standard error of the logarithmic ratio.
+
+    It is the larger of those from blocks in time and from recordings.
+    """
     if row is best:
         return 0.0
     pairs = [(row["blocks"][name], best["blocks"][name]) for name in best["blocks"]]
-    missed, least = (np.concatenate(each) for each in zip(*pairs, strict=True))
-    change = missed - least
+    squares, best_squares = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    change = squares - best_squares
     # d ln √(a/b) = (a − b) / (a + b) to first order
     of_sum = float(np.std(change, ddof=1)) * sqrt(len(change))
     between = float(np.std(logs, ddof=1)) / sqrt(len(logs)) if len(logs) > 1 else 0.0
-    return max(between, of_sum / float(np.sum(missed + least)))
+    return max(between, of_sum / float(np.sum(squares + best_squares)))
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
+    """Return the converged model with the smallest prediction error; None if there is none."""
     predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
     return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
 
 def chosen_row(rows: Sequence[Row]) -> Row | None:
-    """The model to use; None if none could be fitted."""
+    """Return the model to use; None if none could be fitted.
+
+    Without predictions it is the one with the least AIC.
+    """
     best = _best_prediction(rows)
     if best is None:
         fitted = [row for row in rows if row["delta_aic"] is not None]
@@ -163,7 +193,7 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
 
 
 def _as_good(rows: Sequence[Row], errors: float) -> list[Row]:
-    """Models that predict as well as the best, within so many standard errors."""
+    """Return the models that predict as well as the best, within so many standard errors."""
     return [
         row
         for row in rows
@@ -174,7 +204,13 @@ def _as_good(rows: Sequence[Row], errors: float) -> list[Row]:
 
 
 def advice(rows: Sequence[Row]) -> str:
-    """Which model to use, why, and how sure that is, in a sentence or two."""
+    """Return in words which model to use, why, and how certain that is.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, which contain "chosen".
+    """
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None:
         return "No model could be fitted."
@@ -189,16 +225,16 @@ def advice(rows: Sequence[Row]) -> str:
             f"ahead of {rival['model']}."
         )
     predicted = [row for row in others if row["log_ratio"] is not None]
-    lost = [_lost(row, chosen) for row in others if row["log_ratio"] is None]
+    failures = [_lost(row, chosen) for row in others if row["log_ratio"] is None]
     if not predicted:
-        return " ".join([f"{use}: no other predicts what is held out.", *lost])
+        return " ".join([f"{use}: no other predicts what is held out.", *failures])
     rival = min(predicted, key=lambda row: row["log_ratio"])
-    said = [f"{use}: {_compared(chosen, rival)}.", _sureness(chosen, rival), *lost]
-    return " ".join([*said, *(each.sentence for each in law_disagreements(rows))])
+    sentences = [f"{use}: {_compared(chosen, rival)}.", _sureness(chosen, rival), *failures]
+    return " ".join([*sentences, *(each.sentence for each in law_disagreements(rows))])
 
 
 def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
-    """The numbers that the models which predict as well as the best disagree about."""
+    """Return the estimates in which the models that predict as well as the best disagree."""
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None or chosen["log_ratio"] is None:
         return []
@@ -206,19 +242,20 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
 
 
 def _lost(row: Row, chosen: Row) -> str:
-    """On a model that what is held out cannot be predicted with."""
+    """Return a sentence on a model with which the held-out samples cannot be predicted."""
     without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
-    said = f"{row['model']} does not predict {without}"
+    sentence = f"{row['model']} does not predict {without}"
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
-        return f"{said}."
+        return f"{sentence}."
     return (
-        f"{said}, but fits all of them better (AIC puts it {more:.3g} ahead): only there was seen "
-        "what its parameters need, and more such recordings would decide."
+        f"{sentence}, but fits all of them better (AIC puts it {more:.3g} ahead): only there was "
+        "seen what its parameters need, and more such recordings would decide."
     )
 
 
 def _compared(chosen: Row, rival: Row) -> str:
-    missed = f"it predicts what is held out to {_size(chosen)}"
+    """Return the comparison of the chosen model with its closest rival, in words."""
+    prediction = f"it predicts what is held out to {_size(chosen)}"
     ratio, error = _between(chosen, rival)
     more = chosen["free"] - rival["free"]
     count = f"{abs(more)} parameter{'s' * (abs(more) > 1)}"
@@ -226,30 +263,33 @@ def _compared(chosen: Row, rival: Row) -> str:
     support = rival["delta_aic"] - chosen["delta_aic"]
     better, worse = (chosen, rival) if support > 0 else (rival, chosen)
     return (
-        f"{missed}{size}, {rival['model']} to {_size(rival)}, {exp(ratio):.3g} times as far off "
-        f"(±{100 * error:.2g} %). AIC puts {better['model']} {abs(support):.3g} ahead of "
+        f"{prediction}{size}, {rival['model']} to {_size(rival)}, {exp(ratio):.3g} times as far "
+        f"off (±{100 * error:.2g} %). AIC puts {better['model']} {abs(support):.3g} ahead of "
         f"{worse['model']}"
     )
 
 
 def _size(row: Row) -> str:
-    """What a model misses of what is held out."""
+    """Return the prediction error of a model as text with its unit."""
     factor, unit = shown_in(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
 
 
 def shown_in(unit: str) -> tuple[float, str]:
-    """The factor and the unit that people see metres or newtons in."""
+    """Return factor and unit for display: metres as millimetres, other units unchanged."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def _between(chosen: Row, rival: Row) -> tuple[float, float]:
-    """The logarithm of how many times worse the rival predicts, and its standard error."""
+    """Return the logarithmic ratio of the rival's error to the chosen model's, and its
+    standard error.
+    """
     ratio = rival["log_ratio"] - chosen["log_ratio"]
     return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
 
 
 def _sureness(chosen: Row, rival: Row) -> str:
+    """Return a sentence on how certain the choice is."""
     ratio, error = _between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
     if ratio > SURE * error and support > NO_SUPPORT:
@@ -268,17 +308,17 @@ def _sureness(chosen: Row, rival: Row) -> str:
 
 
 def model_notes(rows: Sequence[Row]) -> list[str]:
-    """How to read the table, and what failed."""
+    """Return notes that explain the table and list failures."""
     names = rows[0]["predictions"]
     kept = "each recording in turn" if len(names) > 1 else "the last third of the recording"
     counted = rows[0]["independent"]
     evidence = next((row["evidence"] for row in rows if row["evidence"]), None)
-    worth = ""
+    equivalent = ""
     if counted is not None and evidence is not None:
-        worth = f" The {evidence['measurements']} measurements tell as much as {counted:.0f} "
-        worth += "independent ones would."
+        equivalent = f" The {evidence['measurements']} measurements tell as much as {counted:.0f} "
+        equivalent += "independent ones would."
     return [
-        f"Held out is {kept}; ± is the standard error of the ratio to the best.{worth}",
+        f"Held out is {kept}; ± is the standard error of the ratio to the best.{equivalent}",
         *(f"{row['model']}: {row['status']}" for row in rows if not row["converged"]),
         *(
             f"{row['model']} without '{name}': {why}"
@@ -290,19 +330,20 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the criterion needs to know of a fit.
+    """Data of a fit for Akaike's criterion.
 
     Attributes
     ----------
     misfit : float
-        Σ residual² of the markers, in units of σ²; rounding at least.
+        Sum of the squared measurement residuals, in units of σ²; not less than rounding.
     prior : float
-        Σ residual² of the priors.
+        Sum of the squared residuals of the priors.
     fitted : float
         Number of parameters that the data determine, nuisance parameters included.
     measurements : int
+        Number of measurements.
     independent : float
-        The number of independent measurements that these are worth.
+        Equivalent number of independent measurements.
     """
 
     misfit: float
@@ -312,13 +353,16 @@ class Evidence:
     independent: float
 
     def criterion(self, independent: float) -> float:
-        """Akaike's, if the measurements are worth so many; models are compared at the same."""
+        """Return Akaike's criterion for an equivalent number of measurements, equal for all
+        compared models.
+        """
         return independent * float(np.log(self.misfit)) + self.prior + 2 * self.fitted
 
 
 def evidence_of(fit: LinearisedFit) -> Evidence:
-    """The evidence for a model from its fit near the answer."""
-    factored, rounding = information(fit), ROUNDING**2 * fit.measurements
+    """Return the evidence of a model from its linearised fit at the solution."""
+    factored = information(fit)
+    rounding = ROUNDING**2 * fit.measurements
     independent = float(fit.measurements)
     if fit.chi_squared > rounding:
         processes = error_processes(fit, factored)
@@ -334,14 +378,15 @@ def evidence_of(fit: LinearisedFit) -> Evidence:
 
 
 def _independent(block: FitBlock, process: ErrorProcess) -> float:
+    """Return the equivalent number of independent measurements in one block of residuals."""
     lags = np.arange(1, len(process.along_time))
     in_time = 1 + 2 * float((1 - lags / len(block.t_s)) @ process.along_time[1:])
-    seen = block.channels[2].any(axis=0)
-    among = process.among_channels[np.ix_(seen, seen)]
+    is_observed = block.channels[2].any(axis=0)
+    among = process.among_channels[np.ix_(is_observed, is_observed)]
     total = float(np.trace(among)) ** 2
     # Few samples make channels look alike that are not: that much is taken off tr Σ².
-    alike = float(np.sum(among**2)) - total / max(process.samples, 1.0)
-    channels = float(np.clip(total / max(alike, 1e-300), 1.0, len(among)))
+    sum_of_squares = float(np.sum(among**2)) - total / max(process.samples, 1.0)
+    channels = float(np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among)))
     return block.measurements * channels / len(among) / max(1.0, in_time)
 
 
@@ -352,14 +397,23 @@ BLOCKS = 8
 
 
 def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
-    """Fit a model, to all recordings or to all but what is held out, and tell how well it does.
+    """Fit a model to all recordings, or to all but the held-out one, and return its fit and
+    prediction.
 
     Parameters
     ----------
     problem : Problem
+        Problem with the model.
     method : str
+        Name of the method.
     held_out : str
-        A recording; "" to fit all.
+        Recording that is predicted; "" to fit all.
+
+    Returns
+    -------
+    dict
+        Status, parameters and RMS; with converged fits also "evidence" and "budget" if all are
+        fitted, else "prediction", which is None with a "failure" if the simulation failed.
     """
     known, start_s = without(problem, held_out) if held_out else (problem, np.inf)
     solution = solve(known, method)
@@ -387,13 +441,17 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
     rollout = roll_out(replace(known, rollout=RolloutOptions("scheme")), experiment, solution)
     if not isinstance(rollout, Rollout):
         return record | {"prediction": None, "failure": rollout}
-    whole = next(e for e in problem.experiments if e.name == held_out)
-    return record | {"prediction": _missed(whole, rollout, start_s)}
+    complete_experiment = next(e for e in problem.experiments if e.name == held_out)
+    return record | {"prediction": _missed(complete_experiment, rollout, start_s)}
 
 
 def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[str, Any]:
-    """What the variance of each estimate is made of, but for noise of the poses, step and mesh."""
-    options, parameters = problem.uncertainty, solution.collocation.parameters
+    """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh.
+
+    Empty if the error bars cannot be computed.
+    """
+    options = problem.uncertainty
+    parameters = solution.collocation.parameters
     try:
         known = uncertainty_of(fit, parameters, solution.q, options)
         changes = assumed(solution.collocation, solution.z, options.considered)
@@ -405,22 +463,27 @@ def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[st
 
 
 def without(problem: Problem, name: str) -> tuple[Problem, float]:
-    """The problem without a recording, or its end, and the time from which it is held out."""
+    """Return the problem without a recording, or without its end, and the time of the first
+    held-out sample [s].
+
+    The end of a single recording is held out. The time is −∞ if the complete recording is held out.
+    """
     chosen = next(e for e in problem.experiments if e.name == name)
     if len(recordings(problem)) > 1:
-        left, start_s = replace(chosen, validation=True), -np.inf
+        remaining = replace(chosen, validation=True)
+        start_s = -np.inf
     else:
         start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
         tracks = np.where((chosen.t_s > start_s)[:, None, None], np.nan, chosen.markers.positions_m)
         grasps = tuple(_until(grasp, start_s) for grasp in chosen.grasps)
         depths = [each for d in chosen.depths if (each := d.until(start_s)) is not None]
-        left = replace(with_markers(chosen, tracks), grasps=grasps, depths=depths)
-    experiments = [left if e is chosen else e for e in problem.experiments]
+        remaining = replace(with_markers(chosen, tracks), grasps=grasps, depths=depths)
+    experiments = [remaining if e is chosen else e for e in problem.experiments]
     return replace(problem, experiments=experiments), start_s
 
 
 def _until(grasp: Grasp, end_s: float) -> Grasp:
-    """The grasp without what its sensor measured later."""
+    """Return the grasp without measurements of its sensor after a time [s]."""
     wrench = grasp.wrench
     if wrench is None:
         return grasp
@@ -429,26 +492,31 @@ def _until(grasp: Grasp, end_s: float) -> Grasp:
 
 
 def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[str, Any]:
-    """How far held-out samples are from the simulation: RMS, number, and Σ of squares by block.
+    """Return RMS, number of samples and sums of squares by block, of held-out measurements against
+    a simulation.
 
-    Of the markers [m], or of the forces [N] on the whole specimen where there are none; `unit` says
-    which.
+    The measurements are markers [m] or, without any, forces [N] on the complete specimen; `unit`
+    says which. Samples up to `start_s` are ignored; the RMS is None without samples.
     """
-    markers, unit = experiment.markers, "m"
-    t_s, apart = experiment.t_s, rollout.trajectory.markers_m - markers.positions_m
-    counted = markers.present
+    markers = experiment.markers
+    unit = "m"
+    t_s = experiment.t_s
+    residuals = rollout.trajectory.markers_m - markers.positions_m
+    is_counted = markers.present
     if not markers.samples:
         t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
         pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
-        apart = np.concatenate(
+        residuals = np.concatenate(
             [sensor.symmetry * (read - sensor.values)[:, :3] for read, sensor in pairs]
         )
-        order, unit = np.argsort(t_s, kind="stable"), "N"
-        t_s, apart = t_s[order], apart[order, None]
-        counted = np.asarray(np.isfinite(apart).any(axis=2))
-    later = t_s > start_s
-    squares = np.where(counted, np.nansum(apart**2, axis=2), 0.0)[later]
-    samples = int(counted[later].sum())
+        order = np.argsort(t_s, kind="stable")
+        unit = "N"
+        t_s = t_s[order]
+        residuals = residuals[order, None]
+        is_counted = np.asarray(np.isfinite(residuals).any(axis=2))
+    is_held_out = t_s > start_s
+    squares = np.where(is_counted, np.nansum(residuals**2, axis=2), 0.0)[is_held_out]
+    samples = int(is_counted[is_held_out].sum())
     blocks = [float(np.sum(each)) for each in np.array_split(squares, BLOCKS)]
     rms = float(np.sqrt(squares.sum() / samples)) if samples else None
     return {"rms": rms, "unit": unit, "samples": samples, "blocks": blocks}

@@ -1,8 +1,9 @@
-"""What the choice of a law is worth: numbers about which laws that predict alike disagree.
+"""Dependence of estimates on the material law: estimates in which equally good laws disagree.
 
-Recordings that do not tell laws apart do not tell a number better than by what these laws say of
-it, however sure each of them is. That is one more source in the budget of the law that is chosen:
-the mean square of how far the others are from it, each being as likely.
+If the recordings do not distinguish between laws, an estimate is not more certain than the
+difference between the laws' estimates, however small each interval is. This difference is one more
+source in the uncertainty budget of the chosen law: the mean square difference of the other laws'
+estimates, all equally likely.
 """
 
 from __future__ import annotations
@@ -27,18 +28,20 @@ MODULI = ("young_pa", "poisson")
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A number that laws which predict alike disagree about.
+    """Parameter in whose value equally good laws disagree.
 
     Attributes
     ----------
     name : str
-    values : mapping of law to number, that of the chosen first
+        Name of the parameter.
+    values : mapping of str to float
+        Estimate by law, the chosen one first.
     without : BudgetLine or None
-        The chosen one's, where its budget is known.
-    combined95 : (lower, upper) or None
-        Its combined interval, with what the laws disagree by.
+        Budget with the chosen law alone; None if it is not known.
+    combined95 : tuple of two floats or None
+        Combined interval with the difference between laws; None if the budget is not known.
     share : float
-        Of its variance.
+        Share of the difference between laws in the variance.
     """
 
     name: str
@@ -49,58 +52,64 @@ class Disagreement:
 
     @property
     def sentence(self) -> str:
-        """For people."""
-        low, high, symbol = (
-            min(self.values.values()),
-            max(self.values.values()),
-            symbol_of(self.name),
-        )
+        """Explanation for the user."""
+        low = min(self.values.values())
+        high = max(self.values.values())
+        symbol = symbol_of(self.name)
         unit = with_unit(self.name).removeprefix(symbol)
-        said = f"By those that predict alike, {symbol} is {low:.3g} to {high:.3g}{unit}"
-        told = f"{said}: these recordings do not tell it better."
+        range_text = f"By those that predict alike, {symbol} is {low:.3g} to {high:.3g}{unit}"
+        conclusion = f"{range_text}: these recordings do not tell it better."
         if self.without is None or self.combined95 is None:
-            return told
+            return conclusion
         ends, least = (
             "{:.3g} to {:.3g}".format(*w) for w in (self.combined95, self.without.combined95)
         )
         share = f"{self.share:.0%} of the variance"
-        return f"{told} Its combined interval is {ends} with the law ({share}), {least} without."
+        return (
+            f"{conclusion} Its combined interval is {ends} with the law ({share}), {least} without."
+        )
 
 
 def disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
-    """The numbers that models disagree about, of which the chosen one is one.
+    """Return the parameters in which models disagree.
 
     Parameters
     ----------
     rows : sequence of Row
-        Of those that predict alike.
+        Models that predict equally well.
     chosen : Row
+        Chosen model, one of them.
     """
     others = [row for row in rows if row is not chosen]
-    told = []
+    result = []
     for name in chosen["parameters"]:
         values = {r["model"]: r["parameters"].get(name) for r in (chosen, *others)}
         if (bare(name) in MODULI or is_damping(name)) and all(v and v > 0 for v in values.values()):
-            found = {model: float(value or 0.0) for model, value in values.items()}
-            if max(found.values()) > APART * min(found.values()):
-                told.append(_of_number(name, found, chosen["budget"].get(name)))
-    return told
+            estimates = {model: float(value or 0.0) for model, value in values.items()}
+            if max(estimates.values()) > APART * min(estimates.values()):
+                result.append(_of_number(name, estimates, chosen["budget"].get(name)))
+    return result
 
 
 def _of_number(
     name: str, values: Mapping[str, float], known: Mapping[str, object] | None
 ) -> Disagreement:
+    """Return the disagreement of one parameter, from the chosen model's budget line; None
+    if unknown.
+    """
     if known is None:
         return Disagreement(name, values, None, None, 0.0)
     line = BudgetLine(**known)  # type: ignore[arg-type]
-    at = Coordinate.of(name, (*values.values(), *line.combined95), False)
-    places = np.array([at.at(value) for value in values.values()])
-    with_law = line.widened(LAW, float(np.sqrt(np.mean((places - places[0]) ** 2))), at)
+    coordinate = Coordinate.of(name, (*values.values(), *line.combined95), False)
+    coordinates = np.array([coordinate.at(value) for value in values.values()])
+    with_law = line.widened(
+        LAW, float(np.sqrt(np.mean((coordinates - coordinates[0]) ** 2))), coordinate
+    )
     return Disagreement(name, values, line, with_law.combined95, with_law.shares[LAW])
 
 
 def law_table(told: Sequence[Disagreement]) -> Table:
-    """The numbers by law, with their spread and the chosen one's intervals."""
+    """Return a table of estimates by law, with their spread and the chosen law's intervals."""
     laws = dict.fromkeys(model for each in told for model in each.values)
     rows = []
     for each in told:

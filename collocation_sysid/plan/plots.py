@@ -1,4 +1,4 @@
-"""Figures of a study: convergence in time, success and basins of the starts, tips, estimates."""
+"""Figures of a study: convergence, success and basins of the starts, tip tracks, and estimates."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ PANEL_MM = 32.0
 def comparison_plots(
     rows: Sequence[Row], records: Mapping[str, Record], yardstick: Yardstick
 ) -> dict[str, Figure]:
-    """The figures of a comparison by file name; those for which there is something to draw."""
+    """Return the figures of a comparison by file name; those without data are left out."""
     figures: dict[str, Figure] = {}
     answered = [row for row in rows if row["rms_m"] is not None]
     if answered:
@@ -74,7 +74,7 @@ def comparison_plots(
 
 
 def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
-    """Each method's colour and rows."""
+    """Return colour and rows of each method."""
     methods = dict.fromkeys(row["method"] for row in rows)
     return {
         method: (CYCLE[k % len(CYCLE)], [row for row in rows if row["method"] == method])
@@ -83,7 +83,9 @@ def _by_method(rows: Sequence[Row]) -> dict[str, tuple[str, list[Row]]]:
 
 
 def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
-    """Loss and violated dynamics against the time of the solve, a line for each run."""
+    """Return a figure of loss and violation of the equations of motion against time, a line
+    per run.
+    """
     figure = new_figure(PAGE_MM, 70)
     panels = figure.subplots(1, 2)
     for method, (colour, runs) in _by_method(rows).items():
@@ -111,7 +113,9 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
 
 
 def success_by_distance(rows: Sequence[Row], centre: Mapping[str, float], known: bool) -> Figure:
-    """Success rate against the factor by which the worst guess misses, in logarithmic bins."""
+    """Return a figure of the success rate against the largest ratio of guess to reference,
+    in logarithmic bins.
+    """
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
     factors = np.array([distance(row, centre) for row in rows])
@@ -119,11 +123,14 @@ def success_by_distance(rows: Sequence[Row], centre: Mapping[str, float], known:
     methods = _by_method(rows)
     for k, (method, (colour, runs)) in enumerate(methods.items()):
         off = np.array([distance(row, centre) for row in runs])
-        places, rates, bars = [], [], []
+        places = []
+        rates = []
+        bars = []
         for low, high in itertools.pairwise(edges):
             hits = [row["success"] for row, f in zip(runs, off, strict=True) if low <= f < high]
             if hits:
-                rate, (least, most) = np.mean(hits), wilson_interval(sum(hits), len(hits))
+                rate = np.mean(hits)
+                least, most = wilson_interval(sum(hits), len(hits))
                 shift = (k + 0.5) / len(methods)
                 places.append(low ** (1 - shift) * high**shift)
                 rates.append(100 * rate)
@@ -176,7 +183,7 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known: bool) -> Fig
 
 
 def _ratio_axes(axes: Axes, factor: float) -> None:
-    """Logarithmic axes from 1/factor to the factor with three numbers each."""
+    """Set logarithmic axes from 1/factor to factor, with three ticks each."""
     digit = 10 ** np.floor(np.log10(factor))
     tick = max((t for t in (1.5, 2.0, 5.0, 10.0) if t * digit <= factor), default=1.0) * digit
     axes.set(xscale="log", yscale="log")
@@ -190,7 +197,9 @@ def _ratio_axes(axes: Axes, factor: float) -> None:
 
 
 def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
-    """The tip as measured, and simulated with each method's best answer."""
+    """Return a figure of the measured tip, and of its simulation with each method's best
+    solution.
+    """
     figure = new_figure(PAGE_MM, 65)
     panels = figure.subplots(1, 3, sharex=True)
     tip = records[rows[0]["key"]]["tip"]
@@ -215,7 +224,7 @@ def tip_tracks(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure:
 
 
 def sweep_plots(rows: Sequence[Row], swept: Sequence[str]) -> dict[str, Figure]:
-    """The figure of a sweep by file name, where there is an answer to draw."""
+    """Return the figures of a sweep by file name; empty if no run has a result."""
     if all(row["rms_m"] is None for row in rows):
         return {}
     return {"sweep": estimates_against(rows, swept)}
@@ -252,13 +261,14 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
 
 
 def _places(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
-    """Where swept values are on the axis, evenly spaced in their order, and their names there."""
+    """Return the positions of swept values on the axis, evenly spaced, and their labels."""
     order = list(dict.fromkeys(values))
     names = {float(place): _shortened(value) for place, value in enumerate(order)}
     return np.array([order.index(value) for value in values], dtype=float), names
 
 
 def _shortened(value: str) -> str:
+    """Return a value as text, with numbers shortened."""
     try:
         return f"{float(value):.4g}"
     except ValueError:
@@ -268,7 +278,7 @@ def _shortened(value: str) -> str:
 def _groups(
     rows: Sequence[Row], swept: Sequence[str], key: str, shorts: Mapping[str, str]
 ) -> Iterator[tuple[str | None, str, float, Array]]:
-    """Label, colour, shift and mask of the rows that share a value of another key."""
+    """Return label, colour, offset and mask of the rows that share a value of another key."""
     other = next((name for name in swept if name != key), None)
     if other is None:
         yield None, CYCLE[0], 0.0, np.ones(len(rows), dtype=bool)
@@ -290,6 +300,7 @@ def _draw_estimates(
     colour: str,
     label: str | None,
 ) -> None:
+    """Draw the estimates and intervals of one group of rows."""
     value, low, high = (
         np.array([row[f"{what}_{name}"] for row in rows], dtype=float)
         for what in ("value", "low", "high")

@@ -1,9 +1,9 @@
-"""Runs side by side, each in a process of its own, and what became of them.
+"""Execution of runs, each in its own process, and storage of their records.
 
-A process is started, watched, killed when it is late, and tried again (`execute`): a time limit or
-a segmentation fault costs that run alone. A worker only does that, be it a thread on this machine
-or a worker of a cluster through dask.distributed. Finished runs are on disk, one JSON file each,
-there whole or not at all.
+`execute` starts a process, watches it, stops it after the time limit, and repeats it if it crashes:
+a time limit or a segmentation fault affects only that run. Workers are threads of this process, or
+workers of a Dask cluster. Records of finished runs are stored as one JSON file each, written
+atomically. Use `run_all` for all runs of a study.
 """
 
 from __future__ import annotations
@@ -57,21 +57,22 @@ def execute(
     stopped: Callable[[], bool] = lambda: False,
     retries: int = 1,
 ) -> Record:
-    """Do a run in a process of its own and return its record, whatever happens to the process.
+    """Execute a run in its own process and return its record, whatever happens to the process.
 
     Parameters
     ----------
     planned : dict
-        A `PlannedRun` as a dict.
+        A `PlannedRun` as a dictionary.
     time_limit_s : float, optional
-        The process is asked to end after this, loading included, and killed if it does not; the
-        record has the best answer that it found, where there is one.
+        Time after which the process is asked to end, loading included [s]; it is killed if it does
+        not. The record then contains the best iterate, if there is one.
     stopped : callable
-        Asked now and then; the process is killed once it says so.
+        Function that is called now and then; the process is killed once it returns true.
     retries : int
-        Further tries when the process dies.
+        Further attempts if the process crashes.
     """
-    attempts, record = 0, {}
+    attempts = 0
+    record = {}
     while attempts <= retries:
         attempts += 1
         began = time.monotonic()
@@ -85,32 +86,37 @@ def execute(
 def _attempt(
     planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
 ) -> Record:
+    """Execute a run once and return its record."""
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         file = Path(place) / "record.json"
-        with open(Path(place) / "stderr", "w+b") as said:
+        with open(Path(place) / "stderr", "w+b") as stderr:
             process = subprocess.Popen(
                 [*COMMAND, str(file)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                stderr=said,
+                stderr=stderr,
                 env={**os.environ, **ONE_THREAD},
                 start_new_session=True,  # Ctrl-C is for the study, which decides
             )
             try:
-                verdict = _watch(process, planned, time_limit_s, stopped)
+                interruption = _watch(process, planned, time_limit_s, stopped)
             finally:
                 process.kill()
                 process.wait()
-            if verdict is not None and verdict["outcome"] != TIMEOUT:
-                return verdict
+            if interruption is not None and interruption["outcome"] != TIMEOUT:
+                return interruption
             try:
                 record = json.loads(file.read_text(encoding="utf-8"))
             except (OSError, ValueError):
-                return verdict or {
+                return interruption or {
                     "outcome": CRASHED,
-                    "message": _last_words(process.returncode, said),
+                    "message": _last_words(process.returncode, stderr),
                 }
-            return record if verdict is None or record["outcome"] == ERROR else record | verdict
+            return (
+                record
+                if interruption is None or record["outcome"] == ERROR
+                else record | interruption
+            )
 
 
 def _watch(
@@ -119,7 +125,13 @@ def _watch(
     time_limit_s: float | None,
     stopped: Callable[[], bool],
 ) -> Record | None:
-    """Wait for the process; None once it has ended by itself."""
+    """Send the run to the process and wait for its end.
+
+    Returns
+    -------
+    Record or None
+        None if the process ended by itself; a record if it was stopped or too late.
+    """
     assert process.stdin is not None
     deadline = None if time_limit_s is None else time.monotonic() + time_limit_s
     with contextlib.suppress(BrokenPipeError):
@@ -127,15 +139,15 @@ def _watch(
         process.stdin.flush()
     try:
         while True:
-            left = LOOK_EVERY_S if deadline is None else deadline - time.monotonic()
-            if left <= 0:
+            remaining_s = LOOK_EVERY_S if deadline is None else deadline - time.monotonic()
+            if remaining_s <= 0:
                 process.terminate()  # as Ctrl-C: it may write what it has
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(GRACE_S)
                 message = f"ended after the time limit of {time_limit_s:g} s"
                 return {"outcome": TIMEOUT, "message": message}
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(min(left, LOOK_EVERY_S))
+                process.wait(min(remaining_s, LOOK_EVERY_S))
                 return None
             if stopped():
                 return {"outcome": STOPPED, "message": "stopped with the study"}
@@ -145,32 +157,42 @@ def _watch(
 
 
 def _last_words(code: int, said: IO[bytes]) -> str:
-    """How a process died, with the last line it wrote."""
-    how = killed_by(code) or f"its process ended with code {code}"
+    """Return how a process ended, with the last line of its error output."""
+    cause = killed_by(code) or f"its process ended with code {code}"
     said.seek(0)
     lines = said.read()[-2000:].decode(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
-    return f"{how}: {last}" if last else how
+    return f"{cause}: {last}" if last else cause
 
 
 # What became of a run.
-FINISHED, ERROR, TIMEOUT, CRASHED, STOPPED = "finished", "error", "timeout", "crashed", "stopped"
+FINISHED = "finished"
+ERROR = "error"
+TIMEOUT = "timeout"
+CRASHED = "crashed"
+STOPPED = "stopped"
 
 Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class RunStore:
-    """The folder ``runs/`` of a study."""
+    """Records in the folder ``runs/`` of a study.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the records.
+    """
 
     folder: Path
 
     def save(self, record: Record) -> None:
-        """Write a run's record."""
+        """Write the record of a run."""
         write_whole(self._file(record["key"]), as_json(record) + "\n")
 
     def load(self, key: str) -> Record | None:
-        """A run's record; None if there is none that can be read."""
+        """Return the record of a run; None if it does not exist or cannot be read."""
         try:
             record = json.loads(self._file(key).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -178,32 +200,33 @@ class RunStore:
         return record if isinstance(record, dict) and record.get("key") == key else None
 
     def finished(self, key: str, time_limit_s: float | None) -> Record | None:
-        """A run's record unless it is worth another try.
+        """Return the record of a run; None if the run should be executed again.
 
-        A run that crashed is, and one that ran out of less time than it has now.
+        A run is repeated if it crashed, or if it exceeded a time limit below the present one.
         """
         record = self.load(key)
         if record is None or record["outcome"] == CRASHED:
             return None
         if record["outcome"] == TIMEOUT:
-            had = record.get("time_limit_s") or 0.0
-            return record if time_limit_s is not None and time_limit_s <= had else None
+            previous_limit_s = record.get("time_limit_s") or 0.0
+            return record if time_limit_s is not None and time_limit_s <= previous_limit_s else None
         return record
 
     def _file(self, key: str) -> Path:
+        """Return the file of a record."""
         return self.folder / f"{key}.json"
 
 
 @dataclass(frozen=True)
 class RunOptions(Options):
-    """How the runs of a study are done.
+    """Execution of the runs of a study.
 
     Attributes
     ----------
     workers : int
-        How many runs at once; by default as many as there are cores.
+        Number of runs at once; by default the number of cores.
     scheduler : ADDRESS
-        A dask.distributed scheduler to run on; its workers see the same files.
+        A dask.distributed scheduler to run on; its workers need the same files.
     time_limit_s : --time-limit SECONDS
         A run is stopped after this, loading included, and counts as a failure.
     """
@@ -224,13 +247,16 @@ class RunOptions(Options):
 
 @dataclass(frozen=True)
 class Pool:
-    """Where runs are done.
+    """Executor of runs.
 
     Attributes
     ----------
-    submit : function of a planned run, gives the future of its record
-    slots : int, runs at once
-    stop : function that ends the runs that are going on
+    submit : callable
+        Function of a planned run that returns the future of its record.
+    slots : int
+        Number of runs at once.
+    stop : callable
+        Function that ends the running runs.
     """
 
     submit: Callable[[PlannedRun], Future]
@@ -244,22 +270,25 @@ def run_all(
     limits: RunOptions,
     done: Callable[[Record, int], None] = lambda record, slots: None,
 ) -> None:
-    """Do the runs that are not in the store and put them there, each as soon as it has ended.
+    """Execute the runs of a study and store their records, each as soon as it has ended.
 
     Parameters
     ----------
-    planned : sequence of PlannedRun, started in this order
+    planned : sequence of PlannedRun
+        Runs, started in this order; the caller has removed finished ones.
     store : RunStore
+        Storage of the records.
     limits : RunOptions
+        Options of the execution.
     done : callable
-        Called with every new record and the number of runs at once.
+        Function that is called with every new record and the number of runs at once.
 
     Raises
     ------
     InputError
-        If the scheduler cannot be had.
+        If the scheduler cannot be reached.
     KeyboardInterrupt
-        After the runs that are going on were ended; finished ones are in the store.
+        After the running runs have been ended; finished ones are in the store.
     """
     if not planned:
         return
@@ -279,7 +308,7 @@ def run_all(
 
 
 def _record_of(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
-    """A run's record, also when the worker that watched it is lost."""
+    """Return the record of a run, also if its worker was lost."""
     try:
         return future.result()
     except Exception as error:
@@ -295,11 +324,13 @@ def _record_of(future: Future, planned: PlannedRun, limits: RunOptions) -> Recor
 
 @contextmanager
 def _threads(limits: RunOptions) -> Iterator[Pool]:
-    """Threads that wait for processes: all that one machine needs."""
-    slots, stop = limits.workers or available_threads(), threading.Event()
+    """Context with an executor of threads, which wait for processes on this machine."""
+    slots = limits.workers or available_threads()
+    stop = threading.Event()
     with ThreadPoolExecutor(slots) as executor:
 
         def submit(run: PlannedRun) -> Future:
+            """Start a run and return the future of its record."""
             return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
 
         yield Pool(submit, slots, stop.set)
@@ -307,17 +338,19 @@ def _threads(limits: RunOptions) -> Iterator[Pool]:
 
 @contextmanager
 def _cluster(limits: RunOptions) -> Iterator[Pool]:
-    """The workers of a scheduler that is there."""
+    """Context with an executor on the workers of a scheduler."""
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
     with connected(limits.scheduler) as client:
         stop = distributed().Event(flag, client=client)
         with client.get_executor(pure=False) as executor:
 
             def submit(run: PlannedRun) -> Future:
+                """Start a run and return the future of its record."""
                 return executor.submit(_on_worker, run.as_dict(), limits.time_limit_s, flag)
 
             yield Pool(submit, max(1, sum(client.nthreads().values())), stop.set)
 
 
 def _on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
+    """Execute a run on a worker until the event named `flag` is set, and return its record."""
     return execute(planned, time_limit_s, distributed().Event(flag).is_set)

@@ -1,4 +1,4 @@
-"""Progress in the terminal, of a study with the time left and of a design."""
+"""Progress display in the terminal: of a study with the remaining time, and of a design."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from .design.designing import FORBIDDEN
 from .process import Record
 from .study import PlannedRun
 
-# How often a search tells where no line is live.
+# Motions between lines of a search without a terminal.
 EVERY = 20
 
 
 class StudyProgress(Watched):
-    """One live line on a terminal, a line for each run elsewhere.
+    """Progress of a study: one updated line on a terminal, else a line per run.
 
     Parameters
     ----------
     console : Console
+        Terminal.
     remaining : sequence of PlannedRun
-        The runs that are to be done.
+        Runs that are not finished yet.
     total : int
-        With those that are done already.
+        Number of all runs, finished ones included.
+    quiet : bool
+        Whether to show nothing.
     """
 
     def __init__(
@@ -49,7 +52,15 @@ class StudyProgress(Watched):
         return self
 
     def done(self, record: Record, slots: int) -> None:
-        """Count a finished run."""
+        """Count a finished run and update the display.
+
+        Parameters
+        ----------
+        record : Record
+            Record of the run.
+        slots : int
+            Number of runs that are executed at once.
+        """
         run = self._waiting.pop(record["key"])
         if record.get("wall_s") is not None:
             self._walls.setdefault(run.method, []).append(record["wall_s"])
@@ -60,33 +71,56 @@ class StudyProgress(Watched):
         self.update(Text(line, style="dim"), line)
 
     def _left(self, slots: int) -> str:
-        left_s = time_left_s([run.method for run in self._waiting.values()], self._walls, slots)
-        return "" if left_s is None else f"; about {duration(left_s)} left"
+        """Return the estimated remaining time as text; empty if it is unknown."""
+        remaining_s = time_left_s(
+            [run.method for run in self._waiting.values()], self._walls, slots
+        )
+        return "" if remaining_s is None else f"; about {duration(remaining_s)} left"
 
 
 class DesignProgress(Watched):
-    """The search, live on a terminal; a line now and then elsewhere."""
+    """Progress of the search for a motion: one updated line on a terminal, else a line now
+    and then.
+    """
 
     def __init__(self, console: Console, evaluations: int, quiet: bool = False) -> None:
         super().__init__(console, quiet)
         self.evaluations = evaluations
 
     def tried(self, number: int, log_size: float) -> None:
-        """Show the smallest error bar so far."""
+        """Show the smallest error bar so far.
+
+        Parameters
+        ----------
+        number : int
+            Number of motions so far.
+        log_size : float
+            Logarithm of the smallest relative error bar.
+        """
         best = "none possible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
         line = f"{number} of {self.evaluations} motions tried, smallest error bar: {best}"
         seldom = number % EVERY == 0 or number == self.evaluations
         self.update(Text(f"{line} (Ctrl-C keeps it)", style="dim"), line if seldom else "")
 
     def say(self, what: str) -> None:
-        """Show what is being done now."""
+        """Show the present activity."""
         self.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"), what)
 
 
 def time_left_s(
     waiting: Sequence[str], walls: Mapping[str, Sequence[float]], slots: int
 ) -> float | None:
-    """Time for the waiting runs from their methods' mean so far; None when nothing is known."""
+    """Return the estimated time for the waiting runs [s]; None if it is unknown.
+
+    Parameters
+    ----------
+    waiting : sequence of str
+        Method of each waiting run.
+    walls : mapping of str to sequence of float
+        Durations of the finished runs by method [s].
+    slots : int
+        Number of runs that are executed at once.
+    """
     every = [wall for of_method in walls.values() for wall in of_method]
     if not waiting or not every:
         return None

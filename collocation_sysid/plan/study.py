@@ -1,6 +1,8 @@
-"""What a study runs: every run is a problem file, overrides and a method.
+"""Planning of studies: every run is a problem file with overrides and a method.
 
-So any of them can be repeated with ``collocation-sysid solve PROBLEM --method M --set …``.
+Each run can therefore be repeated with ``collocation-sysid solve PROBLEM --method M --set …``. Use
+`plan_comparison` for methods and starts, `plan_sweep` for values of keys, and `plan_models` for
+models.
 """
 
 from __future__ import annotations
@@ -36,16 +38,25 @@ class PlannedRun:
     Attributes
     ----------
     key : str
-        Hash of all that decides the result: problem, data files, method, start, options, version.
-    problem : str, the problem file's whole path
+        Hash of everything that determines the result: problem, data files, method, start, options,
+        version.
+    problem : str
+        Absolute path of the problem file.
     method : str
-    start : int, 0 is the file's guess
-    overrides : tuple of "key=value"
-    guess : mapping of the estimated parameters to their guesses, None where there is none
-    swept : mapping of swept keys to their values as text
-    allow_code : bool, run the Python files that the problem names
+        Name of the method.
+    start : int
+        Number of the start; 0 is the file's guess.
+    overrides : tuple of str
+        Overrides "key=value".
+    guess : mapping of str to float or None
+        Guesses of the estimated parameters; None where there is none.
+    swept : mapping of str to str
+        Values of the swept keys as text; for a comparison of models, "model" and its label.
+    allow_code : bool
+        Whether to run the Python files that the problem names.
     held_out : str or None
-        Where models are compared: the recording that is predicted, "" if all are fitted.
+        For a comparison of models, the recording that is predicted; "" if all are fitted. None for
+        other studies.
     """
 
     key: str
@@ -60,7 +71,7 @@ class PlannedRun:
 
     @property
     def label(self) -> str:
-        """The run in a few words."""
+        """Short description of the run for the user."""
         if self.held_out is not None:
             what = f" without '{self.held_out}'" if self.held_out else ""
             return f"{self.swept['model']}{what}"
@@ -69,39 +80,35 @@ class PlannedRun:
         return ", ".join(f"{short}={self.swept[key]}" for key, short in short_keys(self.swept))
 
     def as_dict(self) -> dict[str, Any]:
-        """Content for JSON."""
+        """Return the run as a dictionary for JSON."""
         return asdict(self)
 
 
 def short_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Each dotted key with as much of its end as tells it from the others, and what it is of."""
+    """Yield each dotted key with the shortest ending that distinguishes it from the others."""
     for key in keys:
         parts = key.split(".")
-        least = 2 if parts[0] == "parameters" else 1
-        ends = [".".join(parts[-count:]) for count in range(least, len(parts) + 1)]
-        alone = (e for e in ends if sum(f".{other}".endswith(f".{e}") for other in keys) == 1)
-        yield key, next(alone, key)
+        fewest_parts = 2 if parts[0] == "parameters" else 1
+        ends = [".".join(parts[-count:]) for count in range(fewest_parts, len(parts) + 1)]
+        unique_ends = (e for e in ends if sum(f".{other}".endswith(f".{e}") for other in keys) == 1)
+        yield key, next(unique_ends, key)
 
 
 @dataclass(frozen=True)
 class Starts(Options):
-    """Where runs start: first at the file's guess, then about the truth, or the guess without one.
+    """Starts of the runs: the first at the file's guess, the others around the truth, or the guess
+    without one.
 
-    A start depends on the seed and its number alone, so that more of them can be asked for later.
+    A start depends only on the seed and its number, so that more of them can be added later.
 
     Attributes
     ----------
     starts : int
-        How many starts; the first is the file's guess.
+        Number of starts; the first is the file's guess.
     spread : float
         Starts lie within this factor of the guess.
     seed : int
-        Seed by which starts are drawn.
-
-    Raises
-    ------
-    InputError
-        For a number, spread or seed that cannot be.
+        Seed of the random starts.
     """
 
     starts: AtLeastOne = 1
@@ -113,7 +120,23 @@ class Starts(Options):
         require_few(self.starts, "starts", "starts")
 
     def overrides(self, problem: Problem, truth: Mapping[str, float], start: int) -> Iterator[str]:
-        """Those of a start: log-uniform about truth or guess, and clipped to the bounds."""
+        """Yield the overrides of one start: guesses, log-uniform around truth or guess, within the
+        bounds.
+
+        Parameters
+        ----------
+        problem : Problem
+            Problem with its parameters.
+        truth : mapping of str to float
+            True values by name, empty if unknown.
+        start : int
+            Number of the start; 0 yields nothing.
+
+        Raises
+        ------
+        InputError
+            For a parameter with neither a guess nor a true value.
+        """
         free = problem.parameters.free if start else ()
         exponents = np.random.default_rng([self.seed, start]).uniform(-1, 1, len(free))
         for item, exponent in zip(free, exponents, strict=True):
@@ -137,23 +160,29 @@ def plan_comparison(
     truth: Mapping[str, float] | None = None,
     allow_code: bool = False,
 ) -> list[PlannedRun]:
-    """Every method from every start; all methods get the same starts, and the same time grid.
+    """Return a run of every method from every start; all methods have the same starts and time
+    grid.
 
     Parameters
     ----------
     problem : Problem
-        Read from its file with the same overrides.
+        Problem read from its file with the same overrides.
     methods : sequence of str
-    overrides : sequence of "key=value"
+        Names of methods.
+    overrides : sequence of str
+        Overrides "key=value".
     starts : Starts, optional
-        The file's guess alone by default.
-    truth : mapping of name to value, optional
+        Starts; the file's guess alone by default.
+    truth : mapping of str to float, optional
+        True values by name.
     allow_code : bool
+        Whether to run the Python files that the problem names.
 
     Raises
     ------
     InputError
-        For starts about a parameter that has neither guess nor truth, and a problem without a file.
+        For starts around a parameter without guess and true value, and for a problem without a
+        file.
     """
     starts = starts or Starts()
     if problem.path is None:
@@ -165,10 +194,12 @@ def plan_comparison(
         overrides = [*overrides, f"transcription.substeps={problem.first_substeps}"]
     planned = []
     for start in range(starts.starts):
-        moved = [*overrides, *starts.overrides(problem, truth or {}, start)]
-        file, _ = read_problem_file(problem.path, moved)
-        more = {"start": start, "allow_code": allow_code}
-        planned += [_planned(problem.path, file, method, moved, **more) for method in methods]
+        start_overrides = [*overrides, *starts.overrides(problem, truth or {}, start)]
+        file, _ = read_problem_file(problem.path, start_overrides)
+        details = {"start": start, "allow_code": allow_code}
+        planned += [
+            _planned(problem.path, file, method, start_overrides, **details) for method in methods
+        ]
     return planned
 
 
@@ -179,25 +210,38 @@ def plan_sweep(
     method: str | None = None,
     allow_code: bool = False,
 ) -> list[PlannedRun]:
-    """Every combination of the swept values; the last key changes fastest.
+    """Return a run of every combination of the swept values; the last key changes fastest.
+
+    Parameters
+    ----------
+    path : Path
+        Problem file.
+    over : mapping of str to sequence of str
+        Values as text by key.
+    overrides : sequence of str
+        Further overrides "key=value".
+    method : str, optional
+        Name of the method; the file's own by default.
+    allow_code : bool
+        Whether to run the Python files that the problem names.
 
     Raises
     ------
     InputError
-        For a key or value that the problem file cannot have.
+        For a key or value that the problem file does not accept.
     """
     read_problem_file(path, overrides)
     planned = []
     for values in itertools.product(*over.values()):
         swept = dict(zip(over, values, strict=True))
-        moved = [*overrides, *(f"{key}={value}" for key, value in swept.items())]
+        run_overrides = [*overrides, *(f"{key}={value}" for key, value in swept.items())]
         try:
-            file, _ = read_problem_file(path, moved)
+            file, _ = read_problem_file(path, run_overrides)
         except InputError as error:
             where = "--over" if error.source == "--set" else error.source
             raise InputError(error.message, where, error.where) from error
-        more = {"swept": swept, "allow_code": allow_code}
-        planned.append(_planned(path, file, method, moved, **more))
+        details = {"swept": swept, "allow_code": allow_code}
+        planned.append(_planned(path, file, method, run_overrides, **details))
     return planned
 
 
@@ -207,13 +251,26 @@ def plan_models(
     method: str | None = None,
     allow_code: bool = False,
 ) -> list[PlannedRun]:
-    """Every model fitted to all recordings, and to all but each; of one recording, its last third.
+    """Return runs that fit every model to all recordings, and to all but each one.
+
+    Of a single recording, the last third is held out.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the recordings.
+    variants : sequence of Variant
+        Models.
+    method : str, optional
+        Name of the method; the file's own by default.
+    allow_code : bool
+        Whether to run the Python files that the problem names.
 
     Raises
     ------
     InputError
-        For a model that its problem file cannot have, and a recording that has nothing to compare
-        predictions with.
+        For a model that its problem file does not accept, and for a recording without markers and
+        wrenches.
     """
     for each in problem.experiments:
         if not (each.validation or each.markers.samples or each.wrenches):
@@ -226,22 +283,37 @@ def plan_models(
     for held_out in ("", *recordings(problem)):
         for variant in variants:
             file, _ = read_problem_file(variant.path, variant.overrides)
-            more = {"swept": {"model": variant.label}, "held_out": held_out}
-            more |= {"allow_code": allow_code}
-            planned.append(_planned(variant.path, file, method, variant.overrides, **more))
+            details = {"swept": {"model": variant.label}, "held_out": held_out}
+            details |= {"allow_code": allow_code}
+            planned.append(_planned(variant.path, file, method, variant.overrides, **details))
     return planned
 
 
 def recordings(problem: Problem) -> list[str]:
-    """Names of the recordings that are fitted."""
+    """Return the names of the recordings that are fitted."""
     return [e.name for e in problem.experiments if not e.validation]
 
 
 def _planned(
     path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
 ) -> PlannedRun:
-    """A run of a file as its overrides make it, by its own method if there is no other."""
-    method, start = method or file.solver.method, more.get("start", 0)
+    """Return the run of a file with its overrides.
+
+    Parameters
+    ----------
+    path : Path
+        Problem file.
+    file : ProblemFile
+        Its content with the overrides.
+    method : str or None
+        Name of the method; None means the file's own.
+    overrides : sequence of str
+        Overrides "key=value".
+    more : Any
+        Further fields of `PlannedRun`.
+    """
+    method = method or file.solver.method
+    start = more.get("start", 0)
     guess = {
         name: section.guess
         for name, section in file.parameters.items()
@@ -264,7 +336,7 @@ def _planned(
 
 
 def _hashes_of_files(content: Any, folder: Path) -> dict[str, str]:
-    """Hashes of the files that a problem names: other data is another run."""
+    """Return hashes of the files that a problem names, so that changed data give another run."""
     hashes = {}
     for text in _texts(content):
         with suppress(OSError, ValueError):  # a text that is no file's name
@@ -275,6 +347,7 @@ def _hashes_of_files(content: Any, folder: Path) -> dict[str, str]:
 
 
 def _texts(content: Any) -> Iterator[str]:
+    """Yield all texts in nested content."""
     if isinstance(content, str):
         yield content
     elif isinstance(content, Mapping):

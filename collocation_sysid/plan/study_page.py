@@ -1,4 +1,4 @@
-"""What a study leaves behind: tables for the terminal and for Markdown, CSV, JSON and plots."""
+"""Presentation of a study: tables for the terminal and for Markdown, CSV, JSON, and plots."""
 
 from __future__ import annotations
 
@@ -42,15 +42,20 @@ MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with an answ
 
 @dataclass(frozen=True, eq=False)
 class StudyReport:
-    """A study's numbers, finished or not.
+    """Results of a study, finished or not.
 
     Attributes
     ----------
     title : str
+        Title.
     kind : {"compare", "sweep", "models"}
+        Kind of study.
     planned : tuple of PlannedRun
-    records : mapping of key to record, those there are
+        Runs of the study.
+    records : mapping of str to Record
+        Records of finished runs by key.
     yardstick : Yardstick
+        Criterion of success.
     """
 
     title: str
@@ -68,7 +73,7 @@ class StudyReport:
 
     @property
     def views(self) -> list[Table]:
-        """The tables people look at, each within 80 columns."""
+        """Tables for the terminal, each within 80 columns."""
         if self.kind == "compare":
             return comparison_views(method_rows(self.rows))
         if self.kind == "models":
@@ -78,7 +83,7 @@ class StudyReport:
 
     @property
     def headline(self) -> list[str]:
-        """What the study says, in a sentence or a few."""
+        """Result of the study in a few sentences."""
         if self.kind == "models":
             return [advice(self.rows)]
         if self.kind == "compare":
@@ -87,13 +92,13 @@ class StudyReport:
 
     @property
     def tables(self) -> list[Table]:
-        """The same with heads in words, and a comparison's runs: for pages, where there is room."""
+        """Tables for pages: headings in words, and the runs of a comparison."""
         views = [replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.views]
         return [*views, run_view(self.rows)] if self.kind == "compare" else views
 
     @property
     def failures(self) -> list[str]:
-        """A line for each run without an answer."""
+        """One line for each run without a result."""
         return [
             f"{run.label}: {record['outcome']}: {record.get('message', '')}"
             for run in self.planned
@@ -103,7 +108,7 @@ class StudyReport:
 
     @property
     def notes(self) -> list[str]:
-        """What to know when reading the tables."""
+        """Notes that explain the tables."""
         missing = len(self.planned) - len(self.records)
         kept = [f"{missing} of {len(self.planned)} runs are still to be done."] if missing else []
         if self.kind == "models":
@@ -118,7 +123,7 @@ def load_report(
     store: RunStore,
     yardstick: Yardstick | None = None,
 ) -> StudyReport:
-    """Gather the records of planned runs."""
+    """Return the report of planned runs from their stored records."""
     loaded = {run.key: store.load(run.key) for run in planned}
     records = {key: record for key, record in loaded.items() if record is not None}
     return StudyReport(title, kind, tuple(planned), records, yardstick or Yardstick())
@@ -128,7 +133,7 @@ def load_report(
 
 
 def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
-    """The tables of a study within 80 columns, and what went wrong."""
+    """Return the tables of a study within 80 columns, and its failures."""
     # What no line of the tables says.
     parts: list[Shown] = [*report.headline, ""] if report.kind == "models" else []
     for table in report.views:
@@ -142,7 +147,7 @@ def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
 
 
 def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
-    """The runs of a study, and which of them are done."""
+    """Return a table of the runs of a study, with those that are finished."""
     rows = tuple(
         (
             str(number),
@@ -178,7 +183,7 @@ def write_report(report: StudyReport, folder: Path) -> None:
 
 
 def report_json(report: StudyReport) -> dict[str, Any]:
-    """Content of summary.json."""
+    """Return the content of summary.json."""
     rows = report.rows
     first = report.planned[0]
     content: dict[str, Any] = {
@@ -206,7 +211,9 @@ def report_json(report: StudyReport) -> dict[str, Any]:
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """Rows as CSV; the columns are those of all rows, in the order they first come."""
+    """Return rows as CSV; the columns are those of all rows, in the order of their first
+    occurrence.
+    """
     columns = dict.fromkeys(name for row in rows for name in row)
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
@@ -216,7 +223,7 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def report_section(report: StudyReport) -> Section:
-    """The views and the failures for a paper's appendix or an issue."""
+    """Return tables and failures as a section for a paper's appendix or an issue."""
     failures = (Items(tuple(report.failures)),) if report.failures else ()
     without = tuple(Section("Runs without an answer", (each,)) for each in failures)
     parts = (*report.headline, *report.notes, *report.views, *without)
@@ -224,6 +231,7 @@ def report_section(report: StudyReport) -> Section:
 
 
 def _in_words(head: str) -> str:
+    """Return a heading in words from that in the terminal."""
     if head.startswith("Δ") and head.endswith(" %"):
         return f"error of {head[1:-2]} [%]"
     symbol, space, unit = head.partition(" ")
@@ -236,14 +244,14 @@ Cell = Callable[[Row], str]
 
 
 def comparison_views(summaries: Sequence[Row]) -> list[Table]:
-    """Success, quality and cost of every method."""
+    """Return tables of success, quality and cost of every method."""
     success: dict[str, Cell] = {
         "runs": lambda row: str(row["runs"]),
         "success": lambda row: f"{row['successes']}/{row['runs']}",
         "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
     }
     success |= _errors(summaries)
-    quality = "violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m"
+    quality = ["violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m"]
     cost = ["iterations", "evaluations", "build_s", "evaluations_s", "linear_algebra_s", "total_s"]
     if all(row["evaluations"] is None for row in summaries):
         cost.remove("evaluations")
@@ -255,7 +263,7 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
 
 
 def run_view(rows: Sequence[Row]) -> Table:
-    """Every run of a comparison."""
+    """Return a table of every run of a comparison."""
     names = {"start": _text("start"), "method": _text("method")}
     cells: dict[str, Cell] = {
         "ended": _text("status"),
@@ -268,8 +276,9 @@ def run_view(rows: Sequence[Row]) -> Table:
 
 
 def _method_sentence(row: Row) -> str:
-    """How often, how well and how fast a method found the answer."""
-    low, high = 100 * row["success_low"], 100 * row["success_high"]
+    """Return how often, how accurately and how fast a method found the solution, in words."""
+    low = 100 * row["success_low"]
+    high = 100 * row["success_high"]
     said = f"{row['method']} succeeded in {row['successes']} of {row['runs']} runs"
     said += f" (95 % interval of the rate: {low:.0f} to {high:.0f} %)"
     if row["total_s"] is None:
@@ -279,7 +288,7 @@ def _method_sentence(row: Row) -> str:
 
 
 def sweep_sentences(rows: Sequence[Row]) -> list[str]:
-    """How many runs converged, and how far each estimate moves over them."""
+    """Return how many runs converged, and how much each estimate varies between them, in words."""
     converged = [row for row in rows if row["converged"]]
     said = [f"{len(converged)} of {len(rows)} runs converged."]
     for name in parameters_in(rows):
@@ -287,13 +296,14 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
         errors = [e for row in converged if (e := row[f"std_error_{name}"]) is not None]
         if len(values) > 1:
             spread = f"; the standard errors are {max(errors):.2g} at most" if errors else ""
-            low, high = f"{min(values):.4g}", f"{max(values):.4g} {unit_of(name)}".strip()
+            low = f"{min(values):.4g}"
+            high = f"{max(values):.4g} {unit_of(name)}".strip()
             said.append(f"{symbol_of(name)} is {low} to {high} over them{spread}.")
     return said
 
 
 def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
-    """Estimates and quality against the swept values."""
+    """Return tables of estimates and quality by swept values."""
     places = {short: _swept(key) for key, short in short_keys(swept)}
     estimates: dict[str, Cell] = {}
     for name in parameters_in(rows):
@@ -307,7 +317,7 @@ def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
 
 
 def model_views(rows: Sequence[Row]) -> list[Table]:
-    """Fit and prediction of every model, and what its small-strain moduli are."""
+    """Return tables of fit, prediction and small-strain moduli of every model."""
     factor, unit = shown_in(rows[0]["unit"])
     numbers: dict[str, Cell] = {
         "free": _number("free", 1, "d"),
@@ -335,13 +345,14 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
 def _turned(
     title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
-    """A view with a line for each cell and a column for each row."""
+    """Return a table with a line for each cell and a column for each row."""
     (name,) = names.values()
     lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
     return Table(title, ("", *(name(row) for row in rows)), lines)
 
 
 def _times(row: Row) -> str:
+    """Return the ratio of a model's prediction error to the best one as text."""
     if row["log_ratio"] is None:
         return "–"
     times = exp(row["log_ratio"])
@@ -352,19 +363,22 @@ def _times(row: Row) -> str:
 def _view(
     title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
+    """Return a table of rows, with a column for each cell."""
     columns = {**names, **numbers}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
     return Table(title, tuple(columns), cells, len(names))
 
 
 def _text(name: str) -> Cell:
+    """Return the cell of a text."""
     return lambda row: str(row[name])
 
 
 def _swept(key: str) -> Cell:
-    """A swept value, numbers shortened."""
+    """Return the cell of a swept value, with numbers shortened."""
 
     def cell(row: Row) -> str:
+        """Return the text of the cell in a row."""
         try:
             return f"{float(row[key]):.5g}"
         except ValueError:
@@ -374,24 +388,29 @@ def _swept(key: str) -> Cell:
 
 
 def _number(name: str, factor: float = 1.0, form: str = ".2g", among: str = "") -> Cell:
+    """Return the cell of a number."""
     shown = Column(factor=factor, form=form)
     return lambda row: shown(row[among].get(name) if among else row[name])
 
 
 def _errors(rows: Sequence[Row]) -> dict[str, Cell]:
-    """Of each parameter whose true value is known."""
+    """Return a cell for each parameter whose true value is known."""
     names = parameters_in(rows, "error_")
     return {f"Δ{symbol_of(name)} %": _number(f"error_{name}", 100) for name in names}
 
 
 def _numbers(*names: str) -> dict[str, Cell]:
-    """Columns of quality and cost."""
+    """Return cells of quality and cost."""
     return {COLUMNS[name].head: lambda row, name=name: COLUMNS[name](row[name]) for name in names}
 
 
 def _estimate(name: str) -> Cell:
+    """Return the cell of an estimate."""
+
     def cell(row: Row) -> str:
-        value, spread = row.get(f"value_{name}"), row.get(f"std_error_{name}")
+        """Return the text of the cell in a row."""
+        value = row.get(f"value_{name}")
+        spread = row.get(f"std_error_{name}")
         if value is None:
             return "–"
         return f"{value:.4g}" if spread is None else f"{value:.4g} ± {float(f'{spread:.1g}'):g}"

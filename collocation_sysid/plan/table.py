@@ -1,4 +1,4 @@
-"""Numbers of a study: one row for each run, and a comparison's summary of each method."""
+"""Numbers of a study: one row per run, and a summary per method."""
 
 from __future__ import annotations
 
@@ -20,18 +20,22 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Column:
-    """A number of each run, and how it is shown.
+    """Number of a run, with its heading and format.
 
     Attributes
     ----------
-    head, words : str
-        Over the column where there is little room, and on pages; empty where it is not shown.
-    factor, form
-        What it is multiplied by, and its format.
+    head : str
+        Short heading in the terminal; empty if the column is not shown.
+    words : str
+        Heading on pages.
+    factor : float
+        Factor before display, for example 1000 for millimetres.
+    form : str
+        Format specification.
     of : callable, optional
-        The number in a run's result.
+        Function that returns the number from a result; None if it comes from elsewhere.
     summed_up : bool
-        Whether a method has the median over its runs that have an answer.
+        Whether the summary of a method contains the median over its runs.
     """
 
     head: str = ""
@@ -42,7 +46,7 @@ class Column:
     summed_up: bool = True
 
     def __call__(self, value: float | None) -> str:
-        """The number as it is shown."""
+        """Return a number as text; a dash for None."""
         if value is None:
             return "–"
         value *= self.factor
@@ -82,11 +86,12 @@ NORMAL_975 = 1.959963984540054
 
 @dataclass(frozen=True)
 class Yardstick(Options):
-    """What a success is.
+    """Criterion of success.
 
     Attributes
     ----------
     truth : mapping of name to value, empty where it is unknown
+        True values of the parameters.
     within : float
         Largest relative error of an estimated parameter.
     """
@@ -96,7 +101,7 @@ class Yardstick(Options):
 
     @property
     def sentence(self) -> str:
-        """The same for people."""
+        """Explanation of the criterion for the user."""
         if not self.truth:
             return "A run succeeds when it converges."
         return (
@@ -112,7 +117,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """
     if trials == 0:
         return 0.0, 1.0
-    rate, z2 = successes / trials, NORMAL_975**2
+    rate = successes / trials
+    z2 = NORMAL_975**2
     centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
     spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)
     low = 0.0 if successes == 0 else centre - spread
@@ -123,18 +129,27 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 
 def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row:
-    """One run as a flat row; None where there is no number.
+    """Return one run as a flat row; values are None if they are not known.
 
     Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` and ``error_*``
-    (relative to the truth) hold the parameters; swept keys have columns of their own.
+    (relative to the truth) contain the parameters; swept keys have columns of their own.
+
+    Parameters
+    ----------
+    run : PlannedRun
+        Run.
+    record : Record or None
+        Its record; None if it was not executed.
+    yardstick : Yardstick
+        Criterion of success.
     """
     record = record or {"outcome": "missing", "message": "not run yet"}
     result: Result | None = read(Result | None, record.get("result"))
-    late = record["outcome"] == TIMEOUT
-    converged = result is not None and result.converged and not late
+    is_timeout = record["outcome"] == TIMEOUT
+    converged = result is not None and result.converged and not is_timeout
     parameters = _parameters(run, result, yardstick.truth)
     errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
-    near = all(error is not None and error <= yardstick.within for error in errors)
+    is_accurate = all(error is not None and error <= yardstick.within for error in errors)
     numbers = {
         name: None if result is None else column.of(result)
         for name, column in COLUMNS.items()
@@ -145,9 +160,9 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
         "method": run.method,
         "start": run.start,
         **run.swept,
-        "status": record["outcome"] if late or result is None else result.status,
+        "status": record["outcome"] if is_timeout or result is None else result.status,
         "converged": converged,
-        "success": converged and near,
+        "success": converged and is_accurate,
         **parameters,
         **numbers,
         "tip_max_m": (record.get("tip") or {}).get("max_m"),
@@ -159,6 +174,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
 
 
 def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
+    """Return the columns of the parameters."""
     row: Row = {}
     estimates = {} if result is None else result.parameters
     for name, guess in run.guess.items():
@@ -179,7 +195,7 @@ def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, floa
 
 
 def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
-    """Names of the parameters that rows have a column of this kind for."""
+    """Return the names of the parameters for which rows have a column of this kind."""
     return [name.removeprefix(kind) for name in rows[0] if name.startswith(kind)]
 
 
@@ -187,7 +203,7 @@ def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
 
 
 def method_rows(rows: Sequence[Row]) -> list[Row]:
-    """A comparison's summary, one row for each method in the order of their first runs."""
+    """Return a summary of each method, in the order of their first runs."""
     methods = dict.fromkeys(row["method"] for row in rows)
     return [
         _summary(method, [row for row in rows if row["method"] == method]) for method in methods
@@ -195,6 +211,7 @@ def method_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def _summary(method: str, rows: Sequence[Row]) -> Row:
+    """Return the summary of the runs of one method."""
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
     low, high = wilson_interval(successes, len(done))
@@ -214,10 +231,14 @@ def _summary(method: str, rows: Sequence[Row]) -> Row:
 
 
 def best_run(rows: Sequence[Row]) -> Row | None:
-    """The answer with the lowest loss, of the successes if there are any, else of the converged."""
+    """Return the run with the lowest loss, among successes if there are any, else converged runs.
+
+    None if no run has a result.
+    """
     answered = [row for row in rows if row["rms_m"] is not None]
 
     def rank(row: Row) -> tuple[bool, bool, float]:
+        """Return the sort key of a run."""
         loss = row["loss"] if row["loss"] is not None else inf
         return not row["success"], not row["converged"], loss
 
@@ -225,7 +246,10 @@ def best_run(rows: Sequence[Row]) -> Row | None:
 
 
 def reference(rows: Sequence[Row], yardstick: Yardstick) -> dict[str, float]:
-    """Where guesses are measured from: the truth, or the best answer's parameters."""
+    """Return the parameters from which guesses are measured: the truth, or those of the best run.
+
+    Empty if the best run did not converge.
+    """
     names = parameters_in(rows)
     if yardstick.truth:
         return {name: yardstick.truth[name] for name in names}
@@ -236,6 +260,6 @@ def reference(rows: Sequence[Row], yardstick: Yardstick) -> dict[str, float]:
 
 
 def distance(row: Row, centre: Mapping[str, float]) -> float:
-    """Factor by which the guess that is farthest off misses."""
+    """Return the largest ratio between a guess and the reference; NaN without a reference."""
     logs = [abs(np.log(row[f"guess_{name}"] / value)) for name, value in centre.items()]
     return float(np.exp(max(logs))) if logs else nan

@@ -1,8 +1,8 @@
-"""Variants of a problem's model as overrides of its file: other materials, damping, memory.
+"""Variants of a problem's model as overrides of its file: other materials, damping laws, memory.
 
-What is estimated follows the model. Constants that a material does not have are left out, those
-that it needs besides are estimated, from as stiff a start as the file guesses, or where a scan of
-the stiffness starts them; all else stays as the file states it.
+The estimated parameters follow the model. Constants that a material does not have are removed;
+those that it needs in addition are estimated, starting from the stiffness of the file's guess or
+from a scan of the stiffness. Everything else stays as in the file.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ MOST_BRANCHES = 20
 # Budget entries that stand for other laws of damping, in place of which these are fitted.
 DAMPING_ASSUMPTIONS = ("damping_law", "rayleigh_damping")
 # Of a material of which nothing is said; and of the shear modulus, what a constant about zero has.
-USUAL_POISSON, LESS = 0.3, 0.1
+USUAL_POISSON = 0.3
+LESS = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,11 @@ class Variant:
     Attributes
     ----------
     label : str
-    overrides : tuple of "key=value" that make it of the problem file
+        Name of the model for the user.
+    overrides : tuple of str
+        Overrides "key=value" that derive it from the problem file.
     path : Path
-        Its problem file.
+        Problem file.
     """
 
     label: str
@@ -52,34 +55,34 @@ class Variant:
 
 
 def parse_materials(text: str) -> tuple[str, ...]:
-    """Names of materials separated by commas, each once.
+    """Return names of materials from text separated by commas, each once.
 
     Raises
     ------
     InputError
-        For an unknown name, with the one that was probably meant.
+        For an unknown name, with the most similar known one.
     """
     return _each_among(text, MATERIALS, "--materials")
 
 
 def parse_dampings(text: str) -> tuple[str, ...]:
-    """Return names of laws of damping separated by commas, each once.
+    """Return names of damping laws from text separated by commas, each once.
 
     Raises
     ------
     InputError
-        For an unknown name, with the one that was probably meant.
+        For an unknown name, with the most similar known one.
     """
     return _each_among(text, DAMPINGS, "--damping")
 
 
 def _each_among(text: str, known: Iterable[str], option: str) -> tuple[str, ...]:
-    """Return names separated by commas, each once, all of which are known to the option.
+    """Return names from text separated by commas, each once.
 
     Raises
     ------
     InputError
-        For an unknown name or none, with the one that was probably meant.
+        For an unknown name or none; it refers to the command-line option.
     """
     names = each_once(text)
     for name in names or ("",):
@@ -88,12 +91,12 @@ def _each_among(text: str, known: Iterable[str], option: str) -> tuple[str, ...]
 
 
 def parse_branches(text: str) -> tuple[int, ...]:
-    """Numbers of Prony branches separated by commas, each once.
+    """Return numbers of Prony branches from text separated by commas, each once.
 
     Raises
     ------
     InputError
-        For anything but whole numbers from 0 on.
+        For anything but whole numbers from 0 to `MOST_BRANCHES`.
     """
     items = [item.strip() for item in text.split(",") if item.strip()]
     counts = [int(item) for item in items if item.isascii() and item.isdecimal() and len(item) < 3]
@@ -217,12 +220,13 @@ def variants(
 
 
 def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list[Variant]:
-    """Problem files of the same recordings, a model each, called after the file.
+    """Return problem files of the same recordings as models, named after the files.
 
     Raises
     ------
     InputError
-        Where what they fit differs: neither misses nor AIC could be compared.
+        If the files do not fit the same recordings and samples, so that neither predictions nor AIC
+        could be compared, or a file is given twice.
     """
     first, *others = map(_measured, problems)
     for problem, measured in zip(problems[1:], others, strict=True):
@@ -241,7 +245,7 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
 
 
 def _measured(problem: Problem) -> dict[str, int]:
-    """How many numbers each recording that is fitted has measured."""
+    """Return how many numbers are measured in each fitted recording."""
     return {
         e.name: 3 * e.markers.samples
         + sum(int(np.isfinite(wrench.values).sum()) for wrench in e.wrenches)
@@ -251,10 +255,12 @@ def _measured(problem: Problem) -> dict[str, int]:
 
 
 def _listed(measured: Mapping[str, int]) -> str:
+    """Return the recordings with their numbers in words."""
     return " and ".join(f"'{name}' ({numbers} numbers)" for name, numbers in measured.items())
 
 
 def _refuse_region(body: Mapping[str, Any], region: str | None, branches: bool, path: Path) -> None:
+    """Raise `InputError` for an unknown region, or for branches that belong to other regions."""
     names = [each["name"] for each in body.get("region", [])]
     if region is not None and not names:
         message = f"found {region!r}; expected none: it has no regions"
@@ -289,10 +295,9 @@ def _with_law(
 def _of_material(
     parameters: Mapping[str, Any], material: str, region: str | None
 ) -> dict[str, Any]:
-    """The parameters of a body whose parts, or one of whose regions, are of this material instead.
+    """Return the parameters for a body with another material in all parts, or in one region.
 
-    A part that has constants of a material for itself goes on having them for itself; the others
-    share theirs.
+    A part with its own constants keeps constants of its own; the others share theirs.
     """
     of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {*ELASTIC}
     fronts = {name[: -len(bare(name))] for name in parameters if bare(name) in of_any}
@@ -306,7 +311,7 @@ def _of_material(
 def _of_part(
     parameters: Mapping[str, Any], front: str, material: str, of_any: set[str]
 ) -> dict[str, Any]:
-    """The same of the part whose constants have something in front of their names."""
+    """Return the parameters with another material in the part whose constants have this prefix."""
     own = [constant.name for constant in MATERIALS[material].constants]
     possible = {*own, *elastic_names(MATERIALS[material])}
     mine = {front + name for name in of_any}
@@ -321,9 +326,10 @@ def _of_part(
 
 
 def _shear_pa(parameters: Mapping[str, Any], front: str) -> float | None:
-    """The small-strain shear modulus where the file guesses its own constants."""
+    """Return the shear modulus at small strain [Pa] from the guesses of a part; None if unknown."""
 
     def value(name: str) -> float:
+        """Return the guess or fixed value of a constant; NaN if it has none."""
         stated = parameters.get(front + name, parameters.get(name))
         if isinstance(stated, Mapping):
             stated = stated.get("fixed", stated.get("guess"))
@@ -336,7 +342,7 @@ def _shear_pa(parameters: Mapping[str, Any], front: str) -> float | None:
 
 
 def _start(name: str, shear_pa: float | None) -> dict[str, Any]:
-    """A constant of another material: as stiff as the file's own, or found by a scan."""
+    """Return the table of a constant: with a guess as stiff as the file's, or empty for a scan."""
     if shear_pa is None:
         return {}
     usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, USUAL_POISSON)
@@ -348,7 +354,7 @@ def _start(name: str, shear_pa: float | None) -> dict[str, Any]:
 def _branches(
     own: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
 ) -> list[dict[str, Any]]:
-    """The first branches of the file, and more up to a number."""
+    """Return the first `count` branches of the file, followed by new ones if there are fewer."""
     tables = [dict(each) for each in own[:count]]
     taken = {each["name"] for each in tables} | others
     names = (f"prony_{k}" for k in range(1, count + len(taken) + 1))
@@ -363,10 +369,24 @@ def _with_memory(
     tables: Sequence[Mapping[str, Any]],
     times_s: tuple[float, float],
 ) -> dict[str, Any]:
-    """The parameters with a share and a time constant of each branch."""
+    """Return the parameters with a share and a time constant of each branch.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Parameters of the file.
+    old : sequence of str
+        Names of the file's branches; parameters of those that are removed are removed.
+    tables : sequence of mapping
+        Tables of the new branches.
+    times_s : tuple of two floats
+        Interval in which time constants start [s].
+    """
     names = [each["name"] for each in tables]
-    gone = {name for name in old if name not in names}
-    kept = {n: v for n, v in parameters.items() if n.removesuffix(f".{bare(n)}") not in gone}
+    removed_names = {name for name in old if name not in names}
+    kept = {
+        n: v for n, v in parameters.items() if n.removesuffix(f".{bare(n)}") not in removed_names
+    }
     shortest, longest = times_s
     for k, name in enumerate(names, start=1):
         tau_s = shortest * (longest / shortest) ** (k / (len(names) + 1))
@@ -376,7 +396,7 @@ def _with_memory(
 
 
 def toml(value: Any) -> str:
-    """A value in TOML's inline syntax."""
+    """Return a value in TOML's inline syntax."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, (list, tuple)):

@@ -1,7 +1,7 @@
-"""One run of a study in a process of its own: ``python -m collocation_sysid.plan.worker OUT``.
+"""Worker process for one run of a study: ``python -m collocation_sysid.plan.worker OUT``.
 
-The run comes as one line of JSON on stdin, and its record goes to the file OUT. The process ends
-when its stdin is closed, so that none outlives the study that started it.
+The run is read as one line of JSON from stdin, and its record is written to the file OUT. The
+process ends when its stdin is closed, so that it never outlives the study.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .process import ERROR, FINISHED
 
 
 def main() -> None:
-    """Entry point."""
+    """Entry point: read the run, execute it, and write its record."""
     heed_interrupts()
     planned = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_the_study, daemon=True).start()
@@ -38,7 +38,13 @@ def main() -> None:
 
 
 def attempt(planned: dict[str, Any]) -> dict[str, Any]:
-    """Do a planned run; what goes wrong becomes part of its record."""
+    """Execute a planned run and return its record; errors become part of the record.
+
+    Parameters
+    ----------
+    planned : dict
+        A `PlannedRun` as a dictionary.
+    """
     try:
         problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
         held_out = planned.get("held_out")
@@ -60,13 +66,16 @@ def attempt(planned: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tip(finished: Run) -> dict[str, Any] | None:
-    """Measured and re-simulated track of the marker farthest from the grasp, if there is one."""
+    """Return measured and simulated track of the marker farthest from the grasp; None
+    without markers.
+    """
     experiment = finished.solution.collocation.segments[0].experiment
-    markers, nodes_m = experiment.markers, experiment.body.nodes_m
-    held = held_nodes(experiment.grasps)
+    markers = experiment.markers
+    nodes_m = experiment.body.nodes_m
+    grasped_nodes = held_nodes(experiment.grasps)
     if not markers.names:
         return None
-    centre = nodes_m[held if len(held) else slice(None)].mean(axis=0)
+    centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0)
     tip = int(np.linalg.norm(markers.observe(nodes_m) - centre, axis=1).argmax())
     measured = markers.positions_m[:, tip]
     rollout = finished.rollouts[experiment.name]
@@ -85,6 +94,7 @@ def _tip(finished: Run) -> dict[str, Any] | None:
 
 
 def _end_with_the_study() -> None:
+    """Wait until stdin is closed, and end the process."""
     os.read(0, 1)  # returns when the other end is closed
     os._exit(1)
 

@@ -1,4 +1,4 @@
-"""A new problem: a commented file, and beside it simulated data with which it runs as it is."""
+"""New problem: a commented problem file, with simulated data that make it runnable."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def begin(folder: Path, kind: str | None = None) -> list[Path]:
-    """Write problem.toml into a folder, which is made; its name is the title.
+    """Write problem.toml, and data for it, to a folder; the title is the folder's name.
 
     Parameters
     ----------
     folder : Path
+        Folder; it is created if necessary.
     kind : str, optional
-        With a simulated recording of this kind; by default the file alone, of a body that swings.
+        Kind of simulated recording that is written too; None writes only the file, for a swinging
+        body.
 
     Returns
     -------
     list of Path
-        The problem file, then its data.
+        The problem file, followed by its data files.
 
     Raises
     ------
     InputError
-        Where there is one of these files already, or the folder cannot be made.
+        If one of these files exists, or the folder cannot be created.
     """
-    file, template = folder / "problem.toml", TEMPLATES / (kind or "swing")
+    file = folder / "problem.toml"
+    template = TEMPLATES / (kind or "swing")
     require_possible(folder)
     data = sorted(each for each in template.iterdir() if kind and each.name != file.name)
     for each in (file, *(folder / each.name for each in data)):

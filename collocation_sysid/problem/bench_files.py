@@ -37,22 +37,21 @@ OTHER_TIME = "Time (s)"
 
 
 def length_m(table: DisplacementSection, body: Body) -> float | None:
-    """The undeformed length that a strain multiplies; None where displacements are measured."""
+    """Return the undeformed length [m] by which a strain is multiplied; None for displacements."""
     if table.length_m != "body":
         return table.length_m
     return float(np.ptp(body.nodes_m[:, "xyz".index(table.axis)]))
 
 
 def is_bench(section: ExperimentSection) -> bool:
-    """Whether a table says how a grasp or an obstacle is displaced."""
+    """Return whether a grasp or an obstacle of an experiment is moved by a table of
+    displacements.
+    """
     return any(moved.displacement is not None for moved in section.moved)
 
 
 def table_name(section: ExperimentSection, table: TableSection) -> str:
-    """The name of a table of a bench within the folder of a simulation.
-
-    That under which the problem reads it, without folders where it is none below the problem's.
-    """
+    """Return the name of a test bench's table in the folder of a simulation."""
     path = PurePath(section.file_of(table) or f"{section.name}.csv")
     is_below = not path.is_absolute() and ".." not in path.parts
     return str(path) if is_below else path.name
@@ -113,7 +112,9 @@ class BenchTable:
 def add_displacement(
     table: BenchTable, layout: DisplacementSection, grasp: Grasp, rest_length_m: float | None
 ) -> None:
-    """Add the shifts of a grasp at the times of the table, as `read_displacement` reads them."""
+    """Add the translations of a grasp at the times of the table, as `read_displacement`
+    reads them.
+    """
     shifts_m = layout.sign * grasp.poses.at(table.t_s)[1]
     along = shifts_m[:, "xyz".index(layout.axis)]
     values = {"displacement": along, **dict(zip("xyz", shifts_m.T, strict=True))}
@@ -156,7 +157,7 @@ def add_wrench(table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Ar
 
 
 def _mapped(layout: TableSection) -> list[str]:
-    """The quantities whose columns the problem names."""
+    """Return the quantities whose columns the problem names."""
     return [key for key in layout.columns if key != TIME.key]
 
 

@@ -1,4 +1,7 @@
-"""What a problem file takes from Python files: foreign code, run only when allowed."""
+"""Python files that a problem names: custom materials, forces, sensors and nuisance parameters.
+
+They are run only if the user allows it.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +23,12 @@ from .schema import CodeSection, NodeForceSection
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:
-    """The file, or topic of a log, that a key of the problem file names.
+    """Return the path of a file, or of a topic of a log, that a key of the problem file names.
 
     Raises
     ------
     InputError
-        If there is none.
+        If it does not exist.
     """
     file = folder / name
     require_regular(file, key)
@@ -40,25 +43,26 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
 
 @dataclass(frozen=True)
 class Code:
-    """Python files that a problem names, which are run only where that is allowed.
+    """Loader of Python files, which runs them only if that is allowed.
 
     Attributes
     ----------
     folder : Path
-        Where they are sought.
+        Folder that contains the files.
     allowed : bool
+        Whether files may be run.
     """
 
     folder: Path
     allowed: bool
 
     def material(self, section: CodeSection, key: str) -> Material:
-        """A material of a function.
+        """Return a custom material.
 
         Raises
         ------
         InputError
-            See `function`; or if it is no energy density, see `Material.of`.
+            See `function`; also if the function is no energy density, see `Material.of`.
         """
         file, loaded = self.function(section.file, section.function, f"{key}.file")
         if isinstance(loaded, Material):
@@ -67,16 +71,17 @@ class Code:
             return Material.of(cast(Energy, loaded), section.function)
 
     def force(self, section: NodeForceSection, key: str) -> NodeForce:
-        """A force on nodes of a function.
+        """Return a custom force on nodes.
 
         Raises
         ------
         InputError
-            See `function`; or if it is no force, see `NodeForce.of`.
+            See `function`; also if the function is no force, see `NodeForce.of`.
         """
         file, loaded = self.function(section.file, section.function, f"{key}.file")
         nodes = None if section.nodes is None else selection(section.nodes)
-        name, carries = section.function, section.carries
+        name = section.function
+        carries = section.carries
         if isinstance(loaded, NodeForce):
             if carries not in (0, loaded.carries):
                 message = f"found {carries}, but the force {name!r} says that it carries"
@@ -87,25 +92,36 @@ class Code:
             return NodeForce.of(loaded, nodes=nodes, name=name, on=section.on, carries=carries)
 
     def row(self, section: OwnRow) -> NuisanceRow:
-        """A nuisance parameter; see `function` for the errors."""
+        """Return a custom nuisance parameter; see `function` for the errors."""
 
         def fits(value: Any) -> bool:
+            """Return whether a value of the file is a nuisance parameter."""
             return isinstance(value, NuisanceRow)
 
         key = "nuisance.own.file"
         return self._named(section.file, section.row, key, "NuisanceRow", fits)[1]
 
     def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
-        """A function of a file that a key names, and the file's path.
+        """Return the path of a file and a function in it.
+
+        Parameters
+        ----------
+        file : str
+            Name of the file.
+        name : str
+            Name of the function.
+        key : str
+            Key of the problem file that names it, for messages.
 
         Raises
         ------
         InputError
-            If running code is not allowed, the file or the function is not there, or the file
+            If running code is not allowed, the file or the function does not exist, or the file
             fails.
         """
 
         def fits(value: Any) -> bool:
+            """Return whether a value of the file is a function or a force."""
             return callable(value) or isinstance(value, NodeForce)
 
         return self._named(file, name, key, "function", fits)
@@ -113,7 +129,26 @@ class Code:
     def _named(
         self, name: str, wanted: str, key: str, what: str, fits: Callable[[Any], bool]
     ) -> tuple[Path, Any]:
-        """What is called so in a file after it has run."""
+        """Run a file, and return its path and the value with a name.
+
+        Parameters
+        ----------
+        name : str
+            Name of the file.
+        wanted : str
+            Name of the value.
+        key : str
+            Key of the problem file, for messages.
+        what : str
+            Kind of value, for messages.
+        fits : callable
+            Function that returns whether a value is of this kind.
+
+        Raises
+        ------
+        InputError
+            See `function`.
+        """
         if not self.allowed:
             message = (
                 f"found the file {name}, which would be run as Python code; allow that with "
@@ -126,7 +161,7 @@ class Code:
         except (Exception, SystemExit) as error:
             raise InputError(f"running it failed: {reason(error)}", file) from error
         if not fits(names.get(wanted)):
-            there = [n for n, value in names.items() if fits(value) and not n.startswith("_")]
-            known = f"{', '.join(there) or 'none'}{hint_at(wanted, there)}"
+            known_names = [n for n, value in names.items() if fits(value) and not n.startswith("_")]
+            known = f"{', '.join(known_names) or 'none'}{hint_at(wanted, known_names)}"
             raise InputError(f"there is no {what} {wanted!r}; expected one of {known}", file)
         return file, names[wanted]

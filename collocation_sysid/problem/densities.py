@@ -1,4 +1,6 @@
-"""Densities that are parameters: their guesses and what [object] states stand in for each other."""
+"""Densities and masses as parameters: [object] and the guesses in [parameters] complete
+each other.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,12 @@ Sections = Mapping[str, ParameterSection | float]
 
 
 def completed(section: ObjectSection, parameters: Sections) -> ObjectSection:
-    """[object] with the guesses of densities that it leaves out.
+    """Return [object] with missing densities taken from guesses of parameters.
 
     Raises
     ------
     InputError
-        Where neither tells the body's mass.
+        If neither states the body's mass.
     """
     regions = [_weighed(region, parameters) for region in section.region]
     changes: dict[str, object] = {"region": regions}
@@ -26,9 +28,9 @@ def completed(section: ObjectSection, parameters: Sections) -> ObjectSection:
         guesses = {name: _guess(parameters, name) for name in (DENSITY.name, MASS.name)}
         known = {name: guess for name, guess in guesses.items() if guess is not None}
         if len(known) != 1:
-            which = " and ".join(known) or f"no {MASS.name} or {DENSITY.name}"
+            names = " and ".join(known) or f"no {MASS.name} or {DENSITY.name}"
             raise InputError(
-                f"found {which}; expected exactly one of {MASS.name}, {DENSITY.name}, here or with "
+                f"found {names}; expected exactly one of {MASS.name}, {DENSITY.name}, here or with "
                 "a guess in [parameters]"
             )
         changes |= known
@@ -36,7 +38,7 @@ def completed(section: ObjectSection, parameters: Sections) -> ObjectSection:
 
 
 def guessed(parameters: Sections, body: Body) -> dict[str, ParameterSection | float]:
-    """[parameters] with the densities that [object] states as guesses, where there are none."""
+    """Return [parameters] with missing guesses of densities taken from the body."""
     return {
         name: section.model_copy(update={"guess": _stated(body, name)})
         if isinstance(section, ParameterSection)
@@ -50,6 +52,7 @@ def guessed(parameters: Sections, body: Body) -> dict[str, ParameterSection | fl
 
 
 def _weighed(region: RegionSection, parameters: Sections) -> RegionSection:
+    """Return a region with its density; if it has none, the guess of its parameter."""
     if region.density_kg_m3 is not None:
         return region
     guess = _guess(parameters, f"{region.name}.{DENSITY.name}")
@@ -57,6 +60,7 @@ def _weighed(region: RegionSection, parameters: Sections) -> RegionSection:
 
 
 def _guess(parameters: Sections, name: str) -> float | None:
+    """Return the guess, prior mean or fixed value of a parameter; None if it has none of these."""
     section = parameters.get(name)
     if not isinstance(section, ParameterSection):
         return section
@@ -66,6 +70,9 @@ def _guess(parameters: Sections, name: str) -> float | None:
 
 
 def _stated(body: Body, name: str) -> float | None:
+    """Return the mass [kg] or density [kg/m³] that the body states for a parameter; None if
+    it has none.
+    """
     if bare(name) == MASS.name:
         return body.mass_kg
     region = name.rpartition(".")[0]

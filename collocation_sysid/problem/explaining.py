@@ -1,4 +1,4 @@
-"""Pydantic's complaints about a file in this project's words."""
+"""Messages for validation errors of pydantic: key, what was found, and what was expected."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ Fault = Mapping[str, Any]
 def explain(
     error: ValidationError, content: dict[str, Any], path: Path, root: type[BaseModel] = ProblemFile
 ) -> InputError:
-    """Turn the first complaint into an `InputError`, and count the others.
+    """Return an `InputError` for the first fault, with the number of other faults.
 
     Parameters
     ----------
     error : ValidationError
+        Error of pydantic.
     content : dict
-        The file's content that was validated.
+        Content that was validated.
     path : Path
+        File, for the message.
     root : type
-        What it was validated as.
+        Model that the content was validated as.
     """
     faults = error.errors(include_url=False)
     # An unknown key explains the others around it.
@@ -44,7 +46,9 @@ def explain(
 
 
 def _key(fault: Fault, root: type[BaseModel]) -> list[Part]:
-    """The key at fault: without the union's tags, and without places in an array of numbers."""
+    """Return the key of a fault, without tags of unions and without indices in an array of
+    numbers.
+    """
     loc = fault["loc"]
     own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
     parts = [p for k, p in enumerate(loc) if k >= own or not str(p).startswith("<")]
@@ -56,11 +60,13 @@ def _key(fault: Fault, root: type[BaseModel]) -> list[Part]:
 
 
 def _message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
+    """Return what was found and what was expected."""
     key = _key(fault, root)
     field, _ = _field(key, root)
     description = (field.description if field else None) or ""
     expected = description[:1].lower() + description[1:].rstrip(".").split(";")[0]
-    kind, model = fault["type"], _model_in(field.annotation) if field else None
+    kind = fault["type"]
+    model = _model_in(field.annotation) if field else None
     if kind == "extra_forbidden":
         table, _ = _field(key[:-1], root)
         inside = _model_in(table.annotation) if table else None
@@ -86,15 +92,18 @@ def _message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> st
 
 
 def _place(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
-    """Where a fault is; an `InputError` knows the place inside what is one value here."""
+    """Return the location of a fault as text.
+
+    An `InputError` that a validator raised contains the location within its value.
+    """
     error = (fault.get("ctx") or {}).get("error")
     known = error.where if isinstance(error, InputError) else None
     return known or _where(_key(fault, root), content)
 
 
 def _where(key: Sequence[Part], content: dict[str, Any]) -> str:
-    """The key as it is written in the file, experiments by their names."""
-    place: Any = content
+    """Return the key as it is written in the file, with experiments by their names."""
+    value: Any = content
     defaults = _inside(content, "experiment_defaults")
     if key[:1] == ["experiment"] and len(key) > 2:
         own = _value_at(key[:2], content)
@@ -103,22 +112,25 @@ def _where(key: Sequence[Part], content: dict[str, Any]) -> str:
     written: list[str] = []
     experiment = ""
     for part in key:
-        place = _inside(place, part)
+        value = _inside(value, part)
         written.append(str(part))
-        name = _inside(place, "name")
+        name = _inside(value, "name")
         if len(written) == 2 and written[0] == "experiment" and name and isinstance(name, str):
-            experiment, written = f"experiment {name!r}", []
+            experiment = f"experiment {name!r}"
+            written = []
     return ": ".join(text for text in (experiment, ".".join(written)) if text)
 
 
 def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
-    place: Any = content
+    """Return the value of a key; None if it does not exist."""
+    value: Any = content
     for part in key:
-        place = _inside(place, part)
-    return place
+        value = _inside(value, part)
+    return value
 
 
 def _inside(place: Any, part: Part) -> Any:
+    """Return an item of a table or list; None if it does not exist."""
     try:
         return place[part]
     except (KeyError, IndexError, TypeError):
@@ -129,9 +141,15 @@ def _inside(place: Any, part: Part) -> Any:
 
 
 def _field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo | None, int]:
-    """The deepest field of the schema on the way to a key, and how many parts lead to it."""
+    """Return the deepest field of the schema on the path of a key, and the number of parts up to
+    it.
+
+    The field is None if no part is in the schema.
+    """
     model: type[BaseModel] | None = root
-    field, depth, named = None, 0, False
+    field = None
+    depth = 0
+    named = False
     for count, part in enumerate(key, start=1):
         if isinstance(part, int):
             continue
@@ -140,13 +158,15 @@ def _field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo | None
             continue
         if model is None or part not in model.model_fields:
             break
-        field, depth, named = model.model_fields[part], count, False
+        field = model.model_fields[part]
+        depth = count
+        named = False
         model = _model_in(field.annotation)
     return field, depth
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """The table that a field is, or is a list of."""
+    """Return the model of a field that is a table or a list of tables; None for other fields."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in getattr(annotation, "__args__", ()):
@@ -157,7 +177,7 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 
 
 def short(value: Any) -> str:
-    """A value as text of 60 characters at most."""
+    """Return a value as text of at most 60 characters."""
     if isinstance(value, bool):
         return str(value).lower()
     try:

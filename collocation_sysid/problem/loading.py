@@ -1,4 +1,4 @@
-"""What a problem file holds: a body, experiments, parameters, and how it is to be solved."""
+"""Conversion of a validated problem file to the arguments of `Problem`."""
 
 from __future__ import annotations
 
@@ -42,14 +42,18 @@ def contents_of(
     folder: str | Path | None = None,
     say: Say | None = None,
 ) -> dict[str, Any]:
-    """The arguments of a `Problem` by a file and the files it names, see `Problem.read`."""
+    """Return the arguments of `Problem` from a problem file and the files it names.
+
+    See `Problem.read` for the parameters and errors.
+    """
     file, text = read_problem_file(path, overrides)
     if not simulation and all(section.validation for section in file.experiment):
         raise InputError(
             "every experiment has validation = true; expected at least one to fit", path
         )
     folder = path.parent if folder is None else Path(folder)
-    unknowns, code = file.parameters, Code(folder, allow_code)
+    unknowns = file.parameters
+    code = Code(folder, allow_code)
     if say is not None:
         announce_reading({*_named_files(file, folder)}, say)
     with _in_table(path, "object"):
@@ -64,13 +68,14 @@ def contents_of(
         require_feasible(replace(size, substeps=1), None if generated else say)
         body = _load_body(completed(file.object, unknowns), mesh, code)
         body = body.with_free_densities(body.weighed_by(unknowns))
-        odd = [oddity.sentence for oddity in oddities(body)]
+        mesh_warnings = [oddity.sentence for oddity in oddities(body)]
     with _in_table(path, "parameters"):
-        rubbed = body.with_frames(0, frictions=_frictions(file))
-        stated = guessed(unknowns, rubbed)
-        parameters = Parameters.of({name: _stated(name, each) for name, each in stated.items()})
-        parameters.fit([rubbed])
-    experiments, notes = [], []
+        body_with_friction = body.with_frames(0, frictions=_frictions(file))
+        sections = guessed(unknowns, body_with_friction)
+        parameters = Parameters.of({name: _stated(name, each) for name, each in sections.items()})
+        parameters.fit([body_with_friction])
+    experiments = []
+    notes = []
     for section in file.experiment:
         reader = RecordingReader(
             section,
@@ -83,7 +88,7 @@ def contents_of(
             size=size,
             say=say,
         )
-        with _in_table(path, f"experiment '{section.name}'", odd):
+        with _in_table(path, f"experiment '{section.name}'", mesh_warnings):
             experiments.append(reader.read())
         notes += reader.notes
     return {
@@ -102,7 +107,9 @@ def contents_of(
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
-    """Nodes and elements of a mesh that is to be generated; None where they are not known yet."""
+    """Return the numbers of nodes and elements of a mesh to be generated; None for meshes
+    from files.
+    """
     if section.box_m is not None:
         return counts_of_box(section.box_m, section.edge_length_m)
     if (shape := section.cylinder) is not None:
@@ -113,7 +120,7 @@ def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
 
 
 def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation: bool) -> Size:
-    """Size of a problem of one sample, by the corners and elements of its mesh."""
+    """Return the size of the problem with one sample, from the corners and elements of its mesh."""
     # A quadratic element has a node on every edge; a mesh has about 7 edges per corner.
     nodes = corners if file.object.element == "tet4" else 8 * corners
     substeps = file.transcription.substeps
@@ -132,13 +139,14 @@ def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation
 
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
-    """The files of data that a problem names, whether they are there or not."""
+    """Return the data files that a problem names, whether or not they exist."""
     names = [file.object.mesh, file.object.surface]
     for section in file.experiment:
         names += [section.markers.file, *(each.file for each in (*section.reading, *section.depth))]
         for grasp in section.moved:
-            moved, sensed = section.file_of(grasp.displacement), section.file_of(grasp.wrench)
-            names += [grasp.poses or moved, sensed]
+            displacement_file = section.file_of(grasp.displacement)
+            wrench_file = section.file_of(grasp.wrench)
+            names += [grasp.poses or displacement_file, wrench_file]
         for _, word, kind in tables_of(Experiment):
             keys = [key.name for _, key in keys_of(kind) if key.constant is not None]
             names += [getattr(table, key) for table in getattr(section, word) for key in keys]
@@ -147,21 +155,27 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def _in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
-    """Errors get the file and the table they lack, and say first what is odd about the body."""
+    """Context that adds file and table to errors without them, and begins with warnings on
+    the body.
+    """
     try:
         yield
     except InputError as error:
-        source, where = error.source, error.where
+        source = error.source
+        where = error.where
         if where == AIR_KEY:
-            source, where = path, f"environment.{AIR_KEY}"
+            source = path
+            where = f"environment.{AIR_KEY}"
         elif source is None:  # else it speaks of a file of its own
             inner = where if where != table else None
             separator = ": " if " " in table else "."
-            source, where = path, separator.join(part for part in (table, inner) if part)
+            source = path
+            where = separator.join(part for part in (table, inner) if part)
         raise InputError("; ".join([*odd, error.message]), source, where) from error
 
 
 def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
+    """Return the mesh from a file, a surface, or a shape."""
     if section.mesh is not None:
         file = existing_file(folder, section.mesh, "mesh")
         return TetMesh.read(file, section.length_unit)
@@ -202,6 +216,8 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
 
 
 def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
+    """Return the body with its materials, regions, forces and fields."""
+
     def material(law: str | CodeSection | None, key: str) -> Any:
         return code.material(law, key) if isinstance(law, CodeSection) else law
 
@@ -240,21 +256,21 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
 
 
 def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"] | None:
-    """Return what is stated of the stress-free shape; None where nothing is."""
+    """Return the stated stress-free shape; None if the file states none."""
     if section.scan is not None:
         return UnderGravity(selection(section.scan.nodes), section.scan.gravity_m_s2)
     return "stress_free" if section.rest_shape is not None else None
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
-    """Those of obstacles that are parameters; others than frictions are refused where they are."""
+    """Return the friction parameters that obstacles name, each once."""
     stated = (each.friction for section in file.experiment for each in section.obstacle)
     named = (one for one in stated if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
 
 
 def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
-    """A parameter as the file states it."""
+    """Return one parameter from its table, or from its fixed value."""
     if not isinstance(section, ParameterSection):
         return section
     if section.fixed is not None:
@@ -262,12 +278,15 @@ def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | fl
     if section.tied_to is not None:
         return Tied(section.tied_to, 1.0 if section.ratio is None else section.ratio)
     linear = (section.scale or constant_named(name).scale) == "linear"
-    said = section.model_dump(include={each.name for each in fields(Unknown)})
-    return Unknown(**said | {"prior": section.prior and _prior(section.prior, linear)})
+    values = section.model_dump(include={each.name for each in fields(Unknown)})
+    return Unknown(**values | {"prior": section.prior and _prior(section.prior, linear)})
 
 
 def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:
-    """Mean and deviation: absolute of a linear parameter, else relative."""
+    """Return mean and standard deviation of a prior.
+
+    The deviation is absolute for a linear parameter, and relative otherwise.
+    """
     size = abs(section.mean)
     if linear:
         return section.mean, section.deviation or (section.relative or 0.0) * size

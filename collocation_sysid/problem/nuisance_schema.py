@@ -1,6 +1,6 @@
-"""The nuisance keys of a recording, made from the table of what may be estimated.
+"""Keys of [experiment.nuisance], generated from the table of nuisance parameters.
 
-A key has the priors of one row of the table, or of several.
+A key contains the priors of one or more nuisance parameters.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ KEYS = {key: list(rows) for key, rows in groupby(ROWS, key=lambda row: row.key)}
 
 
 def _scope(word: str) -> str:
+    """Return a scope if it is valid; raise `ValueError` otherwise."""
     if word != "recording" and not re.fullmatch(SCOPE, word):
         raise ValueError(f'found {word!r}; expected "recording", {SCOPES}')
     return word
@@ -32,15 +33,16 @@ class Scoped(Section):
     Attributes
     ----------
     scope : str
-        Whose it is: that of each recording by itself, or the same in all that say "shared", or
-        "shared" and a word for each of several groups.
+        Which recordings have the same value: "recording" for a value of each recording, "shared"
+        for one value of all recordings that say "shared", or "shared" and a word for each of
+        several groups.
     """
 
     scope: Annotated[str, AfterValidator(_scope)] = "recording"
 
 
 class OwnRow(Scoped):
-    """A nuisance parameter of the user's own: a NuisanceRow in a Python file.
+    """A custom nuisance parameter: a NuisanceRow in a Python file.
 
     Attributes
     ----------
@@ -55,12 +57,15 @@ class OwnRow(Scoped):
 
 
 class Prior(Scoped):
-    """How well something is known; what is left out of several is taken as exact."""
+    """Standard deviations of nuisance parameters; of several, those that are missing mean
+    exact values.
+    """
 
     usual: ClassVar[bool] = False
 
     @model_validator(mode="after")
     def _some(self) -> Prior:
+        """Raise `ValueError` if no prior is given and the scope alone is not sufficient."""
         priors = [key for key in type(self).model_fields if key != "scope"]
         if not given_keys(self, *priors) and (self.scope == "recording" or not self.usual):
             expected = "one or both" if len(priors) > 1 else "it"
@@ -69,38 +74,44 @@ class Prior(Scoped):
 
 
 def _prior(key: str, rows: list[NuisanceRow]) -> type[Section]:
-    """The table of a key."""
+    """Return the generated table of a key."""
     # What another prior goes with has to be there.
     needed = any(row.beside is not None for row in rows)
     fields: dict[str, Any] = {}
     for row in rows:
         known = row.beside or (... if needed else None)
         kind: Any = Positive if needed else Optional[Positive]  # noqa: UP045
-        said = f"Standard deviation [{row.unit}]."
-        fields[row.prior] = (kind, Field(known, description=said))
+        description = f"Standard deviation [{row.unit}]."
+        fields[row.prior] = (kind, Field(known, description=description))
     name = "".join(word.title() for word in key.split("_")) + "Prior"
-    said = f"How well it is known: {rows[0].said}."
-    made = create_model(name, __base__=Prior, __doc__=said, **fields)
-    made.usual = any(row.sigma is not None for row in rows)
-    return made
+    description = f"How well it is known: {rows[0].said}."
+    section = create_model(name, __base__=Prior, __doc__=description, **fields)
+    section.usual = any(row.sigma is not None for row in rows)
+    return section
 
 
 def _section() -> type[Section]:
+    """Return the generated table [experiment.nuisance]."""
     fields: dict[str, Any] = {}
     for key, rows in KEYS.items():
-        said = " ".join(f"{row.said[0].upper()}{row.said[1:]}: {_said(row)}." for row in rows)
+        description = " ".join(
+            f"{row.said[0].upper()}{row.said[1:]}: {_said(row)}." for row in rows
+        )
         kind: Any = Annotated[Literal["none"] | _prior(key, rows), ByForm(str)]
-        fields[key] = (kind | None, Field(None, description=said))
-    said = "[[experiment.nuisance.own]] tables: what a Python file makes of markers' readings."
-    fields["own"] = (list[OwnRow], Field(default_factory=list, description=said))
-    said = (
+        fields[key] = (kind | None, Field(None, description=description))
+    description = (
+        "[[experiment.nuisance.own]] tables: what a Python file makes of markers' readings."
+    )
+    fields["own"] = (list[OwnRow], Field(default_factory=list, description=description))
+    description = (
         "What is estimated of this recording alone, each with a prior around zero.\n\n"
         'What has a prior by default is estimated unless it is "none".'
     )
-    return create_model("NuisanceSection", __base__=Section, __doc__=said, **fields)
+    return create_model("NuisanceSection", __base__=Section, __doc__=description, **fields)
 
 
 def _said(row: NuisanceRow) -> str:
+    """Return the name of a prior, with its default."""
     return row.prior if row.sigma is None else f"{row.prior}, {row.usual} by default"
 
 
@@ -114,7 +125,15 @@ else:
 def nuisance_of(
     section: Section | Literal["none"], row_of: Callable[[OwnRow], NuisanceRow]
 ) -> Nuisance:
-    """The defaults, with what the table says otherwise, and rows of the user's own."""
+    """Return the nuisance parameters of a recording: the defaults with the changes of the table.
+
+    Parameters
+    ----------
+    section : NuisanceSection or "none"
+        Table; "none" means no nuisance parameters.
+    row_of : callable
+        Function that returns the custom nuisance parameter of a table.
+    """
     if section == "none":
         return Nuisance.none()
     deviations: dict[str, float | None] = {}
@@ -131,7 +150,7 @@ def nuisance_of(
             if prior.scope != "recording":
                 scope |= {row.name: prior.scope for row in rows}
     tables: list[OwnRow] = vars(section)["own"]
-    own = [row_of(each) for each in tables]
-    said = {row.name: each.scope for row, each in zip(own, tables, strict=True)}
-    scope |= {name: word for name, word in said.items() if word != "recording"}
-    return Nuisance(**deviations, scope=scope, own=own)
+    custom_rows = [row_of(each) for each in tables]
+    scopes_by_name = {row.name: each.scope for row, each in zip(custom_rows, tables, strict=True)}
+    scope |= {name: word for name, word in scopes_by_name.items() if word != "recording"}
+    return Nuisance(**deviations, scope=scope, own=custom_rows)

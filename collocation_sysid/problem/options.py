@@ -1,4 +1,6 @@
-"""How a problem's answer is checked and its error bars are found; and where it came from."""
+"""Options of the uncertainties and of the check by forward simulation, and the origin of a
+problem.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,9 @@ class RolloutOptions(Options):
     Attributes
     ----------
     integrator : {"newmark", "scheme"}
+        Newmark's method, or the scheme of the transcription.
     timestep_s : float, optional
-        Newmark's step; a quarter of the sample interval by default.
+        Time step of Newmark's method; a quarter of the sample interval by default.
     """
 
     integrator: Literal["newmark", "scheme"] = "newmark"
@@ -29,16 +32,16 @@ class RolloutOptions(Options):
 
 @dataclass(frozen=True)
 class UncertaintyOptions(ErrorModel):
-    """How the error bars are found.
+    """Intervals of the estimates.
 
     Attributes
     ----------
     profile : tuple of str
-        List of the parameters whose profile likelihood is wanted.
+        List of the parameters whose profile likelihood is computed.
     numerical : bool
-        Solve again with half the step and on a finer mesh: the numerical error.
+        Solve again with half the step and on a finer mesh, to estimate the discretisation error.
     assumptions : Assumptions
-        How far off what is assumed may be.
+        Standard deviations of systematic effects, by name.
     surface_correlation : float
         Correlation length of the error of the surface over the longest extent of the body.
     """
@@ -50,19 +53,24 @@ class UncertaintyOptions(ErrorModel):
 
     @property
     def considered(self) -> dict[str, float | None]:
-        """Deviations of what is assumed by name, and the correlation length of the surface."""
+        """Standard deviations of systematic effects and the surface's correlation length,
+        by name.
+        """
         return self.assumptions.deviations | {CORRELATION_KEY: self.surface_correlation}
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a problem came from.
+    """Problem file of a problem.
 
     Attributes
     ----------
-    path : Path of the problem file
-    text : str, the problem as run, with what was overridden
-    files : tuple of Path, those it names
+    path : Path
+        Path of the problem file.
+    text : str
+        Text of the problem with the overrides that were applied.
+    files : tuple of Path
+        Data files that the problem names.
     """
 
     path: Path

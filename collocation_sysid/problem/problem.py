@@ -1,4 +1,4 @@
-"""A problem as plain data: what was recorded, what is estimated, and how it is to be solved."""
+"""Estimation problem: experiments, parameters to estimate, and options of the solve."""
 
 from __future__ import annotations
 
@@ -30,44 +30,52 @@ from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
 def _as_parameters(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
+    """Return the parameters; a mapping by name is converted."""
     return parameters if isinstance(parameters, Parameters) else Parameters.of(parameters)
 
 
 @stated
 class Problem:
-    """Experiments that share parameters, and how these are to be found.
+    """Experiments that share parameters, and how the parameters are estimated.
 
     Parameters
     ----------
     experiments : sequence of Experiment
-        With names that differ; those for validation are predicted only. Their bodies may differ.
+        Experiments with different names; those for validation are predicted, not fitted. Their
+        bodies may differ.
     parameters : Parameters, or mapping of name to Unknown, Tied or a fixed number
+        Parameters of the bodies, estimated or fixed.
     scheme : str or Scheme, default "midpoint"
+        Time discretisation.
     substeps : int or "auto"
-        Grid steps between samples. By default a run takes one, and if that moves a parameter by
-        more than half a standard error, solves again with as many as do not, 8 at most.
+        Grid steps between samples. "auto", the default, solves with one step; if this moves a
+        parameter by more than half a standard error, the problem is solved again with as many steps
+        as needed, at most 8.
     explicit_grasps : bool, default False
-        Grasped nodes as constraint rows instead of bounds.
+        Whether prescribed displacements are constraints instead of bounds.
     huber : float, optional
-        Huber's loss beyond this many standard deviations.
+        Threshold of Huber's loss in standard deviations; the loss is quadratic by default.
     method : str or Method, default "reduced-space"
-        A name in `methods` or `METHODS`, or anything that solves a `Collocation`.
+        A name in `methods` or `METHODS`, or a callable that solves a `Collocation`.
     methods : mapping of name to Method
-        What names stand for, where not for a method of `METHODS` with its default options.
+        Methods by name; other names mean a method of `METHODS` with its default options.
     rollout : RolloutOptions
+        Options of the forward simulation that checks the solution.
     uncertainty : UncertaintyOptions
+        Options of the uncertainties.
     title : str
+        Title in reports.
     notes : sequence of str
-        What was assumed on the way; what was cleaned in the meshes joins it.
+        Assumptions that were made when the files were read; notes on the meshes are added.
     origin : Origin, optional
-        The problem file, if there is one.
+        Problem file; None if the problem was made in Python.
 
     Raises
     ------
     InputError
-        For experiments of one name, parameters that do not give the constants of the bodies, an
-        unknown scheme or method, a profile of what is not estimated, or a size or density that no
-        body has.
+        For experiments with equal names, parameters that do not match the constants of the bodies,
+        an unknown scheme or method, a profile of a parameter that is not estimated, or an
+        implausible size or density.
     """
 
     experiments: tuple[Experiment, ...] = key(converter=tuple[Experiment, ...])
@@ -111,27 +119,29 @@ class Problem:
         folder: str | Path | None = None,
         say: Callable[[str], None] | None = None,
     ) -> Problem:
-        """Read a problem file (TOML) and the files it names.
+        """Read a problem file (TOML) and the files that it names.
 
         Parameters
         ----------
         path : str or Path
-        overrides : sequence of "dotted.key=value"
+            Problem file.
+        overrides : sequence of str
+            Values that replace those of the file, "dotted.key=value".
         allow_code : bool
-            Run the Python files that materials name.
+            Whether to run the Python files that materials, forces and sensors name.
         simulation : bool
-            Markers need no file then: those with a `reference_m` are sampled at the poses' times.
-            And every experiment may be for validation.
+            Whether the problem is to be simulated. Files of measurements may then be missing:
+            markers with a `reference_m` are sampled at the times of the poses. All experiments may
+            be for validation.
         folder : str or Path, optional
-            Where the files that it names are sought; next to it by default.
+            Folder that contains the named files; that of the problem file by default.
         say : callable, optional
-            Called with a sentence before work that takes long.
+            Function that is called with a sentence before work that takes long.
 
         Raises
         ------
         InputError
-            One clear message for the first thing that is wrong, or that this machine's memory
-            cannot hold.
+            For the first mistake in the file, or if this machine's memory is too small.
         """
         from .loading import contents_of  # the schema is only built to read a file
 
@@ -142,21 +152,21 @@ class Problem:
 
     @property
     def path(self) -> Path | None:
-        """The problem file, if there is one."""
+        """Path of the problem file; None if there is none."""
         return None if self.origin is None else self.origin.path
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """The bodies of the experiments, each once."""
+        """Bodies of the experiments, each once."""
         return tuple({id(e.body): e.body for e in self.experiments}.values())
 
     @property
     def lengths_m(self) -> dict[str, float]:
-        """Of the fields of its bodies, by the names of their constants."""
+        """Correlation lengths of spatially varying constants [m], by name of the constant."""
         return {name: each for body in self.bodies for name, each in body.lengths_m.items()}
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
-        """The same with fields of other lengths."""
+        """Return the problem with other correlation lengths [m] of spatially varying constants."""
         if dict(lengths_m) == self.lengths_m:
             return self
         bodies = {id(body): body.with_lengths(lengths_m) for body in self.bodies}
@@ -166,7 +176,7 @@ class Problem:
 
     @property
     def two_phase_fields(self) -> dict[str, TwoPhaseModes]:
-        """Two-phase fields of its bodies, by the names of their constants."""
+        """Two-phase fields of the bodies, by name of the constant."""
         return {
             part.field_name: part.field
             for body in self.bodies
@@ -175,29 +185,30 @@ class Problem:
         }
 
     def with_fields(self, fields: Mapping[str, FieldModes]) -> Problem:
-        """Return the same problem with other fields, by the names of their constants.
+        """Return the problem with other fields of spatially varying constants, by name of the
+        constant.
 
-        Parameters that no longer belong to a field of any body are left out, and those of the
-        fields that are not stated are added.
+        Parameters that no longer belong to a field of any body are removed, and those of the new
+        fields are added.
         """
         bodies = {id(body): body.with_fields(fields) for body in self.bodies}
-        lost = {n for b in self.bodies for n in (*b.mode_names, *b.contrasts)}
-        lost -= {n for b in bodies.values() for n in (*b.mode_names, *b.contrasts)}
+        removed_names = {n for b in self.bodies for n in (*b.mode_names, *b.contrasts)}
+        removed_names -= {n for b in bodies.values() for n in (*b.mode_names, *b.contrasts)}
         return replace(
             self,
             experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments],
             parameters=Parameters(
-                tuple(item for item in self.parameters.items if item.name not in lost)
+                tuple(item for item in self.parameters.items if item.name not in removed_names)
             ),
         )
 
     @property
     def first_substeps(self) -> int:
-        """Grid steps between samples of the first solve, and of all that solves nothing."""
+        """Grid steps between samples in the first solve, and where nothing is solved."""
         return 1 if self.substeps == "auto" else self.substeps
 
     def collocation(self) -> Collocation:
-        """The nonlinear program of the problem, with the first number of substeps."""
+        """Return the nonlinear program of the problem, with the first number of substeps."""
         return Collocation(
             self.experiments,
             self.parameters,
@@ -208,12 +219,12 @@ class Problem:
         )
 
     def solver(self, method: str | Method | None = None) -> Method:
-        """The method that a name stands for, the problem's own by default.
+        """Return the method for a name; the problem's own by default.
 
         Raises
         ------
         InputError
-            For an unknown name, or a method whose options the experiments rule out.
+            For an unknown name, or a method that does not support the experiments.
         """
         chosen = self.method if method is None else method
         if isinstance(chosen, str) and chosen in self.methods:
@@ -227,6 +238,7 @@ class Problem:
         return chosen
 
     def _check(self) -> None:
+        """Raise `InputError` if experiments, parameters and options do not fit together."""
         names = [experiment.name for experiment in self.experiments]
         if not names:
             raise InputError("there is no experiment; expected at least one")
@@ -263,9 +275,9 @@ class Problem:
 
 
 def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None:
-    """Refuse guesses with which no stress-free shape hangs as the mesh does.
+    """Raise `InputError` if no stress-free shape exists for the mesh under gravity at the guess.
 
-    Parameters without a guess are not known yet: the search starts where there is such a shape.
+    Nothing is checked if a parameter has no guess: the search then starts where the shape exists.
     """
     if any(item.guess is None for item in parameters.items if item.tied is None):
         return
@@ -276,12 +288,12 @@ def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None
 
 
 def _require_one_of_each_field(bodies: Iterable[Body]) -> None:
-    """Refuse shapes that differ and would share what is estimated of them."""
-    found: dict[str, Array] = {}
+    """Raise `InputError` if two bodies have fields of the same constant with different shapes."""
+    shapes_by_name: dict[str, Array] = {}
     for part in (part for body in bodies for part in body.parts if part.field):
         assert part.field is not None
         shapes = part.field.shapes
-        if not np.array_equal(found.setdefault(part.field_name, shapes), shapes):
+        if not np.array_equal(shapes_by_name.setdefault(part.field_name, shapes), shapes):
             raise InputError(
                 f"two bodies have a field of {part.field_name}, whose shapes differ as their "
                 "meshes do; expected one body, or fields of regions with names of their own"
@@ -289,11 +301,12 @@ def _require_one_of_each_field(bodies: Iterable[Body]) -> None:
 
 
 def _weighed(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[Experiment, ...]:
-    """The experiments with bodies whose densities are free where parameters give them."""
-    weighed, experiments = {}, tuple(experiments)
+    """Return the experiments with bodies whose densities are free if parameters refer to them."""
+    bodies = {}
+    experiments = tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():
-        weighed[id(body)] = body.with_free_densities(body.weighed_by(parameters.names))
+        bodies[id(body)] = body.with_free_densities(body.weighed_by(parameters.names))
     return tuple(
-        e if weighed[id(e.body)] is e.body else replace(e, body=weighed[id(e.body)])
+        e if bodies[id(e.body)] is e.body else replace(e, body=bodies[id(e.body)])
         for e in experiments
     )

@@ -1,4 +1,4 @@
-"""From TOML text and overrides to a validated `ProblemFile`, with one clear message if not."""
+"""Reading of a problem file: TOML syntax, overrides, and validation."""
 
 from __future__ import annotations
 
@@ -36,18 +36,20 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
     Parameters
     ----------
     path : str or Path
-    overrides : sequence of "dotted.key=value"
-        Values in TOML syntax; bare words are strings; list items by index, counted from 0,
-        tables in a list also by name.
+        Problem file.
+    overrides : sequence of str
+        Overrides "dotted.key=value", with values in TOML syntax. Words without quotes are strings.
+        Items of a list are selected by index, counted from 0, and tables of a list also by name.
 
     Returns
     -------
-    ProblemFile, and the text of the problem as run (with the overrides in it)
+    tuple of ProblemFile and str
+        Validated content, and the text of the problem with its overrides.
 
     Raises
     ------
     InputError
-        Naming the file, the key or line, what was found and what was expected.
+        Names the file, the key or line, what was found and what was expected.
     """
     path = Path(path)
     text = read_text(path)
@@ -64,12 +66,12 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
-    """The content of a TOML text.
+    """Return the content of a TOML text.
 
     Raises
     ------
     InputError
-        Where it is none, with the line where there is one.
+        For invalid syntax, with the line if it is known, and for excessive nesting.
     """
     try:
         if _ENDLESS_KEY.search(text) is not None:  # on which the parser would spend minutes
@@ -85,8 +87,9 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _depth(content: Any) -> int:
-    """How many levels of tables and lists there are, as far as it matters."""
-    level, depth = [content], 0
+    """Return the number of nested levels of tables and lists, at most `DEEPEST` + 1."""
+    level = [content]
+    depth = 0
     while level and depth <= DEEPEST:
         tables = [each.values() if isinstance(each, dict) else each for each in level]
         level = [each for table in tables for each in table if isinstance(each, (dict, list))]
@@ -95,18 +98,26 @@ def _depth(content: Any) -> int:
 
 
 def _beyond_limits(error: Exception) -> str:
+    """Return the message for a file that exceeds the parser's limits."""
     if isinstance(error, RecursionError):
         return "nests tables or lists too deeply; expected a few levels"
     return "holds a whole number of too many digits; expected fewer than 4,300"
 
 
 def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
-    """The text of a file that is `what`.
+    """Return the text of a file (UTF-8).
+
+    Parameters
+    ----------
+    path : Path
+        File.
+    what : str
+        Kind of file that is expected, for messages.
 
     Raises
     ------
     InputError
-        If there is none.
+        If the file does not exist or is not a text file.
     """
     require_regular(path)
     try:
@@ -122,6 +133,7 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
 
 
 def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
+    """Return the error for invalid TOML, with the line if the parser states it."""
     reason, _, place = complaint.rpartition(" (at ")
     reason = _PLAINER.get(reason, reason)
     matched = re.match(r"line (\d+)", place)
@@ -136,6 +148,13 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 
 
 def _apply(content: dict[str, Any], override: str) -> None:
+    """Set one value of the content, in place, from "key=value".
+
+    Raises
+    ------
+    InputError
+        For an invalid key or value.
+    """
     key, equals, value = override.partition("=")
     key = key.strip()
     parts = key.split(".")
@@ -144,36 +163,43 @@ def _apply(content: dict[str, Any], override: str) -> None:
     if not equals or not all(parts):
         expected = "expected key=value such as parameters.mu_pa.guess=200"
         raise InputError(f"found {override!r}, {expected}")
-    place: Any = content
+    table: Any = content
     shared: Any = content.get("experiment_defaults")
     *leading, last = _as_written(content, parts)
     for depth, part in enumerate(leading):
-        at: Any = _place(place, part, key)
-        if isinstance(place, dict):
+        item: Any = _place(table, part, key)
+        if isinstance(table, dict):
             # An experiment gets a default of its own, a part of which is to be overridden.
-            usual = depth == 2 and leading[0] == "experiment" and isinstance(shared, dict)
-            place.setdefault(at, deepcopy(shared[at]) if usual and at in shared else {})
-        place = place[at]
-    at = _place(place, last, key)
-    place[at] = _value(value, key)
+            has_default = depth == 2 and leading[0] == "experiment" and isinstance(shared, dict)
+            table.setdefault(item, deepcopy(shared[item]) if has_default and item in shared else {})
+        table = table[item]
+    item = _place(table, last, key)
+    table[item] = _value(value, key)
 
 
 def _as_written(content: Any, parts: list[str]) -> list[str]:
-    """The parts of a key, those joined that the file has as one key, such as "core.mu_pa"."""
-    joined, place = [], content
+    """Return the parts of a key, with names that contain dots joined, such as "core.mu_pa"."""
+    joined = []
+    table = content
     while parts:
         count = 1
-        if isinstance(place, dict):
+        if isinstance(table, dict):
             several = range(len(parts), 1, -1)
-            count = next((n for n in several if ".".join(parts[:n]) in place), 1)
+            count = next((n for n in several if ".".join(parts[:n]) in table), 1)
         joined.append(".".join(parts[:count]))
         parts = parts[count:]
-        place = place.get(joined[-1]) if isinstance(place, dict) else None
+        table = table.get(joined[-1]) if isinstance(table, dict) else None
     return joined
 
 
 def _place(place: Any, part: str, key: str) -> str | int:
-    """The key of a table, or the place in a list, that a part of a key stands for."""
+    """Return the key in a table, or the index in a list, that a part of a dotted key refers to.
+
+    Raises
+    ------
+    InputError
+        If the list has no such item, or the value is neither table nor list.
+    """
     if isinstance(place, dict):
         return part
     if not isinstance(place, list):
@@ -189,6 +215,7 @@ def _place(place: Any, part: str, key: str) -> str | int:
 
 
 def _value(text: str, key: str) -> Any:
+    """Return a value in TOML syntax; words without quotes are strings."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

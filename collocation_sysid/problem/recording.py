@@ -1,4 +1,6 @@
-"""From an experiment's table and its files to an `Experiment` on one time grid."""
+"""Reading of one experiment: its table and files are converted to an `Experiment` on one
+time grid.
+"""
 
 from __future__ import annotations
 
@@ -60,13 +62,41 @@ from .tracking import gripper_markers, into_body_frame, poses_from_markers, read
 
 Moved = GraspSection | ObstacleSection
 
-# Markers span about the body's own size and stay near it; a unit mistaken is a factor of 1000.
-LEAST_SPAN, LARGEST_SPAN, LARGEST_MISS = 0.005, 10.0, 3.0
+# Smallest span of the markers over the body's size: a wrong unit is a factor of 1000.
+LEAST_SPAN = 0.005
+# Largest span of the markers over the body's size.
+LARGEST_SPAN = 10.0
+# Largest distance of a marker from its rigidly moved position, over the body's size.
+LARGEST_MISS = 3.0
 
 
 @dataclass
 class RecordingReader:
-    """Reads one experiment's files; `notes` tells what was assumed."""
+    """Reader of one experiment's files.
+
+    Attributes
+    ----------
+    section : ExperimentSection
+        Table of the experiment.
+    folder : Path
+        Folder that contains the files.
+    body : Body
+        Body of the experiment.
+    parameters : Parameters
+        Parameters, from which markers' plausibility is judged.
+    simulation : bool
+        Whether files of measurements may be missing.
+    code : Code
+        Loader of Python files.
+    air_density_kg_m3 : float or "none"
+        Density of the air.
+    notes : list of str
+        Assumptions that were made; reading adds to them.
+    size : Size or None
+        Size of the problem with one sample; None skips the check of memory.
+    say : callable or None
+        Function that is called with a sentence before long work.
+    """
 
     section: ExperimentSection
     folder: Path
@@ -85,7 +115,7 @@ class RecordingReader:
         Raises
         ------
         InputError
-            Naming the file and line, or the key within the experiment's table.
+            Names the file and line, or the key within the experiment's table.
         """
         section = self.section
         t_s, poses, table = self._align([*map(self._poses, range(len(section.moved)))])
@@ -119,41 +149,48 @@ class RecordingReader:
 
     @property
     def _static(self) -> bool:
+        """Whether the samples are equilibria."""
         return self.section.kind == "static"
 
     def _note(self, *notes: str) -> None:
+        """Add notes, which begin with the experiment's name."""
         self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
 
     # Files ----------------------------------------------------------------------------------------
 
     def _is_there(self, name: str | None) -> bool:
-        """Whether a file is to be read; a simulation does without where there is none."""
+        """Return whether a file is to be read: always, unless it is missing and the problem
+        is simulated.
+        """
         return not self.simulation or bool(name and stored_files(self.folder / name))
 
     def _existing(self, name: str | None, key: str, what: str = "a file") -> Path:
+        """Return the path of a file; raise `InputError` if none is named or it does not exist."""
         if name is None:
             raise InputError(f"missing; expected {what}", where=key)
         return existing_file(self.folder, name, key)
 
     def _file(self, table: TableSection, key: str) -> Path:
-        """The file of a displacement or a wrench."""
+        """Return the file of a displacement or a wrench, its own or that of the experiment."""
         key = "file" if table.file is None and self.section.file else key
         return self._existing(self.section.file_of(table), key, "a file here, or of the experiment")
 
     @property
     def _timed(self) -> bool:
-        """Whether files must tell times: of equilibria without memory rows are enough."""
+        """Whether files must contain times: not for equilibria of bodies without memory."""
         return not self._static or self.body.remembers
 
     # Grasps ---------------------------------------------------------------------------------------
 
     def _grasp_key(self, k: int, key: str = "") -> str:
+        """Return the key of grasp or obstacle number k, from 0, in messages."""
         grasps = len(self.section.grasps)
         one = f"grasp.{k}" if grasps > 1 else "grasp"
         one = one if k < grasps else f"obstacle.{k - grasps}"
         return f"{one}.{key}" if key else one
 
     def _poses(self, k: int) -> PoseSequence:
+        """Return the poses of grasp or obstacle number k, from 0; constant if none are stated."""
         grasp = self.section.moved[k]
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
@@ -167,13 +204,16 @@ class RecordingReader:
         else:
             file = existing_file(self.folder, grasp.poses, self._grasp_key(k, "poses"))
             poses = read_poses(file, grasp.quaternion, grasp.length_unit)
-        if (moved := grasp.gripper_to_body) is not None:
+        if (transform := grasp.gripper_to_body) is not None:
             with located(where=self._grasp_key(k, "gripper_to_body")):
-                first = PoseSequence([0.0], [moved.position_m], [moved.quaternion_xyzw])
-                poses = poses.after(first)
+                transform_pose = PoseSequence(
+                    [0.0], [transform.position_m], [transform.quaternion_xyzw]
+                )
+                poses = poses.after(transform_pose)
         return replace(poses, interpolation=grasp.interpolation)
 
     def _poses_from_markers(self, grasp: Moved, key: str) -> PoseSequence:
+        """Return the poses of a grasp fitted to its markers, and add notes on the fit."""
         if self._recorded is None:
             message = "there are no tracks to fit the poses to; expected markers.file, or poses"
             raise InputError(message, where=key)
@@ -184,7 +224,9 @@ class RecordingReader:
         return poses
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
-        section, zero = self.section.moved[k], ""
+        """Return grasp or obstacle number k, from 0, on the body."""
+        section = self.section.moved[k]
+        zero = ""
         if (table := section.displacement) is not None:
             file = self._file(table, self._grasp_key(k, "displacement"))
             rest_m = length_m(table, self.body)
@@ -192,67 +234,77 @@ class RecordingReader:
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasps)
-        usual = {"name": f"obstacle {number}"} if is_obstacle else {}
-        said: dict[str, Any] = usual | stated_in(section, kind, self._grasp_key(k))
+        defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
+        arguments: dict[str, Any] = defaults | stated_in(section, kind, self._grasp_key(k))
         wrench = section.wrench and self._wrench(section.wrench, self._grasp_key(k, word), t_s)
         with located(where=self._grasp_key(k)):
-            made = kind(**said, poses=poses, zero=zero, wrench=wrench)
+            grasp = kind(**arguments, poses=poses, zero=zero, wrench=wrench)
         if is_obstacle:
-            return made
+            return grasp
         with located(where=self._grasp_key(k, "nodes")):
-            return made.on(self.body, t_s)
+            return grasp.on(self.body, t_s)
 
     # What is measured, and what acts --------------------------------------------------------------
 
     def _read_wrench(self, section: WrenchSection, key: str) -> tuple[Array, Array]:
-        file, layout = self._file(section, f"{key}.file"), section.layout
+        """Return times (S,) [s] and values (S, 6) of a wrench's file."""
+        file = self._file(section, f"{key}.file")
+        layout = section.layout
         return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._timed)
 
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
-        """What is measured within the experiment's time; zeros to simulate without a file."""
+        """Return the measured wrench within the experiment's time; zeros if a simulation
+        has no file.
+        """
         name = self.section.file_of(section)
-        said: dict[str, Any] = stated_in(section, Wrench, key)
-        for sigma in {"sigma_n", "sigma_nm"} & said.keys():
-            said[sigma] /= section.symmetry
+        arguments: dict[str, Any] = stated_in(section, Wrench, key)
+        for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
+            arguments[sigma] /= section.symmetry
         with located(where=key):
             if not self._is_there(name):
-                return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **said})
+                return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
             at_s, values = self._read_wrench(section, key)
-            inside = within(at_s, t_s, str(name), self._static)
+            is_used = within(at_s, t_s, str(name), self._static)
             if self._static and not self.section.marked:
                 # Between equilibria it would be read off their chord, unless all of it is.
-                near = np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
-                inside &= near if near.any() else True
-            self._note(f"{name}: {inside.sum()} of {len(at_s)} samples are used")
-            return Wrench(at_s[inside], values[inside], **said)
+                is_at_sample = np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
+                is_used &= is_at_sample if is_at_sample.any() else True
+            self._note(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
+            return Wrench(at_s[is_used], values[is_used], **arguments)
 
     def _reading(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
-        """What is measured within the experiment's time; to be simulated without a file."""
+        """Return custom sensor number k, from 0, with its values within the experiment's time.
+
+        Values are None if a simulation has no file.
+        """
         key = f"reading.{k}"
-        told: dict[str, Any] = {"name": section.name, **stated_in(section, Gauge, key)}
-        _, told["expression"] = self.code.function(section.code, section.function, f"{key}.code")
+        arguments: dict[str, Any] = {"name": section.name, **stated_in(section, Gauge, key)}
+        _, arguments["expression"] = self.code.function(
+            section.code, section.function, f"{key}.code"
+        )
         if section.grasp and section.grasp > (count := len(self.section.grasps)):
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")
         with located(where=key):
             if not self._is_there(section.file):
-                return Gauge(t_s=t_s, values=None, **told)
+                return Gauge(t_s=t_s, values=None, **arguments)
             file = self._existing(section.file, f"{key}.file")
-            at_s, values, told["columns"] = read_gauge(file, section.columns)
-            inside = within(at_s, t_s, str(section.file), self._static)
-            self._note(f"{section.file}: {inside.sum()} of {len(at_s)} samples are used")
-            return Gauge(t_s=at_s[inside], values=values[inside], **told)
+            at_s, values, arguments["columns"] = read_gauge(file, section.columns)
+            is_used = within(at_s, t_s, str(section.file), self._static)
+            self._note(f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used")
+            return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
     def _seen(self, k: int) -> tuple[DepthFile, Array]:
-        """What a depth camera saw, and when."""
+        """Return the images or clouds of depth camera number k, from 0, and their times [s]."""
         section = self.section.depth[k]
         file = self.folder / section.file
         if not file.is_dir():
             file = existing_file(self.folder, section.file, f"depth.{k}.file")
-        unit_m, known = METRES_PER_UNIT[section.length_unit], section.camera.model_fields_set
-        seen = read_depth(file, section.count_m, unit_m, known)
-        count = len(seen.images_m) or len(seen.clouds_m)
-        t_s = section.t_s if section.t_s is not None else seen.t_s
+        unit_m = METRES_PER_UNIT[section.length_unit]
+        stated_keys = section.camera.model_fields_set
+        depth_file = read_depth(file, section.count_m, unit_m, stated_keys)
+        count = len(depth_file.images_m) or len(depth_file.clouds_m)
+        t_s = section.t_s if section.t_s is not None else depth_file.t_s
         if t_s is None and count > 1 and not self._static:
             message = f"{section.file} says no times of its {count} images; expected them here"
             raise InputError(message, where=f"depth.{k}.t_s")
@@ -260,53 +312,72 @@ class RecordingReader:
         if len(times) != count:
             message = f"found {len(times)} times for {count} images or clouds; expected as many"
             raise InputError(message, where=f"depth.{k}.t_s")
-        return seen, times
+        return depth_file, times
 
     def _depth(self, k: int, t_s: Array) -> Depth:
-        """What was seen within the experiment's time."""
-        section, where = self.section.depth[k], f"depth.{k}"
-        seen, at_s = self._seen(k)
+        """Return the depth measurements of camera number k, from 0, within the experiment's
+        time.
+        """
+        section = self.section.depth[k]
+        where = f"depth.{k}"
+        depth_file, at_s = self._seen(k)
         names = ("matrix", "pose", "distortion")
-        known: dict[str, Any] = {name: getattr(seen, name) for name in names}
-        known |= stated_in(section.camera, DepthCamera, f"{where}.camera")
+        camera_arguments: dict[str, Any] = {name: getattr(depth_file, name) for name in names}
+        camera_arguments |= stated_in(section.camera, DepthCamera, f"{where}.camera")
         if section.camera.poses is not None:
             file = existing_file(self.folder, section.camera.poses, f"{where}.camera.poses")
-            known["poses"] = read_poses(file)
+            camera_arguments["poses"] = read_poses(file)
         with located(where=f"{where}.camera"):
             camera = DepthCamera(
-                **{name: value for name, value in known.items() if value is not None}
+                **{name: value for name, value in camera_arguments.items() if value is not None}
             )
         with located(where=where):
-            inside = within(at_s, t_s, section.file, self._static)
-            used = np.flatnonzero(inside).tolist()
-            clouds = [seen.clouds_m[k] for k in used] if seen.clouds_m else []
-            images, outlined = [], outlined_samples(len(used))
-            for number, sample in enumerate(used if len(seen.images_m) else ()):
-                image = seen.images_m[sample]
+            is_used = within(at_s, t_s, section.file, self._static)
+            used = np.flatnonzero(is_used).tolist()
+            clouds = [depth_file.clouds_m[k] for k in used] if depth_file.clouds_m else []
+            images = []
+            outlined = outlined_samples(len(used))
+            for number, sample in enumerate(used if len(depth_file.images_m) else ()):
+                image = depth_file.images_m[sample]
                 clouds.append(points_of(image, camera))
                 images.append(image if number in outlined else None)
-            told = {"name": section.name, **stated_in(section, Depth, where)}
-            depth = Depth(t_s=at_s[inside], clouds=clouds, camera=camera, images_m=images, **told)
+            arguments = {"name": section.name, **stated_in(section, Depth, where)}
+            depth = Depth(
+                t_s=at_s[is_used], clouds=clouds, camera=camera, images_m=images, **arguments
+            )
         self._note(f"{section.file}: {len(clouds)} of {len(at_s)} images are used")
         return depth
 
     def _made(self, kind: type, word: str, k: int) -> Any:
-        """What a table of a list states, on the body."""
-        table, where = getattr(self.section, word)[k], f"{word}.{k}"
-        usual = {"name": f"{word}_{k + 1}"} if "name" in type(table).model_fields else {}
-        said = usual | stated_in(table, kind, where)
+        """Return the object of a table in a list, such as a tendon or a pressure, on the body.
+
+        Parameters
+        ----------
+        kind : type
+            Class of the object.
+        word : str
+            Key of the list.
+        k : int
+            Index of the table in it.
+        """
+        table = getattr(self.section, word)[k]
+        where = f"{word}.{k}"
+        defaults = {"name": f"{word}_{k + 1}"} if "name" in type(table).model_fields else {}
+        arguments = defaults | stated_in(table, kind, where)
         for name, key in keys_of(kind):
-            if key.constant and key.read and (named := getattr(table, key.name)):
-                file = existing_file(self.folder, named, f"{where}.{key.name}")
-                said[name], said[key.constant] = key.read(file)
-        with located(where=f"{where}.nodes" if "nodes" in said else where):
-            return kind(**said).on(self.body)
+            if key.constant and key.read and (file_name := getattr(table, key.name)):
+                file = existing_file(self.folder, file_name, f"{where}.{key.name}")
+                arguments[name], arguments[key.constant] = key.read(file)
+        with located(where=f"{where}.nodes" if "nodes" in arguments else where):
+            return kind(**arguments).on(self.body)
 
     # Markers --------------------------------------------------------------------------------------
 
     @cached_property
     def _recorded(self) -> MarkerTable | None:
-        """All measured tracks that are used, in the body's frame; None to simulate without."""
+        """Tracks of all markers that are used, in the body's frame; None if a simulation
+        has no file.
+        """
         markers = self.section.markers
         if not self.section.marked or not self._is_there(markers.file):
             return None
@@ -320,7 +391,7 @@ class RecordingReader:
         return table
 
     def _table(self, poses: Sequence[PoseSequence]) -> MarkerTable:
-        """The measured tracks; to simulate without them, zeros at the poses' times."""
+        """Return the tracks to fit; zeros at the times of the poses if a simulation has no file."""
         if not self.section.marked:
             times = self._times(poses)
             return MarkerTable(times, (), np.zeros((len(times), 0, 3)))
@@ -328,27 +399,33 @@ class RecordingReader:
             return self._fitted(self._recorded)
         markers = self.section.markers
         names = tuple(markers.names or markers.reference_m)
-        lacking = [name for name in names if name not in markers.reference_m]
-        if lacking or not names:
+        names_without_position = [name for name in names if name not in markers.reference_m]
+        if names_without_position or not names:
             message = (
                 f"there is no {markers.file or 'file'} yet and no place for "
-                f"{lacking[0] if lacking else 'any marker'}; to simulate, expected an entry "
-                "name = [x, y, z] for each marker"
+                f"{names_without_position[0] if names_without_position else 'any marker'}; "
+                "to simulate, expected an entry name = [x, y, z] for each marker"
             )
             raise InputError(message, where="markers.reference_m")
         times = self._times(poses)
         return self._fitted(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
 
     def _times(self, poses: Sequence[PoseSequence]) -> Array:
-        """Those of the wrench where there are no markers, else of the poses."""
+        """Return the sample times [s] without a marker file: those of a wrench, a camera,
+        or the poses.
+        """
         section = self.section
-        sensed = [(k, grasp.wrench) for k, grasp in enumerate(section.moved) if grasp.wrench]
-        if not (sensed or section.marked or section.reading or section.depth):
+        wrench_sections = [
+            (k, grasp.wrench) for k, grasp in enumerate(section.moved) if grasp.wrench
+        ]
+        if not (wrench_sections or section.marked or section.reading or section.depth):
             message = "nothing is measured: expected markers, a wrench, a reading, or depth"
             raise InputError(message, where="markers")
-        there = [s for s in sensed if stored_files(self.folder / str(section.file_of(s[1])))]
-        if there and not section.marked:
-            k, sensor = there[0]
+        existing_wrenches = [
+            s for s in wrench_sections if stored_files(self.folder / str(section.file_of(s[1])))
+        ]
+        if existing_wrenches and not section.marked:
+            k, sensor = existing_wrenches[0]
             return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]
         if self._static and section.depth and max(len(each.t_s) for each in poses) < 2:
             return np.unique(np.concatenate([self._seen(k)[1] for k in range(len(section.depth))]))
@@ -363,7 +440,13 @@ class RecordingReader:
         return times
 
     def _fitted(self, table: MarkerTable) -> MarkerTable:
-        """The tracks asked for, without the gripper's markers and those of weight 0."""
+        """Return the tracks to fit, without markers of the gripper alone and those of weight 0.
+
+        Raises
+        ------
+        InputError
+            If none remains, or a key names an unknown marker.
+        """
         markers = self.section.markers
         for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
             if isinstance(by_name := getattr(markers, key), dict):
@@ -372,32 +455,36 @@ class RecordingReader:
         if unweighted:
             self._note(f"left out, with the weight 0: {', '.join(unweighted)}")
         # Markers that only the gripper or the template needs are read, and not fitted.
-        wanted = set(markers.names or set(table.names) - gripper_markers(self.section))
-        kept = [k for k, n in enumerate(table.names) if n in wanted and n not in unweighted]
-        if not kept:
+        fitted_names = set(markers.names or set(table.names) - gripper_markers(self.section))
+        indices = [
+            k for k, n in enumerate(table.names) if n in fitted_names and n not in unweighted
+        ]
+        if not indices:
             message = (
                 f"none is left of {', '.join(table.names)}: all are the gripper's or have the "
                 "weight 0; expected at least one that the body's motion is compared with"
             )
             raise InputError(message, where="markers")
-        names = tuple(table.names[k] for k in kept)
-        return MarkerTable(table.t_s, names, table.positions_m[:, kept])
+        names = tuple(table.names[k] for k in indices)
+        return MarkerTable(table.t_s, names, table.positions_m[:, indices])
 
     def _align(
         self, poses: list[PoseSequence]
     ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
-        """Times, poses and tracks on one clock."""
-        section, table, static = self.section, self._table(poses), self._static
-        said = [each.model_dump(include={"from_s", "until_s"}) for each in section.moved]
+        """Return times [s], poses and tracks on one clock and time grid."""
+        section = self.section
+        table = self._table(poses)
+        static = self._static
+        intervals = [each.model_dump(include={"from_s", "until_s"}) for each in section.moved]
         held_s = [
             (-np.inf if first is None else first, np.inf if last is None else last)
-            for first, last in (each.values() for each in said)
+            for first, last in (each.values() for each in intervals)
         ]
-        moved = [grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved]
+        pose_files = [grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved]
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
-        for name, sequence, held in zip(moved, poses, held_s, strict=True):
+        for name, sequence, held in zip(pose_files, poses, held_s, strict=True):
             if name is not None and len(t_s) and not static:
                 refuse_untold(sequence, t_s, held, self.folder / name)
         rate_hz = section.resample_hz
@@ -411,7 +498,7 @@ class RecordingReader:
         try:
             aligned = align(poses, table, section.window_s, rate_hz, every, held_s, static)
         except InputError as error:
-            files = dict.fromkeys(name for name in (*moved, section.markers.file) if name)
+            files = dict.fromkeys(name for name in (*pose_files, section.markers.file) if name)
             raise InputError(error.message, where=" and ".join(files)) from error
         self._note(*aligned.notes)
         if rate_hz and rate_hz > 1.01 / np.median(np.diff(table.t_s)):
@@ -422,16 +509,18 @@ class RecordingReader:
         return aligned.t_s, aligned.poses, aligned.table
 
     def _markers(self, t_s: Array, table: MarkerTable) -> Markers:
-        """Attached where references are given; the others' places are unknown."""
+        """Return the markers; positions on the body are NaN where they are to be estimated."""
         if not self.section.marked:
             return Markers.none(t_s)
-        section, names = self.section.markers, table.names
-        sigma_m, known_m = _each(section.sigma_m, names, np.nan), section.reference_sigma_m
+        section = self.section.markers
+        names = table.names
+        sigma_m = _each(section.sigma_m, names, np.nan)
+        known_m = section.reference_sigma_m
         if np.isnan(sigma_m).any():
-            lacking = names[int(np.isnan(sigma_m).argmax())]
-            message = f"no value for {lacking!r}; expected one for every marker"
+            missing_name = names[int(np.isnan(sigma_m).argmax())]
+            message = f"no value for {missing_name!r}; expected one for every marker"
             raise InputError(message, where="markers.sigma_m")
-        said: dict[str, Any] = stated_in(section, Markers, "markers")
+        arguments: dict[str, Any] = stated_in(section, Markers, "markers")
         return Markers(
             t_s,
             table.positions_m,
@@ -439,17 +528,18 @@ class RecordingReader:
             names,
             places_m=np.array([section.reference_m.get(name, [np.nan] * 3) for name in names]),
             places_sigma_m=None if known_m is None else _each(known_m, names, np.nan),
-            **said,
+            **arguments,
         )
 
 
 def _each(values: Mapping[str, float] | float, names: Sequence[str], usual: float) -> Array:
-    """(M,) values of the markers, given for all or by name."""
+    """Return values (M,) of the markers, given for all or by name, with a default."""
     by_name = values if isinstance(values, Mapping) else dict.fromkeys(names, values)
     return np.array([by_name.get(name, usual) for name in names])
 
 
 def _refuse_unknown(asked: Iterable[str], names: Sequence[str], key: str) -> None:
+    """Raise `InputError` if a name is not that of a marker."""
     present = set(names)
     for name in asked:
         if name not in present:
@@ -458,7 +548,16 @@ def _refuse_unknown(asked: Iterable[str], names: Sequence[str], key: str) -> Non
 
 
 def refuse_other_scale(experiment: Experiment, constants: Mapping[str, float]) -> None:
-    """Refuse tracks that cannot be of this body: a unit or a frame is mistaken."""
+    """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
+    frame.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with markers.
+    constants : mapping of str to float
+        Physical values by name, to find the likely cause.
+    """
     if (message := _other_scale(experiment)) is None:
         return
     likeliest = "".join(f"; likely {cause.sentence}" for cause in doubts(experiment, constants)[:1])
@@ -466,11 +565,12 @@ def refuse_other_scale(experiment: Experiment, constants: Mapping[str, float]) -
 
 
 def _other_scale(experiment: Experiment) -> str | None:
-    """Why tracks cannot be of this body; None if they can."""
-    markers, body_m = experiment.markers, _diagonal(experiment.body.nodes_m)
+    """Return why the tracks cannot belong to this body; None if they can."""
+    markers = experiment.markers
+    body_m = _diagonal(experiment.body.nodes_m)
     k = int(markers.present.sum(axis=1).argmax())
-    seen = markers.present[k]
-    measured = markers.positions_m[k, seen]
+    is_measured = markers.present[k]
+    measured = markers.positions_m[k, is_measured]
     span_m = _diagonal(measured)
     if len(measured) > 1 and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m:
         return (
@@ -479,20 +579,23 @@ def _other_scale(experiment: Experiment) -> str | None:
         )
     if not experiment.gripping:
         return None
-    carried = markers.observe(experiment.rigid_positions(experiment.t_s[[k]]))[0, seen]
-    miss_m = np.linalg.norm(measured - carried, axis=1)
+    rigid_positions = markers.observe(experiment.rigid_positions(experiment.t_s[[k]]))[
+        0, is_measured
+    ]
+    miss_m = np.linalg.norm(measured - rigid_positions, axis=1)
     worst = int(miss_m.argmax())
     if miss_m[worst] > LARGEST_MISS * body_m:
-        name = markers.names[np.flatnonzero(seen)[worst]]
+        name = markers.names[np.flatnonzero(is_measured)[worst]]
         return (
             f"at t = {experiment.t_s[k]:.6g} s marker {name!r} is measured at "
             f"{triple(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp carries its "
-            f"place on the body, {triple(carried[worst])} m; check length_unit, the marker's "
-            "reference_m, that poses and markers share frame and clock, and that the poses map "
-            "undeformed to current positions"
+            f"place on the body, {triple(rigid_positions[worst])} m; check length_unit, the "
+            "marker's reference_m, that poses and markers share frame and clock, and that "
+            "the poses map undeformed to current positions"
         )
     return None
 
 
 def _diagonal(points_m: Array) -> float:
+    """Return the diagonal [m] of the box that contains points (n, 3)."""
     return float(np.linalg.norm(np.ptp(points_m, axis=0)))

@@ -1,4 +1,4 @@
-"""The keys of one recording: grasps, markers, loads, and what is not known of it."""
+"""Keys of [[experiment]]: grasps, obstacles, loads, measurements and nuisance parameters."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class TransformSection(Section):
     Attributes
     ----------
     position_m : (3,) array
-        Shift [x, y, z].
+        Translation [x, y, z].
     quaternion_xyzw : list
-        Turn before the shift [x, y, z, w].
+        Rotation before the translation [x, y, z, w].
     """
 
     position_m: Vector = (0.0, 0.0, 0.0)
@@ -35,8 +35,8 @@ class TableSection(Section):
     file : str, optional
         A table of columns with units; the experiment's file by default.
     columns : mapping of name to str
-        Column of the file by what it is, where its name is not recognised; with a unit behind,
-        "Load (N)", that the file does not state.
+        Column of the file by quantity, where its name is not recognised; with a unit behind, "Load
+        (N)", that the file does not state.
     axis : {"x", "y", "z"}
         Axis of the world along which a machine measures.
     sign : {1, -1}
@@ -50,12 +50,12 @@ class TableSection(Section):
 
     @property
     def layout(self) -> dict[str, Any]:
-        """How its columns are read."""
+        """Arguments with which the columns are read, by name."""
         return self.model_dump(include={"columns", "axis", "sign", "length_m", "area_m2"})
 
 
 class DisplacementSection(TableSection):
-    """Shifts without turns from the undeformed place, as of a test bench's crosshead.
+    """Translations without rotations from the undeformed position, as of a test bench's crosshead.
 
     Columns t_s and any of x_m, y_m, z_m, in these or other units; or a machine's displacement, or
     engineering strain with a length.
@@ -71,7 +71,7 @@ class DisplacementSection(TableSection):
 
 
 class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
-    """The force and the torque that the grasp was measured to give the body.
+    """The measured force and torque that the grasp exerts on the body.
 
     Columns t_s and any of fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm, in these or other units, at their
     own rate; or a machine's force, or engineering stress with an area. Blank cells are missing.
@@ -90,6 +90,7 @@ class WrenchSection(section_of(Wrench, "WrenchSection", TableSection)):
 
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
+    """Return a displacement as a table; text is the name of its file."""
     return DisplacementSection.model_validate({"file": value}) if isinstance(value, str) else value
 
 
@@ -102,7 +103,7 @@ else:
 
 
 class MovedSection(Section):
-    """What moves on a path of its own.
+    """Grasp or obstacle that moves on a path of its own.
 
     Attributes
     ----------
@@ -141,6 +142,9 @@ class MovedSection(Section):
 
     @model_validator(mode="after")
     def _one_source_of_poses(self) -> MovedSection:
+        """Raise `ValueError` for several sources of poses, or keys without the source they
+        belong to.
+        """
         sources = given_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
             raise ValueError(f"found {' and '.join(sources)}; expected one of them")
@@ -153,9 +157,9 @@ class MovedSection(Section):
             ("poses", ("quaternion", "length_unit", "gripper_to_body")),
             ("markers", ("max_residual_m", "weights")),
         ):
-            there = [key for key in keys if getattr(self, key)]
-            if there and getattr(self, owner) is None:
-                raise ValueError(f"found {there[0]} without {owner}; it belongs to {owner}")
+            given_names = [key for key in keys if getattr(self, key)]
+            if given_names and getattr(self, owner) is None:
+                raise ValueError(f"found {given_names[0]} without {owner}; it belongs to {owner}")
         _at_least_three(self.markers, "markers")
         for name in self.weights:
             if name not in (names := self.markers or ()):
@@ -171,7 +175,7 @@ class GraspSection(section_of(Grasp, "GraspSection", MovedSection)):
     Attributes
     ----------
     wrench : WrenchSection, optional
-        What it was measured to give the body: file, sigma_n, sigma_nm, …
+        Measured force and torque on the body: file, sigma_n, sigma_nm, …
     """
 
     wrench: WrenchSection | None = None
@@ -183,14 +187,14 @@ class ObstacleSection(section_of(Obstacle, "ObstacleSection", MovedSection)):
     Attributes
     ----------
     force : WrenchSection, optional
-        The force that it was measured to give the body: file, sigma_n, …
+        Measured force on the body: file, sigma_n, …
     """
 
     force: WrenchSection | None = None
 
     @property
     def wrench(self) -> WrenchSection | None:
-        """The same, as of a grasp."""
+        """Measured force, under the name that grasps have for it."""
         return self.force
 
 
@@ -249,11 +253,12 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
 
     @model_validator(mode="after")
     def _template(self) -> MarkersSection:
-        there = given_keys(self, "template_m", "template_window_s", "max_template_residual_m")
-        if there and not {"template_m", "template_window_s"} <= set(there):
+        """Raise `ValueError` for an incomplete template."""
+        given_names = given_keys(self, "template_m", "template_window_s", "max_template_residual_m")
+        if given_names and not {"template_m", "template_window_s"} <= set(given_names):
             raise ValueError(
-                f"found {', '.join(there)}; expected template_m and template_window_s, both or "
-                "neither"
+                f"found {', '.join(given_names)}; expected template_m and template_window_s, both "
+                "or neither"
             )
         _at_least_three(self.template_m, "template_m")
         if (window := self.template_window_s) is not None and not window[0] <= window[1]:
@@ -264,6 +269,7 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
 
 
 def _file_name(name: str) -> str:
+    """Return a name that can be part of a file name; raise `ValueError` for others."""
     if (
         not name.isprintable()
         or name[:1] in ("", ".")
@@ -280,24 +286,24 @@ Grasps = Annotated[list[GraspSection] | GraspSection, ByForm(list)]
 
 
 class NamedSection(Section):
-    """Something whose name is one of files."""
+    """Table with a name that is also part of file names."""
 
     name: Annotated[str, AfterValidator(_file_name)]
 
 
 class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
-    """A reading of the user's own: a Python function of what it looks at and of its unknowns.
+    """A custom sensor: a Python function of positions or forces and of its own unknowns.
 
     Attributes
     ----------
     name : str
-        Of its error bars, and of the file that `simulate` writes.
+        Name in error bars, and of the file that `simulate` writes.
     code : str
         Python file; it is run, which needs --allow-code.
     function : str
         Name of the function in it.
     file : str, optional
-        What it said: a column t_s, and one for each number; only `simulate` can do without.
+        Measured values: a column t_s, and one for each number; only `simulate` can do without.
     """
 
     code: Text
@@ -306,34 +312,35 @@ class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
 
 
 class DepthCameraSection(section_of(DepthCamera, "DepthCameraSection")):
-    """A depth camera, or the frame of a scanner; what an .npz or a log says need not be said.
+    """A depth camera, or the frame of a scanner; keys that an .npz or a log contains may be left
+    out.
 
     Attributes
     ----------
     poses : str, optional
-        File of poses of what carries the camera; it is at rest by default.
+        File of poses of the body that carries the camera; it is at rest by default.
     """
 
     poses: Text | None = None
 
 
 class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
-    """What a depth camera or a scanner sees of the body; nothing is labelled.
+    """Depth images or point clouds of the body from a camera or a scanner, without labels.
 
     Attributes
     ----------
     name : str
-        For messages, error bars and pictures.
+        Name in messages, error bars and pictures.
     file : str
         Depth images (.npz, .png of 16 bits, .exr) or clouds of points (.ply, .pcd, .npy, .xyz), or
         a folder of these in the order of their names, with times.csv or t_s; or a topic of a log,
         ``run.mcap#/camera/depth/image_rect_raw``.
     camera : DepthCameraSection
-        Where it stands, and how it projects.
+        Pose and projection of the camera.
     t_s : list of float, optional
-        Times, where the file does not say them; of one image that of the first sample.
+        Times, where the file does not contain them; of one image that of the first sample.
     count_m : float, optional
-        What a count of an image is, 0.001 by default.
+        Depth of one count of an image, 0.001 by default.
     length_unit : {"m", "cm", "mm", "in"}
         Unit of clouds.
     """
@@ -352,7 +359,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     Attributes
     ----------
     file : str, optional
-        Table that displacements and wrenches are read from which name no file: CSV as a test bench
+        Table of displacements and wrenches that name no file of their own: CSV as a test bench
         writes it.
     grasp : Grasps
         A table of nodes and poses, or a list of them.
@@ -367,7 +374,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     every : int
         Use every n-th sample of the markers.
     reading : list of ReadingSection
-        [[experiment.reading]] tables: instruments of the user's own.
+        [[experiment.reading]] tables: custom sensors.
     depth : list of DepthSection
         [[experiment.depth]] tables: depth cameras and scanners.
     nuisance : NuisanceOrNone
@@ -388,25 +395,26 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
     @property
     def marked(self) -> bool:
-        """Whether there are markers."""
+        """Whether the table contains markers."""
         return "markers" in self.model_fields_set
 
     def file_of(self, table: TableSection | None) -> str | None:
-        """The file that a table is read from; None where none is named."""
+        """Return the file of a table; None if neither it nor the experiment names one."""
         return table and (table.file or self.file)
 
     @property
     def grasps(self) -> list[GraspSection]:
-        """The grasps, however they are written."""
+        """Grasps as a list, also if the file has a single table."""
         return self.grasp if isinstance(self.grasp, list) else [self.grasp]
 
     @property
     def moved(self) -> list[GraspSection | ObstacleSection]:
-        """The grasps, then the obstacles."""
+        """Grasps, followed by the obstacles."""
         return [*self.grasps, *self.obstacle]
 
     @model_validator(mode="after")
     def _window(self) -> ExperimentSection:
+        """Raise `ValueError` if the window does not begin before it ends."""
         if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
             raise ValueError(
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
@@ -415,6 +423,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
     @model_validator(mode="after")
     def _static(self) -> ExperimentSection:
+        """Raise `ValueError` for keys that make no sense for equilibria."""
         if self.kind == "dynamic":
             return self
         usual = {"start": "equilibrium", "start_rule": "standard", "resample_hz": None}
@@ -430,6 +439,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
 
 
 def _at_least_three(places: dict[str, Any] | None, key: str) -> None:
+    """Raise `ValueError` for fewer than three positions, which do not determine a rotation."""
     if places is not None and len(places) < 3:
         raise ValueError(
             f"found {len(places)} in {key}; expected at least three, to fix a rotation"

@@ -1,4 +1,4 @@
-"""The problem file's keys: SI units, the unit in the key; unknown keys are refused."""
+"""Keys of the problem file: SI units, with the unit in the key; unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ else:
 
 
 class CodeSection(Section):
-    """A material of the user's own: a Python function of F and named constants.
+    """A custom material: a Python function of F and named constants.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class CodeSection(Section):
 
 
 class NodeForceSection(CodeSection):
-    """A force of the user's own: a Python function of x, v, at and named constants.
+    """A custom force: a Python function of x, v, at and named constants.
 
     Attributes
     ----------
@@ -67,8 +67,8 @@ class NodeForceSection(CodeSection):
     on : str
         What it acts on: these nodes, or faces of the surface that have all of theirs among them.
     carries : int
-        How many numbers each of them carries from step to step: the function takes them behind v,
-        and returns the force and those for the next step.
+        Number of internal variables of each node or face from step to step: the function gets them
+        after v, and returns the force and those for the next step.
     """
 
     nodes: Nodes | None = None
@@ -80,7 +80,7 @@ Material = Annotated[MaterialName | CodeSection, ByForm(str)]
 
 
 class RegionSection(Section):
-    """Cells that differ from the rest; its parameters have its name in front.
+    """Cells with other properties; its parameters begin with its name.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class RegionSection(Section):
         Selection of cells, by their centres: a table of box_m, ball_m or indices, or the name of a
         cell array or of a physical group.
     field : FieldSection, optional
-        A constant that differs from place to place within the region.
+        A constant that varies in space within the region.
     """
 
     name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")]
@@ -131,7 +131,7 @@ class CylinderSection(Section):
 
 
 class ScanSection(Section):
-    """How the object hung or stood while its mesh was made, with rest_shape = "under_gravity".
+    """Gravity and held nodes while the mesh was scanned, with rest_shape = "under_gravity".
 
     Attributes
     ----------
@@ -210,6 +210,7 @@ class ObjectSection(Section):
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ObjectSection:
+        """Raise `ValueError` for keys that exclude or require each other."""
         require_one(self, "mesh", "surface", "cylinder", "box_m")
         if (self.mesh is None) != (self.edge_length_m is not None):
             raise ValueError(
@@ -249,6 +250,7 @@ class PriorSection(Section):
 
     @model_validator(mode="after")
     def _one(self) -> PriorSection:
+        """Raise `ValueError` unless exactly one of both deviations is given."""
         require_one(self, "relative", "deviation")
         return self
 
@@ -273,8 +275,9 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
 
     @model_validator(mode="after")
     def _one_kind(self) -> ParameterSection:
-        if len(there := given_keys(self, "guess", "fixed", "tied_to")) > 1:
-            raise ValueError(f"found {' and '.join(there)}; expected one of them, or none")
+        """Raise `ValueError` for keys that do not belong together."""
+        if len(given_kinds := given_keys(self, "guess", "fixed", "tied_to")) > 1:
+            raise ValueError(f"found {' and '.join(given_kinds)}; expected one of them, or none")
         of_kind = {
             "guess": ("lower", "upper", "prior", "scale", "typical"),
             "fixed": (),
@@ -283,22 +286,24 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
         kind = next((key for key in of_kind if getattr(self, key) is not None), "guess")
         others = {key for keys in of_kind.values() for key in keys} - set(of_kind[kind])
         if useless := given_keys(self, *(n for n in type(self).model_fields if n in others)):
-            instead = "guess or nothing in its place to estimate the parameter"
+            alternative = "guess or nothing in its place to estimate the parameter"
             raise ValueError(
-                f"found {kind} beside {', '.join(useless)}; expected {kind} alone, or {instead}"
+                f"found {kind} beside {', '.join(useless)}; expected {kind} alone, or {alternative}"
             )
         return self
 
 
 def _flat(tables: Any, *, front: str = "") -> Any:
-    """Regions' parameters, ``core.mu_pa``, also where they are written as tables in a table."""
+    """Return parameters by their full names, such as ``core.mu_pa``, from tables nested by
+    region.
+    """
     if not isinstance(tables, dict):
         return tables
     flat: dict[str, Any] = {}
     for name, value in tables.items():
         nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
-        whole = f"{front}{name}"
-        inner = _flat(value, front=f"{whole}.") if nested and value else {whole: value}
+        full_name = f"{front}{name}"
+        inner = _flat(value, front=f"{full_name}.") if nested and value else {full_name: value}
         if twice := [key for key in inner if key in flat]:
             raise ValueError(f"{twice[0]!r} is given twice; expected one value")
         flat.update(inner)
@@ -311,7 +316,7 @@ Substeps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
 
 
 class TranscriptionSection(Section):
-    """How the equations of motion become constraints.
+    """Discretisation of the equations of motion.
 
     Attributes
     ----------
@@ -331,13 +336,13 @@ AirDensity = Annotated[Literal["none"] | NotNegative, ByForm(str)]
 
 
 class EnvironmentSection(Section):
-    """What surrounds the object.
+    """Surroundings of the object.
 
     Attributes
     ----------
     air_density_kg_m3 : float or "none"
-        Of the air, which lifts the object, moves along and drags at it, 1.2 by default; or "none"
-        in a vacuum, and for recordings that were simulated without air.
+        Density of the air, which causes buoyancy, added mass and drag, 1.2 by default; "none" in a
+        vacuum, and for recordings that were simulated without air.
     """
 
     air_density_kg_m3: AirDensity = Field(default_factory=usual_air_density)
@@ -370,14 +375,19 @@ class ProblemFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _completed(cls, content: Any) -> Any:
+        """Insert [experiment_defaults] before validation."""
         return completed(content)
 
 
 def completed(content: Any) -> Any:
-    """The content of a problem file with what its experiments share in each of them."""
+    """Return the content of a problem file with [experiment_defaults] inserted into each
+    experiment.
+    """
     shared = content.get("experiment_defaults") if isinstance(content, dict) else None
     experiments = content.get("experiment") if isinstance(content, dict) else None
     if not (isinstance(shared, dict) and isinstance(experiments, list)):
         return content
-    whole = [shared | table if isinstance(table, dict) else table for table in experiments]
-    return content | {"experiment": whole}
+    completed_tables = [
+        shared | table if isinstance(table, dict) else table for table in experiments
+    ]
+    return content | {"experiment": completed_tables}

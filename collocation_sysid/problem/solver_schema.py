@@ -1,4 +1,6 @@
-"""[solver] of the problem file: the method, the loss, and a table of options for each method."""
+"""Table [solver] of the problem file: the method, the loss, and a table of options for each
+method.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +25,9 @@ DEFAULT = "reduced-space"
 
 
 def _offered(name: Any) -> Any:
+    """Return the name of a method; raise `ValueError` with the reason if CasADi's solver is
+    not offered.
+    """
     reason = why_not(name) if isinstance(name, str) else None
     if reason is not None:
         raise ValueError(reason)
@@ -38,7 +43,8 @@ class MethodSection(Section):
     Attributes
     ----------
     huber : float, optional
-        Samples farther off than this many sigmas count linearly, not squared.
+        Threshold in standard deviations beyond which residuals count linearly, not squared (Huber's
+        loss).
     """
 
     method: MethodName = DEFAULT
@@ -47,6 +53,7 @@ class MethodSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _options_are_in_tables(cls, table: Any) -> Any:
+        """Raise `ValueError` if options of a method are outside the method's table."""
         outside = [name for name in table if _owners(name)] if isinstance(table, Mapping) else []
         if outside:
             remedy = f"move {_moves(outside, table.get('method', DEFAULT))}"
@@ -55,12 +62,18 @@ class MethodSection(Section):
 
     @property
     def methods(self) -> dict[str, Method]:
-        """The methods by name, with the options of their tables."""
+        """Methods by name, with the options of their tables."""
         return {name: getattr(self, name) for name in METHODS}
 
 
 def _read(method: str, table: Any) -> Any:
-    """The method with the options that its table gives."""
+    """Return the method with the options of its table.
+
+    Raises
+    ------
+    InputError
+        For options that the method does not have, or invalid values.
+    """
     where = f"solver.{method}"
     if not isinstance(table, Mapping):
         raise InputError(f"found {table!r}; expected a table of options", None, where)
@@ -74,27 +87,29 @@ def _read(method: str, table: Any) -> Any:
 
 
 def _owners(option: str) -> list[str]:
-    """Methods that have an option."""
+    """Return the names of the methods that have an option."""
     return [method for method in METHODS if option in OPTIONS[method]]
 
 
 def _moves(options: Sequence[str], chosen: Any) -> str:
-    """Which options belong in which tables: in the chosen method's where it has them."""
-    places: dict[str, list[str]] = {}
+    """Return advice in words which options belong to which tables."""
+    options_by_method: dict[str, list[str]] = {}
     for option in options:
         owners = _owners(option)
-        places.setdefault(chosen if chosen in owners else owners[0], []).append(option)
-    return " and ".join(f"{', '.join(names)} to {heading(to)}" for to, names in places.items())
+        options_by_method.setdefault(chosen if chosen in owners else owners[0], []).append(option)
+    return " and ".join(
+        f"{', '.join(names)} to {heading(to)}" for to, names in options_by_method.items()
+    )
 
 
 def heading(method: str) -> str:
-    """How a method's table begins in the file."""
+    """Return the heading of a method's table in the file."""
     return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"
 
 
 @dataclass(frozen=True)
 class _Options:
-    """The type of a method's key."""
+    """Pydantic type of a method's key."""
 
     method: str
 
@@ -106,7 +121,7 @@ class _Options:
 
 
 def _table(method: str) -> tuple[Any, Any]:
-    """Type and default of a method's key."""
+    """Return type and default of a method's key."""
     return Annotated[Any, _Options(method)], Field(default_factory=partial(_read, method, {}))
 
 

@@ -1,4 +1,6 @@
-"""What drives a body from within: an energy c(t) S(x), S being a scalar of its shape."""
+"""Actuators inside a body: energies c(t) S(x) of an amplitude c and a scalar S of the body's
+shape.
+"""
 
 from __future__ import annotations
 
@@ -19,25 +21,27 @@ S = TypeVar("S", Length, Volume)
 
 @dataclass(frozen=True, eq=False)
 class Placed(Generic[S]):
-    """A scalar of the shape of a body."""
+    """A scalar S of the shape of a given body: the length of a tendon, or a volume."""
 
     body: Body
     measure: S
 
 
 class Actuator(ABC, Generic[S]):
-    """A tendon or a pressure; what is stated of it may be off by a factor and an amount.
+    """A tendon or a pressure, whose stated amplitude may be wrong by a factor and an offset.
 
     Attributes
     ----------
     name : str
         For messages and reports.
     t_s : (m,) or None
+        Times of the stated tension or pressure; None if it is constant.
     course : Course
         The tension or pressure as stated.
     factor : float
+        Factor on the stated tension or pressure.
     placed : Placed, optional
-        S, on a body.
+        The scalar S of a body; None before the actuator belongs to an experiment.
     """
 
     name: str
@@ -51,12 +55,12 @@ class Actuator(ABC, Generic[S]):
     lost: ClassVar[str]  # the field of what is lost
 
     def on(self, body: Body) -> Self:
-        """The same on a body.
+        """Return the actuator with its scalar S evaluated for a body.
 
         Raises
         ------
         InputError
-            If it does not fit there.
+            If the actuator does not fit this body.
         """
         if self.placed is not None and self.placed.body is body:
             return self
@@ -64,28 +68,30 @@ class Actuator(ABC, Generic[S]):
 
     @abstractmethod
     def _measure_on(self, body: Body) -> S:
-        """S of a body."""
+        """Return the scalar S of a body."""
 
     @property
     def measure(self) -> S:
-        """S, on a body."""
+        """Scalar S of the body's shape; an `InputError` if the actuator is on no body yet."""
         if self.placed is None:
             raise InputError(f"{self.name} is not on a body yet; expected one of an experiment")
         return self.placed.measure
 
     @property
     def off(self) -> tuple[float, float]:
-        """Factor, and what is lost."""
+        """Factor on the stated tension or pressure, and its offset (the part that is lost)."""
         return self.factor, getattr(self, self.lost)
 
     def off_by(self, factor: float, lost: float) -> Self:
-        """The same with other ones."""
+        """Return the actuator with another factor and another offset."""
         return replace(self, factor=factor, **{self.lost: lost})
 
     @abstractmethod
     def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
-        """C of a tension or pressure as stated, of numbers, arrays or CasADi's expressions."""
+        """Return the amplitude c for a stated tension or pressure: numbers, arrays or CasADi
+        expressions.
+        """
 
     def amplitude(self, t_s: Array) -> Array:
-        """C at the times `t_s` (T,)."""
+        """Return the amplitude c at the times `t_s` (T,), as (T,)."""
         return self.driven(self.course.at(t_s), *self.off)

@@ -13,9 +13,11 @@ from .clock import STEP_TOLERANCE, even_times_s, rounding_s, sample_interval_s, 
 from .poses import PoseSequence
 from .readers import MarkerTable
 
-# Samples further apart than this many usual steps have lost ones between them.
+# Distance of samples, in median steps, above which samples were lost between them.
 _GAP_STEPS = 1.5
+# Distance of equal times, in steps: rounding of the grid.
 _SAME_TIME_STEPS = 1e-6
+# Fewest samples of a motion: an acceleration needs three.
 _FEWEST_SAMPLES = 3
 
 
@@ -91,7 +93,8 @@ def align(
         t_s = grid = table.t_s
     elif resample_hz is None:
         sample_interval_s(table.t_s, "markers")
-        t_s, grid = table.t_s, even_times_s(table.t_s)
+        t_s = table.t_s
+        grid = even_times_s(table.t_s)
         table = MarkerTable(grid, table.names, table.positions_m)
     else:
         t_s = grid = _grid(table.t_s, resample_hz)
@@ -123,25 +126,25 @@ def _shared(
         If fewer than `fewest` samples remain.
     """
     t_s = table.t_s
-    kept = np.ones(len(t_s), dtype=bool)
-    moving = [(p, held) for p, held in zip(poses, held_s, strict=True) if len(p.t_s) > 1]
+    is_kept = np.ones(len(t_s), dtype=bool)
+    moving = [(p, window_s) for p, window_s in zip(poses, held_s, strict=True) if len(p.t_s) > 1]
     for sequence, (from_s, until_s) in moving:
         slack_s = _tolerance_s(sequence, t_s)
         # Beyond its first or last pose a grasp must not be asked for one.
         if from_s < sequence.t_s[0] - slack_s:
-            kept &= t_s >= sequence.t_s[0] - slack_s
+            is_kept &= t_s >= sequence.t_s[0] - slack_s
         if until_s > sequence.t_s[-1] + slack_s:
-            kept &= t_s <= sequence.t_s[-1] + slack_s
-    if kept.all():
+            is_kept &= t_s <= sequence.t_s[-1] + slack_s
+    if is_kept.all():
         return table, []
     spans = " and ".join(_span(sequence.t_s) for sequence, _ in moving)
-    if kept.sum() < fewest:
+    if is_kept.sum() < fewest:
         raise InputError(
-            f"poses run {spans}, markers {_span(t_s)}: they share {kept.sum()} marker samples; "
+            f"poses run {spans}, markers {_span(t_s)}: they share {is_kept.sum()} marker samples; "
             f"expected at least {fewest}: check that both are of one recording and one "
             "clock, and window_s"
         )
-    cut = t_s[kept]
+    cut = t_s[is_kept]
     ends = [
         f"{length_s:.6g} s at the {end}"
         for length_s, end in ((cut[0] - t_s[0], "start"), (t_s[-1] - cut[-1], "end"))
@@ -149,11 +152,11 @@ def _shared(
     ]
     note = (
         f"the markers were cut to the time of the poses by {' and '.join(ends)}, "
-        f"{(~kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran {_span(t_s)}"
+        f"{(~is_kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran {_span(t_s)}"
     )
     if cut[0] > t_s[0]:
         note += f"; start tells the state at {cut[0]:.9g} s now"
-    return MarkerTable(cut, table.names, table.positions_m[kept]), [note]
+    return MarkerTable(cut, table.names, table.positions_m[is_kept]), [note]
 
 
 def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
@@ -161,13 +164,13 @@ def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
     slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
-    kept = (table.t_s >= first_s - slack_s) & (table.t_s <= last_s + slack_s)
-    if not kept.any():
+    is_kept = (table.t_s >= first_s - slack_s) & (table.t_s <= last_s + slack_s)
+    if not is_kept.any():
         raise InputError(
             f"window_s = [{first_s:g}, {last_s:g}] holds no marker sample; "
             f"the markers run from {table.t_s[0]:.9g} s to {table.t_s[-1]:.9g} s"
         )
-    return MarkerTable(table.t_s[kept], table.names, table.positions_m[kept])
+    return MarkerTable(table.t_s[is_kept], table.names, table.positions_m[is_kept])
 
 
 def _grid(t_s: Array, rate_hz: float) -> Array:
@@ -187,7 +190,8 @@ def _between_neighbours(table: MarkerTable, grid: Array) -> Array:
     """Return marker positions on the grid; NaN beside a missing sample or within a gap of the
     times.
     """
-    t_s, x = table.t_s, table.positions_m
+    t_s = table.t_s
+    x = table.positions_m
     k = np.clip(np.searchsorted(t_s, grid, side="right") - 1, 0, len(t_s) - 2)
     step_s = t_s[k + 1] - t_s[k]
     fraction = ((grid - t_s[k]) / step_s)[:, None, None]
@@ -225,12 +229,12 @@ def _matched(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | Non
         return None
     moved = poses.t_s + np.interp(poses.t_s, times, grid[within] - poses.t_s[nearest])
     moved[nearest] = grid[within]
-    kept = slice(nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None)
+    kept_samples = slice(nearest[0] if within[0] else 0, nearest[-1] + 1 if within[-1] else None)
     return replace(
         poses,
-        t_s=moved[kept],
-        positions_m=poses.positions_m[kept],
-        quaternions_xyzw=poses.quaternions_xyzw[kept],
+        t_s=moved[kept_samples],
+        positions_m=poses.positions_m[kept_samples],
+        quaternions_xyzw=poses.quaternions_xyzw[kept_samples],
     )
 
 
@@ -246,15 +250,15 @@ def _interpolated(poses: PoseSequence, grid: Array) -> str:
     """Return a note on poses that were interpolated to the grid, without its subject."""
     how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
     at = f"{_rate_hz(grid):.6g} Hz {_span(grid)}" if len(grid) > 1 else _span(grid)
-    told = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
+    note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
     steps = np.diff(poses.t_s)
-    lost = (steps > _GAP_STEPS * np.median(steps)) & (poses.t_s[1:] > grid[0])
-    lost &= poses.t_s[:-1] < grid[-1]
-    if not lost.any():
-        return told
-    k = int(np.argmax(np.where(lost, steps, 0.0)))
+    is_gap = (steps > _GAP_STEPS * np.median(steps)) & (poses.t_s[1:] > grid[0])
+    is_gap &= poses.t_s[:-1] < grid[-1]
+    if not is_gap.any():
+        return note
+    k = int(np.argmax(np.where(is_gap, steps, 0.0)))
     return (
-        f"{told}, also across {lost.sum()} gap{'s' * int(lost.sum() > 1)} in them, the longest "
+        f"{note}, also across {is_gap.sum()} gap{'s' * int(is_gap.sum() > 1)} in them, the longest "
         f"{_span(poses.t_s[k : k + 2])}"
     )
 

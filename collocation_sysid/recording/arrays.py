@@ -46,8 +46,7 @@ def read_only_floats(
 def floats(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
-    """Return a converter that applies `read_only_floats` with these arguments to a field's value.
-    """
+    """Return a converter of field values that applies `read_only_floats` with these arguments."""
     return lambda values: read_only_floats(values, shape, name, finite)
 
 
@@ -58,8 +57,8 @@ def read_only_tracks(values: ArrayLike, shape: tuple[int | None, ...], name: str
     NaN.
     """
     tracks = read_only_floats(values, shape, name, finite=False)
-    whole = np.isfinite(tracks).all(axis=2, keepdims=True)
-    tracks = np.where(whole, tracks, np.nan)
+    is_complete = np.isfinite(tracks).all(axis=2, keepdims=True)
+    tracks = np.where(is_complete, tracks, np.nan)
     tracks.setflags(write=False)
     return tracks
 
@@ -95,5 +94,5 @@ def _require_shape(shape: tuple[int, ...], expected: tuple[int | None, ...], nam
         want is None or have == want for have, want in zip(shape, expected, strict=True)
     )
     if not matches:
-        wanted = ", ".join("any" if want is None else str(want) for want in expected)
-        raise InputError(f"{name} has the shape {shape}; expected ({wanted})")
+        expected_text = ", ".join("any" if want is None else str(want) for want in expected)
+        raise InputError(f"{name} has the shape {shape}; expected ({expected_text})")

@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..errors import InputError
 
+# Largest deviation of a time step from the mean step, as a share of it.
 STEP_TOLERANCE = 0.01
-# A window opens and closes at its times, also where they are rounded to just off a grid time.
+# Difference of equal times [s]: rounding of the ends of windows.
 TIME_TOLERANCE_S = 1e-9
-# Rounding of printed times is forgiven up to this part of a step, so that no lost frame passes.
+# Largest rounding of printed times, in steps: more could hide a lost frame.
 _ROUNDING_LIMIT = 0.3
-# No clock tells less: rates of such steps overflow.
+# Shortest time step [s]: no clock resolves less, and rates of shorter steps overflow.
 SHORTEST_S = 1e-12
 _PRINTED_DECIMALS = range(10)
 

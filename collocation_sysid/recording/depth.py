@@ -26,12 +26,12 @@ from .selected import Nodes, selection
 
 Row = tuple[Finite, Finite, Finite, Finite]
 Pose = tuple[Row, Row, Row, Row]
-# A depth that differs from the next pixel's by more than this share of itself is of another thing.
+# Relative difference of the depths of neighbouring pixels above which they show two surfaces.
 JUMP = 0.02
-# Of distortion: fixed-point iterations, of which each gains two digits for usual lenses.
+# Fixed-point iterations that invert the distortion; each gains two digits for usual lenses.
 UNDISTORTING = 12
-# Images of a recording whose outlines are compared, at most: each is kept whole in memory, and one
-# of 640 x 480 pixels takes 1.2 MB.
+# Largest number of images of a recording whose outlines are compared: they are stored in memory,
+# and one of 640 x 480 pixels takes 1.2 MB.
 MOST_OUTLINED = 40
 
 Background = Literal["auto", "empty", "unknown"]
@@ -102,28 +102,31 @@ class DepthCamera:
         world.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        turn, at = self.pose[:3, :3], self.pose[:3, 3]
+        rotation = self.pose[:3, :3]
+        translation = self.pose[:3, 3]
         if self.poses is None:
-            return np.tile(turn, (len(times), 1, 1)), np.tile(at, (len(times), 1))
+            return np.tile(rotation, (len(times), 1, 1)), np.tile(translation, (len(times), 1))
         rotations, translations = self.poses.at(times)
-        return rotations @ turn, rotations @ at + translations
+        return rotations @ rotation, rotations @ translation + translations
 
     def rays(self, pixels: Array) -> Array:
         """Return the points (P, 3) at depth z = 1 that appear at the pixels (P, 2), u and v.
 
         Distortion is inverted by a fixed-point iteration.
         """
-        seen = np.linalg.solve(self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T).T
+        distorted = np.linalg.solve(
+            self.matrix, np.column_stack([pixels, np.ones(len(pixels))]).T
+        ).T
         k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
-        plain = seen[:, :2].copy()
+        undistorted = distorted[:, :2].copy()
         for _ in range(UNDISTORTING if len(self.distortion) else 0):
-            x, y = plain.T
+            x, y = undistorted.T
             r2 = x**2 + y**2
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             across = 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
             down = p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-            plain = (seen[:, :2] - np.column_stack([across, down])) / radial[:, None]
-        return np.column_stack([plain, np.ones(len(plain))])
+            undistorted = (distorted[:, :2] - np.column_stack([across, down])) / radial[:, None]
+        return np.column_stack([undistorted, np.ones(len(undistorted))])
 
     def distorted_pixels(self, points_m: Array) -> Array:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, with
@@ -135,14 +138,14 @@ class DepthCamera:
         k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
         r2 = x**2 + y**2
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        bent = np.stack(
+        distorted = np.stack(
             [
                 x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
                 y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
                 np.ones_like(x),
             ]
         )
-        return (self.matrix @ bent)[:2].T
+        return (self.matrix @ distorted)[:2].T
 
     def pixels(self, points_m: Array) -> Array:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, without
@@ -287,8 +290,8 @@ class Depth:
         images = np.asarray(images_m, dtype=float)
         images = images[None] if images.ndim == 2 else images
         clouds = [points_of(image, camera) for image in images]
-        kept = outlined_samples(len(images))
-        options["images_m"] = [image if k in kept else None for k, image in enumerate(images)]
+        outlined = outlined_samples(len(images))
+        options["images_m"] = [image if k in outlined else None for k, image in enumerate(images)]
         return cls(name, t_s, clouds, sigma_m, camera, **options)
 
     def _thinned(self, cloud: Array) -> Array:
@@ -317,7 +320,7 @@ class Depth:
 
     @property
     def times(self) -> Array:
-        """(S,) sample times [s]."""
+        """(S,) sample times of the camera [s]."""
         return cast(Array, self.t_s)
 
     @property
@@ -389,12 +392,12 @@ def points_of(image_m: Array, camera: DepthCamera) -> Array:
     if camera.matrix is None:
         raise InputError("a depth image needs the matrix of its camera; a cloud does without")
     depth = np.where(np.isfinite(image_m) & (image_m > 0), image_m, np.nan)
-    whole = np.isfinite(depth)
+    is_inner = np.isfinite(depth)
     for axis in (0, 1):
         for way in (1, -1):
-            whole &= np.abs(np.roll(depth, way, axis) - depth) < JUMP * np.nan_to_num(depth)
-    whole[[0, -1]] = whole[:, [0, -1]] = False
-    v, u = np.nonzero(whole)
+            is_inner &= np.abs(np.roll(depth, way, axis) - depth) < JUMP * np.nan_to_num(depth)
+    is_inner[[0, -1]] = is_inner[:, [0, -1]] = False
+    v, u = np.nonzero(is_inner)
     return camera.rays(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
 
 
@@ -417,17 +420,17 @@ def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array)
     """
     image = np.full(shape, np.inf)
     for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:
-        seen = camera.pixels(corners)
-        low = np.maximum(np.ceil(seen.min(axis=0)), 0).astype(int)
-        high = np.minimum(np.floor(seen.max(axis=0)), [shape[1] - 1, shape[0] - 1]).astype(int)
-        sides = (seen[1:] - seen[0]).T
+        pixels = camera.pixels(corners)
+        low = np.maximum(np.ceil(pixels.min(axis=0)), 0).astype(int)
+        high = np.minimum(np.floor(pixels.max(axis=0)), [shape[1] - 1, shape[0] - 1]).astype(int)
+        sides = (pixels[1:] - pixels[0]).T
         if (high < low).any() or abs(np.linalg.det(sides)) < 1e-12:
             continue
         u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
-        share = np.linalg.solve(sides, np.stack([u.ravel(), v.ravel()]) - seen[0][:, None])
+        share = np.linalg.solve(sides, np.stack([u.ravel(), v.ravel()]) - pixels[0][:, None])
         share = np.vstack([1 - share.sum(axis=0), share])
         # What is linear over a triangle in the image is one over the depth.
         depth = np.where((share >= -1e-9).all(axis=0), 1 / (share.T @ (1 / corners[:, 2])), np.inf)
-        here = image[low[1] : high[1] + 1, low[0] : high[0] + 1]
-        np.minimum(here, depth.reshape(here.shape), out=here)
+        window = image[low[1] : high[1] + 1, low[0] : high[0] + 1]
+        np.minimum(window, depth.reshape(window.shape), out=window)
     return np.where(np.isfinite(image), image, np.nan)

@@ -182,8 +182,8 @@ class Experiment:
         """Ratio of the specimen's loads to those of the modelled part; 1 if the wrenches state
         different ones.
         """
-        stated = {wrench.symmetry for wrench in self.wrenches}
-        return stated.pop() if len(stated) == 1 else 1
+        symmetries = {wrench.symmetry for wrench in self.wrenches}
+        return symmetries.pop() if len(symmetries) == 1 else 1
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
@@ -212,8 +212,8 @@ class Experiment:
     @cached_property
     def held_dofs(self) -> Index:
         """Sorted dofs (3 · node + axis) with prescribed displacements at every sample time."""
-        held = self.held(self.t_s)
-        return np.flatnonzero(held.all(axis=0))
+        is_held = self.held(self.t_s)
+        return np.flatnonzero(is_held.all(axis=0))
 
     @cached_property
     def free_dofs(self) -> Index:
@@ -233,24 +233,24 @@ class Experiment:
             Prescribed coordinates [m]; NaN where a coordinate is free.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        held = self.held(times)
-        positions = np.full(held.shape, np.nan)
+        is_held = self.held(times)
+        positions = np.full(is_held.shape, np.nan)
         for grasp in self.grasps:
-            here = np.flatnonzero(grasp.holds(times))
-            carried = grasp.carry(self.body.nodes_m, times[here])
-            positions[np.ix_(here, grasp.nodes, grasp.columns)] = carried[..., grasp.columns]
-        return held, positions
+            holding = np.flatnonzero(grasp.holds(times))
+            carried_m = grasp.carry(self.body.nodes_m, times[holding])
+            positions[np.ix_(holding, grasp.nodes, grasp.columns)] = carried_m[..., grasp.columns]
+        return is_held, positions
 
     def held(self, t_s: ArrayLike) -> NDArray[np.bool_]:
         """Return whether each nodal coordinate is prescribed at the times `t_s` (T,), as (T, n, 3)
         bool.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
+        is_held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
         for grasp in self.grasps:
-            here = np.flatnonzero(grasp.holds(times))
-            held[np.ix_(here, grasp.nodes, grasp.columns)] = True
-        return held
+            holding = np.flatnonzero(grasp.holds(times))
+            is_held[np.ix_(holding, grasp.nodes, grasp.columns)] = True
+        return is_held
 
     def held_positions(self, t_s: ArrayLike) -> Array:
         """Return the prescribed coordinates of `held_dofs` at the times `t_s` (T,), as (T, held)
@@ -267,9 +267,9 @@ class Experiment:
         return self.body.node_mass + self.tied_mass_kg(t_s)
 
     def tied_mass_kg(self, t_s: ArrayLike) -> Array:
-        """Return the mass of all point masses at each node at the times `t_s` (T,), as (T, n) [kg].
-        """
-        n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
+        """Return the mass of all point masses at each node at times `t_s` (T,), as (T, n) [kg]."""
+        n = len(self.body.nodes_m)
+        times = np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
             mass = mass + np.outer(self.share(point, times), point.at_nodes(n))
@@ -283,8 +283,10 @@ class Experiment:
         from the start. In a static experiment the share jumps at these times.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        joined, left = (self._changed(load, change, times) for change in get_args(Change))
-        return joined - left
+        share_joined, share_left = (
+            self._changed(load, change, times) for change in get_args(Change)
+        )
+        return share_joined - share_left
 
     def _changed(self, load: PointMass | Force, change: Change, times: Array) -> Array:
         """Return the share (T,) of a load that has joined (or left, by `change`) at the given
@@ -303,9 +305,9 @@ class Experiment:
         return bool(within) and not self.static
 
     def node_forces_n(self, t_s: ArrayLike) -> Array:
-        """Return the forces besides gravity on each node at the times `t_s` (T,), as (T, n, 3) [N].
-        """
-        n, times = len(self.body.nodes_m), np.atleast_1d(t_s)
+        """Return the forces besides gravity on each node at times `t_s` (T,), as (T, n, 3) [N]."""
+        n = len(self.body.nodes_m)
+        times = np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
             total = total + self.share(force, times)[:, None, None] * force.at_nodes(times, n)
@@ -313,10 +315,11 @@ class Experiment:
 
     @property
     def sensed(self) -> tuple[int, ...]:
-        """Indices of the grasps whose force or torque is measured, by a wrench or a custom sensor.
-        """
-        looked = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
-        sensed = (k for k, g in enumerate(self.grasps) if g.wrench is not None or k in looked)
+        """Indices of the grasps whose force or torque is measured, by a wrench or custom sensor."""
+        grasps_of_gauges = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
+        sensed = (
+            k for k, g in enumerate(self.grasps) if g.wrench is not None or k in grasps_of_gauges
+        )
         return tuple(sensed)
 
     @property
@@ -339,7 +342,7 @@ class Experiment:
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
-        """Tendons, then pressures."""
+        """Tendons of the experiment, then its pressures."""
         return (*self.tendons, *self.pressures)
 
     @property
@@ -472,10 +475,10 @@ class Experiment:
             if [other.name for other in self.depths].count(depth.name) > 1:
                 raise InputError(f"two depth cameras are called {depth.name!r}; expected another")
             within(depth.times, self.t_s, what, self.static)
-            beside = np.abs(depth.times[:, None] - self.t_s).min(axis=1)
-            if self.static and beside.max() > TIME_TOLERANCE_S:
+            distance_s = np.abs(depth.times[:, None] - self.t_s).min(axis=1)
+            if self.static and distance_s.max() > TIME_TOLERANCE_S:
                 raise InputError(
-                    f"{what} sees at {depth.times[beside.argmax()]:g} s, where the static "
+                    f"{what} sees at {depth.times[distance_s.argmax()]:g} s, where the static "
                     "experiment has no sample; expected times among its own"
                 )
 
@@ -496,7 +499,8 @@ class Experiment:
             beyond = [load.nodes[-1] for load in loads if load.nodes[-1] >= n]
             if beyond:
                 raise InputError(f"a {what} node {beyond[0]}, but the body has {n}")
-        placed, own = self.markers.placement.node_count, len(self.body.nodes.points_m)
+        placed = self.markers.placement.node_count
+        own = len(self.body.nodes.points_m)
         if placed not in (own, n):
             raise InputError(
                 f"the markers were placed on a body of {placed} nodes, but this one has {own}"
@@ -517,8 +521,8 @@ class Experiment:
             actuator.course.refuse_short(self.t_s, actuator.name)
         if not self.pressures:
             return
-        held, places_m = self.grasped(self.t_s)
-        throughout = np.asarray(held.all(axis=0))
+        is_held, places_m = self.grasped(self.t_s)
+        throughout = np.asarray(is_held.all(axis=0))
         bounded = tuple(pressure.bounded(throughout, places_m) for pressure in self.pressures)
         vars(self)["pressures"] = bounded
 
@@ -528,7 +532,7 @@ class Experiment:
                 f"loaded_since_s is given, but start is '{self.start}'; it says how long a body "
                 "that starts in equilibrium has been loaded"
             )
-        stated = self.start_positions_m is not None or self.start_velocities_m_s is not None
+        is_state_given = self.start_positions_m is not None or self.start_velocities_m_s is not None
         if self.start == "given":
             if self.start_positions_m is None:
                 raise InputError("start = 'given' needs start_positions_m")
@@ -537,7 +541,7 @@ class Experiment:
             self._start_frames(len(self.start_positions_m))
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
-        elif stated:
+        elif is_state_given:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
         if self.start == "equilibrium":
             self._refuse_free_motions()
@@ -563,12 +567,12 @@ class Experiment:
     def _refuse_free_motions(self) -> None:
         if self.obstacles:
             return  # these may carry it: the rest state is looked for
-        held = self.held(self.t_s[:1])[0]
-        free = free_motions(self.body.nodes_m, held)
-        if free:
+        is_held = self.held(self.t_s[:1])[0]
+        motions = free_motions(self.body.nodes_m, is_held)
+        if motions:
             raise InputError(
                 "start = 'equilibrium' needs grasps that leave the body no rigid motion, but it "
-                f"can {' and '.join(free)}, so that its rest state is not unique; "
-                f"{int(held.any(axis=1).sum())} nodes are held then. Grasp at least 3 nodes that "
-                "do not lie on one line, or more axes, or start 'undeformed'"
+                f"can {' and '.join(motions)}, so that its rest state is not unique; "
+                f"{int(is_held.any(axis=1).sum())} nodes are held then. Grasp at least 3 nodes "
+                "that do not lie on one line, or more axes, or start 'undeformed'"
             )

@@ -80,8 +80,8 @@ class Gauge:
     unknowns : mapping of name to float
         Prior standard deviation of each unknown of the sensor, about zero, by the argument's name.
     grasp : int, optional
-        In place of points: the index of the grasp, counted from 0 in Python and from 1 in problem
-        files, whose force and torque the sensor measures; obstacles count after the grasps.
+        In place of points: the number of the grasp, counted from 1, whose force and torque the
+        sensor measures; obstacles count after the grasps.
     frame : {"grasp", "world"}
         Axes and origin of force and torque: those of the undeformed body as the grasp carries it,
         or the poses' world.
@@ -112,7 +112,8 @@ class Gauge:
     unit: str = key(str, default="")
 
     def __post_init__(self) -> None:
-        where, points = f"the reading '{self.name}'", cast(Sequence[Any], self.points_m)
+        where = f"the reading '{self.name}'"
+        points = cast(Sequence[Any], self.points_m)
         times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
         points = read_only_floats(
             points if len(points) else np.zeros((0, 3)), (None, 3), f"points_m of {where}"
@@ -129,7 +130,8 @@ class Gauge:
 
     def _checked_values(self, count: int) -> Array:
         """Return the values (S, m), zeros if none were given; `count` is m by the expression."""
-        where, samples = f"the reading '{self.name}'", len(self.times)
+        where = f"the reading '{self.name}'"
+        samples = len(self.times)
         if self.values is None:
             return read_only_floats(np.zeros((samples, count)), (None, None), where)
         columns = np.array(self.values, dtype=float)
@@ -151,7 +153,7 @@ class Gauge:
 
     @property
     def times(self) -> Array:
-        """(S,) sample times [s]."""
+        """(S,) sample times of the sensor [s]."""
         return np.asarray(self.t_s)
 
     @property
@@ -199,10 +201,12 @@ class Gauge:
             If the expression cannot be evaluated, or it or its Jacobian is not finite at rest.
         """
         points = np.asarray(self.points_m).T
-        still = np.zeros_like(points), np.zeros_like(points)
-        rest = [points, *still] if self.grasp is None else [np.ones(3), np.ones(3)]
+        zero_rates = np.zeros_like(points)
+        of_points = [points, zero_rates, zero_rates]
+        rest = of_points if self.grasp is None else [np.ones(3), np.ones(3)]
         looked = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
-        t_s, own = ca.SX.sym("t_s"), ca.SX.sym("own", len(self.unknowns))
+        t_s = ca.SX.sym("t_s")
+        own = ca.SX.sym("own", len(self.unknowns))
         names = OF_POINTS if self.grasp is None else OF_GRASP
         try:
             read = self.read(t_s, looked, ca.vertsplit(own) if self.unknowns else [])

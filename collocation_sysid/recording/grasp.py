@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..fem.body import Body
 
 
-# Of the largest singular value: what is held less than so much of it is not held.
+# Smallest singular value of a constrained rigid motion, relative to the largest: less is rounding.
 HELD = 1e-6
 Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
@@ -40,8 +40,8 @@ class Grasp:
     Parameters
     ----------
     nodes : (h,) int array or Selection
-        Selection: a table of box_m, ball_m or indices, or the name of a point array or physical
-        group.
+        Selection: a table of box_m, ball_m, face or indices, or the name of a point array or
+        physical group.
     poses : PoseSequence or (T, 4, 4) array
         Rigid motion that carries the nodes.
     from_s : float
@@ -158,9 +158,9 @@ def held_dofs(grasps: Sequence[Grasp]) -> Index:
         shared = np.intersect1d(first.dofs, second.dofs)
         if shared.size and max(first.from_s, second.from_s) <= min(first.until_s, second.until_s):
             node, axis = divmod(int(shared[0]), 3)
-            along = "" if first.axes == second.axes == "xyz" else f" along {'xyz'[axis]}"
+            on_axis = "" if first.axes == second.axes == "xyz" else f" along {'xyz'[axis]}"
             raise InputError(
-                f"node {node} is held by the grasps {i} and {j} at the same time{along}; "
+                f"node {node} is held by the grasps {i} and {j} at the same time{on_axis}; "
                 "select nodes so that each is held once"
             )
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(g.dofs for g in grasps)]))
@@ -193,10 +193,11 @@ def free_motions(points_m: Array, held: NDArray[np.bool_]) -> list[str]:
     if not len(free):
         return []
     # What is left without a turn, and the axes of what turns.
-    shifts, turns = _null(free[:, 3:].T) @ free[:, :3], free[:, 3:]
+    shifts = _null(free[:, 3:].T) @ free[:, :3]
+    rotations = free[:, 3:]
     return [
         *(f"move along {_named(d)}" for d in _plain(shifts)),
-        *(f"turn about {_named(d)}" for d in _plain(turns)),
+        *(f"turn about {_named(d)}" for d in _plain(rotations)),
     ]
 
 

@@ -1,4 +1,4 @@
-"""What acts on a body besides its own weight, and how it goes over time: masses, and forces."""
+"""Loads besides the body's own weight: point masses and forces, and their course over time."""
 
 from __future__ import annotations
 
@@ -28,16 +28,23 @@ Change = Literal["from_s", "until_s"]
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Values (m, ...) at times (m,), or one without times.
+    """Values that change over time, linearly between samples, or a constant value.
 
     Parameters
     ----------
     values : (...) or (m, ...) array
+        One value, or a row for each time.
     t_s : (m,) array, optional
+        Sample times, ascending; None for a constant.
     what : str
-        The key and whose it is, for messages.
+        Key and owner of the values, for messages.
     shape : tuple of int
-        Of a value.
+        Shape of a value.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, a value is not finite, or time does not increase.
     """
 
     values: Array
@@ -57,23 +64,25 @@ class Course:
         vars(self).update(values=rows, t_s=t_s)
 
     def at(self, t_s: ArrayLike) -> Array:
-        """(T,) values at times (T,)."""
-        wanted = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        """Return scalar values (T,) at the times (T,); the end values outside the samples."""
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if self.t_s is None:
-            return np.full(len(wanted), self.values[0])
-        return np.interp(wanted, self.t_s, self.values)
+            return np.full(len(times), self.values[0])
+        return np.interp(times, self.t_s, self.values)
 
     def refuse_short(self, t_s: Array, name: str) -> None:
-        """Refuse a table that does not reach over the times of a recording.
+        """Raise an `InputError` if the samples do not cover the times `t_s` (T,) of a recording.
 
-        Raises
-        ------
-        InputError
-            Naming what the table is of.
+        Parameters
+        ----------
+        t_s : (T,) array
+        name : str
+            What the values belong to, for the message.
         """
         if self.t_s is None:
             return
-        (first, last), (start, end) = self.t_s[[0, -1]], t_s[[0, -1]]
+        (first, last) = self.t_s[[0, -1]]
+        (start, end) = t_s[[0, -1]]
         if first > start + TIME_TOLERANCE_S or last < end - TIME_TOLERANCE_S:
             raise InputError(
                 f"{name} is given from {first:.6g} s to {last:.6g} s, the recording lasts from "
@@ -83,16 +92,17 @@ class Course:
 
 
 def ramp(u: Any) -> Any:
-    """What joins around u = 0: none before −1, all after 1, with a continuous slope between.
+    """Return a smooth ramp from 0 at u ≤ −1 to 1 at u ≥ 1, with a continuous derivative.
 
-    Its slope is a hat: whatever the time between two steps of an even grid at which it joins, the
-    shares add up to the steps that are left. Of an array, or of CasADi's expressions.
+    The derivative is a hat function, so that the sum over an even grid with unit spacing is the
+    remaining length after u = 0, wherever u = 0 lies between grid points. `u` is an array or a
+    CasADi expression.
     """
     return (abs(u) < 1) * (0.5 + u - 0.5 * u * abs(u)) + (u >= 1)
 
 
 class Load:
-    """Something that is on nodes of a body for a while."""
+    """Something that acts on nodes of a body during a time window."""
 
     nodes: Index
     from_s: float
@@ -110,7 +120,7 @@ class Load:
             vars(self)["selection"] = self.nodes
 
     def on(self, body: Body) -> Self:
-        """The same on the nodes of a body that are selected."""
+        """Return the load with its selection replaced by the selected nodes of a body."""
         nodes = on_body(self.nodes, body)
         return self if nodes is self.nodes else replace(self, nodes=nodes)
 
@@ -119,7 +129,7 @@ class Load:
 class PointMass(Load):
     """A rigid point mass tied to nodes: inertia and weight.
 
-    Like all mass that moves it is damped by γ_m.
+    Like all moving mass it is subject to mass-proportional damping γ_m.
 
     Parameters
     ----------
@@ -127,11 +137,12 @@ class PointMass(Load):
         Nodes that carry it in equal parts, selected as in a grasp.
     mass_kg : float
     from_s : float
-        When it joins the body, as well as nuisance.joining knows; always there by default.
+        When it joins the body, with the uncertainty nuisance.joining; always there by default.
     until_s : float
         When it leaves the body, likewise.
     selection : Selection, optional
-        What selected the nodes, where something did: on a finer mesh it selects others.
+        The selection that the nodes come from; None for node numbers. On a finer mesh it is
+        evaluated again.
     """
 
     nodes: Index = key(Nodes, converter=some_nodes("the point mass"), read=selection)
@@ -143,7 +154,7 @@ class PointMass(Load):
     called: ClassVar[str] = "point mass"
 
     def at_nodes(self, node_count: int) -> Array:
-        """Mass that each node carries, (n,) [kg]."""
+        """Return the mass at each of the body's nodes, (n,) [kg]."""
         mass = np.zeros(node_count)
         mass[self.nodes] = self.mass_kg / len(self.nodes)
         return mass
@@ -169,9 +180,10 @@ class Force(Load):
     t_s : (m,) array, optional
         Times of the rows of `force_n`, where it is not constant; it is zero outside them.
     selection : Selection, optional
-        What selected the nodes, where something did: on a finer mesh it selects others.
+        The selection that the nodes come from; None for node numbers. On a finer mesh it is
+        evaluated again.
     from_s : float
-        When it begins to act, as well as nuisance.joining knows; always by default.
+        When it begins to act, with the uncertainty nuisance.joining; always by default.
     until_s : float
         When it ends, likewise.
     """
@@ -191,7 +203,9 @@ class Force(Load):
         vars(self).update(force_n=course.values, t_s=course.t_s)
 
     def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
-        """Force on each node at the times `t_s` (T,) while it acts, (T, n, 3) [N]."""
+        """Return the force on each node at the times `t_s` (T,), (T, n, 3) [N], without its time
+        window.
+        """
         times = np.atleast_1d(np.asarray(t_s, dtype=float))
         total = np.repeat(self.force_n[:1], len(times), axis=0)
         if self.t_s is not None:

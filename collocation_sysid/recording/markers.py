@@ -110,7 +110,9 @@ class Markers:
 
     def _find_places(self, m: int) -> None:
         """Check the places of the m markers and store them with `located`."""
-        places_m, placement, known = self.places_m, self.placement, self.located
+        places_m = self.places_m
+        placement = self.placement
+        known = self.located
         if places_m is not None and placement is not None:
             raise InputError(
                 "the markers have places_m and a placement; expected one of them, or neither "
@@ -155,7 +157,8 @@ class Markers:
         """
         if self.places_m is None:
             return self
-        known, places = self.located, self.places_m.copy()
+        known = self.located
+        places = self.places_m.copy()
         if not known.all():
             shape = Shape(body.nodes_m, body)
             points_m, times_s = self.first_samples
@@ -212,5 +215,5 @@ class Markers:
     def observe(self, node_positions_m: ArrayLike) -> Array:
         """Return predicted marker positions (..., M, 3) from node positions (..., n, 3)."""
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
-        around = nodes_m[..., self.placement.nodes, :]
-        return np.einsum("mk,...mkd->...md", self.placement.weights, around)
+        element_nodes_m = nodes_m[..., self.placement.nodes, :]
+        return np.einsum("mk,...mkd->...md", self.placement.weights, element_nodes_m)

@@ -17,11 +17,13 @@ import numpy as np
 from ..errors import InputError, listed
 
 DEGREE = float(np.pi / 180)
-# What enters linearly needs no trust region.
+# Reach of parameters on which predictions depend linearly, which need no trust region [σ].
 FREELY = 1e3
-# A place may move this many edges of the mesh in a step, the time of a load this many samples.
-EDGES_A_STEP = SAMPLES_A_STEP = 2.0
-# What a depth camera sees is where it was seen on the surface about so far away.
+# Mesh edges that a marker's place may move in a step of the solver: it stays near its element.
+EDGES_A_STEP = 2.0
+# Samples that the time of a load may move in a step of the solver: the motion is smooth over these.
+SAMPLES_A_STEP = 2.0
+# Shift of a depth camera in a step of the solver [m]: correspondences stay about the same.
 SEEN_A_STEP_M = 0.02
 
 Of = Literal[
@@ -38,9 +40,10 @@ Of = Literal[
     "gauge",
 ]
 Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth"]
-# What recordings say that share something, besides "recording" for those that do not.
-SCOPE, SCOPES = r"shared( \S+)?", '"shared", or "shared" and a word for each of several groups'
-# Units for people.
+# Scope of parameters that recordings share, as a pattern and in words for messages.
+SCOPE = r"shared( \S+)?"
+SCOPES = '"shared", or "shared" and a word for each of several groups'
+# Readable units: factor and text by SI unit.
 SHOWN = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°"), "kg": (1e3, " g")}
 SHOWN |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
 
@@ -128,7 +131,8 @@ class NuisanceRow:
 
     def __post_init__(self) -> None:
         if not self.label:
-            which, axis = " of {which}" * (self.of == "marker"), ", {axis}" * bool(self.axes)
+            which = " of {which}" * (self.of == "marker")
+            axis = ", {axis}" * bool(self.axes)
             vars(self)["label"] = self.name.replace("_", " ") + which + axis
 
     @property

@@ -1,4 +1,6 @@
-"""What a body may touch: a table, a plate, a finger, at rest or moving."""
+"""Rigid obstacles that a body may touch, such as a table, a plate or a finger, at rest or
+moving.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
 
 def _shape(shape: Any) -> Solid:
+    """Return `shape` unchanged; an `InputError` if it is no `Solid`."""
     if not isinstance(shape, Solid):
         kinds = ", ".join(kind.__name__ for kind in KINDS.values())
         raise InputError(f"shape of an obstacle is {shape!r}; expected one of {kinds}")
@@ -34,6 +37,7 @@ def _shape(shape: Any) -> Solid:
 
 
 def _faces(faces: Any) -> Selection:
+    """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(f"faces of an obstacle is {faces!r}; expected a selection")
     return faces
@@ -41,38 +45,38 @@ def _faces(faces: Any) -> Selection:
 
 @stated
 class Obstacle(Grasp):
-    """A rigid solid that pushes away the surface of a body, and may rub on it.
+    """A rigid solid that pushes against the surface of a body, with or without friction.
 
-    It is a grasp that holds nothing but a frame of its own, so that poses, displacements and forces
-    are stated and read as those of grasps are. Its force is that on the body. Where a body comes
-    to rest on it, take the scheme "bdf2": under the midpoint rule contact rings.
+    It is a grasp of a frame of its own instead of body nodes, so that its poses, displacements and
+    forces are stated as those of grasps. Its force is the force on the body. For a body that comes
+    to rest on it, use the scheme "bdf2": with the midpoint rule contact forces oscillate.
 
     Parameters
     ----------
     shape : Solid
         Plane, Sphere, Cylinder, Capsule or Cuboid.
     poses : PoseSequence or (T, 4, 4) array
-        Where its frame is; at rest in the body's frame by default.
+        Motion of its frame; at rest in the body's frame by default.
     name : str
         For messages and pictures.
     friction : float or str
         Coefficient of friction; or the name of a parameter, whose bounds are 0 and 2.
     faces : Selection, optional
-        Faces that it may touch: those with all corners there. All by default.
+        Faces that may touch it: those whose corners are all selected. All by default.
     stiffness_pa_m : float, optional
-        κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; a hundred times E over the mean edge
-        of the face at each point by default, at the E of the trial.
+        κ of the pressure κ (⟨δ − g⟩² − ⟨−g⟩²)/δ at the gap g; by default 100 times Young's modulus
+        at the current parameters over the mean edge of the face at each point.
     width_m : float, optional
-        δ, the gap at which it begins; a five-thousandth of that edge by default, with friction a
-        five-hundredth.
+        δ, the gap at which the pressure begins; by default that edge over 5000, with friction over
+        500.
     slip : float, optional
-        Speed [m/s], or slip from sample to sample [m] of a static experiment, at which friction is
-        seven tenths of its limit.
+        Sliding speed [m/s], or slip from sample to sample [m] of a static experiment, at which
+        friction is 0.7 of its limit.
     wrench : Wrench, optional
-        What it was measured to give the body.
+        Measured force and torque that it exerts on the body.
     relaxed : float, optional
-        Of contact as complementarity, without friction: in shares of κδ², what pressure times gap
-        is. The energy's by default.
+        Complementarity of contact without friction: value of pressure times gap, in units of κδ².
+        By default contact has an energy instead.
 
     Raises
     ------
@@ -109,28 +113,45 @@ class Obstacle(Grasp):
             )
 
     def framed(self, frame: Index, t_s: Array) -> Obstacle:
-        """The same with the nodes (4,) of its frame, and matrices as the poses at `t_s`."""
+        """Return the obstacle with the nodes (4,) of its frame, and matrices as poses at `t_s`
+        (T,).
+        """
         same = np.array_equal(frame, self.nodes)
         return self._with_nodes(self.nodes if same else frame, t_s)
 
     def surface(self, body: Body) -> Touching:
-        """Where it may touch a body; that is kept."""
+        """Contact points between a body and the obstacle; the result is cached."""
         return _touching(body, self)
 
     @property
     def direction(self) -> Array:
-        """(3,) along which its place may be off: as it is displaced, or of its shape."""
-        along = np.array([float(axis in self.zero) for axis in "xyz"])
-        return along if along.any() else self.shape.normal
+        """(3,) direction of its uncertain offset: axes with an uncertain zero, else the normal of
+        its shape.
+        """
+        uncertain_axes = np.array([float(axis in self.zero) for axis in "xyz"])
+        return uncertain_axes if uncertain_axes.any() else self.shape.normal
 
     @property
     def across(self) -> Array:
-        """(2, 3) axes that it may be tilted about: they complete its normal to a basis."""
+        """(2, 3) unit axes of its uncertain tilt; with the normal of its shape they are an
+        orthonormal basis.
+        """
         return across(self.shape.normal)
 
     def off_by(self, offset_m: float, tilt_rad: Array, late_s: float) -> Obstacle:
-        """The same elsewhere, by a shift along its direction, a tilt (2,), and later."""
-        motion, middle = np.eye(4), self.shape.middle_m
+        """Return the obstacle shifted, tilted and delayed.
+
+        Parameters
+        ----------
+        offset_m : float
+            Shift along `direction`.
+        tilt_rad : (2,) array
+            Rotation about the axes `across`, through the middle of its shape.
+        late_s : float
+            Delay of its motion.
+        """
+        motion = np.eye(4)
+        middle = self.shape.middle_m
         motion[:3, :3] = Rotation.from_rotvec(tilt_rad @ self.across).as_matrix()
         motion[:3, 3] = middle - motion[:3, :3] @ middle + offset_m * self.direction
         poses = self.poses.after(motion)
@@ -138,25 +159,26 @@ class Obstacle(Grasp):
 
     @property
     def rubs(self) -> bool:
-        """Whether there is friction."""
+        """Whether the obstacle has friction."""
         return self.friction != 0
 
     @cached_property
     def coefficient(self) -> Constant | None:
-        """Its friction as a parameter; None where it is a number."""
+        """Parameter that is the coefficient of friction; None if the coefficient is a number."""
         return constant_named(self.friction) if isinstance(self.friction, str) else None
 
 
 @lru_cache(maxsize=32)
 def _touching(body: Body, obstacle: Obstacle) -> Touching:
+    """Return the contact points between a body and an obstacle; the last 32 pairs are cached."""
     return Touching.of(body, obstacle.nodes, obstacle.faces)
 
 
 def with_frames_of(body: Body, obstacles: Sequence[Obstacle], *, static: bool) -> Body:
-    """Return the body with a frame for each obstacle.
+    """Return the body with four nodes for the frame of each obstacle.
 
-    Slopes of contact have a skew part where an obstacle has friction, and where pressures are
-    averaged over time steps, which they may be unless the experiment is static.
+    The Jacobian of the contact forces is not symmetric if an obstacle has friction, or if pressures
+    are averaged over time steps, which happens in motions without `relaxed` contact.
     """
     named = (each.coefficient for each in obstacles)
     frictions = tuple(dict.fromkeys(constant for constant in named if constant is not None))

@@ -22,9 +22,11 @@ if TYPE_CHECKING:
 
 Attachment = Literal["auto", "vertex", "embedded"]
 
-# "auto" takes a mesh vertex for the marker when it is this near, in mean edge lengths.
+# Largest distance, in mean edge lengths, at which "auto" attaches a marker to a mesh vertex.
 VERTEX_SNAP = 0.05
+# Least barycentric coordinate of a point inside an element: rounding.
 _INSIDE_TOLERANCE = 1e-9
+# Most iterations for a point in a curved element; they stop when the distance no longer decreases.
 _EMBEDDING_ITERATIONS = 30
 
 
@@ -100,11 +102,11 @@ def place_markers(
         raise InputError(f"{len(labels)} marker names for {len(points)} marker positions")
     if attach not in get_args(Attachment):
         raise InputError(f"attach is {attach!r}; expected one of {', '.join(get_args(Attachment))}")
-    lost = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if lost.size:
+    unplaced = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if unplaced.size:
         raise InputError(
-            f"marker '{labels[lost[0]]}' has no position from which to find its place on the body; "
-            "give its reference_m"
+            f"marker '{labels[unplaced[0]]}' has no position from which to find its place on the "
+            "body; give its reference_m"
         )
     shape = Shape(nodes_m, body)
     snap_m = {"auto": VERTEX_SNAP * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[attach]
@@ -144,7 +146,8 @@ class Shape:
     def __init__(self, nodes_m: Array, body: Body) -> None:
         self.nodes_m = nodes_m
         self.body = body
-        corners, ends = body.cells[:, :4], nodes_m[body.mesh.edges]
+        corners = body.cells[:, :4]
+        ends = nodes_m[body.mesh.edges]
         self.mean_edge_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.origin = nodes_m[corners[:, 0]]
         edges = nodes_m[corners[:, 1:]] - self.origin[:, None]
@@ -222,13 +225,15 @@ class Shape:
         """
         one = np.array([cell])
         local = self.barycentric(point, one)
-        best, best_miss = self.body.element.shape_functions(local)[0], np.inf
+        best = self.body.element.shape_functions(local)[0]
+        best_miss = np.inf
         for _ in range(_EMBEDDING_ITERATIONS):
             weights = self.body.element.shape_functions(local)[0]
             miss = point - weights @ self.nodes_m[self.body.cells[cell]]
             if not np.linalg.norm(miss) < best_miss:
                 break
-            best, best_miss = weights, np.linalg.norm(miss)
+            best = weights
+            best_miss = np.linalg.norm(miss)
             step = miss @ self.inverse[cell]
             local = local + np.concatenate([[-step.sum()], step])
         return best
@@ -240,11 +245,14 @@ def nearest_on(point: Array, triangles: Array) -> Array:
     """
     point = point[..., None, :]
     ends = np.roll(triangles, -1, axis=1)
-    sides, away = ends - triangles, point - triangles
+    sides = ends - triangles
+    away = point - triangles
     share = np.einsum("fci,fci->fc", away, sides) / np.einsum("fci,fci->fc", sides, sides)
     on_sides = triangles + np.clip(share, 0.0, 1.0)[:, :, None] * sides
     best = np.linalg.norm(point - on_sides, axis=2).argmin(axis=1)
-    ab, ac, ap = sides[:, 0], -sides[:, 2], away[:, 0]
+    ab = sides[:, 0]
+    ac = -sides[:, 2]
+    ap = away[:, 0]
     normal = np.cross(ab, ac)
     squared = np.einsum("fi,fi->f", normal, normal)
     in_c = np.einsum("fi,fi->f", np.cross(ab, ap), normal) / squared

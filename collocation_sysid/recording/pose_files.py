@@ -137,18 +137,18 @@ def _axes(grid: Grid, length_unit: str | None) -> tuple[list[int], float]:
     """
     parts = [name_and_unit(column) for column in grid.columns]
     axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
-    stated = [parts[k][1] for k in axes]
-    metres = [si_factor(unit or length_unit or "m", "length") for unit in stated]
+    units = [parts[k][1] for k in axes]
+    metres = [si_factor(unit or length_unit or "m", "length") for unit in units]
     if len(axes) != 3 or None in metres or len(set(metres)) > 1:
         raise _other_columns(grid)
     named = ", ".join(grid.columns[k] for k in axes)
-    if length_unit is None and None in stated:
+    if length_unit is None and None in units:
         raise grid.refusal(
             f"the columns {named} name no unit; expected length_unit, one of "
             f"{', '.join(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m"
         )
     if length_unit and any(
-        unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit] for unit in stated
+        unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit] for unit in units
     ):
         raise grid.refusal(
             f"length_unit is '{length_unit}', but the columns are {named}; expected the same "

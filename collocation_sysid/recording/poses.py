@@ -28,14 +28,17 @@ Interpolation = Literal["smooth", "linear", "hold"]
 QUATERNION_NORM_TOLERANCE = 1e-3
 # A held pose starts at its sample, also where the time asked for is rounded to just before it.
 _HOLD_SNAP = 1e-6
-_ORTHONORMAL, _LAST_ROW = 1e-3, 1e-6
-# No motion that its samples resolve is this many times slower just before and just after.
+# Largest entry of RᵀR − I of a rotation: files print few digits, and mistakes are far larger.
+_ORTHONORMAL = 1e-3
+# Largest deviation of a matrix's last row from 0, 0, 0, 1, which files print exactly.
+_LAST_ROW = 1e-6
+# A motion that its samples resolve is not this many times slower just before and just after.
 _JUMP_RATIO = 10.0
-# Of the whole range: less is rounding.
+# Smallest jump as a share of the range of the values: less is rounding.
 _LEAST_JUMP = 1e-3
-# Poses further apart do not tell how a grasp moves between them.
+# Longest time between poses [s] at which they still determine a smooth motion between them.
 LONGEST_STEP_S = 1.0
-# Poses that differ by less, in metres and in a quaternion's components, are of one that stands.
+# Largest difference of the poses of a grasp at rest, in metres and in a quaternion's components.
 STILL = 1e-6
 
 
@@ -70,7 +73,8 @@ class PoseSequence:
     interpolation: Interpolation = key(Interpolation, default="smooth")
 
     def __post_init__(self) -> None:
-        t_s, m = self.t_s, len(self.t_s)
+        t_s = self.t_s
+        m = len(self.t_s)
         if not m:
             raise InputError("a pose sequence needs at least one pose")
         positions_m = read_only_floats(self.positions_m, (m, 3), "positions_m", False)
@@ -123,7 +127,8 @@ class PoseSequence:
         first = matrix
         if not isinstance(first, PoseSequence):
             first = PoseSequence.from_matrices([0.0], np.asarray(first)[None])
-        rotations, positions_m = self._rotations, self.positions_m
+        rotations = self._rotations
+        positions_m = self.positions_m
         return replace(
             self,
             positions_m=positions_m + rotations.as_matrix() @ first.positions_m[0],
@@ -166,7 +171,8 @@ class PoseSequence:
         return self._linear_at(times)
 
     def _linear_at(self, times: Array) -> tuple[Array, Array]:
-        """Return rotations (k, 3, 3) and translations (k, 3) at times (k,), linearly interpolated.
+        """Return linearly interpolated rotations (k, 3, 3) and translations (k, 3) at times
+        (k,).
         """
         k = np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 2)
         fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
@@ -176,8 +182,7 @@ class PoseSequence:
         return rotations, self.positions_m[k] + fraction * step_m
 
     def carry(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Return the positions (T, k, 3) [m] of undeformed points (k, 3) at the times `t_s` (T,).
-        """
+        """Return positions (T, k, 3) [m] of undeformed points (k, 3) at the times `t_s` (T,)."""
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
         return np.einsum("tij,kj->tki", rotations, points) + translations[:, None, :]
@@ -202,7 +207,7 @@ class PoseSequence:
 
     @cached_property
     def _rotations(self) -> Rotation:
-        """Rotations of all samples."""
+        """Rotations (m,) of all samples."""
         return Rotation.from_quat(self.quaternions_xyzw)
 
     @cached_property
@@ -304,8 +309,8 @@ def jumps(t_s: Array, values: Array) -> Index:
     change = np.linalg.norm(np.diff(values, axis=0), axis=1)
     rate = change / np.diff(t_s)
     large = change > _LEAST_JUMP * np.linalg.norm(np.ptp(values, axis=0))
-    around = np.maximum(rate[:-2], rate[2:])
-    return 1 + np.flatnonzero(large[1:-1] & (rate[1:-1] > _JUMP_RATIO * around))
+    neighbour_rate = np.maximum(rate[:-2], rate[2:])
+    return 1 + np.flatnonzero(large[1:-1] & (rate[1:-1] > _JUMP_RATIO * neighbour_rate))
 
 
 def smooth_spline(t_s: Array, values: Array) -> PPoly:
@@ -350,7 +355,8 @@ def refuse_untold(
         For a single pose, for poses that are missing for more than a sample at either end, and for
         a smooth motion that is sampled below 1 Hz.
     """
-    first_s, last_s = max(t_s[0], held_s[0]), min(t_s[-1], held_s[1])
+    first_s = max(t_s[0], held_s[0])
+    last_s = min(t_s[-1], held_s[1])
     lasts = f"the recording lasts from {first_s:.6g} s to {last_s:.6g} s"
     if len(poses.t_s) == 1:
         raise InputError(

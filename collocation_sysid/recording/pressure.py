@@ -1,4 +1,4 @@
-"""A pressure: the energy −p(t) V(x) of a pressure p and the volume V behind faces of a body."""
+"""Pressures: energies −p(t) V(x) of a pressure p and the volume V behind faces of a body."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ from .tables import read_pressure
 if TYPE_CHECKING:
     from ..fem.body import Body
 
-# Points of a plane are this near to it, of the body's size.
+# Largest distance of points of a plane from it, relative to the size of the body: rounding.
 PLANE = 1e-9
 
 
 def _faces(wanted: Selection | ArrayLike) -> Selection | Index:
+    """Return a selection, or node numbers (F, 3) of triangles; an `InputError` for anything
+    else.
+    """
     if isinstance(wanted, Selection):
         return wanted
     faces = np.array(wanted)
@@ -52,22 +55,23 @@ _TABLE = Key(
 class Pressure(Actuator[Volume]):
     """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall.
 
-    Its force follows the faces as they move. It has an energy, and a symmetric stiffness, where
-    the faces are closed, as a cavity's wall is, or where their rim is held.
+    Its force follows the faces as they move. It derives from an energy, and has a symmetric
+    stiffness, if the faces are closed, as a cavity's wall is, or if their rim is held.
 
     Parameters
     ----------
     faces : Selection or (F, 3) array
-        Faces with all their corners in box_m, ball_m or indices; or the name of a physical group
-        or cell array of triangles, or of a point array.
+        Faces with all their corners in box_m, ball_m or indices; or the name of a physical group or
+        cell array of triangles, or of a point array.
     pressure_pa : float or (m,) array
-        Constant pressure; negative sucks.
+        Constant pressure; negative for suction.
     t_s : (m,) array, optional
-        Times of the rows of `pressure_pa`, between which it is linear; over all of the recording.
+        Times of the rows of `pressure_pa`, between which it is linear; they cover the whole
+        recording.
     name : str
         Name; pressure_1, pressure_2 and so on by default.
     factor, lost_pa : float
-        How the pressure in the body differs: factor · pressure − lost.
+        Pressure in the body: factor · stated pressure − lost_pa.
     """
 
     faces: Selection | Index = key(Nodes, converter=_faces, read=selection)
@@ -87,6 +91,13 @@ class Pressure(Actuator[Volume]):
         vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, course=pressure)
 
     def _measure_on(self, body: Body) -> Volume:
+        """Return the volume behind the faces of a body.
+
+        Raises
+        ------
+        InputError
+            If a face is not on the boundary, or the faces enclose the body instead of a cavity.
+        """
         mesh = body.mesh
         if isinstance(self.faces, Selection):
             rows = self.faces.resolve_faces(mesh)
@@ -105,42 +116,48 @@ class Pressure(Actuator[Volume]):
         return volume
 
     def refined(self, body: Body, finer: Body) -> Pressure:
-        """The same on a body whose mesh is that of `body`, split in eight."""
+        """Return the pressure on a body whose mesh is that of `body` with every element split in
+        eight.
+        """
         if isinstance(self.faces, Selection) and not isinstance(self.faces, Indices):
             return replace(self, placed=None)
         corners = self.on(body).measure.faces[:, :3]
         return replace(self, faces=faces_in_four(corners, body.mesh), placed=None)
 
     def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
-        """The negative of the pressure."""
+        """Return the amplitude of the energy: minus the pressure in the body."""
         return lost - factor * stated
 
     def bounded(self, held: NDArray[np.bool_], places_m: Array) -> Pressure:
-        """The same, with a volume that the rim's motion does not change, where the rim is held.
+        """Return the pressure with a volume that does not depend on the motion of a held rim.
 
-        The volume of an open patch is that of the cones over it from an apex. It has the pressure's
-        work where its rim is held, or slides in planes, such as those of symmetry: then the apex
-        must lie in these.
+        The volume of an open patch is that of the cones over its faces from an apex. The pressure
+        does the work p dV if the rim is held, or slides in planes, such as planes of symmetry, that
+        contain the apex.
 
         Parameters
         ----------
-        held : (n, 3) bool, coordinates that grasps hold throughout
-        places_m : (T, n, 3) where they hold them, NaN elsewhere
+        held : (n, 3) bool
+            Whether each coordinate is prescribed throughout.
+        places_m : (T, n, 3)
+            Prescribed coordinates, NaN elsewhere.
 
         Raises
         ------
         InputError
             If the rim moves otherwise.
         """
-        placed, volume = self.placed, self.measure
+        placed = self.placed
+        volume = self.measure
         if placed is None or not volume.rim.size:
             return self
-        loose = volume.rim[~held[volume.rim].all(axis=(1, 2))]
-        slides = np.asarray(np.logical_and.reduce(held[loose], axis=1))  # (k, 3)
-        free = int((~slides.any(axis=1)).sum())
-        apex, size_m = np.zeros(3), np.nanmax(np.abs(places_m), initial=0.0)
+        moving_rim = volume.rim[~held[volume.rim].all(axis=(1, 2))]
+        is_sliding = np.asarray(np.logical_and.reduce(held[moving_rim], axis=1))  # (k, 3)
+        free = int((~is_sliding.any(axis=1)).sum())
+        apex = np.zeros(3)
+        size_m = np.nanmax(np.abs(places_m), initial=0.0)
         for axis in range(3):
-            plane = places_m[:, loose[slides[:, axis]], axis]
+            plane = places_m[:, moving_rim[is_sliding[:, axis]], axis]
             if plane.size and np.ptp(plane) > PLANE * size_m:
                 free += plane.shape[1]
             elif plane.size:

@@ -101,9 +101,9 @@ def read_markers(
     raw = _read_tracks(path, _choice(names, labels))
     metres = METRES_PER_UNIT[_unit(raw, length_unit)]
     t_s = _times_s(raw, rate_hz)
-    taken = [labels.get(label, label) for label in raw.labels]
-    coordinates, notes = _present(raw, taken)
-    return MarkerTable(t_s, tuple(taken), coordinates * metres, (*raw.notes, *notes))
+    names_taken = [labels.get(label, label) for label in raw.labels]
+    coordinates, notes = _present(raw, names_taken)
+    return MarkerTable(t_s, tuple(names_taken), coordinates * metres, (*raw.notes, *notes))
 
 
 def _read_tracks(path: str | Path, choose: Choose) -> RawTracks:
@@ -187,18 +187,19 @@ def _unit(raw: RawTracks, length_unit: str | None) -> str:
 
 def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
     """Return the times (T,) of the frames [s]: as in the file, else from the frame rate."""
-    t_s, rates = raw.t_s, {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
-    stated = {key: rate for key, rate in rates.items() if rate}
+    t_s = raw.t_s
+    rates = {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
+    stated_rates = {key: rate for key, rate in rates.items() if rate}
     if t_s is not None:
-        for key, rate in stated.items():
+        for key, rate in stated_rates.items():
             _refuse_other_rate(t_s, key, rate)
         return t_s
-    if not stated:
+    if not stated_rates:
         raise InputError(
             f"neither {raw.rate_key} nor a column of times states when the frames were taken; "
             "expected rate_hz"
         )
-    first, *others = stated.values()
+    first, *others = stated_rates.values()
     if not all(math.isclose(first, other, rel_tol=1e-6) for other in others):
         raise InputError(
             f"rate_hz is {rate_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "
@@ -215,7 +216,8 @@ def _refuse_other_rate(t_s: Array, key: str, rate_hz: float) -> None:
     if len(t_s) < 2:
         return
     steps = np.diff(t_s)
-    mean_hz, median_hz = 1 / steps.mean(), 1 / np.median(steps)
+    mean_hz = 1 / steps.mean()
+    median_hz = 1 / np.median(steps)
     if min(abs(mean_hz / rate_hz - 1), abs(median_hz / rate_hz - 1)) > _RATE_TOLERANCE:
         raise InputError(
             f"{key} is {rate_hz:g} Hz, but the times are {1 / mean_hz:.6g} s apart, "

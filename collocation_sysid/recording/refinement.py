@@ -1,4 +1,4 @@
-"""The same recording of a body on a finer mesh."""
+"""An experiment moved to a finer mesh of its body, for estimates of the discretisation error."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ if TYPE_CHECKING:
 
 
 def refined(experiment: Experiment, finer: Body) -> Experiment:
-    """The experiment with the finer body: held and loaded nodes anew, markers where they were.
+    """Return the experiment on a finer body.
 
-    Markers are material points: their places on the undeformed body stay, whether they are nodes,
-    inside elements or beyond the surface.
+    Selections of nodes are evaluated on the finer mesh. Markers are material points: their places
+    on the undeformed body stay, whether they are nodes, inside elements or beyond the surface.
     """
-    body, markers = experiment.body, experiment.markers
+    body = experiment.body
+    markers = experiment.markers
 
     def anew(load):
         return replace(load, nodes=refined_nodes(load.nodes, load.selection, body, finer))
@@ -42,9 +43,12 @@ def refined(experiment: Experiment, finer: Body) -> Experiment:
 
 
 def _interpolated(state: Array | None, body: Body, finer: Body) -> Array | None:
-    """A field (n, 3) of the nodes at those of the finer body, by the shape functions."""
+    """Interpolate nodal vectors (n, 3) to the nodes of the finer body by the shape functions; None
+    stays.
+    """
     if state is None:
         return None
-    here_m, there_m = finer.nodes.points_m, body.nodes.points_m
+    here_m = finer.nodes.points_m
+    there_m = body.nodes.points_m
     places = place_markers(here_m, there_m, body, "embedded")
     return (places.weights[:, :, None] * state[places.nodes]).sum(axis=1)

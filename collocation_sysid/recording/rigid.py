@@ -22,24 +22,25 @@ from .clock import STEP_TOLERANCE
 from .poses import PoseSequence
 from .readers import MarkerTable
 
-# Markers whose spread across their line is below this part of that along it do not fix a rotation.
+# Smallest spread of markers across their line, relative to the spread along it, that determines a
+# rotation.
 _FLAT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class RigidFit:
-    """Poses of a cluster of markers, x = R X + p, and how far it is from rigid.
+    """Poses of a cluster of markers, x = R X + p, and their residuals.
 
     Parameters
     ----------
     positions_m : (T, 3) array
-        p; NaN at frames that are missing.
+        Translations p; NaN at missing frames.
     quaternions_xyzw : (T, 4) array
-        R; NaN at frames that are missing.
+        Rotations R; NaN at missing frames.
     residual_m : (T,) array
-        Weighted root mean square over the markers present; NaN at frames that are missing.
+        Weighted root mean square over the markers present; NaN at missing frames.
     marker_residual_m : (T, B) array
-        Distance of each marker from where the pose puts it; NaN where missing.
+        Distance of each marker from its place in the pose; NaN where missing.
     missing : (T,) bool array
         Frames without three markers off one line.
     """
@@ -81,17 +82,17 @@ def fit_poses(
     Parameters
     ----------
     reference_m : (B, 3) array
-        Their places X on the undeformed body.
+        Places X of the markers on the undeformed body.
     tracks_m : (T, B, 3) array
-        Where they were measured, NaN where missing.
+        Measured positions, NaN where missing.
     weights : (B,) array, optional
         At least 0; all 1 by default.
 
     Raises
     ------
     InputError
-        If shapes disagree, a weight is negative, or the places of the markers that have a weight
-        lie on one line.
+        If shapes disagree, a weight is negative, or the places of the markers with a positive
+        weight lie on one line.
     """
     reference = read_only_floats(reference_m, (None, 3), "reference_m")
     count = len(reference)
@@ -110,8 +111,8 @@ def fit_poses(
     repeated = np.broadcast_to(reference, tracks.shape)
     missing = ~_fixes_rotation(repeated, weight)
     rotations, translations = _best_motions(repeated, tracks, weight)
-    carried = np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
-    distance = np.linalg.norm(tracks - carried, axis=2)
+    fitted = np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
+    distance = np.linalg.norm(tracks - fitted, axis=2)
     distance[missing] = np.nan
     total = np.where(missing, np.nan, weight.sum(axis=1))
     residual = np.sqrt(np.nansum(weight * distance**2, axis=1) / total)
@@ -127,14 +128,15 @@ def fit_poses(
 
 
 class TemplateFit(NamedTuple):
-    """The rigid change of frame x → rotation x + translation_m, and how well it fits.
+    """A rigid change of frame, x → rotation x + translation_m, and its residuals.
 
     Attributes
     ----------
     rotation : (3, 3) array
     translation_m : (3,) array
     residual_m : (k,) array
-        Of each marker of the template; NaN for one without a sample in the window.
+        Distance of each marker of the template from its place; NaN for a marker without a sample in
+        the window.
     """
 
     rotation: Array
@@ -150,7 +152,7 @@ class TemplateFit(NamedTuple):
 def align_to_template(
     table: MarkerTable, template: Mapping[str, Sequence[float]], window_s: tuple[float, float]
 ) -> TemplateFit:
-    """Fit the camera's frame to the body's: mean positions in a window to where the markers are.
+    """Fit the change from the camera's frame to the body's, from mean marker positions in a window.
 
     Parameters
     ----------
@@ -164,8 +166,8 @@ def align_to_template(
     Raises
     ------
     InputError
-        If a name is not in the table, the window is empty, or fewer than three markers that are
-        not on one line have samples in it.
+        If a name is not in the table, the window is empty, or fewer than three markers that are not
+        on one line have samples in it.
     """
     for name in template:
         if name not in table.names:
@@ -198,9 +200,11 @@ def align_to_template(
 
 
 def loosest_marker(reference_m: Array, positions_m: Array) -> int:
-    """Return which marker's distances from the others changed most, of (B, 3) in one frame.
+    """Return the index of the marker whose distances to the others differ most between two
+    configurations.
 
-    A rigid fit spreads one marker's motion over all of them; distances do not.
+    Both are (B, 3); frames need not agree, as distances do not depend on them. A rigid fit would
+    distribute one marker's motion over all of them.
     """
 
     def distances(points: Array) -> Array:
@@ -211,7 +215,14 @@ def loosest_marker(reference_m: Array, positions_m: Array) -> int:
 
 
 def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
-    """Whether points (T, B, 3) with a weight (T, B) above 0 spread in two directions, (T,)."""
+    """Return whether the points (B, 3) of each frame are not on one line, as (T,) bool.
+
+    Parameters
+    ----------
+    points : (T, B, 3) array
+    weight : (T, B) array
+        Points with a weight above 0 are used.
+    """
     used = (weight > 0).astype(np.float64)
     centred = (points - _mean(points, used)[:, None]) * used[:, :, None]
     spread = (
@@ -223,14 +234,20 @@ def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
 
 
 def _mean(points: Array, weight: Array) -> Array:
+    """Weighted mean (T, 3) of points (T, B, 3) with weights (T, B); 0 if all weights of a frame are
+    0.
+    """
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
     present = np.where(weight[:, :, None] > 0, points, 0.0)
     return np.einsum("tb,tbi->ti", weight, present) / total[:, None]
 
 
 def _best_motions(source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
-    """Rotations (T, 3, 3) and translations (T, 3) from source to target, both (T, B, 3)."""
-    source_mean, target_mean = _mean(source, weight), _mean(target, weight)
+    """Return least-squares rotations (T, 3, 3) and translations (T, 3) from source to target (T, B,
+    3).
+    """
+    source_mean = _mean(source, weight)
+    target_mean = _mean(target, weight)
     used = weight[:, :, None] > 0
     a = np.where(used, source - source_mean[:, None], 0.0)
     b = np.where(used, target - target_mean[:, None], 0.0)

@@ -1,4 +1,4 @@
-"""Nodes that a user selects: by numbers, by what selects them, or by a table in a file."""
+"""Selections of mesh nodes: node numbers, geometric selections, or tables in a problem file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class NodesSection(Section):
-    """A selection of mesh nodes, by exactly one of these.
+    """A selection of mesh nodes, by exactly one of these keys.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class NodesSection(Section):
         Lowest and highest corner [[x, y, z], [x, y, z]].
     ball_m : list, optional
         Centre and radius [[x, y, z], radius].
+    indices : list of int, optional
+        List of node numbers as in the mesh file, counted from 0.
     face : str, optional
         top or bottom: nodes with the highest or lowest z of the body; side_x or side_y: nodes with
         its lowest x or y that are on neither.
-    indices : list of int, optional
-        List of node numbers as in the mesh file, counted from 0.
     name : str, optional
         A point array of the mesh, 1 where selected, or a physical group of elements of any
         dimension.
@@ -64,7 +64,7 @@ KINDS: dict[str, Any] = {
 
 
 def selection(section: NodesSection | str) -> Selection:
-    """What a table selects, or the name of a point array."""
+    """Return the selection that a table states, or that a text names."""
     if isinstance(section, str):
         return Named(section)
     ((kind, value),) = ((KINDS[key], value) for key, value in section if value is not None)
@@ -72,12 +72,17 @@ def selection(section: NodesSection | str) -> Selection:
 
 
 def some_nodes(what: str) -> Callable[[ArrayLike | Selection], Index]:
-    """To node numbers, sorted and without repeats; a selection stays until there is a body.
+    """Return a converter to sorted distinct node numbers; a `Selection` is returned unchanged.
+
+    Parameters
+    ----------
+    what : str
+        Owner of the nodes, for messages.
 
     Raises
     ------
     InputError
-        If there are none, or see `read_only_nodes`.
+        By the converter: if there are no nodes, or as `read_only_nodes` does.
     """
 
     def chosen(wanted: Any) -> Any:
@@ -93,5 +98,5 @@ def some_nodes(what: str) -> Callable[[ArrayLike | Selection], Index]:
 
 
 def on_body(nodes: Index | Selection, body: Body) -> Index:
-    """Return the nodes of a body that are selected; node numbers as they are."""
+    """Return the nodes of a body that a selection selects; node numbers are returned unchanged."""
     return body.select(nodes) if isinstance(nodes, Selection) else nodes

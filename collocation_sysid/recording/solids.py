@@ -17,7 +17,7 @@ from ..section import Section, Vector, require_one, section_of, stated_in
 from ..stated import key, stated
 from .arrays import floats
 
-# Below it the square root of a distance has no second derivative.
+# Added to squared distances [m²]: the square root has no derivative at zero.
 TINY_M2 = 1e-24
 
 
@@ -26,8 +26,7 @@ class Solid(ABC):
 
     @abstractmethod
     def gap(self, point: ca.SX) -> ca.SX:
-        """Signed distance of a point (3,) from the surface [m], as an expression; negative inside.
-        """
+        """Signed distance of a point (3,) from the surface [m], an expression; negative inside."""
 
     @abstractmethod
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
@@ -61,6 +60,7 @@ def _unit(name: str) -> Any:
     """Return a converter that normalises a vector (3,); it raises an `InputError` for a zero
     vector.
     """
+
     def made(value: Any) -> Array:
         vector = floats((3,), name)(value)
         length = float(np.linalg.norm(vector))
@@ -165,9 +165,10 @@ class _Round(Solid):
         """
         first, last = self.ends_m
         half = float(np.linalg.norm(last - first)) / 2
-        axis, away = ca.DM((last - first) / (2 * half)), point - ca.DM((first + last) / 2)
-        along = ca.dot(axis, away)
-        return along, _length(away - along * axis), half
+        axis = ca.DM((last - first) / (2 * half))
+        offset = point - ca.DM((first + last) / 2)
+        axial = ca.dot(axis, offset)
+        return axial, _length(offset - axial * axis), half
 
 
 @stated
@@ -187,8 +188,8 @@ class Cylinder(_Round):
 
     def gap(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the cylinder [m]; negative inside."""
-        along, away, half = self._along(point)
-        beyond = ca.vertcat(away - self.radius_m, ca.fabs(along) - half)
+        axial, radial, half = self._along(point)
+        beyond = ca.vertcat(radial - self.radius_m, ca.fabs(axial) - half)
         return _of_corner(beyond + self.rounding_m) - self.rounding_m
 
 
@@ -205,9 +206,9 @@ class Capsule(_Round):
 
     def gap(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the capsule [m]; negative inside."""
-        along, away, half = self._along(point)
-        beyond = ca.fmax(ca.fabs(along) - half, 0)
-        return _length(ca.vertcat(beyond, away)) - self.radius_m
+        axial, radial, half = self._along(point)
+        beyond = ca.fmax(ca.fabs(axial) - half, 0)
+        return _length(ca.vertcat(beyond, radial)) - self.radius_m
 
 
 @stated
@@ -242,8 +243,8 @@ class Cuboid(Solid):
     def outline(self, about_m: Array, size_m: float) -> list[Array]:
         """Return the twelve edges; both arguments are ignored."""
         corners = np.array(list(product(*self.corners_m.T)))
-        apart = (corners[:, None] != corners).sum(axis=2)
-        return [corners[[i, j]] for i, j in np.argwhere(apart == 1) if i < j]
+        differences = (corners[:, None] != corners).sum(axis=2)
+        return [corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j]
 
     def gap(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the box [m]; negative inside."""

@@ -1,4 +1,4 @@
-"""What acts or is measured over time, as tables: columns with units, in any order."""
+"""Tables of loads and measurements over time: columns with units, in any order."""
 
 from __future__ import annotations
 
@@ -29,14 +29,16 @@ from .formats.text import decode, numbers, of_file, read_bytes, read_grid, times
 from .poses import PoseSequence
 
 WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
-# Pressures far above these are likely in another unit, tensions in grams or from a raw sensor.
-LARGEST_PA, LARGEST_N = 1e8, 1e5
-# So many samples must lie within an experiment.
+# Largest plausible pressure [Pa]: larger ones are likely in another unit.
+LARGEST_PA = 1e8
+# Largest plausible tension [N]: larger ones are likely in another unit, or raw counts of a sensor.
+LARGEST_N = 1e5
+# Least number of samples of a file within a moving experiment: fewer come from different clocks.
 FEWEST = 3
 
 
 def read_forces(path: str | Path) -> tuple[Array, Array]:
-    """Read a force over time: t_s, fx_n, fy_n, fz_n, in any order.
+    """Read a force over time: t_s, fx_n, fy_n, fz_n, columns in any order.
 
     Returns
     -------
@@ -66,7 +68,15 @@ def read_tension(path: str | Path) -> tuple[Array, Array]:
 
 
 def read_pressure(path: str | Path) -> tuple[Array, Array]:
-    """Read a pressure above the surroundings', `t_s` (T,) and `pressure_pa` (T,); see above."""
+    """Read a pressure above the surroundings', `t_s` (T,) and `pressure_pa` (T,), columns in any
+    order.
+
+    Raises
+    ------
+    InputError
+        If a column is missing or unknown, a cell is not a number, time does not increase, or a
+        pressure is implausibly large; the line is named.
+    """
     return _course(path, PRESSURE, LARGEST_PA)
 
 
@@ -74,6 +84,13 @@ def read_pressure(path: str | Path) -> tuple[Array, Array]:
 def _course(
     path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
 ) -> tuple[Array, Array]:
+    """Return times (T,) and values (T,) of one quantity, with limits on the values.
+
+    Raises
+    ------
+    InputError
+        As `read_columns`, or if a value is below `at_least` or larger in magnitude than `largest`.
+    """
     table = read_columns(path, [quantity])
     values = table.values[quantity.key]
     for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
@@ -98,24 +115,24 @@ def read_wrench(
     symmetry: int = 1,
     timed: bool = True,
 ) -> tuple[Array, Array]:
-    """Read what a grasp gives the body over time, columns in any order; blank cells are missing.
+    """Read force and torque of a grasp over time, columns in any order; blank cells are missing.
 
     Parameters
     ----------
     path : str or Path
     columns : mapping, optional
-        The column of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t, where
-        their names are not recognised.
+        Names of the columns of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t,
+        if their names are not recognised.
     axis : {"x", "y", "z"}
-        Along which a machine's force or stress acts.
+        Axis of a machine's force or stress.
     sign : {1, -1}
-        What multiplies the file's values: -1 where a positive one pulls the body the other way.
+        Factor on the file's values: -1 if a positive value pulls the body against the axis.
     area_m2 : float, optional
-        The undeformed area that an engineering stress multiplies.
+        Undeformed area that an engineering stress multiplies; given if the file holds a stress.
     symmetry : int
-        The body is one of so many equal parts of what was measured.
+        Number of equal parts of the specimen, of which the body is one; loads are divided by it.
     timed : bool
-        Whether there must be times; else rows count as seconds where there are none.
+        Whether times are required; otherwise rows are numbered in seconds if there are no times.
 
     Returns
     -------
@@ -126,11 +143,11 @@ def read_wrench(
     Raises
     ------
     InputError
-        If a column names no unit or one of something else, is unknown or repeated, a cell is not a
-        number, or time does not increase; the line is named.
+        If a column names no unit or a wrong one, is unknown or repeated, a cell is not a number, or
+        time does not increase; the line is named.
     """
-    wanted = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
-    table = read_columns(path, wanted, columns, blank_allowed=True, timed=timed)
+    quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
+    table = read_columns(path, quantities, columns, blank_allowed=True, timed=timed)
     factor = sign * (area_m2 or 1.0) / symmetry
     return _unrounded(table.t_s), factor * _components(table, (*FORCES, *TORQUES), axis)
 
@@ -143,7 +160,7 @@ def read_displacement(
     length_m: float | None = None,
     timed: bool = True,
 ) -> PoseSequence:
-    """Read shifts from the undeformed place over time, such as those of a test bench's crosshead.
+    """Read displacements from the undeformed place over time, such as those of a crosshead.
 
     A table has t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), or a machine's displacement or
     strain, in any order; along the other axes nothing moves.
@@ -152,16 +169,21 @@ def read_displacement(
     ----------
     path : str or Path
     columns : mapping, optional
-        The column of x, y, z, or of a machine's displacement or strain, and of t, where their names
-        are not recognised.
+        Names of the columns of x, y, z, or of a machine's displacement or strain, and of t, if
+        their names are not recognised.
     axis : {"x", "y", "z"}
-        Along which a machine's displacement or strain is.
+        Axis of a machine's displacement or strain.
     sign : {1, -1}
-        What multiplies the file's values: -1 where positive ones go against the axis.
+        Factor on the file's values: -1 if positive values go against the axis.
     length_m : float, optional
-        The undeformed length that an engineering strain multiplies.
+        Undeformed length that an engineering strain multiplies; given if the file holds a strain.
     timed : bool
-        Whether there must be times; else rows count as seconds where there are none.
+        Whether times are required; otherwise rows are numbered in seconds if there are no times.
+
+    Returns
+    -------
+    PoseSequence
+        Pure translations.
 
     Raises
     ------
@@ -180,23 +202,26 @@ def displaced_axes(
     axis: str = "z",
     length_m: float | None = None,
 ) -> str:
-    """Return along which axes a file tells shifts, such as "z"; see `read_displacement`."""
+    """Return the axes along which a file has displacements, such as "z"; see
+    `read_displacement`.
+    """
     shifts = _components(_shifts(path, columns, length_m, timed=False), SHIFTS, axis)
-    told = np.asarray(np.isfinite(shifts).any(axis=0))
-    return "".join(each for each, there in zip("xyz", told, strict=True) if there)
+    is_present = np.asarray(np.isfinite(shifts).any(axis=0))
+    return "".join(each for each, there in zip("xyz", is_present, strict=True) if there)
 
 
 def _shifts(
     path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
 ) -> Columns:
-    wanted = (*SHIFTS, DISPLACEMENT) if length_m is None else (STRAIN,)
-    return read_columns(path, wanted, columns, timed=timed)
+    """Read the columns of a displacement, or of a strain if the undeformed length is given."""
+    quantities = (*SHIFTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    return read_columns(path, quantities, columns, timed=timed)
 
 
 def _components(table: Columns, wanted: Sequence[Quantity], axis: str) -> Array:
-    """(T, n) components, of which the first three are along axes; NaN where missing.
+    """Return the (T, n) values of the `wanted` quantities; NaN where missing.
 
-    What has no axis in its name, as of a machine, is along that given.
+    A machine's quantity, whose name contains no axis, becomes the component along `axis`.
     """
     places = {quantity.key: k for k, quantity in enumerate(wanted)}
     values = np.full((len(table.t_s), len(wanted)), np.nan)
@@ -206,6 +231,7 @@ def _components(table: Columns, wanted: Sequence[Quantity], axis: str) -> Array:
 
 
 def _unrounded(t_s: Array) -> Array:
+    """Return times without the rounding of the file, see `unrounded_s`; two or fewer stay."""
     return unrounded_s(t_s) if len(t_s) > 2 else t_s
 
 
@@ -214,13 +240,21 @@ def _unrounded(t_s: Array) -> Array:
 
 @of_file
 def read_gauge(path: str | Path, columns: Sequence[str] = ()) -> tuple[Array, Array, list[str]]:
-    """Read times (S,) and what an instrument said then (S, m); NaN where a cell is blank.
+    """Read the values of a custom sensor over time.
 
     Parameters
     ----------
     path : str or Path
     columns : sequence of str
-        Those of its numbers; all besides t_s by default. Their names are given back.
+        Columns of the values; all besides t_s by default.
+
+    Returns
+    -------
+    t_s : (S,) array
+    values : (S, m) array
+        NaN where a cell is blank.
+    columns : list of str
+        Names of the columns of the values.
 
     Raises
     ------
@@ -242,19 +276,28 @@ def read_gauge(path: str | Path, columns: Sequence[str] = ()) -> tuple[Array, Ar
 
 
 def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_]:
-    """Return which samples at `at_s` (S,) of a file lie within an experiment's times `t_s` (T,).
+    """Return which samples lie within an experiment's times, as (S,) bool.
 
-    Of a static experiment one is enough.
+    Parameters
+    ----------
+    at_s : (S,) array
+        Sample times of a file.
+    t_s : (T,) array
+        Times of the experiment.
+    name : str
+        What was sampled, for messages.
+    static : bool
+        Whether one sample is enough.
 
     Raises
     ------
     InputError
-        If fewer than three do: clocks or units differ.
+        If fewer than three samples do (one if static), as when clocks or units differ.
     """
-    inside = (at_s >= t_s[0] - TIME_TOLERANCE_S) & (at_s <= t_s[-1] + TIME_TOLERANCE_S)
+    is_inside = (at_s >= t_s[0] - TIME_TOLERANCE_S) & (at_s <= t_s[-1] + TIME_TOLERANCE_S)
     fewest = 1 if static else FEWEST
-    if inside.sum() >= fewest:
-        return inside
+    if is_inside.sum() >= fewest:
+        return is_inside
     span = [f"{t[0]:.6g} s to {t[-1]:.6g} s" for t in (at_s, t_s)]
     ratio = np.ptp(at_s) / max(np.ptp(t_s), TIME_TOLERANCE_S)
     hint = (
@@ -263,6 +306,6 @@ def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_
         else "both need one clock, in seconds; subtract where they began"
     )
     raise InputError(
-        f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(inside.sum())} samples "
-        f"are in common; expected {fewest} at least. {hint}"
+        f"{name} runs from {span[0]}, the experiment from {span[1]}: {int(is_inside.sum())} "
+        f"samples are in common; expected {fewest} at least. {hint}"
     )

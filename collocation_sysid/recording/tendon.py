@@ -1,4 +1,4 @@
-"""A tendon: the energy T(t) L(x) of a tension T and the length L of its polyline in the body."""
+"""Tendons: energies T(t) L(x) of a tension T and the length L of a polyline in the body."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .tables import read_tension
 if TYPE_CHECKING:
     from ..fem.body import Body
 
-# Points of a tendon may be this far outside the body, in mean edge lengths.
+# Largest distance of a tendon's point from the body, in mean edge lengths: coarse meshes cut arcs.
 FARTHEST = 1.0
 
 
@@ -40,8 +40,8 @@ _TABLE = Key(
 class Tendon(Actuator[Length]):
     """A thread through points of the body, straight between them, that pulls itself shorter.
 
-    It slides through its points without friction. A sheath has as many points as it needs to
-    follow the body; what a few rings guide has those of the rings.
+    It slides through its points without friction. A sheath needs as many points as it takes to
+    follow the body; for guide rings, use the places of the rings.
 
     Parameters
     ----------
@@ -50,11 +50,12 @@ class Tendon(Actuator[Length]):
     tension_n : float or (m,) array
         Constant tension.
     t_s : (m,) array, optional
-        Times of the rows of `tension_n`, between which it is linear; over all of the recording.
+        Times of the rows of `tension_n`, between which it is linear; they cover the whole
+        recording.
     name : str
         Name; tendon_1, tendon_2 and so on by default.
     factor, lost_n : float
-        How the tension at the body differs: max(0, factor · tension − lost).
+        Tension at the body: max(0, factor · stated tension − lost_n).
     """
 
     points_m: Array = key(
@@ -73,7 +74,8 @@ class Tendon(Actuator[Length]):
     lost: ClassVar[str] = "lost_n"
 
     def __post_init__(self) -> None:
-        points, name = self.points_m, self.name
+        points = self.points_m
+        name = self.name
         if len(points) < 2:
             raise InputError(
                 f"{name} has {len(points)} points_m; expected at least two, from base to end"
@@ -94,6 +96,9 @@ class Tendon(Actuator[Length]):
         vars(self).update(tension_n=tension.values, t_s=tension.t_s, course=tension)
 
     def _measure_on(self, body: Body) -> Length:
+        """Return the length of the polyline in a body; an `InputError` if a point is too far
+        outside.
+        """
         shape = Shape(body.nodes_m, body)
         embedded = [shape.embed(point) for point in self.points_m]
         nodes, weights, distances = (np.array(part) for part in zip(*embedded, strict=True))
@@ -107,6 +112,8 @@ class Tendon(Actuator[Length]):
         return Length(nodes, weights, len(body.nodes_m))
 
     def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
-        """The tension at the body: a tendon only pulls."""
+        """Return the tension at the body, max(0, factor · stated − lost); 0 if the stated tension
+        is 0.
+        """
         pull = factor * stated - lost
         return (stated > 0) * (pull > 0) * pull

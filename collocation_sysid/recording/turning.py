@@ -1,8 +1,8 @@
-"""How far a recording's grasps turn within a step of the time grid.
+"""Rotation of grasps within a time step, and the substeps that keep it small.
 
-A scheme evaluates forces on the chord of a turn: at midpoint a body that turns rigidly by θ within
-a step seems to be compressed by 1 − cos(θ/2), about θ²/8, and an error of this size goes into the
-parameters, first into the damping.
+A scheme evaluates forces on the chord of a rotation: with the midpoint rule a body that rotates
+rigidly by θ within a step seems to be compressed by 1 − cos(θ/2), about θ²/8, and an error of this
+size enters the parameters, first of all the damping.
 """
 
 from __future__ import annotations
@@ -14,25 +14,29 @@ import numpy as np
 
 from .experiment import Experiment
 
-# A turn a grid step [rad] that is worth a warning, and that substeps bring it down to.
-FAST, SLOW = 0.055, 0.05
-# A turn a grid step [rad] that puts the answer in doubt.
+# Rotation within a grid step [rad] above which there is a warning: it seems a strain of 4e-4.
+FAST = 0.055
+# Rotation within a grid step [rad] that the recommended substeps reach; below FAST for rounding.
+SLOW = 0.05
+# Rotation within a grid step [rad] that makes the result doubtful: it seems a strain of 1e-3.
 TOO_FAST = 0.1
 _KEY = "transcription.substeps"
 
 
 @dataclass(frozen=True)
 class Turn:
-    """The largest turn of a grasp between two times of the grid.
+    """The largest rotation of a grasp between two times of the grid.
 
     Attributes
     ----------
     experiment : str
     angle_rad : float
     time_s : float
-        When the step begins.
+        Begin of the step.
     step_s : float
+        Length of the step.
     remedy : str
+        What to change in the problem, for messages.
     """
 
     experiment: str
@@ -43,32 +47,40 @@ class Turn:
 
     @property
     def rate_rad_s(self) -> float:
-        """Mean angular velocity within the step."""
+        """Mean angular velocity within the step [rad/s]."""
         return self.angle_rad / self.step_s
 
 
 def fastest_turn(experiment: Experiment, substeps: int) -> Turn:
-    """The largest turn of an experiment's grasps within a step, `substeps` of them a sample.
+    """Return the largest rotation of an experiment's grasps within a step of the time grid.
 
-    Between the samples of a static experiment there is no step.
+    Parameters
+    ----------
+    experiment : Experiment
+        Of a static experiment the angle is 0, as there are no steps.
+    substeps : int
+        Steps per sample.
     """
     step_s = experiment.timestep_s / substeps
     steps = (len(experiment.t_s) - 1) * substeps
     t_s = experiment.t_s[0] + step_s * np.arange(steps + 1)
-    largest, time_s, held = 0.0, float(t_s[0]), False
+    largest = 0.0
+    time_s = float(t_s[0])
+    is_hold = False
     for grasp in () if experiment.static else experiment.grasps:
-        held_s = t_s[grasp.holds(t_s)]
-        if len(held_s) < 2:
+        times_s = t_s[grasp.holds(t_s)]
+        if len(times_s) < 2:
             continue
-        rotations = grasp.poses.at(held_s)[0]
+        rotations = grasp.poses.at(times_s)[0]
         # tr RᵀQ = 1 + 2 cos θ loses small angles to rounding; |R − Q|² = 8 sin²(θ/2) does not.
         chords = np.linalg.norm(np.diff(rotations, axis=0), axis=(1, 2))
         k = int(np.argmax(chords))
         angle = 2 * float(np.arcsin(min(1.0, chords[k] / np.sqrt(8))))
         if angle > largest:
-            largest, time_s = angle, float(held_s[k])
-            held = grasp.poses.interpolation == "hold"
+            largest = angle
+            time_s = float(times_s[k])
+            is_hold = grasp.poses.interpolation == "hold"
     needed = max(1, ceil(substeps * largest / SLOW))
     # A pose that is held turns by as much at a sample, however many steps there are between.
-    remedy = 'set interpolation = "smooth" in the grasp' if held else f"set {_KEY} = {needed}"
+    remedy = 'set interpolation = "smooth" in the grasp' if is_hold else f"set {_KEY} = {needed}"
     return Turn(experiment.name, largest, time_s, step_s, remedy)

@@ -1,4 +1,6 @@
-"""Pose, marker and wrench files as this project writes them: CSV in metres and seconds."""
+"""Files of poses, markers, wrenches and custom sensors in the project's own format: CSV in SI
+units.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ _DIGITS = "%.12g"
 
 
 def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
-    """Write poses in the format `read_poses` reads; the file appears whole or not at all."""
+    """Write poses as `read_poses` reads them; the file is replaced only when it is complete."""
     values = np.column_stack([poses.t_s, poses.positions_m, poses.quaternions_xyzw])
     _write_csv(path, POSE_COLUMNS, values)
 
@@ -29,7 +31,7 @@ def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
 def write_markers_csv(
     path: str | Path, t_s: ArrayLike, names: Sequence[str], positions_m: ArrayLike
 ) -> None:
-    """Write marker tracks (T, M, 3) in metres as `read_markers` reads them, blank for NaN."""
+    """Write marker tracks (T, M, 3) [m] as `read_markers` reads them; NaN becomes a blank cell."""
     table = MarkerTable(np.asarray(t_s), tuple(names), np.asarray(positions_m))
     header = ["t_s", *(f"{name}_{axis}" for name in table.names for axis in "xyz")]
     tracks = table.positions_m.reshape(len(table.t_s), -1)
@@ -37,9 +39,10 @@ def write_markers_csv(
 
 
 def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> None:
-    """Write wrenches (S, 3) or (S, 6) as `read_wrench` reads them, blank for NaN.
+    """Write wrenches (S, 3) or (S, 6) [N, N m] as `read_wrench` reads them; NaN becomes a blank
+    cell.
 
-    Components that are never there are left out.
+    Components without any value are left out.
     """
     rows = np.asarray(values, dtype=float)
     there = np.flatnonzero(np.isfinite(rows).any(axis=0))
@@ -55,11 +58,16 @@ def write_columns_csv(path: str | Path, columns: Mapping[str, ArrayLike]) -> Non
 def write_gauge_csv(
     path: str | Path, t_s: ArrayLike, names: Sequence[str], values: ArrayLike
 ) -> None:
-    """Write what an instrument said (S, m) as `read_gauge` reads it, blank for NaN."""
+    """Write values (S, m) of a custom sensor as `read_gauge` reads them; NaN becomes a blank
+    cell.
+    """
     _write_csv(path, ["t_s", *names], np.column_stack([np.asarray(t_s), np.asarray(values)]))
 
 
 def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
+    """Write a header and rows of numbers; NaN becomes a blank cell. The file is replaced when
+    complete.
+    """
     with whole_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)

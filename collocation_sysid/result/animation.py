@@ -1,6 +1,8 @@
-"""A run as a film: the body as fitted, edges of its forward simulation over it, and markers.
+"""Film of a run: the fitted body, the edges of its forward simulation over it, and the markers.
 
-Beside it is how far the markers are from their measurements over time.
+Beside the body a panel shows the distance of the markers from their measurements over time.
+`animate`
+works from a run folder, `film` from a `Replay`.
 """
 
 from __future__ import annotations
@@ -37,15 +39,21 @@ from .pictures.scene import (
 from .replay import Replay, headline, read_run, reading_run
 from .style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, dress, legend_above
 
-WIDTH_MM, TALLEST_MM, LOWEST_MM = 160.0, 110.0, 30.0
-# GIF packs badly. H.264 wants even numbers of pixels either way, see `_even`.
+WIDTH_MM = 160.0
+TALLEST_MM = 110.0
+LOWEST_MM = 30.0
+# Width of a film in pixels, even for H.264 (see `_even`); smaller for GIF, which compresses badly.
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
-HEAD_MM, FOOT_MM, LINE_MM = 12.0, 12.0, 5.0
-# Room for the distance of the markers over time, beside the body; and the colour of their paths.
+HEAD_MM = 12.0
+FOOT_MM = 12.0
+LINE_MM = 5.0
+# Width of the panel of marker errors beside the body.
 ERRORS_MM = 60.0
+# Colour of the paths of measured markers.
 PATH = "#C4CBD4"
+# Frames of a film: more take minutes and hundreds of megabytes.
 MOST_FRAMES = 3000
-# Of a static experiment, however long it took.
+# Samples per second of a static experiment, whose recording may have taken a second or a day.
 STATES_A_SECOND = 8
 NAMES = ("fitted", "simulated")
 
@@ -60,29 +68,30 @@ def animate(
     experiment: str | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Film an experiment of a run from the run folder's files, and return the file.
+    """Film an experiment of a run folder, and return the film's file.
 
     Parameters
     ----------
     run : str or Path
         A run folder.
     to : str or Path, optional
-        A file ending in .mp4, which needs ffmpeg, or .gif; by default <experiment>.gif in the
-        run folder.
+        A file ending in .mp4, which needs ffmpeg, or .gif; by default <experiment>.gif in the run
+        folder.
     fps : float
-        Frames a second.
+        Frames per second.
     slow : float
-        How many times slower than the recording.
+        How many times slower than the recording the film is.
     experiment : str, optional
-        By default the first.
+        Name of the experiment; the first by default.
     progress : callable, optional
-        Called with the share of frames written.
+        Called with the share of frames written, from 0 to 1.
 
     Raises
     ------
     InputError
-        If `run` is not a run folder or has no such experiment, for another kind of file, when
-        ffmpeg is missing, and for numbers that cannot be.
+        If `run` is not a run folder or has no such experiment, for another kind of file, if ffmpeg
+        is
+        missing, and for numbers out of range.
     """
     for name, value in (("--fps", fps), ("--slow", slow)):
         if not 0 < value < np.inf:
@@ -90,13 +99,13 @@ def animate(
     result, replays = read_run(run)
     replay = chosen(replays, experiment, run)
     with reading_run(Path(run)):
-        said = headline(result)
+        text = headline(result)
     file = Path(to) if to is not None else Path(run) / f"{safe_name(replay.name)}.gif"
     if file.suffix.lower() not in PIXELS_WIDE:
         raise InputError(
             f"found '{file.suffix}'; expected {' or '.join(PIXELS_WIDE)}", file, "--to"
         )
-    return film(replay, file, fps, slow, progress, headline=said)
+    return film(replay, file, fps, slow, progress, headline=text)
 
 
 def film(
@@ -108,7 +117,21 @@ def film(
     names: tuple[str, str] = NAMES,
     headline: str = "",
 ) -> Path:
-    """Film one experiment, the body by its two `names` below a headline; see `animate`."""
+    """Film one experiment and return the file.
+
+    Parameters
+    ----------
+    replay : Replay
+        Experiment with at least one trajectory.
+    file : Path
+        Ends in .mp4 or .gif.
+    fps, slow, progress
+        See `animate`. A static experiment is shown with `STATES_A_SECOND` samples per second.
+    names : (str, str)
+        Labels of the fitted and of the simulated trajectory.
+    headline : str
+        Text above the body.
+    """
     picture = Film(replay, names, headline)
     t_s = replay.t_s
     if replay.static:  # which may take a second or a day
@@ -130,29 +153,40 @@ def film(
 def chosen(
     replays: Sequence[Replay], experiment: str | None, run: str | Path | None = None
 ) -> Replay:
-    """The experiment of that name, or the first.
+    """Return the experiment called `experiment`, or the first one if that is None.
+
+    Experiments without a trajectory do not count. `run` is the run folder that errors name.
 
     Raises
     ------
     InputError
-        If there is none of that name, or none with a trajectory.
+        If there is no experiment of that name, or none with a trajectory.
     """
-    seen = {replay.name: replay for replay in replays if replay.has_shapes}
-    if not seen:
+    available = {replay.name: replay for replay in replays if replay.has_shapes}
+    if not available:
         raise InputError("no experiment of this run has a trajectory", run)
     if experiment is None:
-        return next(iter(seen.values()))
-    require_among(experiment, seen, run, None if run is None else "--experiment")
-    return seen[experiment]
+        return next(iter(available.values()))
+    require_among(experiment, available, run, None if run is None else "--experiment")
+    return available[experiment]
 
 
 def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:
-    """Samples (k,) nearest to the times of a film's frames.
+    """Return the indices (k,) of the samples nearest to the times of a film's frames.
+
+    Parameters
+    ----------
+    t_s : (T,)
+        Times of the samples.
+    fps : float
+        Frames per second.
+    slow : float
+        How many times slower than the recording the film is.
 
     Raises
     ------
     InputError
-        If the film would have too many frames.
+        If the film would have more than `MOST_FRAMES` frames.
     """
     duration = float(t_s[-1] - t_s[0])
     count = round(duration * slow * fps) + 1
@@ -161,13 +195,13 @@ def film_samples(t_s: Array, fps: float, slow: float) -> NDArray[np.int64]:
             f"{duration:.3g} s, {slow:g} times slower, at {fps:g} frames a second make {count} "
             f"frames, more than {MOST_FRAMES}; lower --fps or --slow"
         )
-    wanted = np.arange(count) / (slow * fps)
-    share = wanted / max(duration, np.finfo(float).tiny)
+    times_s = np.arange(count) / (slow * fps)
+    share = times_s / max(duration, np.finfo(float).tiny)
     return np.minimum(np.rint(share * (len(t_s) - 1)), len(t_s) - 1).astype(np.int64)
 
 
 class Film:
-    """The picture of one sample after another.
+    """Figure that shows the samples of a film one after another.
 
     Attributes
     ----------
@@ -182,17 +216,22 @@ class Film:
             (names[0], replay.positions_m, replay.markers_m),
             (names[1], replay.rolled_out_positions_m, replay.rolled_out_m),
         )
-        told = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
+        shown = [(n, x, m) for n, x, m in trajectories if x is not None and m is not None]
         # A forward simulation that goes astray may leave the picture; fit and markers may not.
-        outer = told[0][1][:, np.unique(replay.surface)]
-        there = np.isfinite(outer).all(axis=(1, 2))
-        outer, outlines_m = outer[there], replay.obstacles_m
-        camera = Camera.facing(outer, replay.up)
-        beside = with_outlines(outer, None if outlines_m is None else outlines_m[there])
-        seen_m = [rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.seen.values()]
-        everything = np.vstack([beside.reshape(-1, 3), replay.measured_m.reshape(-1, 3), *seen_m])
+        surface_m = shown[0][1][:, np.unique(replay.surface)]
+        is_finite = np.isfinite(surface_m).all(axis=(1, 2))
+        surface_m = surface_m[is_finite]
+        outlines_m = replay.obstacles_m
+        camera = Camera.facing(surface_m, replay.up)
+        surroundings_m = with_outlines(
+            surface_m, None if outlines_m is None else outlines_m[is_finite]
+        )
+        depth_points_m = [rows[np.isfinite(rows[:, 4]), 5:] for rows in replay.seen.values()]
+        everything = np.vstack(
+            [surroundings_m.reshape(-1, 3), replay.measured_m.reshape(-1, 3), *depth_points_m]
+        )
         compared = [
-            (n, m) for n, _, m in told if m.size and np.isfinite(m - replay.measured_m).any()
+            (n, m) for n, _, m in shown if m.size and np.isfinite(m - replay.measured_m).any()
         ]
         width = WIDTH_MM - (ERRORS_MM if compared else 0.0)
         aspect = width_over_height(camera, everything)
@@ -206,15 +245,21 @@ class Film:
         view = View.fitting(camera, everything, (width - 8, height), (4, FOOT_MM))
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
             axes.plot(*view.places(path_m).T, color=PATH, lw=0.6, zorder=0.2)
-        shape = replay.surface, replay.surface_parts, replay.surface_nodes
-        for k, (name, positions, markers) in enumerate(told):
+        for k, (name, positions, markers) in enumerate(shown):
             top = total - 3 - (head - HEAD_MM)
             wire = GREEN if k else None
             title = axes.text(
                 4 + k * WIDTH_MM / 4, top, "", va="top", fontsize=TEXT_PT, zorder=6,
                 color=wire or BLACK,
             )  # fmt: skip
-            body = Drawn(axes, view, *shape, wire=wire)
+            body = Drawn(
+                axes,
+                view,
+                replay.surface,
+                parts=replay.surface_parts,
+                nodes=replay.surface_nodes,
+                wire=wire,
+            )
             self.panels.append((name, positions, markers, body, title))
         self._surround(axes, camera, view.mm_per_m, total)
         self.cursor = self._draw_errors(compared, width, height, total) if compared else None
@@ -223,7 +268,16 @@ class Film:
     def _draw_errors(
         self, compared: Sequence[tuple[str, Array]], left_mm: float, height_mm: float, total: float
     ) -> Line2D:
-        """Draw the distance of the markers (T, M, 3) over time, and return the line of the time."""
+        """Draw the panel of marker errors over time, and return the vertical line that marks the
+        current time.
+
+        Parameters
+        ----------
+        compared : sequence of (str, (T, M, 3))
+            Label and marker positions [m] of each trajectory.
+        left_mm, height_mm, total : float
+            Left edge of the panel, height of the body's picture, and height of the figure [mm].
+        """
         t_s = self.replay.t_s - self.replay.t_s[0]
         place = left_mm + 12, FOOT_MM + 9, ERRORS_MM - 16, min(height_mm - 12, 45.0)
         panel = self.figure.add_axes(
@@ -239,6 +293,7 @@ class Film:
         return panel.axvline(0.0, color=BLACK, lw=0.8)
 
     def _surround(self, axes: Axes, camera: Camera, mm_per_m: float, total: float) -> None:
+        """Draw the axis directions, the scale bar and the legend around the body."""
         draw_directions(axes, camera, (7.0, 4.0))
         draw_scale(axes, mm_per_m, (WIDTH_MM * 0.17, 4.0))
         named = ["grasped", "measured", "behind the body"]
@@ -248,7 +303,7 @@ class Film:
         draw_key(axes, key(*named), (WIDTH_MM * (0.42 if len(named) < 4 else 0.35), 5.5))
 
     def show(self, t: int) -> None:
-        """Show sample `t`."""
+        """Show the sample with index `t`."""
         replay = self.replay
         measured = replay.measured_m[t]
         for name, positions, markers, drawn, title in self.panels:
@@ -265,12 +320,15 @@ class Film:
 
 
 def _even(height_mm: float) -> float:
-    """The next height that is an even number of pixels."""
+    """Return the next larger height [mm] that is an even number of pixels in a film, as H.264
+    needs.
+    """
     per_mm = PIXELS_WIDE[".mp4"] / WIDTH_MM
     return float(2 * np.ceil(height_mm * per_mm / 2) / per_mm)
 
 
 def _writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
+    """Return the writer of frames: for GIF if `ffmpeg` is None, else for H.264 by that program."""
     if ffmpeg is None:
         return PillowWriter(fps=fps)  # type: ignore[arg-type]
     # What every browser plays.
@@ -278,9 +336,15 @@ def _writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
 
 
 def _ffmpeg(file: Path) -> str:
-    """The ffmpeg of the system, or else of imageio-ffmpeg."""
-    if found := shutil.which("ffmpeg"):
-        return found
+    """Return the path of ffmpeg, of the system or else of imageio-ffmpeg.
+
+    Raises
+    ------
+    InputError
+        Naming the film's `file`, if neither is installed.
+    """
+    if program := shutil.which("ffmpeg"):
+        return program
     if find_spec("imageio_ffmpeg") is not None:
         from imageio_ffmpeg import get_ffmpeg_exe  # pyright: ignore[reportMissingImports]
 

@@ -1,4 +1,7 @@
-"""What a check found, for a terminal."""
+"""Findings of a check as tables for the terminal.
+
+`glance_table` shows what is known at once; `closer_table` shows the findings that need simulations.
+"""
 
 from __future__ import annotations
 
@@ -12,24 +15,29 @@ from ..runs.check import BodyFinding, Findings, Glance, Hold, Recording
 from ..runs.check.body import hold_sentence
 from .run_sections import how_to
 
-SHOWN_MODES, SHOWN_RECORDINGS = 3, 4
+# Natural modes in the table, lowest first.
+SHOWN_MODES = 3
+# Recordings that have lines of their own; JSON has all.
+SHOWN_RECORDINGS = 4
 
 
 def glance_table(seen: Glance) -> list[Shown]:
-    """What a check sees at once."""
+    """Return tables of the bodies and of the measurements, which need no simulation."""
     return [*map(_body_section, seen.bodies), _measurements_section(seen)]
 
 
 def closer_table(findings: Findings) -> list[Shown]:
-    """What follows it, warnings last."""
-    said = {"note": (findings.notes, ""), "warning": (findings.warnings, "check")}
+    """Return tables of modes, costs and derivatives, then notes, warnings, remedies and the
+    conclusion.
+    """
+    messages = {"note": (findings.notes, ""), "warning": (findings.warnings, "check")}
     return [
         *_motion_section(findings),
         _solve_section(findings),
         "",
         *(
             Table("", (), tuple((f"{kind}:", each) for each in sentences), texts=1, style=style)
-            for kind, (sentences, style) in said.items()
+            for kind, (sentences, style) in messages.items()
             if sentences
         ),
         *how_to(findings.concerns),
@@ -38,16 +46,18 @@ def closer_table(findings: Findings) -> list[Shown]:
 
 
 def _check_verdict(findings: Findings) -> Line:
+    """Return the conclusion of a check: valid, wrong derivatives, or a suspect description."""
     if not findings.derivatives_agree:
         return Line("The derivatives do not agree with differences at the guess.", "doubtful")
     if findings.causes:
         likeliest = findings.causes[0].sentence
-        said = f"The derivatives agree, but the description looks wrong: {likeliest}"
-        return Line(said, "doubtful")
+        sentence = f"The derivatives agree, but the description looks wrong: {likeliest}"
+        return Line(sentence, "doubtful")
     return Line("The problem is valid and the derivatives agree.", "good")
 
 
 def _body_section(body: BodyFinding) -> Table:
+    """Return the table of a body: size, mass, mesh, element quality, rest shape and fields."""
     size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
     low, mean, high = (1e3 * x for x in body.edges_m)
     worst = ", ".join(f"{e.element} ({e.quality:.2f})" for e in body.worst_elements)
@@ -80,6 +90,7 @@ def _rest_shape(body: BodyFinding) -> str:
 
 
 def _motion_section(findings: Findings) -> list[Shown]:
+    """Return the table of natural modes; empty if all experiments are static."""
     if not findings.motions:  # equilibria only
         return []
     motion, *others = findings.motions
@@ -103,6 +114,7 @@ def _motion_section(findings: Findings) -> list[Shown]:
 
 
 def _measurements_section(findings: Glance) -> Table:
+    """Return the table of recordings: samples, markers, air and grasps."""
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         kind = ", validation" if recording.validation else ""
@@ -121,7 +133,7 @@ def _measurements_section(findings: Glance) -> Table:
 
 
 def _grasps(experiment: str, holds: Iterable[Hold]) -> dict[str, str]:
-    """Return what each grasp of an experiment holds; several grasps are numbered from 1."""
+    """Return a sentence on each grasp of an experiment; several grasps are numbered from 1."""
     own = [hold_sentence(hold) for hold in holds if hold.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
@@ -129,29 +141,37 @@ def _grasps(experiment: str, holds: Iterable[Hold]) -> dict[str, str]:
 
 
 def _air(density_kg_m3: float) -> str:
-    """Return what the model contains of the air around a body; a density of zero is a vacuum."""
+    """Return how the model contains the surrounding air, of a density of zero in a vacuum."""
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
 
 
 def _markers_seen(recording: Recording) -> str:
+    """Return how many markers a recording has, how many samples are missing, and the farthest
+    marker.
+    """
     if not recording.markers:
         return f"{', '.join(recording.instruments)}, no markers"
     besides = "".join(f", {name}" for name in recording.instruments)
-    far, lost = recording.farthest, recording.least_seen
+    farthest = recording.farthest
+    most_missing = recording.least_seen
     missing = (
-        f"{recording.missing} samples missing, most of '{lost.name}' ({lost.missing})"
+        f"{recording.missing} samples missing, most of '{most_missing.name}' "
+        f"({most_missing.missing})"
         if recording.missing
         else "none missing"
     )
     return (
         f"{len(recording.markers)} markers, {missing}; farthest from the body "
-        f"'{far.name}', {round(1e3 * far.distance_m, 2):g} mm{besides}"
+        f"'{farthest.name}', {round(1e3 * farthest.distance_m, 2):g} mm{besides}"
     )
 
 
 def _solve_section(findings: Findings) -> Table:
+    """Return the table of guesses, problem size, expected costs of each method, and derivative
+    errors.
+    """
     rows = {
         "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
             f"{symbol_of(name)} {value:.4g} {unit_of(name)}".strip()

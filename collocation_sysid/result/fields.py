@@ -1,12 +1,15 @@
-"""What the material feels, element by element: det F, energy density, and von Mises stress.
+"""Fields in each element: det F, elastic energy density, and von Mises stress.
 
-Each is the mean over the element, that is over its quadrature points by their volumes. The stress
-is Cauchy's, elastic without the damping's part: with P = ∂ψ/∂F,
+Each value is the mean over an element, weighted by the volumes of its quadrature points. The stress
+is
+Cauchy's elastic stress, without the damping stress: with P = ∂ψ/∂F,
 
     σ = P Fᵀ / J,   s = σ − ⅓ (tr σ) I,   von Mises: √(3/2 s:s)
 
-(Holzapfel 2000, eqs. 3.9 and 6.4); uniaxial stress is its own von Mises stress. F is the one that
-the material feels: where an element averages the dilatation, J is its volume's ratio everywhere.
+(Holzapfel 2000, eqs. 3.9 and 6.4); the von Mises stress of uniaxial stress is that stress itself. F
+is
+the deformation gradient in the constitutive law: where an element averages the dilatation, J is the
+ratio of its volumes at every point.
 """
 
 from __future__ import annotations
@@ -30,12 +33,13 @@ NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
 @dataclass(frozen=True, eq=False)
 class ElementFields:
-    """Evaluates the fields of a body at any states.
+    """Evaluator of the fields of a body at any node positions.
 
     Attributes
     ----------
     body : Body
-    theta : (k,) its constants
+    theta : (k,)
+        Constants of the body.
     """
 
     body: Body
@@ -45,29 +49,41 @@ class ElementFields:
 
     @classmethod
     def of(cls, body: Body, theta: Array) -> ElementFields:
-        """Compile the fields of a body's materials."""
+        """Return the evaluator of a body with the constants `theta` (k,); compiles its materials'
+        kernels.
+        """
         evaluators = []
         for number, part in enumerate(body.parts):
             kernel = field_kernel(body.element, body.law(number))
             # Every element has a place of its own, where its points add up.
             places = len(NAMES) * part.cells[:, None] + np.arange(len(NAMES))
             width = len(NAMES) * len(body.cells)
-            cells, geometry = body.cells[part.cells], body.geometry[part.cells]
-            carried = None
+            cells = body.cells[part.cells]
+            geometry = body.geometry[part.cells]
+            histories = None
             if part.stress_field:
                 logs = np.arange(len(cells))[:, None, None]
-                carried = np.broadcast_to(logs, (*geometry.shape[:2], 1))
+                histories = np.broadcast_to(logs, (*geometry.shape[:2], 1))
             elif body.inverse is not None:
-                carried = body.inverse.places_of_points(number)
-            batch = Batch(kernel, cells, geometry, places, width, carried)
+                histories = body.inverse.places_of_points(number)
+            batch = Batch(kernel, cells, geometry, places, width, histories)
             evaluators.append(body.make_evaluator(batch))
         volumes = body.stress_free_geometry(theta)[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)
 
     def at(self, positions_m: ArrayLike) -> dict[str, Array]:
-        """The fields by `NAMES`, (T, E) each, at positions (T, n, 3).
+        """Return the fields at node positions, by `NAMES`.
 
-        An inverted element has no logarithm of its J: what needs one is NaN there.
+        Parameters
+        ----------
+        positions_m : (T, n, 3)
+
+        Returns
+        -------
+        dict of str to (T, E)
+            det F, elastic energy density [J/m³] and von Mises stress [Pa]. In an inverted element,
+            where
+            ln J does not exist, the values that need it are NaN.
         """
         body = self.body
         x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
@@ -83,18 +99,24 @@ class ElementFields:
 
 
 def field_kernel(element: Element, law: Law) -> PointKernel:
-    """The fields at a quadrature point times its volume, see `expressions` for the inputs."""
+    """Return the compiled fields at a quadrature point times its volume; see `expressions` for the
+    inputs.
+    """
     point = point_of(element, law, "x")
     fields = ca.vertcat(*_point_fields(law, point.constants))
-    felt = ca.substitute(fields, _F, ca.vec(point.felt))
-    return kernel_of("fields", point, {"fields": (Derivative(point.volume * felt, ()),)})
+    evaluated = ca.substitute(fields, _F, ca.vec(point.felt))
+    return kernel_of("fields", point, {"fields": (Derivative(point.volume * evaluated, ()),)})
 
 
 _F = ca.SX.sym("F", 9)
 
 
 def _point_fields(law: Law, theta: ca.SX) -> tuple[ca.SX, ...]:
-    """J, ψ and the von Mises stress at the deformation gradient `_F`, column after column."""
+    """Return det F, the energy density and the von Mises stress as expressions in `_F`.
+
+    `_F` has the nine components of the deformation gradient column after column; `theta` are the
+    constants of the law.
+    """
     f = ca.reshape(_F, 3, 3)
     j = ca.det(f)
     psi = law.psi(f, theta)

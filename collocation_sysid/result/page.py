@@ -1,4 +1,8 @@
-"""A run as one web page that needs nothing else: turn the body and play its motion."""
+"""Stand-alone web page with the moving body of one experiment.
+
+`write_page` is for readers who have a browser and no other software: the page contains all data,
+and its body can be turned and played.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +27,24 @@ from .replay import Replay
 
 # More samples than this are thinned, to keep the page a few megabytes.
 MOST_FRAMES = 300
-# The colours end at the strain below which this share is: single corners are strained most.
+# Quantile of the strain at which the colour scale ends: strains in single corners are far larger.
 STRAINED = 0.995
 
 
 @dataclass(frozen=True)
 class Colouring:
-    """What colours the faces.
+    """Values that colour the faces of the body, with the limits of the colour scale.
 
     Attributes
     ----------
     name : str
+        Name of the quantity.
     values : mapping of trajectory ("fitted", "simulated") to (T, F)
+        Value at T samples on F boundary triangles; only these trajectories are shown.
     low, high : float
-        Where the colours begin and end.
+        Values at the two ends of the colour scale.
     ends : (str, str)
-        What is written there.
+        Labels of the two ends.
     """
 
     name: str
@@ -49,7 +55,7 @@ class Colouring:
 
     @classmethod
     def strain(cls, replay: Replay) -> Colouring:
-        """Largest principal strain."""
+        """Return the colouring of all trajectories by the largest principal strain."""
         values = {name: surface_strain(replay, x) for name, x in _trajectories(replay).items()}
         shown = np.abs(next(iter(values.values())))
         largest = float(np.nanquantile(shown, STRAINED)) or 1e-6
@@ -57,28 +63,44 @@ class Colouring:
 
     @classmethod
     def field(cls, name: str, fitted: Array) -> Colouring:
-        """A field (T, F) of the fitted body."""
-        low, high = float(np.nanmin(fitted)), float(np.nanmax(fitted))
+        """Return the colouring of the fitted body by given values.
+
+        Parameters
+        ----------
+        name : str
+            Name of the quantity, which the label of the upper end contains.
+        fitted : (T, F)
+            Value at each sample on each boundary triangle; NaN is ignored for the limits.
+        """
+        low = float(np.nanmin(fitted))
+        high = float(np.nanmax(fitted))
         return cls(name, {"fitted": fitted}, low, high, (f"{low:.3g}", f"{high:.3g} {name}"))
 
 
 def write_page(
     replay: Replay, file: str | Path, headline: str = "", colouring: Colouring | None = None
 ) -> Path:
-    """Write an experiment, as fitted and as simulated forward, as a stand-alone web page.
+    """Write the fitted and the simulated motion of an experiment as a stand-alone web page.
 
-    The page draws on a plain canvas, in any browser and without a network. Of long trajectories
-    every second, third, … sample is kept.
+    The page draws on a plain canvas, in any browser and without a network. Of more than
+    `MOST_FRAMES` samples every second, third, … is kept.
 
     Parameters
     ----------
     replay : Replay
-        With at least one trajectory.
+        Experiment with at least one trajectory.
     file : str or Path
+        HTML file to write; it is replaced only after the page is complete.
     headline : str
-        What was found, in a line.
+        One line with the main result, below the title.
     colouring : Colouring, optional
-        What colours the body, and which trajectories; the strain of all by default.
+        Colours of the body, and the trajectories to show; the strain of all trajectories by
+        default.
+
+    Returns
+    -------
+    Path
+        The file.
     """
     template = files("collocation_sysid.result").joinpath("page.html").read_text(encoding="utf-8")
     content = _content(replay, colouring or Colouring.strain(replay))
@@ -95,25 +117,31 @@ def write_page(
 
 
 def _trajectories(replay: Replay) -> dict[str, Array]:
+    """Return the node positions (T, n, 3) [m] of the trajectories that exist, by "fitted" and
+    "simulated".
+    """
     named = {"fitted": replay.positions_m, "simulated": replay.rolled_out_positions_m}
     return {name: x for name, x in named.items() if x is not None}
 
 
 def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
-    kept = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MOST_FRAMES))
-    outer, nodes = np.unique(replay.surface_nodes, return_inverse=True)
+    """Return the data of the page, ready for JSON; arrays are in base64, see `_packed`."""
+    samples = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MOST_FRAMES))
+    surface_nodes, nodes = np.unique(replay.surface_nodes, return_inverse=True)
     nodes = nodes.reshape(len(replay.surface), -1)
-    positions, values = _trajectories(replay), colouring.values
-    shapes = {name: positions[name][kept][:, outer] for name in values}
+    positions = _trajectories(replay)
+    values = colouring.values
+    shapes = {name: positions[name][samples][:, surface_nodes] for name in values}
     first = next(iter(shapes.values()))
-    low, high = np.nanmin(first, axis=(0, 1)), np.nanmax(first, axis=(0, 1))
+    low = np.nanmin(first, axis=(0, 1))
+    high = np.nanmax(first, axis=(0, 1))
     span = (colouring.high - colouring.low) or 1.0
-    shares = {name: (x[kept] - colouring.low) / span for name, x in values.items()}
+    shares = {name: (x[samples] - colouring.low) / span for name, x in values.items()}
     shares = {name: np.clip(np.nan_to_num(x), 0.0, 1.0) for name, x in shares.items()}
-    there = first[np.isfinite(first).all(axis=(1, 2))]
+    finite_m = first[np.isfinite(first).all(axis=(1, 2))]
     return {
-        "t_s": replay.t_s[kept].tolist(),
-        "nodes": len(outer),
+        "t_s": replay.t_s[samples].tolist(),
+        "nodes": len(surface_nodes),
         "markers": replay.measured_m.shape[1],
         "faces": _packed(nodes[:, :3], "<i4"),
         "sides": _packed(nodes[:, 3:], "<i4"),
@@ -122,11 +150,13 @@ def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
         "shares": {name: _packed(np.rint(255 * x), "u1") for name, x in shares.items()},
         "opening": int(np.nansum(np.abs(next(iter(shares.values()))), axis=1).argmax()),
         "colours": [[round(255 * c) for c in colormaps["cividis"](k / 8)[:3]] for k in range(9)],
-        "held": _packed(replay.held[kept][:, outer], "u1"),
-        "outlines": "" if replay.obstacles_m is None else _packed(replay.obstacles_m[kept], "<f4"),
-        "measured": _packed(replay.measured_m[kept], "<f4"),
+        "held": _packed(replay.held[samples][:, surface_nodes], "u1"),
+        "outlines": ""
+        if replay.obstacles_m is None
+        else _packed(replay.obstacles_m[samples], "<f4"),
+        "measured": _packed(replay.measured_m[samples], "<f4"),
         "shapes": {name: _packed(x, "<f4") for name, x in shapes.items()},
-        "axes": Camera.facing(there, replay.up).axes.tolist(),
+        "axes": Camera.facing(finite_m, replay.up).axes.tolist(),
         "centre": ((low + high) / 2).tolist(),
         "size": float(np.linalg.norm(high - low)),
         "body": float(np.ptp(replay.undeformed_m, axis=0).max()),
@@ -134,14 +164,24 @@ def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
 
 
 def surface_strain(replay: Replay, positions_m: Array) -> Array:
-    """Largest principal stretch less one (T, F) of the elements below the surface.
+    """Return the largest principal strain (T, F) of the elements below the boundary triangles.
 
-    By their corners: of quadratic elements the mean.
+    The strain is the largest stretch minus one. It is computed from the corners of an element,
+    which
+    for a quadratic element gives an average. NaN where a position is not finite.
+
+    Parameters
+    ----------
+    replay : Replay
+    positions_m : (T, n, 3)
+        Node positions of one of its trajectories.
     """
     cells = cells_of_faces(replay.tetrahedra, replay.surface)
     corners = replay.tetrahedra[cells]
-    undeformed, moved = replay.undeformed_m[corners], positions_m[:, corners]
-    edges, moved = undeformed[:, 1:] - undeformed[:, :1], moved[:, :, 1:] - moved[:, :, :1]
+    undeformed = replay.undeformed_m[corners]
+    moved = positions_m[:, corners]
+    edges = undeformed[:, 1:] - undeformed[:, :1]
+    moved = moved[:, :, 1:] - moved[:, :, :1]
     gradient = np.linalg.solve(edges, moved)  # Fᵀ of each
     there = np.isfinite(gradient).all(axis=(2, 3))
     gradient[~there] = np.eye(3)
@@ -150,11 +190,25 @@ def surface_strain(replay: Replay, positions_m: Array) -> Array:
 
 
 def cells_of_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[np.int64]:
-    """The tetrahedron (F,) that each boundary triangle is a side of."""
+    """Return the index (F,) of the tetrahedron that each boundary triangle is a side of.
+
+    Parameters
+    ----------
+    tetrahedra : (E, 4)
+        Corner nodes of the tetrahedra.
+    faces : (F, 3)
+        Corner nodes of the triangles, in any order.
+
+    Raises
+    ------
+    KeyError
+        If a triangle is no side of any tetrahedron.
+    """
     sides = np.sort(tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
     known = {tuple(side): k // 4 for k, side in enumerate(sides.reshape(-1, 3).tolist())}
     return np.array([known[tuple(face)] for face in np.sort(faces, axis=1).tolist()])
 
 
 def _packed(array: NDArray[Any], kind: str) -> str:
+    """Return an array as base64 text of its bytes in the NumPy data type `kind`, such as "<f4"."""
     return base64.b64encode(np.ascontiguousarray(array, dtype=kind).tobytes()).decode("ascii")

@@ -1,4 +1,4 @@
-"""Probes as a table of refits with a conclusion, and when a deeper check is worthwhile."""
+"""Probes of a run as a table of refits with conclusions, and when a deeper check is worthwhile."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from ..runs.result import Result
 from ..statistics.budget import worded
 from ..statistics.relaxation import Move, Probe
 
-# Estimates in the table, what tells stiffness first.
-FOREMOST, SHOWN = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa"), 4
+# Measures of stiffness, the most important first.
+FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
+# Estimates that have columns in the table.
+SHOWN = 4
 # Concerns that relaxed assumptions and parts of the data can explain: residuals that are not noise,
 # or predictions that miss. A description that is wrong is none: it is to be corrected first.
 EXPLICABLE = (
@@ -32,7 +34,9 @@ DEEPER = (
 
 
 def probe_section(result: Result) -> Section:
-    """Return the table of all probes with its sentences; no parts without probes."""
+    """Return the table of all probes with its conclusions; a section without parts if there are no
+    probes.
+    """
     if not result.probes:
         return Section("Probes", ())
     names = _shown(result)
@@ -54,29 +58,35 @@ def probe_section(result: Result) -> Section:
 
 
 def probe_lines(result: Result) -> list[str | Table]:
-    """Return what a terminal shows of the probes: a line where every solve's found nothing."""
+    """Return the conclusions of the probes for a terminal.
+
+    After routine probes without a significant result the table is left out; empty without probes.
+    """
     if is_routine(result) and not any(probe.told for probe in result.probes):
         return [*_said(result)] if result.probes else []
     return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
 
 
 def _first_order(probe: Probe) -> str:
-    """Return the size of a relaxed assumption and what it gains, in words."""
-    size, error = short(probe.size or 0.0), short(probe.size_error or 0.0)
+    """Return the size of a relaxed assumption and the reduction of χ² by it, in words."""
+    size = short(probe.size or 0.0)
+    error = short(probe.size_error or 0.0)
     return f"{worded(probe.name)} ({size} ± {error}, −Δχ² {probe.chi_squared:.1f})"
 
 
 def is_routine(result: Result) -> bool:
-    """Whether only the probes of every solve were made, not those of a deeper check."""
+    """Return whether only the probes of every solve were made, not those of a deeper check."""
     return all(probe.routine for probe in result.probes)
 
 
 def is_deeper_check_worthwhile(result: Result) -> bool:
-    """Whether `solve --probe` may explain what the verdict says.
+    """Return whether `solve --probe` may explain the concerns of the verdict.
 
-    It may where the residuals, a prediction or a routine probe contradict the model, the error bars
-    are there, and nothing else is to be corrected first. A wide combined interval is no such case:
-    its budget says what to measure.
+    It may if the residuals, a prediction or a routine probe contradict the model, error bars exist,
+    and
+    nothing else has to be corrected first. A wide combined interval does not count, because its
+    budget
+    already says what to measure.
     """
     concerns = result.trust.concerns
     if not result.budget or not is_routine(result):
@@ -87,13 +97,23 @@ def is_deeper_check_worthwhile(result: Result) -> bool:
 
 
 def _shown(result: Result) -> list[str]:
-    """The estimates of the table."""
+    """Return the names of the estimates that the table has as columns, at most `SHOWN`."""
     known = [n for n, each in result.values.items() if each.statistical95]
     first = [name for name in known if name in FOREMOST[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][:SHOWN]
 
 
 def _moved(move: Move | None, value: float) -> str:
+    """Return the change of an estimate with its ratios to the half widths of both intervals; "–"
+    for None.
+
+    Parameters
+    ----------
+    move : Move or None
+        Change of the estimate in a refit; None if the refit does not have it.
+    value : float
+        The estimate itself.
+    """
     if move is None:
         return "–"
     shares = ", ".join(
@@ -103,30 +123,42 @@ def _moved(move: Move | None, value: float) -> str:
 
 
 def _change(move: Move, value: float) -> str:
+    """Return the change of an estimate as text, in percent of `value` unless that is zero."""
     return f"{100 * move.change / abs(value):+.2f} %" if value else f"{move.change:+.2g}"
 
 
 def _said(result: Result) -> Iterator[str]:
-    """What is told by windows, recordings and assumptions, or that nothing is."""
-    told = [probe for probe in result.probes if probe.told]
-    freed = sorted((p for p in told if p.kind == "assumption"), key=lambda p: -p.chi_squared)
+    """Yield sentences on the significant probes, or that there is none.
+
+    First come windows and recordings that disagree with the rest, then relaxed assumptions, then
+    the most
+    important assumption that the data do not determine.
+    """
+    significant = [probe for probe in result.probes if probe.told]
+    relaxed = sorted(
+        (p for p in significant if p.kind == "assumption"), key=lambda p: -p.chi_squared
+    )
     for kind in ("window", "recording"):
-        apart = [p for p in told if p.kind == kind]
-        if apart:
-            said = (f"{p.name}: {listed(_goes(p, result, n) for n in p.told)}" for p in apart)
-            yield f"{kind}s disagree, beyond chance ({'; '.join(said)})"
-    if freed:
-        first, names = freed[0], _shown(result)
+        disagreeing = [p for p in significant if p.kind == kind]
+        if disagreeing:
+            changes = (
+                f"{p.name}: {listed(_goes(p, result, n) for n in p.told)}" for p in disagreeing
+            )
+            yield f"{kind}s disagree, beyond chance ({'; '.join(changes)})"
+    if relaxed:
+        first = relaxed[0]
+        names = _shown(result)
         moved = [_goes(first, result, n) for n in names if n in first.moves][:2]
-        size, error = short(first.size or 0.0), short(first.size_error or 0.0)
+        size = short(first.size or 0.0)
+        error = short(first.size_error or 0.0)
         yield (
             f"the data determine {worded(first.name)}: {size} ± {error}, with which χ² falls by "
             f"{first.chi_squared:.3g} and the estimates change by {listed(moved)}: measure it, or "
             "estimate it"
         )
-        if others := [f"{worded(p.name)} ({p.chi_squared:.3g})" for p in freed[1:]]:
+        if others := [f"{worded(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
             yield f"instead of it also {listed(others)}: one cause may look like another"
-    elif not told:
+    elif not significant:
         tested = " or ".join(_first_order(p) for p in result.probes)
         nothing = "no part of the data, and no relaxed assumption, fits better than by chance"
         yield f"no significant {tested}" if is_routine(result) else nothing
@@ -135,15 +167,23 @@ def _said(result: Result) -> Iterator[str]:
 
 
 def _goes(probe: Probe, result: Result, name: str) -> str:
+    """Return the change of the estimate `name` in a refit, with its symbol."""
     return f"{symbol_of(name)} {_change(probe.moves[name], result.values[name].value)}"
 
 
 def _matters(result: Result) -> Iterator[str]:
-    """The assumption that the data do not tell and that matters most to what tells stiffness."""
-    told = {name.partition(" ")[0] for p in result.probes for name in p.told}
-    rows = {p.name.partition(" ")[0] for p in result.probes if p.kind == "assumption"} - told
+    """Yield a sentence on the most important assumption that the data do not determine, if there is
+    one.
+
+    The most important assumption contributes most to the variance of the first stiffness that has a
+    budget.
+    """
+    significant = {name.partition(" ")[0] for p in result.probes for name in p.told}
+    undetermined = {
+        p.name.partition(" ")[0] for p in result.probes if p.kind == "assumption"
+    } - significant
     for name in (n for n in (*FOREMOST, *result.parameters) if n in result.budget):
-        source = next((s for s in result.budget[name] if s in rows), None)
+        source = next((s for s in result.budget[name] if s in undetermined), None)
         if source is not None:
             share = result.budget[name][source]
             yield (

@@ -1,4 +1,4 @@
-"""What a solve shows while it runs: its iterations on a terminal, a line now and then elsewhere."""
+"""Progress of a solve: a live table of iterations on a terminal, occasional lines elsewhere."""
 
 from __future__ import annotations
 
@@ -16,19 +16,26 @@ from ..methods.solution import Iteration
 from ..problem import Problem
 
 SHOWN_ITERATIONS = 12
-# The first line comes after this time, the next ones when it has grown by this share.
-FIRST_S, SHARE = 10.0, 0.5
+# Time until the first line.
+FIRST_S = 10.0
+# Growth of the elapsed time until each further line.
+SHARE = 0.5
 
 
 class Heartbeat:
-    """Tells what is being done, from a thread of its own: also while one call takes minutes.
+    """Thread that reports the current activity from time to time, also while one call takes
+    minutes.
+
+    The first line comes after `first_s`; each further line when the elapsed time has grown by half.
 
     Parameters
     ----------
-    doing : callable that returns what is being done now
-    tell : callable that shows a line
+    doing : callable
+        Returns the current activity as text.
+    tell : callable
+        Shows a line.
     first_s : float, optional
-        When the first line comes.
+        Time of the first line [s]; `FIRST_S` by default.
     """
 
     NAME = "heartbeat"
@@ -36,30 +43,47 @@ class Heartbeat:
     def __init__(
         self, doing: Callable[[], str], tell: Callable[[str], None], first_s: float | None = None
     ) -> None:
-        self._doing, self._tell = doing, tell
+        self._doing = doing
+        self._tell = tell
         self._first_s = FIRST_S if first_s is None else first_s
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._beat, name=self.NAME, daemon=True)
 
     def start(self) -> None:
-        """Begin to count."""
+        """Start the thread and its clock."""
         self._thread.start()
 
     def stop(self) -> None:
-        """No line comes after this."""
+        """Stop the thread, and wait until it has ended; no line is shown afterwards."""
         self._ended.set()
         if self._thread.is_alive():
             self._thread.join()
 
     def _beat(self) -> None:
-        began, passed_s = time.monotonic(), 0.0
+        """Show lines until `stop` is called; the body of the thread."""
+        began = time.monotonic()
+        passed_s = 0.0
         while not self._ended.wait(max(self._first_s, SHARE * passed_s)):
             passed_s = time.monotonic() - began
             self._tell(f"{self._doing()} ({passed_s:.3g} s so far)")
 
 
 class Progress(Watched):
-    """A live table of iterations on a terminal; elsewhere a line now and then, or all if asked."""
+    """Display of the progress of a solve, used as a context.
+
+    On a terminal it is a live table of the last iterations. Elsewhere, or if `verbose`, lines are
+    printed.
+
+    Parameters
+    ----------
+    console : Console
+    problem : Problem, optional
+        Its notes are shown at the beginning.
+    verbose : bool
+        Print a line for every iteration.
+    quiet : bool
+        Show nothing but notes.
+    """
 
     def __init__(
         self,
@@ -90,19 +114,20 @@ class Progress(Watched):
             self._heartbeat.stop()
 
     def iteration(self, line: Iteration) -> None:
-        """Show an iterate."""
+        """Show an iteration; the callback of a method."""
         self._lines.append(line)
         self._told("solving", "  ".join(_cells(line)))
 
     def say(self, what: str) -> None:
-        """Show what is being done now."""
+        """Show what is being done now, as a sentence."""
         self._told(what, what)
 
     def share(self, done: float) -> None:
-        """Show the share of a simulation that is done."""
+        """Show the completed share of a simulation, from 0 to 1."""
         self._told(f"simulating: {done:.0%}")
 
     def _told(self, doing: str, line: str = "") -> None:
+        """Update the display with the current activity, and print `line` if verbose."""
         self._doing = doing
         if self.verbose and line:
             self.console.print(Text(line), soft_wrap=True)
@@ -110,11 +135,13 @@ class Progress(Watched):
         self.update(Group(table, Text(self._doing, style="dim")))
 
     def _state(self) -> str:
+        """Return the current activity with the number of iterations so far, for the `Heartbeat`."""
         done = f", {len(self._lines)} iterations" if self._lines else ""
         return f"{self._doing}{done}"
 
 
 def _iterations(lines: list[Iteration]) -> Shown:
+    """Return the table of the last iterations; "" before the first."""
     if not lines:
         return ""
     heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")
@@ -122,6 +149,8 @@ def _iterations(lines: list[Iteration]) -> Shown:
 
 
 def _cells(line: Iteration) -> tuple[str, ...]:
+    """Return the table row of an iteration."""
     values = (f"{value:.4g}" for value in line.parameters.values())
-    rms_mm, violation = f"{line.rms_m * 1e3:.4f}", f"{line.violation_n:.1e}"
+    rms_mm = f"{line.rms_m * 1e3:.4f}"
+    violation = f"{line.violation_n:.1e}"
     return str(line.number), rms_mm, violation, *values, f"{line.time_s:.1f}"

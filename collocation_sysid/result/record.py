@@ -1,4 +1,8 @@
-"""What a run leaves behind: result.json, arrays, plots and ParaView frames in one folder."""
+"""Writing of a run folder: result.json, arrays, ParaView frames and pictures.
+
+`write_run` writes the folder of a finished run; `draw_run` adds the pictures afterwards; `replays`
+gives the arrays of each experiment to pictures and films without a folder.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +36,29 @@ REFINEMENT_FILE = "refinement.json"
 def write_run(
     finished: Answer, folder: str | Path, *, frames: bool = True, pictures: bool = True
 ) -> Path:
-    """Write the run folder, whole or not at all, then its pictures, and return it.
+    """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
-    ``result.json``, ``problem.toml`` as run where the problem has a file, ``trajectory.npz``, and
-    ``frames/`` with ``trajectory.pvd`` for ParaView. With several experiments the arrays' names and
-    the frames' folders have the experiment's name in front. `draw_run` adds the pictures, after the
-    folder is in its place, so that nothing which goes wrong there loses the answer.
+    The folder gets ``result.json``, ``problem.toml`` as it was run if the problem has a file,
+    ``trajectory.npz``, and ``frames/`` with ``trajectory.pvd`` for ParaView. With several
+    experiments,
+    the name of the experiment precedes the names of arrays and the folders of frames. `draw_run`
+    adds
+    the pictures after the folder is in its place, so that an error while drawing does not lose the
+    result.
+
+    Parameters
+    ----------
+    finished : Answer
+        The solved problem.
+    folder : str or Path
+        An earlier, unchanged run at this place is replaced.
+    frames, pictures : bool
+        Whether to write ParaView frames, and pictures.
+
+    Raises
+    ------
+    InputError
+        If the folder holds anything but an earlier run; see `writers.run_folder`.
     """
     result = result_of(finished)
     with run_folder(folder) as place:
@@ -58,15 +79,16 @@ def write_run(
 
 
 def draw_run(finished: Answer, folder: Path, say: Callable[[str], None] | None = None) -> Result:
-    """Draw the pictures of a run into its folder, and add to its result how long that took.
+    """Draw the pictures of a run into its folder, and store in ``result.json`` how long that took.
 
     Parameters
     ----------
     finished : Answer
+        The solved problem.
     folder : Path
-        What `write_run` wrote of this answer.
+        The folder that `write_run` wrote for this solved problem.
     say : callable, optional
-        Called with what is being done now, a text.
+        Called with a sentence about each picture before it is drawn.
 
     Returns
     -------
@@ -76,10 +98,11 @@ def draw_run(finished: Answer, folder: Path, say: Callable[[str], None] | None =
     Raises
     ------
     InputError
-        If the folder holds another result, or cannot be written in.
+        If the folder holds another result, or cannot be written to.
     """
     began_s = time.perf_counter()
-    result, file = result_of(finished), folder / RESULT_FILE
+    result = result_of(finished)
+    file = folder / RESULT_FILE
     _write_pictures(finished, result, folder, say or (lambda _: None))
     if not file.is_file() or file.read_text(encoding="utf-8") != _as_text(result):
         raise InputError(
@@ -101,6 +124,9 @@ def _as_text(result: Result) -> str:
 def _write_pictures(
     finished: Answer, result: Result, folder: Path, say: Callable[[str], None]
 ) -> None:
+    """Draw all pictures of a run, including the Jacobian's structure, and write them into its
+    folder.
+    """
     say("drawing the pictures")
     # matplotlib takes a while to import, and nothing else needs it.
     from .pictures import album, jacobian_sparsity, save_pictures
@@ -111,17 +137,30 @@ def _write_pictures(
 
 
 def _told_of_cells(finished: Answer, body: Body) -> dict[str, Any]:
-    """What is the same in every frame: regions, and what differs from place to place."""
-    told: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
+    """Return the cell data that are the same in every frame: region numbers and spatially varying
+    constants.
+
+    Each array has one row for each of the E elements. A constant has four: its estimate, the ends
+    of its
+    95 % interval (suffixes ``_lower``, ``_upper``), and its posterior over its prior standard
+    deviation
+    (suffix ``_over_prior``).
+    """
+    data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
     for name, values in _in_cells(finished, body).items():
         heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
-        told |= dict(zip(heads, values.T, strict=True))
-    return told
+        data |= dict(zip(heads, values.T, strict=True))
+    return data
 
 
 def _write_all_frames(finished: Answer, place: Path) -> None:
+    """Write the ParaView frames of every fitted experiment into the folder `place`.
+
+    With several fitted experiments each has a subfolder of its name.
+    """
     for part in finished.solution.parts:
-        segment, positions = part.segment, part.x.reshape(len(part.x), -1, 3)
+        segment = part.segment
+        positions = part.x.reshape(len(part.x), -1, 3)
         here = place if len(finished.solution.parts) == 1 else place / segment.experiment.name
         here.mkdir(exist_ok=True)
         body = segment.body
@@ -141,8 +180,15 @@ def _write_all_frames(finished: Answer, place: Path) -> None:
 
 
 def replays(finished: Answer) -> list[Replay]:
-    """The experiments as they are looked at: those fitted, then those for validation."""
-    fitted, seen = {}, []
+    """Return each experiment with its measured, fitted and simulated motion, for pictures and
+    files.
+
+    The fitted experiments come first, then those for validation. A validation experiment whose
+    forward
+    simulation failed is left out.
+    """
+    fitted = {}
+    collected = []
     for part, readings in zip(finished.solution.parts, finished.solution.readings_m, strict=True):
         x = part.x[part.segment.markers.grid_rows]
         fitted[part.segment.experiment.name] = x.reshape(len(x), -1, 3), readings
@@ -156,27 +202,36 @@ def replays(finished: Answer) -> list[Replay]:
             motion = finished.motions.get(experiment.name)
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _places_m(finished, experiment.name)
-            read = _sensed(finished, experiment), _own_readings(finished, experiment)
-            own = places_m, *read, _touched(finished, experiment, shown[0])
-            replay = Replay.of(experiment, fit, rolled_out, natural, *own)
-            of_cells, of_cameras = _in_cells(finished, experiment.body), _seen(finished, experiment)
-            seen.append(replace(replay, fields=of_cells, seen=of_cameras))
-    return seen
+            replay = Replay.of(
+                experiment,
+                fit,
+                rolled_out=rolled_out,
+                natural_hz=natural,
+                places_m=places_m,
+                wrenches=_sensed(finished, experiment),
+                readings=_own_readings(finished, experiment),
+                touched=_touched(finished, experiment, shown[0]),
+            )
+            of_cells = _in_cells(finished, experiment.body)
+            of_cameras = _seen(finished, experiment)
+            collected.append(replace(replay, fields=of_cells, seen=of_cameras))
+    return collected
 
 
 def _seen(finished: Answer, experiment: Experiment) -> dict[str, Array]:
-    """Return points of depth cameras on the fitted surface, or else on the simulated one.
+    """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
-    By camera, see `Replay.seen`; empty where neither is known.
+    The arrays are as in `Replay.seen`, by name of the camera; empty where neither surface is known.
     """
-    part, rollout = finished.solution.part_of(experiment.name), finished.rollouts[experiment.name]
+    part = finished.solution.part_of(experiment.name)
+    rollout = finished.rollouts[experiment.name]
     surfaces: Mapping[str, SurfaceComparison] = {}
     if part is not None:
         surfaces = {
             reading.sighting.view.depth.name: SurfaceComparison.from_fit(
-                reading, part.x, looked, part.phi
+                reading, part.x, values, part.phi
             )
-            for reading, looked in part.sights
+            for reading, values in part.sights
         }
     elif isinstance(rollout, Rollout):
         surfaces = rollout.surfaces
@@ -190,7 +245,10 @@ def _seen(finished: Answer, experiment: Experiment) -> dict[str, Array]:
 def _touched(
     finished: Answer, experiment: Experiment, positions_m: Array
 ) -> tuple[Array, Array] | None:
-    """Gaps and pressures of the surface; None where there is nothing to touch."""
+    """Return gap [m] and contact pressure [Pa] on the surface, (T, F) each; None without obstacles.
+
+    `positions_m` are the node positions (T, n, 3).
+    """
     if not experiment.obstacles:
         return None
     if (part := finished.solution.part_of(experiment.name)) is not None:
@@ -200,22 +258,29 @@ def _touched(
 
 
 def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:
-    """(E, 4) of each constant that differs from place to place, NaN where other regions are."""
-    found = {}
+    """Return the estimates (E, 4) of each spatially varying constant, by name of the field.
+
+    The columns are those of `Replay.fields`. Rows of elements in other regions are NaN.
+    """
+    estimates = {}
     for part in body.parts:
         if part.field is not None:
-            found[part.field_name] = np.full((len(body.cells), 4), np.nan)
-            found[part.field_name][part.cells] = finished.fields[part.field_name].by_element
-    return found
+            estimates[part.field_name] = np.full((len(body.cells), 4), np.nan)
+            estimates[part.field_name][part.cells] = finished.fields[part.field_name].by_element
+    return estimates
 
 
 def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
-    """Return (S, 19) of each sensor: time, and the wrench as measured, fitted and simulated.
+    """Return an array (S, 19) for each force sensor: time, and the wrench measured, fitted and
+    simulated.
 
-    Wrenches are those of the whole specimen where the body is a part of it.
+    The wrenches are those of the whole specimen also where symmetry reduces the model to a part of
+    it.
+    NaN where the experiment was not fitted or not simulated.
     """
     sensors = experiment.wrenches
-    rollout, fitted = finished.rollouts[experiment.name], finished.solution.wrenches
+    rollout = finished.rollouts[experiment.name]
+    fitted = finished.solution.wrenches
     fit = fitted.get(experiment.name, [None] * len(sensors))
     rolled = rollout.wrenches if isinstance(rollout, Rollout) else [None] * len(sensors)
     both = zip(sensors, fit, rolled, strict=True)
@@ -228,8 +293,13 @@ def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
 
 
 def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
-    """(S, 1 + 3m) of each reading of one's own: time, as measured, fitted and simulated."""
-    rollout, fit = finished.rollouts[experiment.name], finished.solution.readings
+    """Return an array (S, 1 + 3m) for each custom sensor, by name.
+
+    The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
+    experiment was not fitted or not simulated.
+    """
+    rollout = finished.rollouts[experiment.name]
+    fit = finished.solution.readings
     rolled = rollout.readings if isinstance(rollout, Rollout) else {}
     both = fit.get(experiment.name, {}), rolled
     return {
@@ -239,13 +309,19 @@ def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
 
 
 def _compared(t_s: Array, measured: Array, *models: Array | None) -> Array:
-    """(S, 1 + 3m) times, what is measured, fitted and simulated; NaN where there is none."""
-    there = (np.full_like(measured, np.nan) if each is None else each for each in models)
-    return np.column_stack([t_s, measured, *there])
+    """Return the columns time, measured values and the values of each model, as one array.
+
+    `t_s` is (S,), `measured` and each of `models` (S, m); the columns of a model that is None are
+    NaN.
+    """
+    columns = (np.full_like(measured, np.nan) if each is None else each for each in models)
+    return np.column_stack([t_s, measured, *columns])
 
 
 def _places_m(finished: Answer, experiment: str) -> Array | None:
-    """(M, 3) of the markers as estimated; None where that failed."""
+    """Return the estimated places (M, 3) of the markers on the undeformed body; None where that
+    failed.
+    """
     if experiment in finished.places:
         places = [place.position_m for place in finished.places[experiment].values()]
         return np.array(places).reshape(-1, 3)
@@ -256,7 +332,11 @@ def _places_m(finished: Answer, experiment: str) -> Array | None:
 
 
 def _arrays(seen: Sequence[Replay]) -> dict[str, Array]:
-    """Arrays of trajectory.npz at the samples; a lone fitted experiment has no prefix."""
+    """Return the arrays of trajectory.npz by name.
+
+    The name of the experiment precedes the names of its arrays, except if it is the only fitted
+    one.
+    """
     alone = sum(replay.positions_m is not None for replay in seen) == 1
     arrays = {}
     for replay in seen:

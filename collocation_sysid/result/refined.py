@@ -1,4 +1,8 @@
-"""A finished run and its numerical error: the run's folder gets what `refine` finds."""
+"""Measured discretisation error of a finished run, added to its folder.
+
+`refine_run` solves the problem of a run folder again at finer steps and meshes, and updates
+``result.json``; `refined` does the update alone.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ from ..tree import as_json, read
 from .record import REFINEMENT_FILE
 from .replay import reading_run
 
-# Code of the concern that the budget gives anew.
+# Code of the concern that is derived again from the new budget.
 UNDETERMINED = "information/combined"
 
 
@@ -34,25 +38,40 @@ def refine_run(
     allow_code: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> tuple[Refinement, Result]:
-    """Solve the problem of a run folder again at finer discretisations, and write what that tells.
+    """Solve the problem of a run folder again at finer discretisations, and update the folder.
 
-    ``refinement.json`` holds the levels, and those that it holds already are not solved again. In
-    ``result.json`` the values of parameters and moduli are corrected for the measured error,
-    their combined intervals and the budget contain it, and the verdict takes it into account.
+    ``refinement.json`` holds the levels; levels that it holds already are not solved again. In
+    ``result.json`` the values of parameters and moduli are corrected for the measured error, their
+    combined intervals and the budget contain it, and the verdict takes it into account.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The run folder.
+    levels : int
+        Number of discretisations, with that of the run: 2, or 3 to observe the orders of
+        convergence.
+    allow_code : bool
+        Whether Python files that the problem names may run.
+    say : callable, optional
+        Called with a sentence about what is being done.
 
     Returns
     -------
-    The refinement, and the content of ``result.json``
+    Refinement, Result
+        The measured errors, and the content of ``result.json``.
 
     Raises
     ------
     InputError
-        If the folder holds no converged run of a problem file, or its files are gone.
+        If the folder holds no converged run of a problem file, or files of the problem are missing.
     KeyboardInterrupt
-        Where it was interrupted: the levels that were finished are in the folder.
+        After an interrupt; the levels that were finished are in the folder.
     """
-    run, before = Path(folder), Result.read(folder)
-    file, beside = run / RESULT_FILE, run / REFINEMENT_FILE
+    run = Path(folder)
+    before = Result.read(folder)
+    file = run / RESULT_FILE
+    levels_file = run / REFINEMENT_FILE
     home = before.home(file, "use collocation_sysid.refine")
     if not before.converged:
         raise InputError("the run did not converge: there is no answer to refine", file)
@@ -60,12 +79,12 @@ def refine_run(
     problem = replace(problem, substeps=before.problem.substeps)
     estimates = _at_optimum(before, problem.parameters)
     with reading_run(run):
-        known = _known_levels(beside, estimates)
+        known = _known_levels(levels_file, estimates)
         answer = Earlier.of_result(before, run)
 
     def keep(refinement: Refinement) -> Result:
         after = refined(before, refinement, problem.parameters)
-        with whole_file(beside) as levels, whole_file(file) as draft:
+        with whole_file(levels_file) as levels, whole_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
         return after
@@ -80,11 +99,11 @@ def refined(before: Result, refinement: Refinement, parameters: Parameters) -> R
     Parameters
     ----------
     before : Result
-        Content of ``result.json`` after the solve.
+        Content of ``result.json`` after the solve; not modified.
     refinement : Refinement
         The measured discretisation errors.
     parameters : Parameters
-        Of the problem, with their coordinates and bounds.
+        Parameters of the problem, with their coordinates and bounds.
     """
     optimum = _at_optimum(before, parameters)
 
@@ -104,9 +123,9 @@ def refined(before: Result, refinement: Refinement, parameters: Parameters) -> R
         for name, shares in before.budget.items()
     }
     uncertainties = {name: each.combined_std_error for name, each in after.values.items()}
-    kept = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, UNDETERMINED)]
+    others = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, UNDETERMINED)]
     concerns = (
-        *kept,
+        *others,
         *numerical_concerns(optimum, uncertainties, refinement),
         *combined_concerns(parameters, after.values, budget),
     )
@@ -128,7 +147,18 @@ def _corrected(
     error: NumericalError,
     parameters: Parameters,
 ) -> ReportedEstimate:
-    """Correct an estimate for its measured discretisation error."""
+    """Return an estimate corrected for its measured discretisation error.
+
+    Parameters
+    ----------
+    name : str
+    before : ReportedEstimate
+    optimum : Estimate
+        The estimate at the optimum, before any correction.
+    error : NumericalError
+        The measured discretisation error.
+    parameters : Parameters
+    """
     linear, bounds = parameters.scale_and_bounds(name)
     combined = combine(
         name,
@@ -145,7 +175,15 @@ def _corrected(
 def _shares(
     shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
 ) -> dict[str, float]:
-    """Return the shares of the budget with the measured discretisation error."""
+    """Return the contributions to an estimate's variance with the measured discretisation error.
+
+    Parameters
+    ----------
+    shares : mapping of source to share
+        The contributions before; they sum to one.
+    before, after : ReportedEstimate
+        The estimate with the estimated and with the measured error.
+    """
     if not before.combined_std_error or not after.combined_std_error:
         return dict(shares)
     ratio = (before.combined_std_error / after.combined_std_error) ** 2
@@ -153,13 +191,15 @@ def _shares(
     ratio *= (after.value / before.value) ** 2 if before.value else 1.0
     others = {name: share * ratio for name, share in shares.items() if name != DISCRETISATION}
     total = max(1.0, sum(others.values()))
-    found = {name: share / total for name, share in others.items()}
-    found[DISCRETISATION] = 1.0 - sum(found.values())
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+    corrected = {name: share / total for name, share in others.items()}
+    corrected[DISCRETISATION] = 1.0 - sum(corrected.values())
+    return dict(sorted(corrected.items(), key=lambda item: -item[1]))
 
 
 def _known_levels(file: Path, names: Iterable[str]) -> list[Level]:
-    """The levels that an earlier call has finished."""
+    """Return the levels that an earlier call finished, with the values of `names` alone; empty if
+    none.
+    """
     if not file.is_file():
         return []
     require_own(file)

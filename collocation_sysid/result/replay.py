@@ -1,7 +1,8 @@
-"""One experiment of a run as it is looked at: shapes and markers at its samples.
+"""Motion of one experiment of a run: measured, fitted and simulated shapes and markers.
 
-Pictures, animations and the 3-D view need nothing else, so that they can be made again from the
-arrays of a run folder.
+Pictures, films and the 3-D view need nothing but a `Replay`. It can be read from the arrays of a
+run
+folder (`read_run`), so that they can be drawn again without solving.
 """
 
 from __future__ import annotations
@@ -26,11 +27,13 @@ from ..recording.experiment import Experiment
 from ..runs.result import Result
 
 ARRAYS_FILE = "trajectory.npz"
-# What stands before the number of a wrench, and the names of readings of one's own and of fields.
-WRENCH, GROUPS = "wrench_", {"readings": "reading_", "fields": "field_", "seen": "seen_"}
-# What stands before the name of a reading whose unit it is.
+# Prefix of a wrench array, before its number from 1.
+WRENCH = "wrench_"
+# Prefixes of arrays of the attributes that are mappings, before the name.
+GROUPS = {"readings": "reading_", "fields": "field_", "seen": "seen_"}
+# Prefix of the unit of a custom sensor, before its name.
 UNIT = "unit_"
-# Of the body, and so the same for all experiments of a run.
+# Arrays of the body, the same for all experiments of a run.
 OF_BODY = ("undeformed_m", "tetrahedra", "surface", "surface_parts", "surface_nodes", "part_names")
 # Kind and axes of each array: n nodes, E elements, F triangles, T samples, M markers, k modes,
 # p and o points of lines.
@@ -56,55 +59,80 @@ LAYOUT = {
     "gaps_m": ("f", "TF"),
     "pressures_pa": ("f", "TF"),
 }
-# A plane is shown so many times as long as the body.
+# Side of the square that represents a plane, over the body's largest extent.
 LONGER = 1.4
-# Arrays that may hold NaN or infinity, and the largest length, time or frequency of any.
+# Arrays that may have NaN or infinity.
 GAPS = LAYOUT.keys() - {"undeformed_m", "t_s", "up", "marker_places_m"}
+# Largest magnitude of any number in an array: beyond, squares overflow.
 LARGEST = 1e100
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Measured, fitted and simulated motion of an experiment; T samples, n nodes, M markers.
+    """Measured, fitted and simulated motion of an experiment at T samples of n nodes and M markers.
 
     Attributes
     ----------
     name : str
+        Name of the experiment.
     t_s : (T,)
+        Times of the samples.
     undeformed_m : (n, 3)
-    tetrahedra : (E, 4) corners of the elements
-    surface : (F, 3) boundary triangles, counter-clockwise when seen from outside
-    surface_parts : (F,) number of the part of the body that each belongs to
-    surface_nodes : (F, 3) or (F, 6) nodes of each triangle, those on its sides besides its corners
-    part_names : (P,) str, "" for what no region claims
-    held : (T, n) bool, which nodes are grasped along some axis
-    up : (3,) unit vector against gravity; z where there is none
+        Nodes of the undeformed body.
+    tetrahedra : (E, 4)
+        Corner nodes of the elements.
+    surface : (F, 3)
+        Boundary triangles, counter-clockwise when seen from outside.
+    surface_parts : (F,)
+        Index of the part of the body that each boundary triangle belongs to.
+    surface_nodes : (F, 3) or (F, 6)
+        Nodes of each boundary triangle; of quadratic elements also those on its sides.
+    part_names : (P,) str
+        Names of the parts; "" for elements outside all regions.
+    held : (T, n) bool
+        Whether a node has a prescribed displacement along some axis.
+    up : (3,)
+        Unit vector against gravity; z where there is no gravity.
     marker_names : (M,) str
-    marker_places_m : (M, 3) where the markers sit on the undeformed body, as found
-    given_places_m : (M, 3) the places given, NaN where there was none
-    measured_m : (T, M, 3) NaN where missing
-    positions_m, markers_m : (T, n, 3) and (T, M, 3) as fitted, or None for validation
-    rolled_out_positions_m, rolled_out_m : the same of the simulation with the answer, or None
-    natural_hz : (k,) natural frequencies with the answer, ascending
+    marker_places_m : (M, 3)
+        Estimated places of the markers on the undeformed body.
+    given_places_m : (M, 3)
+        Stated places of the markers, NaN where none was stated.
+    measured_m : (T, M, 3)
+        Measured markers, NaN where missing.
+    positions_m, markers_m : (T, n, 3) and (T, M, 3), or None
+        Fitted nodes and markers; None for a validation experiment.
+    rolled_out_positions_m, rolled_out_m : (T, n, 3) and (T, M, 3), or None
+        Nodes and markers of the forward simulation; None if it failed.
+    natural_hz : (k,), or None
+        Natural frequencies at the estimate, ascending; None if they are unknown.
     wrenches : sequence of (S, 19)
-        Of each sensor of a grasp: time, and six components as measured, as fitted and as rolled
-        out, NaN where there are none.
-    readings : mapping of name to (S, 1 + 3m)
-        The same of readings of one's own, of m numbers each.
+        For each force sensor: time [s], and six components as measured, fitted and simulated; NaN
+        where
+        one of these is missing.
     static : bool
         Whether every sample is an equilibrium of its own.
-    tendons_m : (p, 3) points of the tendons on the undeformed body, a row of NaN after each
-    reading_units : mapping of name to str
-        Units of the readings that state one.
-    obstacles_m : (T, o, 3) points of the obstacles' outlines, NaN after each line
+    tendons_m : (p, 3), or None
+        Points of the tendons on the undeformed body, a row of NaN after each tendon.
+    readings : mapping of name to (S, 1 + 3m)
+        For each custom sensor: time [s], and its m numbers as measured, fitted and simulated.
+    obstacles_m : (T, o, 3), or None
+        Points of the obstacles' outlines, NaN after each line.
+    gaps_m, pressures_pa : (T, F), or None
+        Gap and contact pressure on the fitted or else simulated surface; None without obstacles.
     fields : mapping of name to (E, 4)
-        Constants that differ from place to place: value, the ends of its interval, and its
-        deviation over the prior's, NaN where another region is.
+        For each spatially varying constant: the estimate, the ends of its 95 % interval, and its
+        posterior over its prior standard deviation; NaN in elements of other regions.
     seen : mapping of name to (k, 8)
-        Of each depth camera points: when they were seen [s], u, v and depth [m] in the image, how
-        far behind the surface [m], NaN of those that do not count, and where in the world [m]. Of
-        some samples then when, u and v of outlines of faces, each ended by NaN, and NaN else.
-    gaps_m, pressures_pa : (T, F) of the surface as fitted, or simulated, where there are obstacles
+        For each depth camera, rows of points: time [s], image coordinates u and v, depth [m],
+        distance
+        behind the surface [m] (NaN for points that do not count), and position in the world [m].
+        For
+        some samples, rows of outlines follow: time, u, v, and NaN else; a row without u and v ends
+        each
+        face.
+    reading_units : mapping of name to str
+        Units of the custom sensors that state one.
     """
 
     name: str
@@ -149,13 +177,25 @@ class Replay:
         readings: Mapping[str, Array] | None = None,
         touched: tuple[Array, Array] | None = None,
     ) -> Replay:
-        """Gather an experiment with (positions, markers) as fitted, and as simulated.
+        """Gather the motion of an experiment.
 
-        Its markers are at `places_m` (M, 3), where they were estimated; gaps and pressures of its
-        surface are `touched`.
+        Parameters
+        ----------
+        experiment : Experiment
+        fitted, rolled_out : ((T, n, 3), (T, M, 3)), optional
+            Positions of nodes and markers [m], of the fit and of the forward simulation.
+        natural_hz : (k,), optional
+        places_m : (M, 3), optional
+            Estimated places of the markers; the stated ones by default.
+        wrenches, readings
+            See the attributes.
+        touched : ((T, F), (T, F)), optional
+            Gap [m] and pressure [Pa] on the surface.
         """
-        body, markers = experiment.body, experiment.markers
-        given_m, nodes_m = markers.observe(body.nodes_m), body.nodes.points_m
+        body = experiment.body
+        markers = experiment.markers
+        stated_m = markers.observe(body.nodes_m)
+        nodes_m = body.nodes.points_m
         # Frames of obstacles are left out: experiments of a run have one body, but not as many.
         fitted, rolled_out = (
             each and (each[0][:, : len(nodes_m)], each[1]) for each in (fitted, rolled_out)
@@ -172,8 +212,8 @@ class Replay:
             np.asarray(experiment.held(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
             experiment.up,
             markers.names,
-            given_m if places_m is None else places_m,
-            np.where(markers.located[:, None], given_m, np.nan),
+            stated_m if places_m is None else places_m,
+            np.where(markers.located[:, None], stated_m, np.nan),
             markers.positions_m,
             *(fitted or (None, None)),
             *(rolled_out or (None, None)),
@@ -189,29 +229,40 @@ class Replay:
 
     @property
     def shapes_m(self) -> Array | None:
-        """(T, n, 3) positions to show where there is room for one: fitted, else simulated."""
+        """Fitted node positions (T, n, 3), else the simulated ones; None if neither exists."""
         return self.positions_m if self.positions_m is not None else self.rolled_out_positions_m
 
     def seen_m(self, t: int) -> Array:
-        """(P, 3) points that depth cameras saw nearest to sample `t`, within half a step of it."""
-        near_s = float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
-        found = [np.zeros((0, 3))]
+        """Return the points (P, 3) [m] of all depth cameras at the time of the sample with index
+        `t`.
+
+        Of each camera, the image nearest in time counts if it is at most half a timestep away;
+        without one
+        the camera adds no points.
+        """
+        tolerance_s = float(np.diff(self.t_s).max(initial=0.0)) / 2 + TIME_TOLERANCE_S
+        nearest = [np.zeros((0, 3))]
         for rows in self.seen.values():
             points = rows[np.isfinite(rows[:, 4])]
             times = np.unique(points[:, 0])
-            apart_s = np.abs(times - self.t_s[t])
-            if apart_s.min(initial=np.inf) <= near_s:
-                found.append(points[points[:, 0] == times[apart_s.argmin()], 5:])
-        return np.concatenate(found)
+            differences_s = np.abs(times - self.t_s[t])
+            if differences_s.min(initial=np.inf) <= tolerance_s:
+                nearest.append(points[points[:, 0] == times[differences_s.argmin()], 5:])
+        return np.concatenate(nearest)
 
     @property
     def has_shapes(self) -> bool:
-        """Whether there is a sample with all of them."""
+        """Whether at least one sample has finite positions of all nodes."""
         shapes_m = self.shapes_m
         return shapes_m is not None and bool(np.isfinite(shapes_m).all(axis=(1, 2)).any())
 
     def arrays(self, prefix: str = "") -> dict[str, Array]:
-        """Arrays for a file; those of the body without the prefix, and some as single numbers."""
+        """Return the arrays to store in a file, by name; attributes that are None are left out.
+
+        The names begin with `prefix`, except those of the body, which all experiments of a run
+        share.
+        Simulated positions are rounded to single precision.
+        """
         stored: dict[str, Any] = {key: getattr(self, key) for key in LAYOUT}
         stored |= {
             k: stored[k].astype(np.int32) for k, (kinds, _) in LAYOUT.items() if "i" in kinds
@@ -230,12 +281,14 @@ class Replay:
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Any]) -> Replay:
-        """Take an experiment out of a run's arrays.
+        """Return the experiment called `name` from the arrays of a run, see `Replay.arrays`.
 
         Raises
         ------
         KeyError
-            If an array is missing.
+            If a required array is missing.
+        ValueError
+            If sizes, types or values of the arrays are not consistent.
         """
         prefix = f"{name}/" if f"{name}/t_s" in arrays else ""
         own = {key: key if key in OF_BODY else prefix + key for key in LAYOUT}
@@ -246,8 +299,12 @@ class Replay:
         keys = (f"{prefix}{WRENCH}{k}" for k in count(1))
         stored["wrenches"] = [arrays[key] for key in takewhile(arrays.__contains__, keys)]
         for group, front in GROUPS.items():
-            said = f"{prefix}{front}"
-            stored[group] = {k.removeprefix(said): arrays[k] for k in arrays if k.startswith(said)}
+            group_prefix = f"{prefix}{front}"
+            stored[group] = {
+                k.removeprefix(group_prefix): arrays[k]
+                for k in arrays
+                if k.startswith(group_prefix)
+            }
         stored["reading_units"] = {
             name: str(arrays[at])
             for name in stored["readings"]
@@ -257,36 +314,53 @@ class Replay:
         _require_shapes(stored)
         stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
         stored["part_names"] = [str(part) for part in arrays["part_names"]]
-        numbers = stored["surface_parts"]
+        parts = stored["surface_parts"]
         if len(stored["marker_names"]) != len(stored["marker_places_m"]):
             raise ValueError(f"{len(stored['marker_names'])} marker_names")
-        if numbers.min() < 0 or numbers.max() >= len(stored["part_names"]):
+        if parts.min() < 0 or parts.max() >= len(stored["part_names"]):
             raise ValueError("surface_parts names parts that are not there")
         return cls(name=name, **stored)
 
 
 def _outlines(experiment: Experiment) -> Array | None:
-    """(T, o, 3) outlines of the obstacles where they are stated; None where there are none."""
-    body, found = experiment.body.nodes.points_m, []
+    """Return the outlines of the obstacles at their stated poses, (T, o, 3) [m]; None without
+    obstacles.
+    """
+    body = experiment.body.nodes.points_m
+    outlines = []
     for obstacle in experiment.obstacles:
-        low, high = body.min(axis=0), body.max(axis=0)
+        low = body.min(axis=0)
+        high = body.max(axis=0)
         size_m = LONGER * float((high - low).max())
         outline = _apart(obstacle.shape.outline((low + high) / 2, size_m))
         assert outline is not None
-        turns, shifts = obstacle.poses.at(experiment.t_s)
-        found.append(np.einsum("tij,kj->tki", turns, outline) + shifts[:, None])
-    return np.concatenate(found, axis=1) if found else None
+        rotations, shifts = obstacle.poses.at(experiment.t_s)
+        outlines.append(np.einsum("tij,kj->tki", rotations, outline) + shifts[:, None])
+    return np.concatenate(outlines, axis=1) if outlines else None
 
 
 def _apart(lines_m: Sequence[Array]) -> Array | None:
-    """Polylines (P, 3) in one (p, 3), a row of NaN after each; None where there are none."""
+    """Join polylines (P, 3) into one array (p, 3), NaN after each; None without lines."""
     if not lines_m:
         return None
     return np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in lines_m])
 
 
 def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:
-    """Corners of each face (F, 3), and of quadratic cells (F, 10) the nodes on its sides too."""
+    """Return the nodes of each boundary face: its corners and, for quadratic cells, those on its
+    sides.
+
+    Parameters
+    ----------
+    cells : (F, 4) or (F, 10)
+        Nodes of the cell below each face.
+    faces : (F, 3)
+        Corner nodes of the faces.
+
+    Returns
+    -------
+    (F, 3) or (F, 6) array
+    """
     if cells.shape[1] != 10:
         return faces
     ends = cells[:, np.array(EDGES)]  # (F, 6, 2)
@@ -295,17 +369,19 @@ def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> ND
 
 
 def _require_shapes(arrays: Mapping[str, Any]) -> None:
-    """Refuse arrays whose sizes do not go together, or that hold what pictures cannot show."""
+    """Refuse arrays of a file whose sizes, types or values are inconsistent, by a ValueError."""
     sizes: dict[str, int] = {}
     for key, (kinds, letters) in LAYOUT.items():
         if (array := arrays.get(key)) is None:
             continue
-        wanted = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
+        expected = [int(x) if x.isdigit() else sizes.get(x) for x in letters]
         here = array.shape
         empty = any(not size for x, size in zip(letters, here, strict=False) if x not in "Mk")
         if array.dtype.kind not in kinds or array.ndim != len(letters) or empty:
             raise ValueError(f"{key} is {array.dtype} of shape {here}")
-        if any(size not in (None, found) for size, found in zip(wanted, here, strict=True)):
+        if any(
+            size not in (None, size_here) for size, size_here in zip(expected, here, strict=True)
+        ):
             raise ValueError(f"{key} has shape {here}, which does not go with the others")
         sizes |= {x: size for x, size in zip(letters, here, strict=True) if not x.isdigit()}
         if kinds == "f" and not (key in GAPS or np.isfinite(array).all()):
@@ -330,16 +406,17 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
 
 
 def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:
-    """Read the content of result.json, and all experiments, from a run folder.
+    """Read the result and the motion of all experiments from a run folder.
 
-    The fitted experiments are first, then those for validation that could be simulated.
+    The fitted experiments come first, then those for validation that could be simulated.
 
     Raises
     ------
     InputError
-        If it is not a run folder, or one that is damaged.
+        If it is not a run folder, or a damaged one.
     """
-    run, result = Path(folder), Result.read(folder)
+    run = Path(folder)
+    result = Result.read(folder)
     rolled = result.rollout.experiments
     predicted = [n for n, r in rolled.items() if not r.fitted and r.failed is None]
     with reading_run(run):
@@ -349,23 +426,27 @@ def read_run(folder: str | Path) -> tuple[Result, list[Replay]]:
 
 
 def headline(result: Result) -> str:
-    """Return Young's moduli with their combined uncertainties, and the verdict, in one line."""
+    """Return Young's moduli with their combined standard uncertainties, and the verdict, in one
+    line.
+    """
     moduli = {symbol_of(n): each for n, each in result.values.items() if bare(n) == "young_pa"}
-    said = []
+    sentences = []
     for name, each in moduli.items():
         deviation = each.combined_std_error
         bar = f" ± {float(format(deviation, '.2g')):g}" if deviation else ""
-        said.append(f"{name} = {each.value:.5g}{bar} Pa")
-    return "; ".join([*said, f"verdict: {result.trust.verdict}"])
+        sentences.append(f"{name} = {each.value:.5g}{bar} Pa")
+    return "; ".join([*sentences, f"verdict: {result.trust.verdict}"])
 
 
 def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a run folder.
+    """Return the arrays of a run folder by name.
 
     Raises
     ------
     InputError
-        If there are none.
+        If the folder has no file of arrays.
+    ValueError
+        If the file is damaged.
     """
     file = run / ARRAYS_FILE
     require_own(file)
@@ -379,5 +460,5 @@ def read_arrays(run: Path) -> dict[str, NDArray[Any]]:
 
 
 def reading_run(run: Path) -> AbstractContextManager[None]:
-    """Within this, whatever the files of a run make go wrong is a refusal of the run."""
+    """Return a context that turns errors from damaged files of a run into an InputError."""
     return damage_refused(run, f"{RESULT_FILE} or {ARRAYS_FILE}", "solve the problem again")

@@ -1,4 +1,8 @@
-"""Reports as files, self-contained HTML pages or Markdown; and that of a comparison of methods."""
+"""Reports as self-contained HTML pages or Markdown, and the report of a folder of compare or sweep.
+
+The content of a report is a `Section`: `comparison_report` makes one from a study's folder,
+`run_sections.run_report` one from a run folder.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +38,22 @@ CAPTIONS = {
 
 @dataclass(frozen=True)
 class StudySummary:
-    """What the page needs of ``summary.json``."""
+    """Content of ``summary.json`` that the report of a study needs.
+
+    Attributes
+    ----------
+    title : str
+    problem : str
+        Name of the problem.
+    headline : tuple of str
+        Sentences with the main results.
+    runs : tuple of mapping
+        One record for each finished run.
+    notes : tuple of str
+    tables : tuple of Table
+    failures : tuple of str
+        One sentence for each run that ended without a result.
+    """
 
     title: str
     problem: str
@@ -46,12 +65,12 @@ class StudySummary:
 
 
 def comparison_report(folder: str | Path) -> Section:
-    """What there is to say of a study's folder.
+    """Return the report of a folder that compare or sweep wrote.
 
     Raises
     ------
     InputError
-        If it is not such a folder, or damaged.
+        If the folder has no ``summary.json``, or a damaged one.
     """
     folder = Path(folder)
     content = read_json(folder / SUMMARY_FILE, "a folder of compare or sweep")
@@ -74,12 +93,12 @@ def comparison_report(folder: str | Path) -> Section:
 
 
 def as_file(report: Section, file: Path) -> str:
-    """The content of a file: Markdown for ``.md``, else a page."""
+    """Return the text of a report for a file: Markdown if its name ends in ``.md``, else HTML."""
     return as_markdown([report]) if file.suffix == ".md" else as_page(report)
 
 
 def as_page(report: Section) -> str:
-    """One web page with its pictures inside."""
+    """Return a report as the HTML text of one page that contains its pictures."""
     page = files("collocation_sysid.result").joinpath("report.html").read_text("utf-8")
     # A text cannot hold these places, since "<" is escaped.
     page = page.replace("<!--TITLE-->", escape(report.title))

@@ -1,4 +1,8 @@
-"""A run described once, from its result: for a terminal, and with what is beside it for a page."""
+"""Description of a run in words and tables, for the terminal and for an HTML page.
+
+`summary` is the text after a solve; `run_report` describes a run folder completely, with pictures.
+Both are made from the content of ``result.json``.
+"""
 
 from __future__ import annotations
 
@@ -43,11 +47,18 @@ MEANINGS = {
     "check": "usable after a look at the reasons",
     "doubtful": "something is wrong with the data, the model or the solve",
 }
-# Largest errors shown, and how far apart in samples they are at least: neighbours tell the same.
-WORST, APART = 8, 5
+# Number of largest errors shown.
+WORST = 8
+# Samples between two shown errors of a marker: neighbouring errors have the same cause.
+APART = 5
+# Markers whose residuals are diagnosed in the summary.
 SHOWN_DIAGNOSES = 2
-# Of the budget: estimates and sources; the page has all above a share.
-SHOWN_BUDGETS, SHOWN_SOURCES, LITTLE = 3, 3, 0.01
+# Estimates whose main sources of uncertainty are named.
+SHOWN_BUDGETS = 3
+# Sources named for each of these estimates.
+SHOWN_SOURCES = 3
+# Smallest share of a variance that is shown.
+LITTLE = 0.01
 # Ratio of combined to statistical standard uncertainty beyond which the sources are named.
 MOSTLY_SYSTEMATIC = 1.5
 
@@ -80,7 +91,16 @@ COMPARED = ("tracks", "wrench", "reading", "depth")
 
 
 def summary(result: Result, folder: Path | None = None, budget: bool = False) -> list[Shown]:
-    """A run on one screen, with all of its budget where that is asked for, and its folder."""
+    """Return the description of a run that fits on one screen.
+
+    Parameters
+    ----------
+    result : Result
+    folder : Path, optional
+        The run folder, which the last line names.
+    budget : bool
+        Whether to add the complete table of contributions to each variance.
+    """
     largest = sorted(result.residuals, key=lambda each: -each.rms_m)[:SHOWN_DIAGNOSES]
     ended = [f"residuals: {each.sentence}" for each in largest]
     sections = (_ended(result), *answer(result), _fit(result), _notes(result))
@@ -90,18 +110,21 @@ def summary(result: Result, folder: Path | None = None, budget: bool = False) ->
 
 
 def answer(result: Result) -> list[Shown]:
-    """Verdict, values, intervals and what these hold."""
-    verdict = verdict_of(result.trust), *how_to(result.trust.concerns)
-    return [*flat([*verdict, *_harder(result), _parameters(result)])]
+    """Return the verdict, the recommended remedies, and the table of parameters with their
+    intervals.
+    """
+    sections = [verdict_of(result.trust), *how_to(result.trust.concerns)]
+    sections += [*_harder(result), _parameters(result)]
+    return [*flat(sections)]
 
 
 def run_report(run: str | Path) -> Section:
-    """What there is to say of a run folder.
+    """Return the complete report of a run folder, with its pictures.
 
     Raises
     ------
     InputError
-        If it is not a run folder, or damaged.
+        If it is not a run folder, or a damaged one.
     """
     run = Path(run)
     result = Result.read(run)
@@ -129,15 +152,17 @@ def run_report(run: str | Path) -> Section:
             Section("Pictures", tuple(pictures[1:])),
             Section("Problem and provenance", tuple(_provenance(result, run))),
         ]
-        there = (each for each in parts if not isinstance(each, Section) or each.parts)
-        return Section(result.title or "Run", tuple(there), level=1)
+        shown = (each for each in parts if not isinstance(each, Section) or each.parts)
+        return Section(result.title or "Run", tuple(shown), level=1)
 
 
 # What terminal and page show ----------------------------------------------------------------------
 
 
 def _ended(result: Result) -> Section:
-    """How the solve ended, and where it failed."""
+    """Return how the solve ended, with the largest violations of the equations of motion if it
+    failed.
+    """
     parts: list[Shown] = [Line(result.message, result.trust.verdict)]
     if not result.converged:
         parts.append("Largest violations of the equations of motion:")
@@ -146,29 +171,40 @@ def _ended(result: Result) -> Section:
 
 
 def verdict_of(trust: Trust, linked: bool = False, most: int | None = None) -> Section:
-    """In one word, with the reasons or the gravest of them, linked to their cures on a page."""
+    """Return the verdict in one word, with its reasons.
+
+    Parameters
+    ----------
+    trust : Trust
+    linked : bool
+        Whether each reason links to its remedy on the same page.
+    most : int, optional
+        The largest number of reasons to list, gravest first; all by default.
+    """
     verdict = trust.verdict
     lines = [Line(f"Verdict: {verdict}", f"strong {verdict}")]
     for concern in trust.concerns[:most]:
         cure = Span(" (what to do)", to=f"#cure-{concern.topic}")
-        said = (Span(f"  {concern.sentence}"), *[cure] * linked)
-        lines.append(Line(said, verdict))
+        spans = (Span(f"  {concern.sentence}"), *[cure] * linked)
+        lines.append(Line(spans, verdict))
     return Section("", tuple(lines), style=f"verdict {verdict}")
 
 
 def _harder(result: Result) -> list[Line]:
-    """Return the recommendation of a deeper check, where it is worthwhile."""
+    """Return the recommendation of a deeper check where it is worthwhile, else an empty list."""
     return [Line(DEEPER, "quiet")] if is_deeper_check_worthwhile(result) else []
 
 
 def how_to(concerns: Iterable[Concern]) -> list[Line]:
-    """Return the command that shows how to cure what gives concern, or nothing."""
+    """Return the command that explains the remedies of some concerns; empty without concerns."""
     pages = dict.fromkeys(topic.page for topic in topics_of(concerns).values())
     return [Line(f"what to do: {explain_command(*pages)}", "quiet")] if pages else []
 
 
 def _parameters(result: Result) -> Section:
-    """Corrected values with their combined and statistical uncertainties, and how to read them."""
+    """Return the table of corrected values with combined and statistical uncertainties, and remarks
+    on it.
+    """
     values = result.values
     rows = tuple((with_unit(name), *_cells(result, name)) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
@@ -198,7 +234,11 @@ def _parameters(result: Result) -> Section:
 
 
 def _not_determined(result: Result) -> list[str]:
-    """Name the estimates with intervals wider than their values, and the largest contributions."""
+    """Return a sentence that names the estimates whose interval is wider than their value.
+
+    The largest contribution to each variance is named too; the list is empty if there is no such
+    estimate.
+    """
     sources = []
     for name, shares in result.budget.items():
         if name in result.values and not result.values[name].is_determined:
@@ -210,18 +250,24 @@ def _not_determined(result: Result) -> list[str]:
 
 
 def _covered(result: Result) -> str:
-    """Return what the combined intervals contain, and which discretisation error they do not."""
+    """Return what the combined intervals contain, and which discretisation error they do not
+    contain.
+    """
     moving = any(not each.static for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",)
     covered = [f"the {kind}" for kind in kinds if kind in result.covers]
-    left = [f"the {kind}" for kind in kinds if kind not in result.covers]
+    missing = [f"the {kind}" for kind in kinds if kind not in result.covers]
     parts = listed(["noise", *covered, "systematic effects"])
-    said = f"± (standard uncertainty) and intervals combine {parts}"
-    return said + (f", not {listed(left)}: see refine" if left else "")
+    sentence = f"± (standard uncertainty) and intervals combine {parts}"
+    return sentence + (f", not {listed(missing)}: see refine" if missing else "")
 
 
 def _largest_contributions(result: Result) -> list[str]:
-    """Name the main sources of the estimates whose uncertainty is mostly systematic."""
+    """Return the main sources of uncertainty of the estimates whose uncertainty is mostly
+    systematic.
+
+    There is one sentence for each of at most `SHOWN_BUDGETS` estimates, the most systematic first.
+    """
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
         for name, each in result.values.items()
@@ -239,7 +285,7 @@ def _largest_contributions(result: Result) -> list[str]:
 
 
 def budget_table(result: Result) -> Table:
-    """What the variance of each estimate is made of, in percent."""
+    """Return the table of contributions to the variance of each estimate, in percent."""
     lines = result.budget
     shown = largest_first(lines, LITTLE)
     rows = [(worded(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values())) for s in shown]
@@ -247,7 +293,7 @@ def budget_table(result: Result) -> Table:
 
 
 def _cells(result: Result, name: str) -> tuple[str, ...]:
-    """Return the row of an estimate: value, uncertainties, guess, and a remark."""
+    """Return the table row of an estimate: value, uncertainties, interval, guess, and a remark."""
     each = result.values[name]
     interval = _interval(each.combined95)
     remark = each.reason or ""
@@ -270,12 +316,14 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
 
 
 def _spread(deviation: float | None) -> str:
+    """Return a standard deviation as text; "" if it is None, that is unknown."""
     return "" if deviation is None else short(deviation)
 
 
 def refinement_table(result: Result) -> Table:
-    """Return what step and mesh change, and the corrected values with combined intervals."""
-    halved = ("half the step", "order", "half the edges", "order")
+    """Return the table of measured discretisation errors, with corrected values and combined
+    intervals.
+    """
     rows = []
     for name, error in result.numerical_errors.items():
         each = result.values[name]
@@ -290,21 +338,31 @@ def refinement_table(result: Result) -> Table:
                 _interval(each.combined95),
             )
         )
-    return Table("", ("", *halved, "corrected", "95 % interval"), tuple(rows))
+    return Table(
+        "",
+        ("", "half the step", "order", "half the edges", "order", "corrected", "95 % interval"),
+        tuple(rows),
+    )
 
 
 def _interval(ends: tuple[float, float] | None) -> str:
+    """Return the ends of an interval as text; "" for None."""
     return "" if ends is None else "{:.5g} … {:.5g}".format(*ends)
 
 
 def _fit(result: Result) -> Section:
-    """How well the markers and the equations are met, how long that took, and what is beside."""
-    fit, experiments = result.fit, result.fit.experiments
+    """Return the misfit of measurements and equations, the predictions, the time taken, and side
+    results.
+    """
+    fit = result.fit
+    experiments = result.fit.experiments
     marked = any(each.samples for each in experiments.values())
     markers = f"markers: {_mm(fit.rms_m)} mm RMS, {_mm(fit.noise_rms_m)} mm from noise alone; "
-    violated = result.dynamics.max_violation_n, result.dynamics.max_violation_relative
-    dynamics = "equations of motion violated by at most {:.1e} N ({:.1e} of the largest force)"
-    lines = [markers * marked + dynamics.format(*violated)]
+    dynamics = (
+        f"equations of motion violated by at most {result.dynamics.max_violation_n:.1e} N "
+        f"({result.dynamics.max_violation_relative:.1e} of the largest force)"
+    )
+    lines = [markers * marked + dynamics]
     for name, each in experiments.items():
         if sizes := _forces(each.wrench_rms_n, each.wrench_rms_nm):
             sigma = _forces(each.wrench_sigma_n, each.wrench_sigma_nm)
@@ -314,11 +372,11 @@ def _fit(result: Result) -> Section:
             sigma = short((each.reading_sigma or {})[reading])
             lines.append(f"{reading} of '{name}': {short(rms)}{unit} RMS (sigma {sigma}{unit})")
         unit = "J in the modelled part" if name in (fit.symmetry or {}) else "J"
-        for obstacle, rubbed in (each.friction or {}).items():
-            energy = f"{short(rubbed.dissipated_j)} {unit}"
+        for obstacle, friction in (each.friction or {}).items():
+            energy = f"{short(friction.dissipated_j)} {unit}"
             lines.append(
-                f"friction of {obstacle} in '{name}': at most {rubbed.used:.0%} of its limit, "
-                f"slips {rubbed.slipping:.0%} of the time, takes {energy}"
+                f"friction of {obstacle} in '{name}': at most {friction.used:.0%} of its limit, "
+                f"slips {friction.slipping:.0%} of the time, takes {energy}"
             )
         for camera, error in (each.depth or {}).items():
             lines.append(f"depth of {camera} in '{name}': {_depth(error)}")
@@ -344,7 +402,7 @@ def _elapsed(elapsed: Elapsed) -> str:
 
 
 def _iterations(result: Result) -> str:
-    """Return the number of iterations, and what of the search was spent on them."""
+    """Return the number of iterations, and how much time of the search they took."""
     timing = result.timing_s
     return (
         f"{result.iterations} iterations in {timing.total:.1f} s of the search "
@@ -353,7 +411,18 @@ def _iterations(result: Result) -> str:
 
 
 def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
-    """Yield how far a forward simulation is from the measurements, beside its yardsticks."""
+    """Yield lines on how far a forward simulation is from the measurements.
+
+    For a validation experiment, the errors of a blind prediction and of copied measurements follow
+    for
+    comparison.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    simulated : SimulatedExperiment
+    """
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:
         yield f"{kind} '{name}': failed: {simulated.failed}"
@@ -383,23 +452,23 @@ def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
 def _errors(error: PredictionError, units: Mapping[str, str] | None) -> str:
     """Return the errors of a prediction in words; "" if nothing is compared.
 
-    `units` are those of readings, by name.
+    `units` are the units of custom sensors by name; None if none states a unit.
     """
-    said = []
+    texts = []
     if error.rms_m:  # none without markers
-        said.append(f"{_mm(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
+        texts.append(f"{_mm(error.rms_m)} mm RMS, at most {1e3 * (error.max_m or 0.0):.2f} mm")
     if forces := _forces(error.wrench_rms_n, error.wrench_rms_nm):
-        said.append(f"{forces} RMS")
-    said += [
+        texts.append(f"{forces} RMS")
+    texts += [
         f"{reading} {rms:.2g}{_unit(units, reading)} RMS"
         for reading, rms in (error.reading_rms or {}).items()
     ]
-    said += [f"depth of {camera} {_depth(each)}" for camera, each in (error.depth or {}).items()]
-    return "; ".join(said)
+    texts += [f"depth of {camera} {_depth(each)}" for camera, each in (error.depth or {}).items()]
+    return "; ".join(texts)
 
 
 def _unit(units: Mapping[str, str] | None, reading: str) -> str:
-    """Return the unit of a reading behind a space; empty where none is stated."""
+    """Return the unit of a custom sensor after a space; "" if it states none."""
     unit = (units or {}).get(reading, "")
     return f" {unit}" if unit else ""
 
@@ -408,26 +477,30 @@ def _depth(error: DepthError) -> str:
     """Return the distances of a depth camera's points from the surface, in words."""
     if error.rms_m is None:
         return "has no point near the body"
-    said = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
+    sentence = f"{1e3 * error.rms_m:.3g} mm RMS of {error.points} points"
     if not error.share_beyond_gate:
-        return f"{said}, all within the gate of {1e3 * error.gate_m:.3g} mm"
-    beyond = f"{said}, {error.share_beyond_gate:.0%} beyond the gate of {1e3 * error.gate_m:.3g} mm"
+        return f"{sentence}, all within the gate of {1e3 * error.gate_m:.3g} mm"
+    beyond = (
+        f"{sentence}, {error.share_beyond_gate:.0%} beyond the gate of {1e3 * error.gate_m:.3g} mm"
+    )
     if error.rms_within_gate_m is None:
         return beyond
     return f"{beyond}, the others {1e3 * error.rms_within_gate_m:.3g} mm RMS"
 
 
 def _mm(metres: float) -> str:
+    """Return a length [m] as text in millimetres, without the unit."""
     return f"{1e3 * metres:.3f}"
 
 
 def _forces(*sizes: float | None) -> str:
-    """Force and torque in words, "" where none is measured."""
+    """Return a force [N] and a torque [N m] in words; "" if neither is measured (None or zero)."""
     pairs = zip(sizes, ("N", "N m"), strict=True)
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 
 
 def _notes(result: Result) -> Section:
+    """Return the notes of a run as a section."""
     return Section("Notes", tuple(f"note: {note}" for note in result.notes))
 
 
@@ -435,8 +508,10 @@ def _notes(result: Result) -> Section:
 
 
 def _cards(result: Result) -> Cards:
-    """The three numbers that matter: stiffness, misfit, and how well the answer repeats it."""
-    values, fit, simulated = result.values, result.fit, result.rollout
+    """Return the three main numbers: stiffness, misfit, and misfit of the forward simulation."""
+    values = result.values
+    fit = result.fit
+    simulated = result.rollout
     name = next((key for key in FOREMOST if key in values), next(iter(values)))
     interval = values[name].combined95
     value = f"{number(values[name].value, 4)} {unit_of(name)}"
@@ -453,6 +528,7 @@ def _cards(result: Result) -> Cards:
 
 
 def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
+    """Yield a line for each topic of the concerns: meaning, remedy, and documentation."""
     for name, topic in topics_of(concerns).items():
         about = Span(f"{topic.about}.", "strong")
         command = Span(explain_command(topic.page), "code")
@@ -463,6 +539,9 @@ def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
 
 
 def _error_bars(result: Result) -> Iterator[Shown]:
+    """Yield the number of residuals behind the error bars, their noise level, and the variance
+    table.
+    """
     if (known := result.uncertainty) is not None:
         yield (
             f"Error bars for {known.errors} errors, noise {known.noise}; reduced χ² "
@@ -473,8 +552,8 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 
 
 def _places(result: Result) -> Iterator[Section]:
-    """By experiment the places of the markers in millimetres."""
-    said = (
+    """Yield for each experiment a table of the estimated places of its markers [mm]."""
+    explanation = (
         "On the undeformed body, in millimetres, each with its standard error. Those that were not "
         "given have a prior as wide as the body."
     )
@@ -491,12 +570,14 @@ def _places(result: Result) -> Iterator[Section]:
         if rows:
             table = Table("", heads, tuple(rows), texts=1)
             title = f"Places of the markers of '{experiment}'"
-            yield Section(title, (Line(said, "quiet"), table))
+            yield Section(title, (Line(explanation, "quiet"), table))
 
 
 def _nuisance(result: Result) -> Iterator[Section]:
-    """By experiment its other nuisance parameters in units for people."""
-    said = "Of this recording alone, estimated beside the parameters with a prior about zero."
+    """Yield for each experiment a table of its other nuisance parameters, in mm, ms or degrees."""
+    explanation = (
+        "Of this recording alone, estimated beside the parameters with a prior about zero."
+    )
     for experiment, named in result.nuisance.items():
         rows = []
         for label, each in named.items():
@@ -507,11 +588,11 @@ def _nuisance(result: Result) -> Iterator[Section]:
         title = f"Nuisance parameters of '{experiment}'"
         is_part = experiment in (result.fit.symmetry or {})
         loads = " Forces are those of the modelled part." if is_part else ""
-        yield Section(title, (Line(said + loads, "quiet"), table))
+        yield Section(title, (Line(explanation + loads, "quiet"), table))
 
 
 def _residuals(result: Result, run: Path) -> Iterator[Shown]:
-    """What each marker's residuals suggest, and the largest errors."""
+    """Yield a table of what each marker's residuals suggest, and a table of the largest errors."""
     if result.residuals:
         rows = tuple(
             (
@@ -529,12 +610,24 @@ def _residuals(result: Result, run: Path) -> Iterator[Shown]:
 
 
 def _worst_errors(run: Path) -> list[tuple[float, float, str]]:
-    """The largest residuals [m], with time and marker."""
-    arrays, worst = read_arrays(run), []
+    """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
+    first.
+
+    Of each marker, two listed errors are more than `APART` samples apart.
+
+    Raises
+    ------
+    ValueError
+        If an array of residuals does not have the size of its times and markers.
+    """
+    arrays = read_arrays(run)
+    worst = []
     for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):
         prefix = key.removesuffix("residuals_m")
-        t_s, markers = arrays[f"{prefix}t_s"], arrays[f"{prefix}marker_names"]
-        shape, residuals_m = (len(t_s), len(markers), 3), arrays[key]
+        t_s = arrays[f"{prefix}t_s"]
+        markers = arrays[f"{prefix}marker_names"]
+        shape = (len(t_s), len(markers), 3)
+        residuals_m = arrays[key]
         largest = float(np.nanmax(np.abs(residuals_m), initial=0.0))
         if residuals_m.shape != shape or largest > LARGEST:
             raise ValueError(f"{key} does not go with its times and markers")
@@ -549,7 +642,12 @@ def _worst_errors(run: Path) -> list[tuple[float, float, str]]:
 
 
 def _pictures(run: Path) -> list[Picture]:
-    """Every PNG of the folder: first one of measurement and fit, then those known here."""
+    """Return every PNG picture of the folder with its caption.
+
+    A picture that compares measurement and fit is first; then follow the pictures known to
+    `CAPTIONS`
+    in that order, and unknown ones.
+    """
     order = [*CAPTIONS, ""]
     pictures: list[Picture] = []
 
@@ -566,16 +664,19 @@ def _pictures(run: Path) -> list[Picture]:
 
 
 def _provenance(result: Result, run: Path) -> Iterator[Shown]:
+    """Yield a table of the problem and software versions, and the problem file as it was run."""
     rows = content(result.problem) | content(result.provenance)
-    told = ((key, each if isinstance(each, list) else [each]) for key, each in rows.items())
-    yield Table("", (), tuple((key, ", ".join(map(str, each))) for key, each in told), texts=1)
+    listed_rows = ((key, each if isinstance(each, list) else [each]) for key, each in rows.items())
+    yield Table(
+        "", (), tuple((key, ", ".join(map(str, each))) for key, each in listed_rows), texts=1
+    )
     file = run / "problem.toml"
     if is_own(run, file):
         yield Listing("The problem file as run", file.read_text(encoding="utf-8"))
 
 
 def _size(value: float | None, unit: str) -> str:
-    """A number in the unit that suits it: millimetres, milliseconds or degrees."""
+    """Return a value in a suitable unit, such as millimetres for `unit` "m"; "–" for None."""
     factor, shown = in_unit_for_people(1.0, unit)
     # No powers of ten for the sizes of bodies.
     digits = 2 if value is None or abs(factor * value) < 99.5 else 4

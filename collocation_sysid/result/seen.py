@@ -1,4 +1,8 @@
-"""What depth cameras see, as pictures and films want it: points, and outlines of the surface."""
+"""Points of depth cameras and outlines of the body's surface, as pictures and films need them.
+
+`compared_rows` is for a fitted or simulated surface, `seen_before` for the undeformed body before
+anything is fitted. Both give the rows of `Replay.seen`.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +22,27 @@ from .pictures.album import of_different_names, save_pictures
 from .pictures.camera import Camera
 from .pictures.depth import depth_picture
 
-# Of so many samples outlines are drawn.
+# Number of samples whose outlines are drawn.
 OUTLINED = 4
-# A scene is looked at from so many times its size.
+# Distance of the viewer from a point cloud, over the size of the body: nearly parallel rays.
 AWAY = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A camera's image or, of a cloud, a view of the body's broad side.
+    """Projection into the image of a depth camera or, for a point cloud, onto the body's broad
+    side.
 
     Attributes
     ----------
     view : View
+        Model of the depth camera.
     skin : Skin
-    phi : (k,) what the camera is off by
+        Visible surface of the body.
+    phi : (k,)
+        Nuisance parameters, of which those of the camera correct its pose, bias and scale.
     scene : Camera
+        Parallel projection for point clouds, which have no image of their own.
     """
 
     view: View
@@ -43,11 +52,32 @@ class Projection:
 
     @classmethod
     def of(cls, view: View, skin: Skin, phi: Array, shape_m: Array, up: Array) -> Projection:
-        """Of a cloud it faces a shape (n, 3)."""
+        """Return the projection whose parallel view faces the broad side of the body.
+
+        Parameters
+        ----------
+        view : View
+        skin : Skin
+        phi : (k,)
+        shape_m : (n, 3)
+            Node positions that define the broad side.
+        up : (3,)
+            Unit vector against gravity.
+        """
         return cls(view, skin, phi, Camera.facing(shape_m[None], up))
 
     def points(self, own_m: Array, world_m: Array) -> Array:
-        """(P, 3) u, v and depth of points (P, 3) in either frame."""
+        """Return image coordinates u, v [pixels] and depth [m] of points, as (P, 3).
+
+        For a point cloud, u and v are millimetres in the parallel view.
+
+        Parameters
+        ----------
+        own_m : (P, 3)
+            Points in the camera's frame.
+        world_m : (P, 3)
+            The same points in the world.
+        """
         camera = self.view.depth.camera
         if camera.matrix is not None:
             return np.column_stack([camera.pixels(own_m), own_m[:, 2]])
@@ -55,54 +85,81 @@ class Projection:
         return np.column_stack([right_top_mm * [1, -1], -self.scene.nearness(world_m)])
 
     def outlines(self, shape_m: Array, sample: int) -> Array:
-        """(k, 2) u and v of what is turned to it of a shape, each face ended by a row of NaN."""
+        """Return u and v (k, 2) of the faces that are turned to the camera; NaN in the row after
+        each face.
+
+        Parameters
+        ----------
+        shape_m : (n, 3)
+            Node positions.
+        sample : int
+            Index of the camera's sample, which defines its pose.
+        """
         eye_m = self.view.eye_m(self.phi, sample)
         if eye_m is None:
             size_m = float(np.linalg.norm(np.ptp(shape_m, axis=0)))
             eye_m = shape_m.mean(axis=0) + AWAY * size_m * self.scene.axes[2]
         corners = shape_m[self.skin.flat[self.skin.facing(shape_m, eye_m)]]
         closed = corners[:, [0, 1, 2, 0]].reshape(-1, 3)
-        own = self.view.own_m(self.phi, closed, sample)
+        own_m = self.view.own_m(self.phi, closed, sample)
         if self.view.depth.camera.matrix is not None:
-            ahead = np.repeat((own[:, 2].reshape(-1, 4) > 0).all(axis=1), 4)
-            closed, own = closed[ahead], own[ahead]
-        seen = self.points(own, closed)[:, :2].reshape(-1, 4, 2)
-        return np.pad(seen, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
+            is_in_front = np.repeat((own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4)
+            closed = closed[is_in_front]
+            own_m = own_m[is_in_front]
+        image = self.points(own_m, closed)[:, :2].reshape(-1, 4, 2)
+        return np.pad(image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
 
     def rows(self, sample: int, points_m: Array, rays: Array, apart_m: Array) -> Array:
-        """(P, 8) of points in the camera's frame, see `Replay.seen`."""
+        """Return rows (P, 8) of `Replay.seen` for the points of one sample.
+
+        Parameters
+        ----------
+        sample : int
+            Index of the camera's sample.
+        points_m, rays : (P, 3)
+            Points and viewing directions in the camera's frame.
+        apart_m : (P,)
+            Distance behind the surface; NaN for points that do not count.
+        """
         world = self.view.corrected_at(self.phi, points_m, rays, sample)
         t_s = np.full(len(points_m), self.view.depth.times[sample])
         return np.column_stack([t_s, self.points(points_m, world), apart_m, world])
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
-        """(k, 8) of the outlines of a shape; a row without a place where none is in view."""
+        """Return rows (k, 8) of `Replay.seen` with the outlines of a shape (n, 3).
+
+        The last row has the time alone, so that the sample is known also if no face is in view.
+        """
         drawn = np.vstack([self.outlines(shape_m, sample), np.full((1, 2), np.nan)])
         rows = np.full((len(drawn), 8), np.nan)
-        rows[:, 0], rows[:, 1:3] = self.view.depth.times[sample], drawn
+        rows[:, 0] = self.view.depth.times[sample]
+        rows[:, 1:3] = drawn
         return rows
 
 
 def compared_rows(surface: SurfaceComparison, up: Array) -> Array:
-    """Return the points of all images beside a fitted or simulated surface, see `Replay.seen`.
+    """Return the points of all depth images with their distance from a fitted or simulated surface.
 
     Parameters
     ----------
     surface : SurfaceComparison
-    up : (3,) unit vector against gravity
+    up : (3,)
+        Unit vector against gravity.
 
     Returns
     -------
     (k, 8) array
-        With outlines of some of the samples.
+        Rows of `Replay.seen`, with outlines for at most `OUTLINED` samples.
     """
-    seen, shapes_m, phi = surface.sighting, surface.shapes_m, surface.phi
-    shown = Projection.of(seen.view, seen.skin, phi, shapes_m[0], up)
-    samples = np.flatnonzero(seen.used[: len(shapes_m)].any(axis=1)).tolist()
+    correspondences = surface.sighting
+    shapes_m = surface.shapes_m
+    phi = surface.phi
+    shown = Projection.of(correspondences.view, correspondences.skin, phi, shapes_m[0], up)
+    samples = np.flatnonzero(correspondences.used[: len(shapes_m)].any(axis=1)).tolist()
     rows = [np.zeros((0, 8))]
     for k in samples:
-        within = seen.weights[k].any(axis=1)
-        sights = seen.points[k], seen.rays[k], surface.apart_m[k]
+        within = correspondences.weights[k].any(axis=1)
+        sights = correspondences.points[k], correspondences.rays[k], surface.apart_m[k]
         rows.append(shown.rows(k, *(each[within] for each in sights)))
     few = np.unique(np.linspace(0, len(samples) - 1, OUTLINED).round().astype(int))
     rows += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]
@@ -110,10 +167,18 @@ def compared_rows(surface: SurfaceComparison, up: Array) -> Array:
 
 
 def seen_before(experiment: Experiment) -> dict[str, Array]:
-    """(k, 8) of each depth camera's first image, and of the undeformed body as grasps carry it."""
-    nuisance, by_camera = NuisanceMap.of(experiment), {}
+    """Return the first image of each depth camera with the undeformed body, before anything is
+    fitted.
+
+    The arrays (k, 8) have the rows of `Replay.seen`, by name of the camera; the body is where the
+    grasps
+    carry it rigidly, and distances from it are NaN.
+    """
+    nuisance = NuisanceMap.of(experiment)
+    by_camera = {}
     for number, depth in enumerate(experiment.depths):
-        view, skin = View.of(experiment, number, nuisance), Skin.of(experiment.body, depth)
+        view = View.of(experiment, number, nuisance)
+        skin = Skin.of(experiment.body, depth)
         shape_m = skin.first_m(experiment, depth)
         shown = Projection.of(view, skin, np.zeros(nuisance.size), shape_m, experiment.up)
         points_m = depth.points_m[depth.first]
@@ -125,7 +190,7 @@ def seen_before(experiment: Experiment) -> dict[str, Array]:
 
 
 def save_overlays(experiments: Iterable[Experiment], folder: Path) -> list[Path]:
-    """Draw `seen_before` of all, before anything is fitted, and return the files."""
+    """Draw `seen_before` of all experiments into a folder, and return the files."""
     return save_pictures(
         folder,
         of_different_names(

@@ -1,4 +1,4 @@
-"""One look for all figures: sizes in millimetres, small type, colours for every eye.
+"""Common look of all figures: sizes in millimetres, small type, and colours for any colour vision.
 
 Figures are `matplotlib.figure.Figure` objects without pyplot: no display, no global state.
 """
@@ -28,7 +28,7 @@ VERMILION = "#D55E00"
 PURPLE = "#CC79A7"
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 
-# What is read in a journal's column of 85 mm, or over the whole page, without being scaled.
+# Sizes for a journal page, in whose column or width figures are printed without scaling.
 TEXT_PT = 8.0
 SMALL_PT = 7.0
 LINE_PT = 1.1
@@ -41,22 +41,25 @@ _GREY = "#606060"
 
 
 class Picture(Figure):
-    """A figure that a notebook shows, be pyplot there or not."""
+    """Figure that a notebook shows, with or without pyplot."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        """Return the figure as PNG bytes with its width for a notebook, at 96 pixels per inch."""
         png = BytesIO()
         self.savefig(png, dpi=RESOLUTION_DPI)
         return png.getvalue(), {"width": round(96 * self.get_figwidth())}
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw it; letters that the font lacks, as of a marker's name, are boxes and no news."""
+        """Draw the figure without warnings about letters that the font lacks, as in a marker's
+        name.
+        """
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
             super().draw(renderer)
 
 
 def mathematical(name: str) -> str:
-    """The symbol of a parameter as matplotlib sets it, with its region behind."""
+    """Return the symbol of a parameter for matplotlib, followed by the name of its region."""
     symbol, _, region = symbol_of(name).partition(" ")
     letter, _, index = symbol.partition("_")
     written = rf"${letter}_{{\mathrm{{{index}}}}}$" if index else f"${symbol}$"
@@ -64,7 +67,7 @@ def mathematical(name: str) -> str:
 
 
 def new_figure(width_mm: float, height_mm: float) -> Figure:
-    """An empty figure that arranges itself."""
+    """Return an empty figure that arranges its axes automatically."""
     figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)  # type: ignore[union-attr]
     return figure
@@ -78,7 +81,15 @@ def framed_figure(
     foot_mm: float,
     top_mm: float,
 ) -> Figure:
-    """An empty figure with margins around its axes; it draws in half the time of a `new_figure`."""
+    """Return an empty figure with fixed margins; it draws in half the time of a `new_figure`.
+
+    Parameters
+    ----------
+    width_mm, height_mm : float
+        Size of the figure.
+    left_mm, right_mm, foot_mm, top_mm : float
+        Margins around the axes.
+    """
     figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4))
     figure.subplots_adjust(
         left_mm / width_mm,
@@ -90,7 +101,7 @@ def framed_figure(
 
 
 def dress(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> None:
-    """Give axes their labels, type sizes, and a quiet frame and grid."""
+    """Give axes a title, labels, the type sizes of this module, and a light frame and grid."""
     axes.set_title(title, fontsize=TEXT_PT, loc="left")
     axes.set_xlabel(xlabel, fontsize=TEXT_PT)
     axes.set_ylabel(ylabel, fontsize=TEXT_PT)
@@ -106,13 +117,22 @@ def dress(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") -> No
 
 
 def legend(axes: Axes, title: str = "") -> None:
-    """A small legend that keeps readable over lines."""
+    """Add a small legend with a white background, readable over lines."""
     box = axes.legend(title=title, fontsize=SMALL_PT, title_fontsize=SMALL_PT, framealpha=0.85)
     box.get_frame().set(edgecolor="none", facecolor="white")
 
 
 def legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
-    """A legend over the axes, or over their title at a `height`, where it hides nothing."""
+    """Add a legend above the axes, where it hides nothing.
+
+    Parameters
+    ----------
+    axes : Axes
+    columns : int
+        Number of entries in a row.
+    height : float
+        Lower edge in heights of the axes; above 1 to leave room for a title.
+    """
     axes.legend(
         loc="lower left", bbox_to_anchor=(0.0, height), ncols=columns, fontsize=SMALL_PT,
         frameon=False, borderaxespad=0.1, borderpad=0.1, columnspacing=1.2, handlelength=1.6,
@@ -121,22 +141,36 @@ def legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
 
 
 def legend_of_all(figure: Figure, columns: int, **how: Any) -> None:
-    """A legend over all axes of a figure, which those of the first have the lines of."""
+    """Add a legend above all axes of a figure, with the lines of its first axes.
+
+    Parameters
+    ----------
+    figure : Figure
+    columns : int
+        Number of entries in a row.
+    **how
+        Further arguments of `Figure.legend`.
+    """
     handles, labels = figure.axes[0].get_legend_handles_labels() if figure.axes else ([], [])
     place = {"loc": "outside upper left", "fontsize": TEXT_PT, "frameon": False}
     figure.legend(handles, labels, ncols=columns, **place | how)
 
 
 def plain_numbers(axis: Axis, form: str = "g") -> None:
-    """Numbers without powers of ten along a logarithmic axis, and no ticks between."""
+    """Write the numbers of a logarithmic axis without powers of ten, and remove ticks between them.
+
+    `form` is the format of a number.
+    """
     axis.set_major_formatter(FuncFormatter(lambda value, _: format(value, form)))
     axis.set_minor_locator(NullLocator())
 
 
 def log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
-    """Make the y axis logarithmic, with plain numbers where they are short.
+    """Make the y axis logarithmic, with plain numbers where these are short.
 
-    The axis spans at least `least_ratio`, so that it never has fewer than two numbers.
+    The limits are widened to span at least the ratio `least_ratio`, so that at least two numbers
+    are
+    shown.
     """
     axes.set_yscale("log")
     low, high = axes.get_ylim()

@@ -1,4 +1,7 @@
-"""Synthetic data sets: simulate a problem's experiments and write what a laboratory would."""
+"""Synthetic recordings: simulation of a problem's experiments, written as a laboratory would.
+
+`write_data` is for testing a setup before a measurement, and for studies with known parameters.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,7 @@ _MARKERS = "markers"
 
 @dataclass(frozen=True)
 class Recipe(Options):
-    """How data are made.
+    """Options of a simulation that makes synthetic data.
 
     Attributes
     ----------
@@ -53,12 +56,13 @@ class Recipe(Options):
     noise_m : float
         Standard deviation of the markers' noise.
     noise_n : float
-        That of measured forces, as the sensor measures them: of a modelled quarter, for which the
-        problem states ``symmetry = 4``, that of the whole.
+        Standard deviation of the noise of measured forces, as the sensor measures them: of a
+        modelled
+        quarter, for which the problem states ``symmetry = 4``, that of the whole.
     noise_nm : float
-        That of measured torques.
+        Standard deviation of the noise of measured torques.
     noise_own : float
-        That of custom readings, in their sigmas.
+        Standard deviation of the noise of custom readings, in their sigmas.
     seed : int
         Seed of the noise.
     frames : --frames/--no-frames
@@ -67,7 +71,7 @@ class Recipe(Options):
     Raises
     ------
     InputError
-        For an unknown integrator, and a timestep, noise or seed that cannot be.
+        For an unknown integrator, and for a timestep, noise or seed out of range.
     """
 
     integrator: str = NEWMARK
@@ -96,17 +100,18 @@ def write_data(
     ----------
     problem : Problem
     folder : str or Path
-        Made where it is missing; gets ``<experiment>_markers.csv`` where there are markers,
-        ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) of grasps whose
-        poses the problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) of grasps whose
-        wrench is measured, ``<experiment>_reading_<name>.csv`` of readings of one's own, and
-        ``<experiment>/`` with frames when asked for. An experiment that is displaced by a table,
-        as on a test bench, gets its tables of displacement and load under the names that the
-        problem file has for them in place of poses and wrenches.
+        Created if missing; gets ``<experiment>_markers.csv`` if there are markers,
+        ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) for grasps whose
+        poses the
+        problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) for grasps with a force sensor,
+        ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/`` with frames if
+        requested. An experiment whose displacements come from a table, as on a test bench, gets its
+        tables of displacement and load under their names in the problem file, in place of poses and
+        wrenches.
     recipe : Recipe, optional
-        Without noise by default.
+        Integrator, noise and seed; without noise by default.
     progress : callable, optional
-        Called with the share of a simulation that is done.
+        Called with the completed share of a simulation, from 0 to 1.
 
     Returns
     -------
@@ -116,13 +121,16 @@ def write_data(
     Raises
     ------
     InputError
-        For a parameter without a guess, and before anything is written into a folder that has
-        files of others, or a file is overwritten that the problem reads or that this program did
-        not write. The problem's own folder may have other files.
+        Before anything is written: for a parameter without a guess, if the folder has files of
+        others,
+        or if a file would be overwritten that the problem reads or that this program did not write.
+        The
+        problem's own folder may have other files.
     SimulationError
-        Before anything is written.
+        If a simulation fails, before anything is written.
     """
-    place, recipe = Path(folder), recipe or Recipe()
+    place = Path(folder)
+    recipe = recipe or Recipe()
     _refuse_unguessed(problem)
     sections = _sections(problem)
     names = [_table_names(each, sections.get(each.name)) for each in problem.experiments]
@@ -146,24 +154,32 @@ def write_data(
     ]
     written: list[Path] = []
     drafts_of: dict[Path, Path] = {}
-    with ExitStack() as whole:  # all files appear at its end, or none
+    with ExitStack() as stack:  # all files appear at its end, or none
         for experiment, trajectory, named in zip(
             problem.experiments, simulated, names, strict=True
         ):
-            section, files = sections.get(experiment.name), [place / n for n in named.values()]
-            drafts = [whole.enter_context(whole_file(file)) for file in files]
+            section = sections.get(experiment.name)
+            files = [place / n for n in named.values()]
+            drafts = [stack.enter_context(whole_file(file)) for file in files]
             drafts_of |= dict(zip(files, drafts, strict=True))
             by_key = dict(zip(named, drafts, strict=True))
             _write_tables(experiment, section, trajectory, by_key, rng, recipe)
             written += files
             if recipe.frames:
-                folder, body = place / experiment.name, experiment.body
-                there = run_folder(folder, mark=FRAMES_FILE, what="simulation")
-                at = whole.enter_context(there), trajectory.t_s, trajectory.positions_m
-                write_frames(*at, body.cells, body.element, body.nodes_m)
+                folder = place / experiment.name
+                body = experiment.body
+                subfolder = run_folder(folder, mark=FRAMES_FILE, what="simulation")
+                write_frames(
+                    stack.enter_context(subfolder),
+                    trajectory.t_s,
+                    positions_m=trajectory.positions_m,
+                    cells=body.cells,
+                    element=body.element,
+                    undeformed_m=body.nodes_m,
+                )
                 written.append(folder / FRAMES_FILE)
         by_name = {file.name: draft for file, draft in drafts_of.items()}
-        listing = whole.enter_context(whole_file(place / LIST_FILE))
+        listing = stack.enter_context(whole_file(place / LIST_FILE))
         hashes = listed_hashes(place) | hashes_of(by_name)
         listing.write_text(list_as_text(hashes), encoding="utf-8")
     return written
@@ -177,9 +193,24 @@ def _write_tables(
     rng: np.random.Generator,
     recipe: Recipe,
 ) -> None:
-    """Write what is measured and how grasps move into the files of `_table_names`, by key."""
+    """Write the simulated measurements with noise, and the poses of the grasps.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    section : ExperimentSection or None
+        Table of the experiment in the problem file; None without a file.
+    trajectory : Trajectory
+        The simulated motion.
+    files : mapping of str to Path
+        Files by the keys of `_table_names`.
+    rng : Generator
+        Source of the noise; its state advances.
+    recipe : Recipe
+    """
     noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
-    names, tracks = experiment.markers.names, trajectory.markers_m + noise
+    names = experiment.markers.names
+    tracks = trajectory.markers_m + noise
     if _MARKERS in files:
         write_markers_csv(files[_MARKERS], experiment.t_s, names, tracks)
     for k, grasp in enumerate(experiment.grasps):
@@ -211,12 +242,13 @@ def _write_tables(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
-    """How the tables of the sensors are read, in their order; empty for a problem without file."""
+    """Return the table layout of each force sensor in order; empty without a problem file."""
     moved = section.moved if section is not None else []
     return [each.wrench for each in moved if each.wrench is not None]
 
 
 def _refuse_unguessed(problem: Problem) -> None:
+    """Raise an InputError if a parameter has no guess."""
     if names := problem.parameters.unguessed:
         key = f"parameters.{names[0]}"
         raise InputError(
@@ -227,9 +259,24 @@ def _refuse_unguessed(problem: Problem) -> None:
 
 
 def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> None:
-    """Refuse a folder with files of others, and to overwrite one that the problem reads.
+    """Refuse to write into a folder with files of others, or over a file that the problem reads.
 
-    What the problem reads may be a recording. Its own folder may have other files.
+    A file that the problem reads may be a measured recording. The problem's own folder may have
+    other
+    files.
+
+    Parameters
+    ----------
+    problem : Problem
+    place : Path
+        The folder.
+    files : iterable of Path
+        Files to be written.
+
+    Raises
+    ------
+    InputError
+        Naming the folder or the file.
     """
     require_no_link(place)
     read = {file.resolve() for file in problem.origin.files} if problem.origin else set()
@@ -252,7 +299,7 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
 
 
 def _sections(problem: Problem) -> dict[str, ExperimentSection]:
-    """How the problem file reads each experiment, by name; empty without a file."""
+    """Return the table of each experiment in the problem file, by name; empty without a file."""
     if (origin := problem.origin) is None:
         return {}
     file = ProblemFile.model_validate(parse_toml(origin.text, origin.path))
@@ -260,9 +307,9 @@ def _sections(problem: Problem) -> dict[str, ExperimentSection]:
 
 
 def _table_names(experiment: Experiment, section: ExperimentSection | None) -> dict[str, str]:
-    """The names of the files of an experiment, by what they hold: markers, poses_2, …
+    """Return the names of the files of an experiment, by their content: markers, poses_2, …
 
-    Those of a bench are the problem's own.
+    On a test bench the names, and the keys too, are those of the problem file.
     """
     keys = [_MARKERS] * bool(experiment.markers.names)
     for k in range(len(experiment.grasps)):
@@ -280,12 +327,20 @@ def _table_names(experiment: Experiment, section: ExperimentSection | None) -> d
 
 
 def _numbered(kind: str, index: int) -> str:
-    """The key of a file by its index, counted from 0: poses, poses_2, …"""
+    """Return the key of a file by its index, counted from 0: poses, poses_2, …"""
     return f"{kind}_{index + 1}" if index else kind
 
 
 def _refuse_shared(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
-    """Refuse experiments that read the same file, of which a simulation has one for each."""
+    """Refuse experiments that read the same file, because a simulation writes one for each.
+
+    `names` are the results of `_table_names`, one for each experiment of the problem.
+
+    Raises
+    ------
+    InputError
+        Naming the file and both experiments.
+    """
     owners: dict[str, str] = {}
     for experiment, files in zip(problem.experiments, names, strict=True):
         for name in files.values():

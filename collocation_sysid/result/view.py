@@ -1,6 +1,7 @@
-"""A run in an interactive window, through pyvista: turn it, step through time, colour by a field.
+"""Interactive 3-D view of a run through pyvista, and its web page with a chosen field.
 
-The fields are those of the run's frames for ParaView.
+`view` opens a window in which the body can be turned, stepped through time and coloured by a field
+of the run's ParaView frames. `export_page` needs no pyvista.
 """
 
 from __future__ import annotations
@@ -25,27 +26,29 @@ from .replay import Replay, headline, read_run, reading_run
 from .style import BLACK, VERMILION
 from .writers import FRAMES_FILE
 
+# Width and height of the window in pixels.
 WINDOW = (1100, 800)
 FIELD = "von_mises_pa"
-# Of the surface, in replays of what touches something.
+# Fields on the surface, of replays with obstacles.
 CONTACT = ("pressures_pa", "gaps_m")
 
 
 def export_page(
     run: str | Path, file: str | Path, experiment: str | None = None, field: str | None = None
 ) -> Path:
-    """Write an experiment of a run as a stand-alone web page; needs no pyvista.
+    """Write an experiment of a run folder as a stand-alone web page, and return the page's file.
 
     Parameters
     ----------
     run : str or Path
+        A run folder.
     file : str or Path
+        HTML file to write.
     experiment : str, optional
-        By default the first.
+        Name of the experiment; the first by default.
     field : str, optional
-        Which of the frames' point or cell data colours the body as fitted, or "pressures_pa" or
-        "gaps_m" of what it touches; by default the strain of the body as fitted and as simulated
-        forward.
+        Point or cell data of the frames that colour the fitted body, or the contact quantities
+        "pressures_pa" or "gaps_m"; by default the strain of the fitted and the simulated body.
 
     Raises
     ------
@@ -55,22 +58,31 @@ def export_page(
     result, replays = read_run(run)
     replay = chosen(replays, experiment, run)
     with reading_run(Path(run)):
-        said = headline(result)
+        text = headline(result)
     colouring = None if field is None else Colouring.field(field, _on_faces(run, replay, field))
-    return write_page(replay, file, said, colouring)
+    return write_page(replay, file, text, colouring)
 
 
 def _on_faces(run: str | Path, replay: Replay, field: str) -> Array:
-    """A field of the frames (T, F) on the boundary's faces, at each sample that of the nearest."""
-    if field in CONTACT and (touched := getattr(replay, field)) is not None:
-        return touched
+    """Return a field (T, F) on the boundary triangles, at each sample that of the nearest frame.
+
+    Point data are averaged over the corners of a triangle; of vectors the norm is taken.
+
+    Raises
+    ------
+    InputError
+        If the frames have no such field.
+    """
+    if field in CONTACT and (contact_values := getattr(replay, field)) is not None:
+        return contact_values
     frames = frame_files(Path(run), replay.name)
     cells = cells_of_faces(replay.tetrahedra, replay.surface)
     with _reading_frames(Path(run)):
         shown = []
         for _, file in frames:
             frame = meshio.read(file)
-            points, in_cells = frame.point_data, frame.cell_data
+            points = frame.point_data
+            in_cells = frame.cell_data
             require_among(field, [*in_cells, *points], None, "--field")
             if field in in_cells:
                 values = in_cells[field][0][cells]
@@ -88,23 +100,25 @@ def view(
     experiment: str | None = None,
     screenshot: str | Path | None = None,
 ) -> None:
-    """Show an experiment of a run in a window, and return when that is closed.
+    """Show an experiment of a run folder in a window, and return when the window is closed.
 
     Parameters
     ----------
     run : str or Path
+        A run folder.
     field : str
-        Which of the frames' point or cell data colours the body.
+        Point or cell data of the frames that colour the body.
     experiment : str, optional
-        By default the first.
+        Name of the experiment; the first by default.
     screenshot : str or Path, optional
         Draw the middle of the motion into this file instead, without a window.
 
     Raises
     ------
     InputError
-        If pyvista is missing, `run` is not a run folder or has no frames, no such experiment, or
-        no such field.
+        If pyvista is missing, `run` is not a run folder, or it has no frames, no such experiment or
+        no
+        such field.
     """
     if find_spec("pyvista") is None:
         raise InputError(
@@ -125,12 +139,12 @@ def view(
 
 
 def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
-    """Times and files of an experiment's frames.
+    """Return times [s] and files of an experiment's frames.
 
     Raises
     ------
     InputError
-        If there are none.
+        If the run folder has no frames of that experiment, or a damaged list of frames.
     """
     listings = (run / experiment / FRAMES_FILE, run / FRAMES_FILE)
     listing = next((each for each in listings if each.is_file()), None)
@@ -149,17 +163,32 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
 
 
 def _reading_frames(run: Path) -> AbstractContextManager[None]:
+    """Return a context in which errors from damaged frames become an InputError on the run."""
     return damage_refused(run, f"{FRAMES_FILE} or one of its frames", "solve the problem again")
 
 
 class _Scene:
-    """The window: the body of one frame with the markers measured nearest to its time."""
+    """Window with the body of one frame and the measured markers nearest in time.
+
+    Parameters
+    ----------
+    frames : list of (float, Path)
+        Time [s] and file of each frame.
+    field : str
+        Point or cell data that colour the body.
+    replay : Replay
+        The experiment, for markers, grasped nodes and obstacles.
+    off_screen : bool
+        Draw without a window.
+    """
 
     def __init__(
         self, frames: list[tuple[float, Path]], field: str, replay: Replay, off_screen: bool
     ) -> None:
         pv: Any = import_module("pyvista")
-        self.pv, self.replay, self.field = pv, replay, field
+        self.pv = pv
+        self.replay = replay
+        self.field = field
         self.times = np.array([time for time, _ in frames])
         self.meshes: list[Any] = [pv.read(file) for _, file in frames]
         known = [*self.meshes[0].cell_data, *self.meshes[0].point_data]
@@ -179,20 +208,22 @@ class _Scene:
             )  # fmt: skip
 
     def _range(self) -> tuple[float, float]:
-        """Limits of the colours, the same for all frames."""
+        """Return the limits of the colour scale, the same for all frames."""
         values = [self._values(mesh) for mesh in self.meshes]
         return min(float(np.nanmin(v)) for v in values), max(float(np.nanmax(v)) for v in values)
 
     def _values(self, mesh: Any) -> np.ndarray:
+        """Return the field of a mesh (n,) or (E,); of vectors their norms."""
         values = np.asarray(mesh[self.field])
         return np.linalg.norm(values, axis=1) if values.ndim == 2 else values
 
     def _fit(self) -> None:
-        """Let the camera see all of the motion."""
+        """Place the camera so that the whole motion is in view."""
         bounds = np.array([mesh.bounds for mesh in self.meshes])
-        whole = np.empty(6)
-        whole[::2], whole[1::2] = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
-        self.plotter.reset_camera(bounds=whole)
+        extent = np.empty(6)
+        extent[::2] = bounds[:, ::2].min(axis=0)
+        extent[1::2] = bounds[:, 1::2].max(axis=0)
+        self.plotter.reset_camera(bounds=extent)
         self.plotter.camera.zoom(1.4)  # the box is seen through its sphere
 
     def show(self, time_s: float) -> None:
@@ -222,7 +253,7 @@ class _Scene:
                 self.pv.PolyData(measured), color=VERMILION, name="measured", **balls
             )
         shapes = self.replay.shapes_m
-        held = np.flatnonzero(self.replay.held[sample])
-        if shapes is not None and len(held):
-            nodes = self.pv.PolyData(np.asarray(shapes[sample][held], dtype=float))
+        grasped = np.flatnonzero(self.replay.held[sample])
+        if shapes is not None and len(grasped):
+            nodes = self.pv.PolyData(np.asarray(shapes[sample][grasped], dtype=float))
             self.plotter.add_mesh(nodes, color=BLACK, name="grasped", **{**balls, "point_size": 8})

@@ -1,4 +1,9 @@
-"""Files of a run: frames for ParaView, and a folder that is there whole or not at all."""
+"""ParaView frames, and safe replacement of run folders.
+
+`write_frames` writes a trajectory for ParaView. `run_folder` is the context in which a run folder
+is
+written: it appears at the end, complete or not at all, and never replaces files of others.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +29,7 @@ from ..written_files import LIST_FILE, foreign_files, list_files
 from .fields import ElementFields
 
 VTK_CELL_TYPES = ("tetra", "tetra10")  # by meshio's names
+# More frames take disk space and add little to an animation.
 MAX_FRAMES = 200
 FRAMES_FILE = "trajectory.pvd"
 
@@ -45,10 +51,12 @@ def write_vtu(
     ----------
     path : str or Path
     points_m : (n, 3)
-    cells : (E, nodes per cell) node numbers
+        Positions of the points.
+    cells : (E, nodes per cell)
+        Point indices of each cell.
     meshio_type : {"tetra", "tetra10"}
-    point_data : mapping of name to (n,) or (n, k) numbers
-    cell_data : mapping of name to (E,) or (E, k) numbers
+    point_data : mapping of name to (n,) or (n, k), optional
+    cell_data : mapping of name to (E,) or (E, k), optional
 
     Raises
     ------
@@ -61,7 +69,8 @@ def write_vtu(
         raise InputError(
             f"no cell type {meshio_type!r}; available: {', '.join(VTK_CELL_TYPES)}", path
         )
-    points, nodes = np.asarray(points_m, dtype=float), np.asarray(cells, dtype=np.int64)
+    points = np.asarray(points_m, dtype=float)
+    nodes = np.asarray(cells, dtype=np.int64)
     at_points = _arrays("point", point_data or {}, len(points), path)
     in_cells = _arrays("cell", cell_data or {}, len(nodes), path)
     by_block: dict[str, Any] = {name: [array] for name, array in in_cells.items()}
@@ -72,7 +81,23 @@ def write_vtu(
 def _arrays(
     kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
 ) -> dict[str, NDArray]:
-    """Arrays of kinds that the format has, with a row each."""
+    """Return data as arrays of types that VTK has, with names escaped for XML.
+
+    Parameters
+    ----------
+    kind : {"point", "cell"}
+        The kind of data, for messages.
+    data : mapping of name to (count,) or (count, k)
+    count : int
+        Required number of rows.
+    path : str or Path
+        File that an error names.
+
+    Raises
+    ------
+    InputError
+        For data with another number of rows or of dimensions.
+    """
     arrays = {name: np.asarray(values) for name, values in data.items()}
     for name, array in arrays.items():
         if array.ndim not in (1, 2) or len(array) != count:
@@ -87,9 +112,14 @@ def _arrays(
 
 
 def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
-    """Write the list of (t_s, file) that ParaView opens as one animation.
+    """Write the list of frames that ParaView opens as one animation.
 
-    Files are named relative to the list's own folder.
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    frames : sequence of (float, str or Path)
+        Time [s] and file of each frame; files are stored relative to the folder of `path`.
     """
     folder = Path(path).parent.resolve()
     lines = []
@@ -118,22 +148,32 @@ def write_frames(
     """Write a trajectory as frames/frame_0000.vtu, … and trajectory.pvd, and return the latter.
 
     Every frame has `displacement_m` and `velocity_m_s` at the points, and the `fields` in the
-    cells. Of more than `max_frames` samples every second, third, … is written.
+    cells. Of
+    more than `max_frames` samples every second, third, … is written.
 
     Parameters
     ----------
     folder : str or Path
-        Exists.
-    t_s : (T,) evenly spaced
+        An existing folder.
+    t_s : (T,)
+        Evenly spaced times.
     positions_m : (T, n, 3)
+        Positions of the nodes.
     cells : (E, nodes per element)
+        Node indices of each element.
     element : Element
     undeformed_m : (n, 3)
-    point_series : mapping of name to (T, n) or (T, n, k) numbers
+        Nodes of the undeformed body.
+    point_series : mapping of name to (T, n) or (T, n, k), optional
+        Further data at the points.
+    max_frames : int
     fields : ElementFields, optional
-    cell_data : mapping of name to (E,), the same in every frame
+        Stress, energy density and det F of each element.
+    cell_data : mapping of name to (E,), optional
+        Further data of the cells, the same in every frame.
     """
-    times, positions = np.asarray(t_s, dtype=float), np.asarray(positions_m, dtype=float)
+    times = np.asarray(t_s, dtype=float)
+    positions = np.asarray(positions_m, dtype=float)
     alone = len(times) == 1
     velocities = np.zeros_like(positions) if alone else np.gradient(positions, times, axis=0)
     series = {name: np.asarray(values) for name, values in (point_series or {}).items()}
@@ -164,24 +204,29 @@ def write_frames(
 def run_folder(
     path: str | Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
 ) -> Iterator[Path]:
-    """Give a temporary folder beside `path` to write into, and name it `path` at the end.
+    """Yield a temporary folder to write into, and rename it to `path` at the end.
 
-    An earlier run at `path` is replaced, at the end and whole, if every file in it was written by
-    this program and is unchanged. After an exception the temporary folder is removed and `path` is
-    as it was. The folder gets a list of its files, see `written_files`.
+    An earlier run at `path` is replaced completely, at the end, if this program wrote every file in
+    it
+    and none was changed since. After an exception the temporary folder is removed and `path` is
+    unchanged. The folder gets a list of its files, see `written_files`.
 
     Parameters
     ----------
     path : str or Path
     overwrite : bool
         Whether an earlier run may be replaced.
-    mark, what : str
-        The file by which an earlier one is known, and what messages call it.
+    mark : str
+        Name of a file by which an earlier run is recognised.
+    what : str
+        Word for the content in messages.
 
     Raises
     ------
     InputError
-        If there is anything else at `path`, or a link; at once, so that no work is lost.
+        If there is anything else at `path`, or a link; this is checked before the temporary folder
+        is
+        given, so that no work is lost, and again at the end.
     """
     target = _unlinked(Path(path))
     require_replaceable(target, overwrite, mark, what)
@@ -210,25 +255,27 @@ def run_folder(
 
 
 def _unlinked(path: Path) -> Path:
-    """The absolute path without links in the folders above; the last one is kept."""
+    """Return the absolute path with all links resolved, except a link at `path` itself."""
     return path.resolve() if path.name in ("", "..") else path.parent.resolve() / path.name
 
 
 def _remove_stale(target: Path) -> None:
-    """Remove what a process of this machine that was killed left beside the run's place.
+    """Remove temporary folders beside `target` that a killed process of this machine left behind.
 
-    Windows tells nothing of other processes by their numbers; there it stays.
+    On Windows nothing is removed, because it cannot be known whether a process with that number
+    runs.
     """
     if os.name != "posix":
         return
     for folder in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
-        left = rf".*\.{re.escape(platform.node())}-(\d+)-\w+\.partial"
-        match = re.fullmatch(left, folder.name)
+        pattern = rf".*\.{re.escape(platform.node())}-(\d+)-\w+\.partial"
+        match = re.fullmatch(pattern, folder.name)
         if match and not _runs(int(match[1])):
             shutil.rmtree(folder, ignore_errors=True)
 
 
 def _runs(process: int) -> bool:
+    """Return whether a process with this number is running on this machine."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -242,6 +289,8 @@ def require_replaceable(
     target: Path, overwrite: bool = True, mark: str = RESULT_FILE, what: str = "run"
 ) -> None:
     """Refuse a place for a run folder that holds anything but an earlier run.
+
+    Parameters are those of `run_folder`.
 
     Raises
     ------
@@ -287,7 +336,8 @@ def require_no_link(folder: Path) -> None:
 
 
 def require_only_written(folder: Path) -> None:
-    """Refuse a folder with a file or link that this program did not write, or that was changed.
+    """Refuse a folder with a link, with a file that this program did not write, or with a changed
+    file.
 
     Raises
     ------
@@ -310,6 +360,9 @@ def require_only_written(folder: Path) -> None:
 
 
 def _put_in_place(new: Path, target: Path, aside: Path) -> None:
+    """Rename the folder `new` to `target`, moving an existing `target` to `aside` until that
+    succeeded.
+    """
     if not target.exists():
         new.rename(target)
         return

@@ -1,1 +1,12 @@
-"""What is done with a problem: check, solve, simulate forward, refine, and what was found."""
+"""Runs: the operations on a problem, and their results.
+
+- `check`: examine a problem before it is solved.
+- `solving`: solve it, with `two_phases` for two-phase fields, `several_starts` for local minima,
+and `warm_start` for a start from an earlier run.
+- `forward_simulation`, `prediction`: simulate recordings with the estimates, and compare with the
+measurements.
+- `verdict`: concerns about a solution.
+- `refine`: solve at finer discretisations, for the numerical error.
+- `answer`: the solved problem with all of this; `told` converts it to `result`, the content of
+``result.json``.
+"""

@@ -1,4 +1,4 @@
-"""A solved problem with its checks: what is known of an answer, however it is shown."""
+"""A solved problem with its checks: estimates, uncertainties and verdict."""
 
 from __future__ import annotations
 
@@ -43,26 +43,30 @@ class Answer:
     ----------
     problem : Problem
     solution : Solution
-    rollouts : mapping of experiment name to Rollout, or to the reason why there is none
-    uncertainty : Uncertainty or None, where the solve did not converge
-    diagnoses : tuple of MarkerDiagnosis, what the residuals suggest
-    profiles : tuple of Profile, those asked for
+    rollouts : mapping of experiment name to Rollout or str
+        Forward simulations, or the reason why there is none.
+    uncertainty : Uncertainty or None
+        None if the solve did not converge.
+    diagnoses : tuple of MarkerDiagnosis
+        Findings in the residuals.
+    profiles : tuple of Profile
+        Profile likelihoods that were requested.
     notes : tuple of str
-        What went wrong after the solve.
+        Problems after the solve.
     causes : tuple of Hypothesis
-        What is likely described wrongly, likeliest first.
+        Likely errors in the description of the problem, likeliest first.
     refinement : Refinement or None
-        What the discretisation does: solved again where that was asked for, else what the step
-        does, to first order, from finer forward simulations; None where these are missing.
+        Discretisation errors: from solves at finer discretisations if requested, else the
+        first-order effect of the step from finer forward simulations; None where these are missing.
     missing : str
-        What Ctrl-C left out after there was an answer.
+        Checks that were left out after Ctrl-C; empty if all were done.
     sources : Sources or None
-        What moves the estimates beside the noise, where there are error bars.
+        Systematic effects on the estimates; None without error bars.
     probes : tuple of Probe
         Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
-        of parts of the data, where these were asked for. Empty without error bars.
+        of parts of the data, where these were requested. Empty without error bars.
     elapsed_s : Elapsed
-        How long search and checks took.
+        Durations of search and checks.
     """
 
     problem: Problem
@@ -84,8 +88,8 @@ class Answer:
         free = [item.name for item in self.problem.parameters.free]
         values = ", ".join(f"{name} = {_with_error(self.estimates[name])}" for name in free)
         rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
-        said = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
-        return f"Run({said}: {values}; {rms})"
+        summary = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
+        return f"Run({summary}: {values}; {rms})"
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -149,7 +153,7 @@ class Answer:
 
     @property
     def discretisation_errors(self) -> Mapping[str, NumericalError]:
-        """What is known of the discretisation error of each estimate, by name."""
+        """Known discretisation errors, by name of the estimate; empty without `refinement`."""
         return {} if self.refinement is None else self.refinement.errors
 
     @cached_property
@@ -162,13 +166,15 @@ class Answer:
 
     @cached_property
     def places(self) -> dict[str, dict[str, Place]]:
-        """Where the markers sit on the undeformed body, by fitted experiment and by marker."""
+        """Estimated places of the markers on the undeformed body, by fitted experiment and by
+        marker.
+        """
         named = ((part.segment.experiment.name, part) for part in self.solution.parts)
         return {name: places_of(part, self.uncertainty) for name, part in named}
 
     @cached_property
     def trust(self) -> Trust:
-        """How far the answer can be trusted, in one word, with the reasons."""
+        """Verdict (good, check or doubtful) with its concerns."""
         of_fit = concerns(
             self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
         )
@@ -195,20 +201,25 @@ class Answer:
 
     @cached_property
     def motions(self) -> dict[str, Motion]:
-        """How each experiment's body oscillates with the answer, by name."""
+        """Natural modes of the body at the estimates, by experiment; only motions, empty if not
+        converged.
+        """
         return motions_of(self.problem, self.solution)
 
     @cached_property
     def fields(self) -> dict[str, FieldEstimate]:
-        """The constants that differ from place to place, by name."""
-        collocation, q = self.solution.collocation, self.solution.q
+        """Estimated fields (spatially varying constants), by name."""
+        collocation = self.solution.collocation
+        q = self.solution.q
         bodies = dict.fromkeys(segment.body for segment in collocation.segments)
         known = (fields_of(b, collocation.parameters, q, self.uncertainty) for b in bodies)
         return {field.name: field for each in known for field in each}
 
     @property
     def noise_rms_m(self) -> float:
-        """RMS distance of the fitted markers that noise of the sigma_m given would leave."""
+        """RMS distance of the fitted markers that is expected from noise with the stated
+        sigma_m.
+        """
         return expected_rms_m(self.solution, self.uncertainty)
 
     def interval(self, name: str) -> tuple[float, float]:
@@ -227,7 +238,7 @@ class Answer:
     def std_error(self, name: str) -> float:
         """Return the combined standard uncertainty of a parameter or derived modulus.
 
-        NaN where `interval` is.
+        NaN under the same conditions as `interval`.
 
         Raises
         ------
@@ -242,7 +253,7 @@ class Answer:
         Raises
         ------
         InputError
-            If none, or several with different values, are called so.
+            If no parameter, or several with different values, have this name.
         """
         return self.solution.nuisance(name)
 
@@ -283,6 +294,7 @@ class Answer:
         }
 
     def _estimate(self, name: str) -> ReportedEstimate:
+        """Return an estimate by name; an `InputError` for an unknown name."""
         if name not in self.estimates:
             known = list(self.estimates)
             expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
@@ -291,14 +303,15 @@ class Answer:
 
     @property
     def all_notes(self) -> tuple[str, ...]:
-        """What the user should know after the solve, and what the data say of the parameters."""
+        """Notes on the solve and its uncertainty, and statements on what the data determine."""
         if self.uncertainty is None:
             return self.notes
-        said = (*self.notes, *self.uncertainty.notes, *verdicts(self.uncertainty))
-        return (*dict.fromkeys(said), *(profile.sentence for profile in self.profiles))
+        notes = (*self.notes, *self.uncertainty.notes, *verdicts(self.uncertainty))
+        return (*dict.fromkeys(notes), *(profile.sentence for profile in self.profiles))
 
 
 def _or_nan(value: float | None) -> float:
+    """Return the value; NaN for None."""
     return np.nan if value is None else value
 
 

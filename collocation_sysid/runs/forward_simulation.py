@@ -1,4 +1,4 @@
-"""The check of an answer: every experiment simulated forward with it, and compared."""
+"""Forward simulations with the estimates, and their comparison with the measurements."""
 
 from __future__ import annotations
 
@@ -37,41 +37,43 @@ from .prediction import (
     prediction_error,
 )
 
-# Grid steps over those of a forward simulation that tells the step's error, with room for rounding.
+# Least ratio of grid step and simulation step for an estimate of the step's error: half, rounded.
 LEAST_FINER = 1.99
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A forward simulation with the answer's parameters, against the measurements.
+    """A forward simulation with the estimated parameters, compared with the measurements.
 
     Attributes
     ----------
     rms_m, max_m : float
-        Distance of the markers from the measurements, zero without any; the tip error is in
-        `max_m`.
+        RMS and largest distance of the markers from the measurements; zero without markers.
     trajectory : Trajectory
-        Its markers are read with the experiment's nuisance parameters.
+        Its markers are predicted with the experiment's nuisance parameters.
     nuisance : mapping of name to value
-        Nuisance parameters of an experiment for validation, fitted to it with the material of the
-        answer. Of places they are the way from where these were started.
-    places_m : mapping of marker to place [x, y, z], for validation likewise
+        Nuisance parameters of an experiment for validation, fitted to it at the estimated material;
+        those of places are displacements from their start. Empty for fitted experiments.
+    places_m : mapping of marker to place [x, y, z]
+        Marker places, for validation likewise.
     wrenches : tuple of (S, 6)
-        What the sensors of its grasps should read, NaN where that is not known.
-    wrench_rms : RMS of force [N] and torque [N m], None where there is none
+        Predicted wrenches of the sensors of its grasps; NaN where unknown.
+    wrench_rms : (force, torque)
+        RMS difference of force [N] and torque [N m]; None where there is none.
     readings : mapping of name to (S, m)
-        What readings of one's own should say.
-    reading_rms : RMS of each of them, by name
+        Predicted values of custom sensors.
+    reading_rms : mapping of name to float
+        RMS difference of each custom sensor.
     surfaces : mapping of the name of a depth camera to SurfaceComparison
-        Its points on the simulated surface.
+        Its points against the simulated surface.
     misfits : tuple of Misfit
-        The differences of each instrument over its stated σ.
+        Differences of each instrument over its stated σ.
     blind : PredictionError or None
         Of an experiment for validation: the error with the nuisance parameters of the fitted
         recordings in place of its own; None where that cannot be simulated.
     copied : CopyError or str
         Of an experiment for validation: the error of a fitted recording's measurements, or why
-        there is none. Empty of others.
+        there is none. Empty for fitted experiments.
     """
 
     rms_m: float
@@ -95,14 +97,14 @@ class Rollout:
 
 
 def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
-    """Those of all experiments by their names, see `roll_out`."""
+    """Simulate all experiments in parallel threads; results by experiment name, see `roll_out`."""
     threads = solution.collocation.threads
     rollouts = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
     return {e.name: each for e, each in zip(problem.experiments, rollouts, strict=True)}
 
 
 def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
-    """Simulate an experiment with a solution's parameters; or say why that fails."""
+    """Simulate an experiment with a solution's parameters; return the reason if that fails."""
     try:
         segment, phi = _seen(experiment, solution)
         trajectory = _simulated(problem, segment, phi, solution)
@@ -159,7 +161,20 @@ def _simulated(problem: Problem, segment: Segment, phi: Array, solution: Solutio
 def _predicted(
     segment: Segment, trajectory: Trajectory, phi: Array
 ) -> tuple[Predicted, dict[str, SurfaceComparison]]:
-    """Return what the instruments of a recording should read of a motion, with their φ (k,)."""
+    """Return the predictions of a recording's instruments for a simulated motion.
+
+    Parameters
+    ----------
+    segment : Segment
+    trajectory : Trajectory
+    phi : (k,) array
+        Nuisance parameters of the recording.
+
+    Returns
+    -------
+    predicted : Predicted
+    surfaces : mapping of the name of a depth camera to SurfaceComparison
+    """
     grid, forced = trajectory.reactions
     positions_m = trajectory.positions_m
     x = positions_m.reshape(len(positions_m), -1)
@@ -191,10 +206,15 @@ def _blind(problem: Problem, segment: Segment, solution: Solution) -> Prediction
 
 
 def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
-    """The experiment with its φ: those of the fit, or fitted with θ as found."""
+    """Return an experiment's transcription and its nuisance parameters φ (k,).
+
+    For a fitted experiment φ is the estimate; for validation it is fitted at the estimated
+    material.
+    """
     if (part := solution.part_of(experiment.name)) is not None:
         return part.segment, part.phi
-    values, body = solution.parameters, experiment.body
+    values = solution.parameters
+    body = experiment.body
     alone = replace(
         solution.collocation,
         experiments=[replace(experiment, validation=False)],
@@ -216,75 +236,107 @@ def step_error(
     rollouts: Mapping[str, Rollout | str],
     estimates: Mapping[str, Estimate],
 ) -> Refinement | None:
-    """What the step does to every parameter and modulus, to first order.
+    """Return the effect of the time step on every parameter and modulus, to first order.
 
-    From a Gauss–Newton step towards the forward simulations; None where these are missing or no
-    finer, where all is static, and where something is touched in motion: an impact within a step
-    moves forces by far more than first order tells, and rings in the forward simulation.
+    A Gauss–Newton step is taken towards the forward simulations, which have finer steps.
+
+    Parameters
+    ----------
+    problem : Problem
+    solution : Solution
+    fit : LinearisedFit
+        The measurements linearised at the solution.
+    rollouts : mapping of experiment name to Rollout or str
+    estimates : mapping of name to Estimate
+
+    Returns
+    -------
+    Refinement or None
+        None if a simulation is missing or no finer, if all is static, and with obstacles in a
+        motion: impacts within a step are not of first order, and oscillate in the forward
+        simulation.
     """
-    apart: list[Array] = []
+    differences: list[Array] = []
     collocation = solution.collocation
     moving = [s.experiment for s in collocation.segments if not s.experiment.static]
     if not moving or any(experiment.obstacles for experiment in moving):
         return None
     for part, readings in zip(solution.parts, solution.readings_m, strict=True):
-        segment, experiment = part.segment, part.segment.experiment
+        segment = part.segment
+        experiment = part.segment.experiment
         rollout = rollouts.get(experiment.name)
         share = _share(problem, segment)
         if not isinstance(rollout, Rollout) or share is None:
             return None
         way = share * (rollout.trajectory.markers_m - readings)
-        apart.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
+        differences.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
         fitted = solution.wrenches.get(experiment.name, [])
         for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
             way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
-            apart.append(way.reshape(-1, 2, 3))
-        apart += _of_gauges(part, rollout.trajectory, share)
-        apart += _of_depths(part, rollout.trajectory, share)
-    change = changes_towards(fit, apart)[: collocation.nq]
+            differences.append(way.reshape(-1, 2, 3))
+        differences += _of_gauges(part, rollout.trajectory, share)
+        differences += _of_depths(part, rollout.trajectory, share)
+    change = changes_towards(fit, differences)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
-    linear, order = problem.parameters.linear, as_scheme(problem.scheme).order
+    linear = problem.parameters.linear
+    order = as_scheme(problem.scheme).order
     return Refinement(numerical_errors(estimates, [values_of(collocation, q)], [], order, linear))
 
 
 def _of_gauges(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
-    """A share of the way of one's own readings to a forward simulation, of each (S, G, 3)."""
+    """Return a share of the difference between simulated and fitted custom sensors, over σ.
+
+    Of each sensor (S, G, 3).
+    """
     if not (segment := part.segment).gauges:
         return []
     fitted = part.x[segment.markers.grid_rows], (Grid.of(segment.dynamics), part.motion.forced)
     rolled = trajectory.positions_m.reshape(len(fitted[0]), -1), trajectory.reactions
     here, there = (_gauged(segment, *each, part.phi) for each in (fitted, rolled))
     return [
-        share * np.nan_to_num(far - near) / gauge.sigmas[:, None]
-        for gauge, near, far in zip(segment.gauges, here, there, strict=True)
+        share * np.nan_to_num(simulated_values - fitted_values) / gauge.sigmas[:, None]
+        for gauge, fitted_values, simulated_values in zip(segment.gauges, here, there, strict=True)
     ]
 
 
 def _of_depths(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
-    """The same of depth cameras, of each (S, M, 3), at the points that they see as fitted."""
+    """Return a share of the difference between simulated and fitted depth residuals.
+
+    Of each camera (S, M, 3), at the correspondences of the fit.
+    """
     if not (sights := part.surface_sights):
         return []
-    known_s, rows_s = part.segment.experiment.t_s, part.segment.dynamics.t_s
+    known_s = part.segment.experiment.t_s
+    rows_s = part.segment.dynamics.t_s
     fitted = part.x[part.segment.markers.grid_rows]
     way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
-    along_m = np.array([np.interp(rows_s, known_s, each) for each in way_m.T])
-    by = along_m.T.reshape(len(rows_s), -1, 3, 1)
+    way_rows_m = np.array([np.interp(rows_s, known_s, each) for each in way_m.T])
+    displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
     return [
-        reading.changes(looked, by[:, reading.sighting.skin.nodes], part.phi)[..., 0]
+        reading.changes(looked, displacements_m[:, reading.sighting.skin.nodes], part.phi)[..., 0]
         for reading, looked in sights
     ]
 
 
 def _gauged(segment: Segment, x: Array, reactions: tuple[Grid, Forced], phi: Array) -> list[Array]:
-    """What readings of one's own say (S, G, 3) of positions x (T, 3n) at the samples."""
-    grid, motion = reactions[0], Motion(x, lambda: reactions[1])
+    """Return the predictions (S, G, 3) of custom sensors for positions x (T, 3n) at the samples."""
+    grid = reactions[0]
+
+    def forced() -> Forced:
+        return reactions[1]
+
+    motion = Motion(x, forced)
     gauges = gauge_readings(segment.experiment, segment.experiment.t_s, grid, segment.nuisance)
     return [gauge.of_motion(motion, phi) for gauge in gauges]
 
 
 def _share(problem: Problem, segment: Segment) -> float | None:
-    """Of the way to a forward simulation, what half the step would go; None if it is no finer."""
-    experiment, options = segment.experiment, problem.rollout
+    """Return the share of the difference to a forward simulation that half the step would make.
+
+    None if the simulation is no finer than the fit; 1 for static experiments.
+    """
+    experiment = segment.experiment
+    options = problem.rollout
     if experiment.static:
         return 1.0
     steps = experiment.timestep_s / _step_s(problem, segment) / segment.substeps
@@ -292,11 +344,14 @@ def _share(problem: Problem, segment: Segment) -> float | None:
         return None
     order = as_scheme(problem.scheme).order
     # Newmark's own error is of second order: beside one of the first it is none.
-    left = steps**-order if order > 1 else 0.0
-    return (1 - 0.5**order) / (1 - left)
+    remaining = steps**-order if order > 1 else 0.0
+    return (1 - 0.5**order) / (1 - remaining)
 
 
 def _step_s(problem: Problem, segment: Segment) -> float:
-    """Of forward simulations: a quarter of the samples' distance at most, and half the grid's."""
+    """Return the step of the forward simulation [s]: as stated, or finer than the grid of the fit.
+
+    By default at most a quarter of the sample interval and half the grid step.
+    """
     count = min(max(4, 2 * segment.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or segment.experiment.timestep_s / count

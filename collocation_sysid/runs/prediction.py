@@ -1,8 +1,9 @@
-"""How far a simulated motion is from a recording, in units and in stated standard deviations.
+"""Differences between a simulated motion and a recording, in units and in stated standard
+deviations.
 
-For forward simulations of fitted recordings, and for predictions of others. A prediction is judged
-beside two yardsticks: the same prediction with the nuisance parameters of the fitted recordings
-(blind), and the copy of a fitted recording's measurements.
+They are evaluated for forward simulations of fitted recordings, and for predictions of others. A
+prediction is compared with two references: the same prediction with the nuisance parameters of the
+fitted recordings (blind), and the measurements of a fitted recording (copy).
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from ..recording.clock import TIME_TOLERANCE_S
 
 @dataclass(frozen=True)
 class PredictionError:
-    """Differences between a prediction and the measurements; None of what is not measured.
+    """Differences between a prediction and the measurements; None for what is not measured.
 
     Attributes
     ----------
     rms_m, max_m : float or None
-        Distance of the markers from their measurements.
+        RMS and largest distance of the markers from their measurements.
     wrench_rms_n, wrench_rms_nm : float or None
         Root mean square of the components of force and torque.
     reading_rms : mapping of name to float, or None
-        Of readings of one's own, in their units.
+        RMS difference of custom sensors, in their units.
     depth : mapping of the camera's name to DepthError, or None
     """
 
@@ -45,7 +46,7 @@ class PredictionError:
 
 @dataclass(frozen=True)
 class CopyError:
-    """Differences between a recording and the measurements of another one.
+    """Differences between the measurements of a recording and those of a fitted one.
 
     Attributes
     ----------
@@ -67,15 +68,15 @@ class Misfit:
     what : str
         What is measured, for people.
     stated : str
-        What states σ in the problem.
+        Key of σ in the problem, for people.
     sigmas : float
         Root mean square of the differences over σ.
     tame_sigmas : float
-        The same by which a prediction is judged: of depth without wild points, see `DepthError`.
+        The same without outliers of depth, see `DepthError`; predictions are judged by it.
     numbers : int
-        How many numbers were measured.
+        Number of measured values.
     size : str
-        The root mean square in a unit, for people; empty if it is not one number.
+        Root mean square in a unit, for people; empty if units differ.
     """
 
     what: str
@@ -88,13 +89,15 @@ class Misfit:
 
 @dataclass(frozen=True)
 class Predicted:
-    """What a simulation predicts of a recording, as its instruments would read it.
+    """Predictions of a recording's instruments by a simulation.
 
     Attributes
     ----------
-    markers_m : (T, M, 3), NaN where nothing is predicted
+    markers_m : (T, M, 3)
+        NaN where nothing is predicted.
     wrenches : sequence of (S, 6)
     readings : mapping of name to (S, m)
+        Values of custom sensors.
     depth : mapping of the camera's name to DepthError
     """
 
@@ -105,9 +108,12 @@ class Predicted:
 
 
 def prediction_error(experiment: Experiment, predicted: Predicted) -> PredictionError:
-    """Compare a prediction with the measurements of its recording, where both are known."""
-    apart_m = np.linalg.norm(predicted.markers_m - experiment.markers.positions_m, axis=2)
-    present_m = apart_m[experiment.markers.present & np.isfinite(apart_m)]
+    """Return the differences between a prediction and the measurements of its recording.
+
+    Values that are not measured, or not predicted, are left out.
+    """
+    distance_m = np.linalg.norm(predicted.markers_m - experiment.markers.positions_m, axis=2)
+    present_m = distance_m[experiment.markers.present & np.isfinite(distance_m)]
     force_n, torque_nm = wrench_rms(experiment, predicted.wrenches)
     return PredictionError(
         rms_m=root_mean(present_m**2) if present_m.size else None,
@@ -120,33 +126,33 @@ def prediction_error(experiment: Experiment, predicted: Predicted) -> Prediction
 
 
 def misfits(experiment: Experiment, predicted: Predicted) -> list[Misfit]:
-    """Compare a prediction with the noise of each instrument that measured anything."""
-    found = []
+    """Return the differences over stated σ of each instrument that measured anything."""
+    results = []
     markers = experiment.markers
     if markers.present.any():
-        apart_m = (predicted.markers_m - markers.positions_m)[markers.present]
+        difference_m = (predicted.markers_m - markers.positions_m)[markers.present]
         sigma_m = np.broadcast_to(markers.sigma_m, markers.present.shape)[markers.present]
-        rms_m = root_mean(np.sum(apart_m**2, axis=1))
-        ratio = apart_m / sigma_m[:, None]
-        found.append(_misfit("the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"))
+        rms_m = root_mean(np.sum(difference_m**2, axis=1))
+        ratio = difference_m / sigma_m[:, None]
+        results.append(_misfit("the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"))
     for read, sensor in zip(predicted.wrenches, experiment.wrenches, strict=True):
         ratio = (read - sensor.values) / sensor.sigmas
-        found.append(_misfit("the wrench", "sigma_n", ratio))
+        results.append(_misfit("the wrench", "sigma_n", ratio))
     for gauge in experiment.readings:
         ratio = (predicted.readings[gauge.name] - gauge.measured) / gauge.sigma
-        found.append(_misfit(gauge.name, "its sigma", ratio))
+        results.append(_misfit(gauge.name, "its sigma", ratio))
     for name, error in predicted.depth.items():
         if error.rms_m is not None:
             size = f"{1e3 * error.rms_m:.3g} mm RMS"
             what = f"the depth of {name}"
-            found.append(
+            results.append(
                 Misfit(what, "its sigma_m", error.sigmas, error.tame_sigmas, error.points, size)
             )
-    return found
+    return results
 
 
 def _misfit(what: str, stated: str, ratio: Array, size: str = "") -> Misfit:
-    """Return the misfit of differences over σ, NaN where nothing is measured or known."""
+    """Return the misfit of differences over σ, `ratio`, in which NaN is left out."""
     known = ratio[np.isfinite(ratio)]
     sigmas = root_mean(known**2)
     return Misfit(what, stated, sigmas, sigmas, known.size, size)
@@ -156,7 +162,7 @@ def _misfit(what: str, stated: str, ratio: Array, size: str = "") -> Misfit:
 
 
 def blind_phi(segment: Segment, solution: Solution) -> Array:
-    """Return the nuisance parameters (k,) of a recording as the fitted recordings have them.
+    """Return the nuisance parameters (k,) of a recording by those of the fitted recordings.
 
     Each is the mean over the fitted recordings that have one of the same label, such as the place
     of a marker by its name, and zero, the mean of its prior, where none has: nothing of the
@@ -169,7 +175,8 @@ def blind_phi(segment: Segment, solution: Solution) -> Array:
     solution : Solution
         Of the fitted recordings.
     """
-    nuisance, places = segment.nuisance, segment.markers.place_places
+    nuisance = segment.nuisance
+    places = segment.markers.place_places
     known: dict[str, list[float]] = {}
     for part in solution.parts:
         for entry, _, value in part.segment.nuisance.valued(part.phi):
@@ -180,15 +187,15 @@ def blind_phi(segment: Segment, solution: Solution) -> Array:
     start_m = segment.places_m(np.zeros(nuisance.size))
     for number in segment.chart.estimated.tolist():
         name = segment.experiment.markers.names[number]
-        here = [
+        places_m = [
             part.segment.places_m(part.phi)[part.segment.experiment.markers.names.index(name)]
             for part in solution.parts
             if name in part.segment.experiment.markers.names
         ]
-        if here:
-            along_m = segment.chart.sigma_m[number] * segment.chart.axes[number]
-            way_m = np.mean(here, axis=0) - start_m[number]
-            phi[places[number]] = np.linalg.pinv(along_m) @ way_m
+        if places_m:
+            directions_m = segment.chart.sigma_m[number] * segment.chart.axes[number]
+            way_m = np.mean(places_m, axis=0) - start_m[number]
+            phi[places[number]] = np.linalg.pinv(directions_m) @ way_m
     return phi
 
 
@@ -203,9 +210,10 @@ def copy_error(experiment: Experiment, fitted: Iterable[Experiment]) -> CopyErro
     Returns
     -------
     CopyError or str
-        Or why there is none: no fitted recording has the same instruments and times.
+        A text with the reasons if no fitted recording has the same instruments and times.
     """
-    reasons, found = {}, []
+    reasons = {}
+    copies = []
     for other in fitted:
         reason = _difference(experiment, other)
         if reason:
@@ -218,16 +226,17 @@ def copy_error(experiment: Experiment, fitted: Iterable[Experiment]) -> CopyErro
             wrenches=[each.values for each in other.wrenches],
             readings={gauge.name: gauge.measured for gauge in other.readings},
         )
-        found.append(CopyError(other.name, prediction_error(experiment, copy)))
-    if not found:
-        said = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-        return f"no fitted recording can be copied ({said})"
-    return min(found, key=lambda each: each.error.rms_m or each.error.wrench_rms_n or np.inf)
+        copies.append(CopyError(other.name, prediction_error(experiment, copy)))
+    if not copies:
+        explanation = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        return f"no fitted recording can be copied ({explanation})"
+    return min(copies, key=lambda each: each.error.rms_m or each.error.wrench_rms_n or np.inf)
 
 
 def _difference(experiment: Experiment, other: Experiment) -> str:
     """Return why another recording's measurements do not predict a recording; "" if they do."""
-    own, others = experiment.markers, other.markers
+    own = experiment.markers
+    others = other.markers
     if not (own.samples or experiment.wrenches or experiment.readings):
         return "points of depth cameras have no counterparts"
     if set(own.names) != set(others.names):

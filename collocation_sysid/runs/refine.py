@@ -1,4 +1,4 @@
-"""The answer again with half the step, and on a mesh twice as fine: its numerical error."""
+"""Numerical errors of a solution, from solves with half the step and on a mesh twice as fine."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from .solving import solve
 from .warm_start import Earlier
 
 A = TypeVar("A", bound=Answer)
+# Most discretisations of each kind: three show the order of convergence, and a fourth is too large.
 MOST_LEVELS = 3
-# Last step of the logarithms: far below any error bar.
+# Last step of the parameters' logarithms at convergence: far below any error bar.
 TOLERANCE = 1e-6
 
 
 def finer_step(problem: Problem) -> Problem:
-    """The problem with half the step."""
+    """Return the problem with half the time step."""
     return replace(problem, substeps=2 * problem.first_substeps)
 
 
 def finer_mesh(problem: Problem) -> Problem:
-    """The problem with every tetrahedron split into eight."""
+    """Return the problem with every tetrahedron split into eight."""
     bodies = {id(body): refined(body) for body in problem.bodies}
     experiments = [refinement.refined(e, bodies[id(e.body)]) for e in problem.experiments]
     return replace(problem, experiments=experiments)
@@ -41,7 +42,7 @@ FINER = {"step": finer_step, "mesh": finer_mesh}
 
 
 def refine(finished: A, levels: int = 2, say: Callable[[str], None] | None = None) -> A:
-    """A converged run with its numerical error, see `refinement_of`."""
+    """Return a converged run with its numerical error, see `refinement_of`."""
     answer = Earlier.of(finished.solution)
     problem = replace(finished.problem, substeps=finished.solution.collocation.substeps)
     estimates = finished.optimum
@@ -57,32 +58,33 @@ def refinement_of(
     known: Sequence[Level] = (),
     keep: Callable[[Refinement], object] | None = None,
 ) -> Refinement:
-    """Solve again at finer discretisations, each from the answer before.
+    """Solve again at finer discretisations, each from the previous solution.
 
-    The step and the mesh are halved by themselves: their errors add up to first order. Finer
-    problems are solved by the reduced space, whatever method found the answer.
+    The step and the mesh are refined separately: their errors add up to first order. Finer problems
+    are solved by the reduced space, whatever method found the answer.
 
     Parameters
     ----------
     problem : Problem
     answer : Earlier
+        The solution of the problem.
     estimates : mapping of name to Estimate
-        The answer's, with the intervals for noise.
+        Estimates of that solution, with their statistical intervals.
     levels : int
-        2, or 3 to observe the orders.
+        2 discretisations of each kind, or 3 to observe the orders of convergence.
     say : callable, optional
-        Called with what is being done now.
+        Called with a progress message.
     known : sequence of Level
-        Those that were solved before.
+        Levels that were solved before.
     keep : callable, optional
-        Called after each level with what is found so far.
+        Called after each level with the refinement so far.
 
     Raises
     ------
     InputError
         For another number of levels, or where a finer problem is not solved.
     KeyboardInterrupt
-        Where a solve was interrupted; what `keep` was given stays.
+        If a solve was interrupted; the levels passed to `keep` are complete.
     """
     if not 2 <= levels <= MOST_LEVELS:
         raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
@@ -92,7 +94,8 @@ def refinement_of(
     solved = {(each.halved, each.times): each for each in known}
     reached: list[Level] = []
     for kind, finer in FINER.items():
-        at, start = coarse, answer
+        at = coarse
+        start = answer
         for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
             at = finer(at)
             if (kind, level) in solved:
@@ -112,6 +115,7 @@ def refinement_of(
 def _of_levels(
     levels: Sequence[Level], problem: Problem, estimates: Mapping[str, Estimate]
 ) -> Refinement:
+    """Return the numerical errors from the levels solved so far."""
     by_step, by_mesh = ([each.values for each in levels if each.halved == kind] for kind in FINER)
     order = as_scheme(problem.scheme).order
     errors = numerical_errors(estimates, by_step, by_mesh, order, problem.parameters.linear)
@@ -119,6 +123,9 @@ def _of_levels(
 
 
 def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
+    """Solve a finer problem in reduced space; `what` names it in the message of the
+    `InputError`.
+    """
     solution = solve(problem, ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE), start=start)
     if not solution.unless_interrupted().status.converged:
         raise InputError(
@@ -129,6 +136,15 @@ def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
 
 
 def _level(kind: str, level: int, solution: Solution) -> Level:
+    """Return the summary of a level from its solution.
+
+    Parameters
+    ----------
+    kind : {"step", "mesh"}
+    level : int
+        How often it was halved.
+    solution : Solution
+    """
     segments = solution.collocation.segments
     return Level(
         halved=kind,

@@ -1,4 +1,4 @@
-"""What ``result.json`` holds: one tree of plain values, from which pages and pictures are made."""
+"""Content of ``result.json``: one tree of plain values, from which pages and pictures are made."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class ReportedEstimate(Estimate):
     Attributes
     ----------
     combined_std_error : float or None
-        Standard uncertainty due to noise, discretisation and systematic effects; None for what was
-        not estimated, is at a bound, or if systematic effects were not evaluated.
+        Standard uncertainty due to noise, discretisation and systematic effects; None if the
+        quantity was not estimated or is at a bound, or if systematic effects were not evaluated.
     combined95 : (lower, upper) or None
         95 % interval due to the same, the one to publish; None as above.
     optimum : float or None
@@ -90,7 +90,7 @@ class ReportedEstimate(Estimate):
 
     @property
     def _statistical(self) -> Estimate:
-        """The value with its statistical uncertainty alone."""
+        """The estimate with its statistical uncertainty alone."""
         return Estimate(
             self.value,
             self.statistical_std_error,
@@ -118,7 +118,17 @@ class ReportedEstimate(Estimate):
 
 @dataclass(frozen=True)
 class FoundNuisance:
-    """A nuisance parameter in its unit, with the deviation of its prior."""
+    """A nuisance parameter.
+
+    Attributes
+    ----------
+    value : float
+        In its unit.
+    prior : float
+        Standard deviation of its prior.
+    std_error : float or None
+        Statistical standard error; None without error bars.
+    """
 
     value: float
     prior: float
@@ -127,19 +137,22 @@ class FoundNuisance:
 
 @dataclass(frozen=True)
 class FoundField:
-    """A constant that differs from place to place; its arrays are in ``trajectory.npz``.
+    """A constant that varies in space; its arrays are in ``trajectory.npz``.
 
     Attributes
     ----------
+    shapes : FieldShapes
     range : (least, most)
-        Of its values in the elements.
+        Range of its values in the elements.
     share_told : float or None
-        Of the volume, where the interval is less than half as wide as the prior's.
+        Share of the volume where the interval is less than half as wide as the prior's; None
+        without intervals.
     identified : int or None
-        How many independent shapes the data tell.
-    likelier : mapping of length in metres to the logarithm of how much likelier it is
+        Number of independent shapes that the data determine; None without intervals.
+    likelier : mapping of length in metres to float
+        Logarithm of the evidence of other correlation lengths, relative to the chosen one.
     phases : PhaseFinding or None
-        Contrast and volume of the inclusion of a two-phase field; None of a smooth one.
+        Contrast and volume of the inclusion of a two-phase field; None for a smooth field.
     """
 
     shapes: FieldShapes
@@ -150,31 +163,44 @@ class FoundField:
     phases: PhaseFinding | None = None
 
     def sentence(self, name: str) -> str:
-        """What it is, in a line."""
+        """Return a one-line summary of the field; `name` is the name of its constant."""
         least, most = self.range
-        said = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
+        sentence = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
         if self.identified is None or self.share_told is None:
-            return said
+            return sentence
         if self.phases is not None:
             lower, contrast, upper = self.phases.contrast
             least_m3, volume_m3, most_m3 = self.phases.volume_m3
             return (
-                f"{said}: two phases, contrast {contrast:.3g} ({lower:.3g} to {upper:.3g}), "
+                f"{sentence}: two phases, contrast {contrast:.3g} ({lower:.3g} to {upper:.3g}), "
                 f"inclusion {1e6 * volume_m3:.3g} cm³ ({1e6 * least_m3:.3g} to "
                 f"{1e6 * most_m3:.3g}); the phase of {self.share_told:.0%} of the volume is known"
             )
         shapes = f"{self.identified} of {self.shapes.modes} shapes of its field"
-        told = f"{self.share_told:.0%} of the volume better than the prior by half"
-        beside = [f"details above {short(1e3 * self.shapes.detail_m)} mm"]
+        share = f"{self.share_told:.0%} of the volume better than the prior by half"
+        details = [f"details above {short(1e3 * self.shapes.detail_m)} mm"]
         if len(self.likelier) > 1:
             each = ", ".join(f"{length} m {gain:+.1f}" for length, gain in self.likelier.items())
-            beside.append(f"length {self.shapes.length_m:g} m, ln evidence of {each}")
-        return f"{said}: the data tell {shapes}, and {told} ({'; '.join(beside)})"
+            details.append(f"length {self.shapes.length_m:g} m, ln evidence of {each}")
+        return f"{sentence}: the data tell {shapes}, and {share} ({'; '.join(details)})"
 
 
 @dataclass(frozen=True)
 class RecordingsAgreement:
-    """What each recording says by itself of a parameter, to first order, and how they agree."""
+    """Estimates of a parameter from single recordings, to first order, and their agreement.
+
+    Attributes
+    ----------
+    values : mapping of recording to float
+        Estimates from single recordings; NaN where a recording does not determine the parameter.
+    deviations : mapping of recording to float
+        Their standard deviations, in the coordinate of the estimate.
+    chi_squared : float
+        χ² of their differences.
+    degrees_of_freedom : int
+    disagree : bool
+        Whether the differences are significant.
+    """
 
     values: Mapping[str, float]
     deviations: Mapping[str, float]
@@ -185,7 +211,20 @@ class RecordingsAgreement:
 
 @dataclass(frozen=True)
 class FoundProfile:
-    """A profile likelihood, as how much the loss rises."""
+    """A profile likelihood.
+
+    Attributes
+    ----------
+    interval : (lower, upper)
+        Interval by the threshold; None for an end that was not reached.
+    values : (k,) array
+        Values of the parameter.
+    rises : (k,) array
+        Loss minus its least value.
+    threshold : float
+        Rise of the loss at the ends of the interval.
+    sentence : str
+    """
 
     interval: tuple[float | None, float | None]
     values: Array
@@ -196,7 +235,10 @@ class FoundProfile:
 
 @dataclass(frozen=True, eq=False)
 class FoundUncertainty:
-    """Where the error bars come from; covariance of the logarithms, by `names`."""
+    """Statistics behind the error bars.
+
+    Matrices refer to the logarithms (or other coordinates) of the parameters in `names`.
+    """
 
     noise: str
     errors: str
@@ -214,7 +256,21 @@ class FoundUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class FoundScan:
-    """The scan of the stiffness that found a start."""
+    """The scan over stiffnesses that gave the start of the search.
+
+    Attributes
+    ----------
+    reason : str
+        Why a scan was needed.
+    young_pa, misfit : (k,) arrays
+        Young's moduli and their misfits.
+    best : int
+        Index of the chosen one.
+    samples : int
+        Number of samples that were simulated.
+    time_s : float
+    sentence : str
+    """
 
     reason: str
     young_pa: Array
@@ -227,21 +283,29 @@ class FoundScan:
 
 @dataclass(frozen=True)
 class FittedExperiment:
-    """How far an experiment's markers and wrenches are from the fit.
+    """Residuals of the fit of an experiment.
 
     Attributes
     ----------
+    rms_m : float
+        RMS distance of the markers from the fit.
+    samples, missing : int
+        Numbers of marker samples that are present, and that are missing.
     static : bool
     beside : tuple of str
-        What was estimated of this recording alone, in words.
+        Sentences on the nuisance parameters of this recording.
+    wrench_rms_n, wrench_rms_nm, reading_rms
+        RMS differences of forces, torques and custom sensors; None if not measured.
     wrench_sigma_n, wrench_sigma_nm, reading_sigma
-        What is stated of the noise.
+        Stated standard deviations of their noise.
     reading_unit : mapping of name to str, optional
-        Units of the readings that state one.
-    friction : by obstacle, of those that rub
-    depth : by depth camera, distances of its points from the fitted surface
+        Units of the custom sensors that state one.
+    friction : mapping of obstacle to Rubbing
+        Of the obstacles with friction.
+    depth : mapping of depth camera to DepthError
+        Distances of its points from the fitted surface.
     air_density_kg_m3 : float
-        Of the air around the body in the model; zero in a vacuum.
+        Density of the air around the body in the model; zero in a vacuum.
     """
 
     rms_m: float
@@ -263,14 +327,19 @@ class FittedExperiment:
 
 @dataclass(frozen=True)
 class FoundFit:
-    """The same of all experiments.
+    """Residuals of the fit of all experiments.
 
     Attributes
     ----------
+    rms_m, noise_rms_m : float
+        RMS distance of all markers, and that expected from the stated noise.
+    experiments : mapping of name to FittedExperiment
+    wrench_rms_n, wrench_rms_nm : float or None
+        RMS differences of all forces and torques.
     symmetry : mapping of experiment to int, optional
-        Of those whose loads are reported for the whole specimen, how many times the loads of the
-        modelled part they are. Energies of friction and nuisance parameters are those of the
-        modelled part.
+        Of experiments whose loads are reported for the whole specimen: ratio of these to the loads
+        of the modelled part. Energies of friction and nuisance parameters are those of the modelled
+        part.
     """
 
     rms_m: float
@@ -283,11 +352,20 @@ class FoundFit:
 
 @dataclass(frozen=True)
 class SimulatedExperiment:
-    """An experiment simulated with the answer; of one that `failed` all else is missing.
+    """Errors of the forward simulation of an experiment; if `failed` is set, all else is missing.
 
     Attributes
     ----------
-    depth : by depth camera, distances of its points from the simulated surface
+    fitted : bool
+        Whether the experiment was fitted, not only predicted.
+    failed : str, optional
+        Why there is no simulation.
+    rms_m, max_m : float, optional
+        RMS and largest distance of the markers.
+    nuisance, places_m : mapping, optional
+        Nuisance parameters and marker places that were fitted to a recording for validation.
+    depth : mapping of depth camera to DepthError
+        Distances of its points from the simulated surface.
     blind : PredictionError, optional
         Of an experiment for validation, with the nuisance parameters of the fitted recordings in
         place of its own.
@@ -316,7 +394,9 @@ class SimulatedExperiment:
 
 @dataclass(frozen=True)
 class FoundRollout:
-    """Forward simulations with the answer; distances of those that were fitted."""
+    """Forward simulations with the estimates; RMS and largest distance of the fitted experiments'
+    markers.
+    """
 
     rms_m: float | None
     max_m: float | None
@@ -325,7 +405,9 @@ class FoundRollout:
 
 @dataclass(frozen=True)
 class FoundDynamics:
-    """How far the equations of motion are violated."""
+    """Residuals of the equations of motion: largest force [N], relative to other forces, and
+    where.
+    """
 
     max_violation_n: float
     max_violation_relative: float
@@ -334,7 +416,7 @@ class FoundDynamics:
 
 @dataclass(frozen=True)
 class ProgramSize:
-    """The discretised problem."""
+    """Size of the discretised problem and its scheme."""
 
     nodes: int
     elements: int
@@ -347,7 +429,7 @@ class ProgramSize:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What made the result, of which problem."""
+    """Software, platform and problem files from which the result was made."""
 
     version: str
     casadi: str
@@ -369,7 +451,7 @@ class Elapsed:
         From the problem to the optimum: finding a start, and every search that led to the answer,
         also with finer steps.
     checks : float
-        What follows: forward simulations, uncertainties, budget, probes and likely causes.
+        Forward simulations, uncertainties, budget, probes and likely causes.
     pictures : float or None
         Drawing and writing the pictures; None if they have not been drawn.
     """
@@ -381,12 +463,12 @@ class Elapsed:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The content of ``result.json``, whose names are its keys.
+    """The content of ``result.json``; the attributes are its keys.
 
-    `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run.
-    `basis` says what the values rest on: the law of the damping, and what sets the scale; `budget`
-    has each source's share of an estimate's variance; `probes` are
-    refits with an assumption relaxed and, where that was asked for, of parts of the data.
+    `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run. `basis`
+    names what the values refer to: the damping law, and what sets the scale; `budget` has each
+    source's share of an estimate's variance; `probes` are refits with an assumption relaxed and,
+    where requested, of parts of the data.
     """
 
     schema: int
@@ -422,7 +504,13 @@ class Result:
 
     @classmethod
     def read(cls, run: str | Path, what: str = "a run folder") -> Result:
-        """Read a run folder, which is said to be `what` where it is none.
+        """Read the result in a run folder.
+
+        Parameters
+        ----------
+        run : str or Path
+        what : str
+            What is expected, for the message if the folder has no result.
 
         Raises
         ------
@@ -436,28 +524,35 @@ class Result:
 
     @property
     def values(self) -> dict[str, ReportedEstimate]:
-        """Parameters, then moduli that follow; but the shares of a field."""
+        """Parameters, then derived moduli, by name, without the coefficients of fields."""
         both = {**self.parameters, **self.derived}
         return {name: each for name, each in both.items() if not is_mode(name)}
 
     @property
     def covers(self) -> tuple[str, ...]:
-        """Which discretisation errors the combined intervals contain: "step", "mesh"."""
+        """Kinds of discretisation error that the combined intervals contain: "step", "mesh"."""
         return known_kinds(self.numerical_errors.values())
 
     @property
     def numerical_errors(self) -> dict[str, NumericalError]:
-        """What is known of them, by name."""
+        """Known discretisation errors, by name of the estimate."""
         errors = ((name, each.numerical_error) for name, each in self.values.items())
         return {name: error for name, error in errors if error is not None}
 
     def home(self, run: str | Path, needs: str) -> Path:
-        """The folder of the problem file, which `needs` one.
+        """Return the folder of the problem file.
+
+        Parameters
+        ----------
+        run : str or Path
+            The run folder, for the message.
+        needs : str
+            Who needs the file, for the message, such as "which refine needs".
 
         Raises
         ------
         InputError
-            If the run is of no problem file.
+            If the run was not made from a problem file.
         """
         if self.provenance.problem_file is None:
             raise InputError(f"the run is of no problem file, {needs}", run)

@@ -1,8 +1,9 @@
 """Solves from several stiffnesses of a scan, where correspondences make local minima.
 
-Points of depth cameras belong to whatever of the surface is nearest: a body that is too soft, with
-the camera turned to match, can be a local minimum of the loss. So the scan's best stiffness and
-those next to it are all followed to the end, and the answer with the lowest loss counts.
+Points of depth cameras are associated with the nearest part of the surface: a body that is too
+soft, with the camera turned to match, can be a local minimum of the loss. So the scan's best
+stiffness and those next to it are all followed to convergence, and the solution with the lowest
+loss counts.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.start import placed_at_guess
 from ..program.collocation import Collocation
 
-# Losses that differ by less than this are of the same minimum, reached with other correspondences:
-# from two starts next to it twins differ by up to 5.
+# Difference of losses below which two solutions are the same minimum with other correspondences:
+# in simulated recordings they differ by up to 5.
 SAME_LOSS = 10.0
 Solve = Callable[[Method, Collocation], Solution]
 
 
 @dataclass(frozen=True, eq=False)
 class ScannedStart:
-    """Where to begin after several starts of a scan were followed.
+    """Start of a search after several starts of a scan were followed to convergence.
 
     Attributes
     ----------
@@ -33,9 +34,9 @@ class ScannedStart:
     scan : Scan
         The same scan with that start as its best.
     solution : Solution or None
-        The answer from there; None where another method than the one asked for found it.
+        Solution from there; None if it was found by another method than the one asked for.
     note : str
-        What was compared, for people; empty where there was one start only.
+        Comparison of the losses, for people; empty if there was one start only.
     """
 
     collocation: Collocation
@@ -45,40 +46,42 @@ class ScannedStart:
 
 
 def has_local_minima(collocation: Collocation) -> bool:
-    """Return whether measurements are associated anew while parameters are searched for."""
+    """Return whether correspondences of measurements change during the search."""
     return any(segment.depths for segment in collocation.segments)
 
 
 def robust_loss(solution: Solution) -> float:
-    """Loss with priors, and with points that are too far from the surface counted as at the gate.
+    """Return the loss with priors, with points beyond the gate counted as at the gate.
 
-    Points beyond the gate of a depth camera do not count in the loss: without this the answer that
-    loses most of them would seem the best.
+    The loss leaves out points beyond the gate of a depth camera: compared by it, the solution that
+    loses most points would seem the best.
     """
     collocation = solution.collocation
     p, _ = collocation.unpack(solution.z)
     prior, _ = collocation.prior(p)
-    far = sum(reading.loss_of_far_points for part in solution.parts for reading, _ in part.sights)
-    return sum(part.loss for part in solution.parts) + float(prior @ prior) + far
+    far_loss = sum(
+        reading.loss_of_far_points for part in solution.parts for reading, _ in part.sights
+    )
+    return sum(part.loss for part in solution.parts) + float(prior @ prior) + far_loss
 
 
 def best_start(
     solver: Method, collocation: Collocation, scan: Scan, watch: Watch | None, solve: Solve
 ) -> ScannedStart:
-    """Follow the starts of a scan and return the one with the lowest loss.
+    """Follow the starts of a scan to convergence and return the one with the lowest loss.
 
     Parameters
     ----------
     solver : Method
-        Methods that are not the reduced-space one go on from the best start: the starts are
-        followed in reduced space, which takes a fraction of their time.
+        If this is not the reduced-space method, the starts are followed in reduced space, which is
+        much faster, and the solver goes on from the best start.
     collocation : Collocation
         With the guesses of the scan's best stiffness.
     scan : Scan
     watch : callable, optional
         Called with every iteration.
     solve : callable
-        Solves a collocation by a method, with its correspondences renewed.
+        ``solve(method, collocation)``, with renewed correspondences.
     """
     first = ScannedStart(collocation, scan, None, "")
     if not scan.others or not has_local_minima(collocation):
@@ -86,23 +89,25 @@ def best_start(
     own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
     is_own = own == ReducedSpace.name
     method: Method = solver if is_own else ReducedSpace()
-    found: list[tuple[float, int, Solution]] = []
+    candidates: list[tuple[float, int, Solution]] = []
     for number in (scan.best, *scan.others):
-        begun = placed_at_guess(replace(collocation, parameters=scan.starts[number]))
-        solution = solve(method, begun)
+        started = placed_at_guess(replace(collocation, parameters=scan.starts[number]))
+        solution = solve(method, started)
         if solution.status is Status.INTERRUPTED:
             return first if not is_own else replace(first, solution=solution)
         if solution.status.converged:
-            found.append((robust_loss(solution), number, solution))
-    if not found:
+            candidates.append((robust_loss(solution), number, solution))
+    if not candidates:
         return first
-    loss, best, solution = min(found, key=lambda each: each[0])
-    said = ", ".join(
-        f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa" for each, number, _ in found
+    loss, best, solution = min(candidates, key=lambda each: each[0])
+    losses = ", ".join(
+        f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa" for each, number, _ in candidates
     )
-    note = f"{len(found)} starts of the scan were followed to the end, with the losses {said}"
-    if max(each for each, _, _ in found) - loss > SAME_LOSS:
+    note = (
+        f"{len(candidates)} starts of the scan were followed to the end, with the losses {losses}"
+    )
+    if max(each for each, _, _ in candidates) - loss > SAME_LOSS:
         note += ": local minima, of which the lowest counts"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
-    begun = replace(collocation, parameters=scan.starts[best])
-    return ScannedStart(begun, chosen, solution if is_own else None, note)
+    started = replace(collocation, parameters=scan.starts[best])
+    return ScannedStart(started, chosen, solution if is_own else None, note)

@@ -1,4 +1,4 @@
-"""Solving a problem: where to start, again from elsewhere where that helps, and no checks."""
+"""Solving a problem: choice of the start, and repetition from other starts where that helps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .several_starts import best_start
 from .two_phases import solve_two_phases
 from .warm_start import Earlier
 
-# How a search ends that went astray; another start may help.
+# Outcomes of a failed search, after which another start may help.
 LOST = (
     Status.INFEASIBLE,
     Status.STALLED,
@@ -36,9 +36,9 @@ LOST = (
     Status.NUMERICAL_FAILURE,
     Status.NOT_SIMULABLE,
 )
-# By how much χ² must be lower for another answer to count.
+# Least decrease of χ² for which the solution from a second start is preferred.
 NOTICEABLE = 1e-3
-# A solve is repeated so often where markers turn out to sit in other elements.
+# Most repetitions of a solve whose estimates change the correspondences of the measurements.
 REREADINGS = 5
 
 
@@ -55,22 +55,27 @@ def solve(
     ----------
     problem : Problem
     method : str or Method, optional
-        A name, or anything that solves a `Collocation`, such as a method with other options; the
+        A name, or a callable that solves a `Collocation`, such as a method with other options; the
         problem's own by default.
     watch : callable, optional
         Called with every `Iteration`.
     start : str, Path or Earlier, optional
-        An earlier answer or the folder of its run, of any mesh or timestep; it takes the place of
-        the guesses where names match.
+        An earlier solution or the folder of its run, of any mesh or timestep; its values replace
+        the guesses of parameters with the same names.
     scheduler : str, optional
         Address of a dask.distributed scheduler, whose workers share the experiments of the search;
         for reduced space only.
 
+    Returns
+    -------
+    Solution
+        Also if the search failed: see its `status`.
+
     Raises
     ------
     InputError
-        For an unknown method, a start that is no run or has no parameter of these, where no start
-        is found, for a scheduler that does not answer, and when the solver refuses the problem.
+        For an unknown method, a start that is no run or shares no parameter name, if no start is
+        found, for a scheduler that does not answer, and when the solver refuses the problem.
     """
     solver = problem.solver(method)
     if scheduler is not None and not isinstance(solver, ReducedSpace):
@@ -91,14 +96,16 @@ def _likeliest(
     start: str | Path | Earlier | None,
     solved: Callable[[Problem, str | Path | Earlier | None], Solution],
 ) -> Solution:
-    """Solve with the likeliest of the lengths that fields have to choose from.
+    """Solve a problem with the most likely of the correlation lengths that its fields allow.
 
-    An answer tells, to first order, which of them that is, see `statistics.fields`; with that it is
-    solved again from there, until it is the likeliest by its own answer or one that was tried.
+    The likelihood of each length follows to first order from a solution, see `statistics.fields`.
+    The problem is solved again, from there, with the most likely lengths, until these no longer
+    change or were tried before.
     """
     if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
         return solve_two_phases(problem, start, solved)
-    solution, tried = solved(problem, start), [problem.lengths_m]
+    solution = solved(problem, start)
+    tried = [problem.lengths_m]
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     if all(len(field.field.lengths_m) == 1 for field in fields):
         return solution
@@ -120,10 +127,14 @@ def _solved(
     watch: Watch | None,
     workers: Workers | None,
 ) -> Solution:
+    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
+    solution.
+    """
     earlier = Earlier.read(start) if isinstance(start, (str, Path)) else start
     problem = problem if earlier is None else earlier.started(problem)
     try:
-        whole, collocation = getattr(solver, "needs_whole_start", False), problem.collocation()
+        needs_whole_start = getattr(solver, "needs_whole_start", False)
+        collocation = problem.collocation()
         started_from: list[str] = []
         for experiment in collocation.experiments:
             require_depth_units(experiment)
@@ -132,22 +143,24 @@ def _solved(
         has_guesses = not collocation.parameters.unguessed
         if has_guesses:
             require_memory(problem, collocation, solver)
-        collocation, scan = started(collocation, whole)
+        collocation, scan = started(collocation, needs_whole_start)
         if not has_guesses:  # the estimate evaluates the program at a guess
             require_memory(problem, collocation, solver)
-        collocation, variables = placed_at_guess(collocation), None
+        collocation = placed_at_guess(collocation)
+        variables = None
         if earlier is not None and not scan:
             collocation = earlier.placed(collocation)
             variables = earlier.variables(collocation)
         solver = shared(solver, workers)
         solution = None
         if scan is not None:
-            begun = best_start(
+            scanned = best_start(
                 solver, collocation, scan, watch, lambda by, of: read_where_found(by, of, watch)
             )
-            collocation, scan = placed_at_guess(begun.collocation), begun.scan
-            solution = begun.solution
-            started_from = [begun.note] if begun.note else []
+            collocation = placed_at_guess(scanned.collocation)
+            scan = scanned.scan
+            solution = scanned.solution
+            started_from = [scanned.note] if scanned.note else []
         if solution is None:
             solution = read_where_found(solver, collocation, watch, variables)
         if scan is None and solution.status in LOST:
@@ -159,26 +172,31 @@ def _solved(
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
-    said = [] if scan is None else [scan.sentence]
-    notes = (*said, *started_from, *solution.notes, *_seen(solution))
+    scan_notes = [] if scan is None else [scan.sentence]
+    notes = (*scan_notes, *started_from, *solution.notes, *_seen(solution))
     return replace(solution, scan=scan or solution.scan, notes=notes)
 
 
 def _seen(solution: Solution) -> Iterator[str]:
-    """How near the surface is to what depth cameras saw, and what of that was left out."""
+    """Yield notes on the distances of depth points and outlines from the fitted surface, per
+    camera.
+    """
     for part in solution.parts:
         for reading, looked in part.sights:
-            apart_m, seen = reading.apart_m(looked, part.phi), reading.sighting
-            said = ", ".join(f"{count} {why}" for why, count in seen.left_out.items() if count)
-            off = "count, as none is near enough to the body"
-            if seen.used.any():
-                off = (
-                    f"are off by {1e3 * np.sqrt(np.nanmean(apart_m**2)):.3g} mm (RMS; half of them "
-                    f"by less than {1e3 * np.nanmedian(np.abs(apart_m)):.3g})"
+            distance_m = reading.apart_m(looked, part.phi)
+            sighting = reading.sighting
+            left_out = ", ".join(
+                f"{count} {why}" for why, count in sighting.left_out.items() if count
+            )
+            distances = "count, as none is near enough to the body"
+            if sighting.used.any():
+                distances = (
+                    f"are off by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} mm (RMS; half of "
+                    f"them by less than {1e3 * np.nanmedian(np.abs(distance_m)):.3g})"
                 )
             yield (
-                f"experiment '{part.segment.experiment.name}': {seen.used.sum()} points of "
-                f"'{seen.view.depth.name}' {off}; left out: {said or 'none'}"
+                f"experiment '{part.segment.experiment.name}': {sighting.used.sum()} points of "
+                f"'{sighting.view.depth.name}' {distances}; left out: {left_out or 'none'}"
             )
         for outline, apart_px in part.outline_distances_px:
             if len(apart_px):
@@ -190,17 +208,27 @@ def _seen(solution: Solution) -> Iterator[str]:
 
 
 def shared(solver: Method, workers: Workers | None) -> Method:
-    """The method with the workers that share its experiments, where there are any."""
+    """Return the method with workers for its experiments; itself without workers or for other
+    methods.
+    """
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver
     return partial(solver, workers=workers)
 
 
 def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | None, Solution]:
-    """Solve from a scan what could not be solved from its guess; the loser where that fails too."""
+    """Solve from the result of a scan after a search from the guess failed.
+
+    Returns
+    -------
+    scan : Scan or None
+        None if the scan finds no start, or the search from there fails too.
+    solution : Solution
+        The new solution, or the failed one.
+    """
     reason = f"the search from the guess was lost ({lost.status.value})"
-    whole = getattr(solver, "needs_whole_start", False)
-    scan = rescue(lost.collocation, reason, whole)
+    needs_whole_start = getattr(solver, "needs_whole_start", False)
+    scan = rescue(lost.collocation, reason, needs_whole_start)
     if scan is None:
         return None, lost
     again = placed_at_guess(replace(lost.collocation, parameters=scan.parameters))
@@ -210,7 +238,9 @@ def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | 
 
 
 def _from_elsewhere(solver: Method, first: Solution, watch: Watch | None) -> Solution:
-    """The better of an answer and that of a second start, where there is reason for one."""
+    """Return the better of a solution and the solution from a second start, if `second_start` has
+    one.
+    """
     other = second_start(first)
     if other is None:
         return first
@@ -231,7 +261,11 @@ def _from_elsewhere(solver: Method, first: Solution, watch: Watch | None) -> Sol
 def read_where_found(
     solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
 ) -> Solution:
-    """Solve, and again from there as long as estimates leave where the recordings are read."""
+    """Solve, and repeat while estimates change the correspondences of the measurements.
+
+    These are the elements of markers, the points of depth cameras, and the sample intervals of
+    clocks. At most `REREADINGS` repetitions.
+    """
     solution = solver(collocation, watch, start)
     for _ in range(REREADINGS):
         if not solution.status.converged:
@@ -244,19 +278,24 @@ def read_where_found(
     return solution
 
 
-# Linear elements lock towards ν = ½: with a smaller modulus and a ratio near one half a body can
-# move almost like a stiffer, compressible one. Beyond this Poisson's ratio an answer is looked for
-# from the usual one at the same Young's modulus too, and the better counts; less does not lock.
-NEARLY_INCOMPRESSIBLE, USUAL = 0.42, 0.3
+# Poisson's ratio above which a second search starts from the usual one at the same Young's modulus:
+# linear elements lock towards ν = ½, so that with a smaller modulus and a ratio near one half a
+# body can move almost like a stiffer, compressible one. Smaller ratios do not lock.
+NEARLY_INCOMPRESSIBLE = 0.42
+# Poisson's ratio of that start.
+USUAL = 0.3
+# Names of the constants that determine Young's modulus and Poisson's ratio, two of them at a time.
 LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
 
 
 def second_start(solution: Solution) -> Parameters | None:
-    """The answer with other Poisson's ratios where those it found are high; None where none is.
+    """Return the parameters at a solution with high Poisson's ratios replaced by the usual one.
 
-    Only ratios that were estimated count, by both of the moduli that tell them.
+    Only estimated ratios count, of regions in which both moduli are estimated. None if no ratio is
+    high or a parameter with one is at a bound.
     """
-    collocation, values = solution.collocation, values_of(solution.collocation, solution.q)
+    collocation = solution.collocation
+    values = values_of(solution.collocation, solution.q)
     free = {item.name: item for item in collocation.parameters.free}
     changed: dict[str, float] = {}
     for name, ratio in values.items():
@@ -272,6 +311,7 @@ def second_start(solution: Solution) -> Parameters | None:
 
 
 def _usual(name: str, young_pa: float) -> float:
+    """Return the value of a modulus for the usual Poisson's ratio and a Young's modulus [Pa]."""
     value = USUAL if bare(name) == "poisson" else usual_value(name, young_pa, USUAL)
     assert value is not None
     return value

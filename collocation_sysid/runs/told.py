@@ -1,4 +1,4 @@
-"""What an answer says, as the one tree that files hold and pages, pictures and terminals show."""
+"""Conversion of an answer to `Result`, the content of ``result.json``."""
 
 from __future__ import annotations
 
@@ -50,9 +50,11 @@ from .verdict import depth_errors
 
 
 def result_of(answer: Answer) -> Result:
-    """The content of result.json."""
-    solution, problem = answer.solution, answer.problem
-    collocation, values = solution.collocation, answer.estimates
+    """Return the content of ``result.json`` for an answer."""
+    solution = answer.solution
+    problem = answer.problem
+    collocation = solution.collocation
+    values = answer.estimates
     return Result(
         schema=SCHEMA,
         status=solution.status.value,
@@ -100,6 +102,7 @@ def result_of(answer: Answer) -> Result:
 
 
 def _provenance(problem: Problem) -> Provenance:
+    """Return versions, platform and hashes of the problem's files."""
     origin = problem.origin
     text = None if origin is None else origin.text.encode()
     return Provenance(
@@ -115,28 +118,36 @@ def _provenance(problem: Problem) -> Provenance:
 
 
 def _basis(problem: Problem) -> Iterator[str]:
-    """The law that γ_r belongs to, and what the moduli rest on where nothing sets their scale."""
+    """Yield what the values refer to: the damping law of γ_r, and how moduli are scaled without a
+    force.
+    """
     parts = [part for body in problem.bodies for part in body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
-    said = [law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws]
-    if said:
-        yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(said)}"
+    law_names = [
+        law + (", which also brakes rotation" if law == "rayleigh" else "") for law in laws
+    ]
+    if law_names:
+        yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
     if (relative := relative_sentence(problem.experiments, problem.parameters)) is not None:
         yield relative
 
 
 def _uncertainty(answer: Answer) -> FoundUncertainty | None:
+    """Return the statistics behind the error bars; None without error bars.
+
+    Coefficients of fields are left out of the matrices.
+    """
     known = answer.uncertainty
     if known is None:
         return None
-    told = [k for k, name in enumerate(known.names) if not is_mode(name)]
+    reported = [k for k, name in enumerate(known.names) if not is_mode(name)]
     return alike(
         FoundUncertainty,
         known,
-        names=tuple(known.names[k] for k in told),
-        correlation=known.correlation[np.ix_(told, told)],
-        covariance=known.covariance[np.ix_(told, told)],
-        quantiles=known.quantiles[told],
+        names=tuple(known.names[k] for k in reported),
+        correlation=known.correlation[np.ix_(reported, reported)],
+        covariance=known.covariance[np.ix_(reported, reported)],
+        quantiles=known.quantiles[reported],
         noise_factors=known.level.factors,
         autocorrelation=known.dependence.lag1,
         verdicts=tuple(verdicts(known)),
@@ -151,19 +162,24 @@ def _uncertainty(answer: Answer) -> FoundUncertainty | None:
 
 
 def _field(found: FieldEstimate) -> FoundField:
-    modes, volumes_m3 = found.modes, found.modes.volumes_m3
-    ends, told = (float(found.value.min()), float(found.value.max())), found.told
+    """Return the summary of a field; its intervals are None if the covariance is not finite."""
+    modes = found.modes
+    volumes_m3 = found.modes.volumes_m3
+    ends = (float(found.value.min()), float(found.value.max()))
+    is_determined = found.told
     if not np.isfinite(found.deviation).all():
         return FoundField(modes.told, ends, None, None, {}, found.phases)
-    share = float(volumes_m3[told].sum() / volumes_m3.sum())
+    share = float(volumes_m3[is_determined].sum() / volumes_m3.sum())
     likelier = {f"{each:g}": found.likelier(each) for each in modes.field.lengths_m}
     return FoundField(modes.told, ends, share, found.identified, likelier, found.phases)
 
 
 def _recordings(answer: Answer) -> dict[str, RecordingsAgreement] | None:
+    """Return the agreement of the recordings, by parameter; None if it was not evaluated."""
     if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
         return None
-    q, agreements = answer.solution.q, {}
+    q = answer.solution.q
+    agreements = {}
     for k, item in enumerate(answer.solution.collocation.parameters.free):
         if is_mode(item.name):
             continue
@@ -181,13 +197,17 @@ def _recordings(answer: Answer) -> dict[str, RecordingsAgreement] | None:
 
 
 def _fit(answer: Answer) -> FoundFit:
-    solution, experiments = answer.solution, {}
+    """Return the residuals of the fit of each experiment."""
+    solution = answer.solution
+    experiments = {}
     depths: dict[str, dict[str, DepthError]] = {}
     for (recording, camera), error in depth_errors(solution).items():
         depths.setdefault(recording, {})[camera] = error
     for part in solution.parts:
         experiment = part.segment.experiment
-        name, markers, sensors = experiment.name, experiment.markers, part.segment.sensors
+        name = experiment.name
+        markers = experiment.markers
+        sensors = part.segment.sensors
         wrenches = [sensor.wrench for sensor in sensors]
         sigmas = [
             (wrench.symmetry * wrench.sigmas) ** 2 * np.where(wrench.measured, 1.0, np.nan)
@@ -220,12 +240,15 @@ def _fit(answer: Answer) -> FoundFit:
 
 
 def _simulated(answer: Answer) -> FoundRollout:
-    experiments, squares, largest = {}, [], []
+    """Return the errors of the forward simulations of all experiments."""
+    experiments = {}
+    squares = []
+    largest = []
     for experiment in answer.problem.experiments:
-        experiments[experiment.name] = seen = _compared(answer, experiment)
-        if seen.fitted and seen.rms_m is not None and seen.max_m is not None:
-            squares.append(experiment.markers.samples * np.array([seen.rms_m**2, 1.0]))
-            largest.append(seen.max_m)
+        experiments[experiment.name] = compared = _compared(answer, experiment)
+        if compared.fitted and compared.rms_m is not None and compared.max_m is not None:
+            squares.append(experiment.markers.samples * np.array([compared.rms_m**2, 1.0]))
+            largest.append(compared.max_m)
     if not largest:
         return FoundRollout(None, None, experiments)
     total, count = np.sum(squares, axis=0)
@@ -238,6 +261,7 @@ def _units(experiment: Experiment) -> dict[str, str] | None:
 
 
 def _compared(answer: Answer, experiment: Experiment) -> SimulatedExperiment:
+    """Return the errors of the forward simulation of an experiment."""
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, Rollout):
@@ -262,7 +286,7 @@ def _compared(answer: Answer, experiment: Experiment) -> SimulatedExperiment:
 
 
 def _nuisance(answer: Answer) -> dict[str, dict[str, FoundNuisance]]:
-    """Nuisance parameters but the places."""
+    """Return the nuisance parameters, without the places of markers, by experiment and label."""
     deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     named: dict[str, dict[str, FoundNuisance]] = {}
     for part in answer.solution.parts:
@@ -274,7 +298,9 @@ def _nuisance(answer: Answer) -> dict[str, dict[str, FoundNuisance]]:
 
 
 def _of_places(places: Mapping[str, Place]) -> Iterator[str]:
-    """How far places are from those given, and how well those not given are known."""
+    """Yield sentences on how far places differ from the given ones, and on the accuracy of unknown
+    ones.
+    """
     moved = {
         n: place.moved_m or 0.0 for n, place in places.items() if place.prior_m and place.given
     }
@@ -292,7 +318,9 @@ def _of_places(places: Mapping[str, Place]) -> Iterator[str]:
 
 
 def _of_rows(part: Part, answer: Answer) -> Iterator[str]:
-    """What was found of each row of the table but the places, beside its prior."""
+    """Yield a sentence on each kind of nuisance parameter but the places, with the estimate and its
+    prior.
+    """
     nuisance = part.segment.nuisance
     values = part.phi * nuisance.scales
     for row in (*part.segment.experiment.nuisance.rows, GAUGE):
@@ -312,15 +340,29 @@ def _of_rows(part: Part, answer: Answer) -> Iterator[str]:
 
 
 def _sentence(part: Part, own: Sequence[int], values: Array, answer: Answer) -> str:
-    """The sentence of a row about a vector, or a number."""
-    nuisance, k = part.segment.nuisance, own[0]
-    entry, name = nuisance.entries[k], nuisance.names[k]
+    """Return the sentence on a vector, or a number, of nuisance parameters.
+
+    Parameters
+    ----------
+    part : Part
+        Experiment at the solution.
+    own : sequence of int
+        Indices of its components in φ.
+    values : (k,) array
+        Their values in the unit of the row.
+    answer : Answer
+    """
+    nuisance = part.segment.nuisance
+    k = own[0]
+    entry = nuisance.entries[k]
+    name = nuisance.names[k]
     known = answer.uncertainty.nuisance if answer.uncertainty else {}
     low, high = (limit[k] for limit in nuisance.limits(part.segment.chart.samples))
     factor, unit = in_unit_for_people(1.0, entry.unit)
     if entry.row == TARE:  # of the sensor, on which the whole specimen acts
         factor *= part.segment.experiment.symmetry
-    size, error = float(np.linalg.norm(values)), entry.sigma * known.get(name, np.nan)
+    size = float(np.linalg.norm(values))
+    error = entry.sigma * known.get(name, np.nan)
     allowed = low + 1e-3 < part.phi[k] < high - 1e-3
     sentence = (entry.row.told or "{which} {signed}").format(
         size=f"{short(factor * size)}{unit}",

@@ -1,11 +1,12 @@
-"""Solving a problem whose field has two phases: a smooth field first, then phases and parameters.
+"""Solving a problem with a two-phase field: a smooth field first, then phases and parameters in
+turn.
 
 1. The problem with a smooth field in place of the two phases is solved.
-2. At that answer the measurements are linearised in the logarithm of every element, and phases are
-   drawn from their posterior, see `statistics.phases`.
-3. With the likelier phase of every element the problem is solved for the contrast and all other
-   parameters by the method that was asked for. 2 and 3 repeat from there until no more than a
-   small share of the volume changes its phase.
+2. At that solution the measurements are linearised in the logarithm of every element, and phases
+are sampled from their posterior, see `statistics.phases`.
+3. With the more likely phase of every element the problem is solved for the contrast and all other
+parameters by the chosen method. Steps 2 and 3 repeat until only a small share of the volume changes
+its phase.
 """
 
 from __future__ import annotations
@@ -40,19 +41,19 @@ from .warm_start import Earlier
 
 Solved = Callable[[Problem, str | Path | Earlier | None], Solution]
 
-# Elements of a two-phase field: the sampler has two dense matrices of their square.
+# Most elements of a two-phase field: the sampler stores two dense square matrices of this size.
 MOST_ELEMENTS = 4000
-# Rounds of phases and parameters at most.
+# Most rounds of phases and parameters.
 ROUNDS = 6
-# Phases are final where less than this share of the inclusion's volume changes in a round.
+# Share of the inclusion's volume that changes in a round, below which the phases are final.
 SETTLED = 0.02
-# An inclusion of fewer elements is noise of a single element.
+# Fewest elements of an inclusion: a single element is noise.
 FEWEST_ELEMENTS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class _PhaseSearch:
-    """The two-phase field of a problem.
+    """The two-phase field of a problem, and the names of its parameters.
 
     Attributes
     ----------
@@ -76,7 +77,7 @@ class _PhaseSearch:
 
 @dataclass(frozen=True)
 class _SmoothFit:
-    """Fit of the smooth field.
+    """Quality of the fit with the smooth field.
 
     Attributes
     ----------
@@ -84,8 +85,8 @@ class _SmoothFit:
     misfit : float
         χ² per measurement.
     determined : float
-        Number of parameters and shapes that the data determine; one that a prior determines counts
-        in part.
+        Effective number of parameters and shapes that the data determine; one that is determined by
+        its prior in part counts in part.
     """
 
     chi_squared: float
@@ -98,22 +99,24 @@ class _SmoothFit:
 
 
 def _smooth_fit(fit: LinearisedFit) -> _SmoothFit:
+    """Return the quality of the fit with the smooth field, linearised at its solution."""
     return _SmoothFit(fit.chi_squared, _misfit(fit), information(fit).fitted)
 
 
 def solve_two_phases(
     problem: Problem, start: str | Path | Earlier | None, solved: Solved
 ) -> Solution:
-    """Solve a problem with a two-phase field; the answer's body has the phases and their samples.
+    """Solve a problem with a two-phase field; the body of the solution has the phases and their
+    samples.
 
     Parameters
     ----------
     problem : Problem
         With exactly one two-phase field.
     start : str, Path or Earlier, optional
-        Where the solve with the smooth field starts.
+        Start of the solve with the smooth field.
     solved : callable
-        Solves a problem without a two-phase search.
+        ``solved(problem, start)``, the solution of a problem with given phases or a smooth field.
 
     Raises
     ------
@@ -143,11 +146,11 @@ def solve_two_phases(
         best = candidate
         at_best = at_candidate
         draws = draw_phases(at_best.data(1.0), at_best.faces, phase)
-        following = _likelier(draws.probability)
+        next_phase = _likelier(draws.probability)
         volumes_m3 = search.modes.volumes_m3
-        if volumes_m3 @ np.abs(following - phase) < SETTLED * (volumes_m3 @ phase):
+        if volumes_m3 @ np.abs(next_phase - phase) < SETTLED * (volumes_m3 @ phase):
             break
-        phase = following
+        phase = next_phase
     assert best is not None
     final = _phase_of(best, search)
     temperature = smooth.lack_of_fit(at_best.fit.chi_squared)
@@ -174,6 +177,7 @@ def _phase_of(solution: Solution, search: _PhaseSearch) -> Array:
 
 
 def _body_of(solution: Solution, search: _PhaseSearch) -> Body:
+    """Return the body with the two-phase field."""
     segments = solution.collocation.segments
     return next(s.body for s in segments if search.name in s.body.lengths_m)
 
@@ -187,6 +191,9 @@ def _solved_with(
 
 
 def _search_of(problem: Problem) -> _PhaseSearch:
+    """Return the two-phase field of a problem; an `InputError` for several, or for too many
+    elements.
+    """
     fields = problem.two_phase_fields
     if len(fields) > 1:
         raise InputError(
@@ -208,13 +215,13 @@ def _search_of(problem: Problem) -> _PhaseSearch:
 
 def _likelier(probability: Array) -> Array:
     """Return the likelier phase (E,) of every element; neither phase is left empty."""
-    found = inclusion(probability).astype(float)
+    phase = inclusion(probability).astype(float)
     order = np.argsort(probability)
-    if found.sum() < FEWEST_ELEMENTS:
-        found[order[-FEWEST_ELEMENTS:]] = 1.0
-    elif found.sum() > len(found) - FEWEST_ELEMENTS:
-        found[order[:FEWEST_ELEMENTS]] = 0.0
-    return found
+    if phase.sum() < FEWEST_ELEMENTS:
+        phase[order[-FEWEST_ELEMENTS:]] = 1.0
+    elif phase.sum() > len(phase) - FEWEST_ELEMENTS:
+        phase[order[:FEWEST_ELEMENTS]] = 0.0
+    return phase
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +231,10 @@ class _Linearised:
     Attributes
     ----------
     fit : LinearisedFit
-    columns : (E,) of the elements in the fit
-    base : (E,) logarithms over the mean where they are linearised
+    columns : (E,) int array
+        Columns of the elements' logarithms in the fit.
+    base : (E,) array
+        Logarithms relative to the mean at which the measurements are linearised.
     faces : Faces
     deviation : float
         Prior standard deviation of the logarithm of the contrast.
@@ -238,7 +247,9 @@ class _Linearised:
     deviation: float
 
     def data(self, temperature: float) -> ElementInformation:
-        """Return the normal equations, with the measurements' over the temperature T."""
+        """Return the normal equations, with those of the measurements divided by the
+        temperature T.
+        """
         return _information(
             self.fit,
             self.columns,
@@ -300,42 +311,58 @@ def _samples(
 
 
 def _by_elements(problem: Problem, solution: Solution, search: _PhaseSearch) -> LinearisedFit:
-    """Return the fit at a solution, by the coefficients of the elements too, which are zero."""
-    found = solution.collocation
+    """Return the linearised fit at a solution, with the elements' logarithms as further parameters.
+
+    The values of these parameters are zero.
+    """
+    solved = solution.collocation
     elements = set(search.elements)
     collocation = replace(
-        found,
+        solved,
         experiments=problem.experiments,
         parameters=problem.parameters,
-        charts=_charts(found, problem.experiments),
+        charts=_charts(solved, problem.experiments),
         explicit=False,
     )
-    p, positions = found.unpack(solution.z)
-    values = dict(zip((item.name for item in found.parameters.free), p, strict=False))
+    p, positions = solved.unpack(solution.z)
+    values = dict(zip((item.name for item in solved.parameters.free), p, strict=False))
     q = [
         0.0 if item.name in elements else values[item.name] for item in collocation.parameters.free
     ]
-    both = np.concatenate([q, p[found.nq :]])
+    both = np.concatenate([q, p[solved.nq :]])
     return linearised_fit(collocation, collocation.pack(both, positions))
 
 
 def _misfit(fit: LinearisedFit) -> float:
-    """χ² per measurement."""
+    """Return χ² per measurement of a linearised fit."""
     return fit.chi_squared / max(1, fit.measurements)
 
 
 def _information(
     fit: LinearisedFit, of_z: Index, *, base: Array, deviation: float, temperature: float
 ) -> ElementInformation:
-    """Return the normal equations, with the columns `of_z` those of the elements."""
+    """Return the normal equations of a linearised fit.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+    of_z : (E,) int array
+        Columns of the elements' logarithms.
+    base : (E,) array
+        Logarithms relative to the mean at which the fit is linearised.
+    deviation : float
+        Prior standard deviation of the logarithm of the contrast.
+    temperature : float
+        Divides the information of the measurements, not that of the priors.
+    """
     size = len(fit.names)
     normal = np.zeros((size, size))
     score = np.zeros(size)
     for block in fit.blocks:
         residual, slope, _ = block.channels
-        flat = slope.reshape(residual.size, size)
-        normal += flat.T @ flat
-        score += flat.T @ residual.ravel()
+        matrix = slope.reshape(residual.size, size)
+        normal += matrix.T @ matrix
+        score += matrix.T @ residual.ravel()
     normal /= temperature
     score /= temperature
     of_p = np.delete(np.arange(size), of_z)
@@ -372,7 +399,7 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
 
 
 def _charts(collocation: Collocation, experiments: Sequence[Experiment]) -> dict[str, Chart]:
-    """Return where recordings are read, for bodies that differ in their fields only."""
+    """Return the marker–element associations for bodies that differ in their fields only."""
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {
         segment.experiment.name: replace(segment.chart, body=bodies[segment.experiment.name])

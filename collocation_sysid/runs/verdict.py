@@ -1,4 +1,4 @@
-"""Everything about a finished run that gives concern, see `statistics.trust`."""
+"""Concerns about a finished run, from which its verdict follows, see `statistics.trust`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from .check.motion import Motion, motion_of
 from .forward_simulation import Rollout
 from .result import ReportedEstimate
 
-# Noise of cameras over a body's size is less.
+# Largest noise of cameras, relative to the size of the body.
 NO_CAMERA = 0.01
 
 
@@ -55,7 +55,20 @@ def concerns(
     uncertainty: Uncertainty | None,
     diagnoses: Sequence[MarkerDiagnosis],
 ) -> Iterator[Concern]:
-    """What speaks against an answer."""
+    """Yield the concerns about a solution and its forward simulations.
+
+    If the search failed, only concerns about the bodies and about this failure.
+
+    Parameters
+    ----------
+    solution : Solution
+    rollouts : mapping of experiment name to Rollout or str
+        Forward simulations, or the reason why there is none.
+    motions : iterable of Motion
+        Natural modes at the estimates.
+    uncertainty : Uncertainty or None
+    diagnoses : sequence of MarkerDiagnosis
+    """
     status = solution.status
     yield from body_concerns(solution)
     if not status.converged:
@@ -81,11 +94,12 @@ def concerns(
             yield from camera_pose_concerns(
                 [nuisance.names[k] for k in pose], part.phi[pose].tolist()
             )
-        for reading, apart_px in part.outline_distances_px:
+        for reading, distance_px in part.outline_distances_px:
             camera = f"'{reading.sighting.view.depth.name}' of '{part.segment.experiment.name}'"
-            yield from outline_concerns(camera, apart_px)
+            yield from outline_concerns(camera, distance_px)
         for k in nuisance.places(TIME):
-            scale, name = float(nuisance.scales[k]), part.segment.experiment.name
+            scale = float(nuisance.scales[k])
+            name = part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
     yield from stability_concerns(instabilities(solution.collocation, solution.z))
     yield from contact_concerns(touched(solution.parts))
@@ -120,7 +134,8 @@ def combined_concerns(
     ----------
     parameters : Parameters
     estimates : mapping of name to ReportedEstimate
-    shares : mapping of name to the shares of its budget, largest first
+    shares : mapping of name to mapping of source to float
+        Shares of the variance in the budget, largest first.
     """
     return [
         _undetermined(item.name, estimates[item.name], shares[item.name])
@@ -130,6 +145,7 @@ def combined_concerns(
 
 
 def _undetermined(name: str, estimate: ReportedEstimate, shares: Mapping[str, float]) -> Concern:
+    """Return the concern about an undetermined estimate, with the largest share of its budget."""
     source, share = next(iter(shares.items()))
     low, high = estimate.combined95 or (np.nan, np.nan)
     data = {"name": name, "low": low, "high": high, "source": worded(source), "share": share}
@@ -137,7 +153,9 @@ def _undetermined(name: str, estimate: ReportedEstimate, shares: Mapping[str, fl
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
-    """Bodies of a size or a density that is hardly meant, not with the stiffness, or not known."""
+    """Yield concerns about implausible sizes and densities, implausible stiffness, and unknown
+    scale.
+    """
     for body in dict.fromkeys(segment.body for segment in solution.collocation.segments):
         odd = oddities(body) or [odd_material(body, body.theta(solution.parameters))]
         yield from (each.concern("doubtful") for each in odd if each is not None)
@@ -146,9 +164,9 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:
-    """A `sigma_m` of equilibria that allows for more than cameras miss.
+    """Yield a concern for each static experiment with a `sigma_m` larger than the noise of cameras.
 
-    Recordings that go on in time tell it by their autocorrelation; of these nothing does.
+    In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
     for experiment in (segment.experiment for segment in solution.collocation.segments):
         if not experiment.static or not experiment.markers.samples:
@@ -160,14 +178,14 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 
 
 def _of_predictions(rollouts: Mapping[str, Rollout | str]) -> Iterator[Concern]:
-    """Return where simulations with stated parameters miss by more than the noise."""
+    """Yield concerns about simulations with given parameters that differ by more than the noise."""
     for name, rollout in rollouts.items():
         for misfit in rollout.misfits if isinstance(rollout, Rollout) else ():
             yield from prediction_concerns(name, **vars(misfit))
 
 
 def _of_unseen(name: str, rollout: Rollout | str) -> Iterator[Concern]:
-    """Return depth cameras none of whose points is near the simulated surface."""
+    """Yield a concern for each depth camera without a point near the simulated surface."""
     for camera, error in rollout.depth.items() if isinstance(rollout, Rollout) else ():
         if not error.points:
             data = {"experiment": name, "camera": camera, "seen": error.seen}
@@ -177,13 +195,25 @@ def _of_unseen(name: str, rollout: Rollout | str) -> Iterator[Concern]:
 def _of_rollout(
     name: str, rollout: Rollout | str, solution: Solution, noise_m: float
 ) -> list[Concern]:
+    """Return concerns about the forward simulation of an experiment.
+
+    Parameters
+    ----------
+    name : str
+        Name of the experiment.
+    rollout : Rollout or str
+    solution : Solution
+    noise_m : float
+        Expected RMS distance of the markers by their noise.
+    """
     fit_rms_m = solution.rms_by_experiment_m
     if not isinstance(rollout, Rollout):
         return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
     fitted = name in fit_rms_m
     fit_m = fit_rms_m.get(name, solution.rms_m)
     of_markers = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
-    predicted_n, fit_n = rollout.wrench_rms[0], pooled_wrench_rms(solution)[0]
+    predicted_n = rollout.wrench_rms[0]
+    fit_n = pooled_wrench_rms(solution)[0]
     if fitted or of_markers:
         return of_markers
     if predicted_n is not None and fit_n is not None:
@@ -192,7 +222,9 @@ def _of_rollout(
 
 
 def _of_predicted_depth(name: str, rollout: Rollout, solution: Solution) -> Iterator[Concern]:
-    """Compare predicted depth with the fitted one, or with its noise where that is larger."""
+    """Yield concerns about predicted depth, against the larger of the fitted residuals and the
+    noise.
+    """
     fitted = [error.tame_sigmas for error in depth_errors(solution).values()]
     yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
     for camera, error in rollout.depth.items():
@@ -200,7 +232,7 @@ def _of_predicted_depth(name: str, rollout: Rollout, solution: Solution) -> Iter
 
 
 def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
-    """Distances of depth cameras' points from the fitted surface, by experiment and camera."""
+    """Distances of depth cameras' points from the fitted surface, by (experiment, camera)."""
     return {
         (part.segment.experiment.name, reading.sighting.view.depth.name): (
             SurfaceComparison.from_fit(reading, part.x, looked, part.phi).error
@@ -211,7 +243,7 @@ def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
-    """RMS distance of the fitted markers that noise of the σ given would leave."""
+    """RMS distance of the fitted markers that is expected from noise with the stated σ [m]."""
     markers = [segment.experiment.markers for segment in solution.collocation.segments]
     samples = np.concatenate([each.present.sum(axis=0) for each in markers]).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
@@ -221,8 +253,12 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
 
 
 def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
-    """How each body oscillates with the answer; a solve that failed has none worth the search."""
-    motions, substeps = {}, solution.collocation.substeps
+    """Natural modes of each body at the estimates, by experiment; empty if the search failed.
+
+    Static experiments, and those without an equilibrium, are left out.
+    """
+    motions = {}
+    substeps = solution.collocation.substeps
     scheme = as_scheme(solution.collocation.scheme)
     moving = [experiment for experiment in problem.experiments if not experiment.static]
     for experiment in moving if solution.status.converged else ():

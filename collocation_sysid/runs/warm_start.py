@@ -1,4 +1,4 @@
-"""An earlier answer, from its run folder, as the start of another solve."""
+"""Warm start: an earlier solution, from its run folder or from memory, as the start of a solve."""
 
 from __future__ import annotations
 
@@ -22,16 +22,20 @@ from .result import Result
 
 @dataclass(frozen=True)
 class Earlier:
-    """What an earlier run found.
+    """Estimates of an earlier solution, by name, as the start of another solve.
 
     Attributes
     ----------
     folder : Path
-    values : mapping of name to value, of parameters and of moduli derived from them
-    nuisance : mapping of experiment and name to value, by names as in `Collocation.names`
-    places_m : mapping of experiment to places (3,) by marker
+        Run folder, for messages; empty for a solution from memory.
+    values : mapping of name to value
+        Parameters, and moduli derived from them.
+    nuisance : mapping of name to value
+        Nuisance parameters by "experiment: label", as in `Collocation.names`.
+    places_m : mapping of experiment to mapping of marker to (3,)
+        Places of the markers.
     substeps : int
-        Time steps per sample that it was found with.
+        Time steps per sample.
     """
 
     folder: Path
@@ -42,23 +46,23 @@ class Earlier:
 
     @classmethod
     def read(cls, folder: str | Path) -> Earlier:
-        """Read a run folder.
+        """Return the estimates in a run folder.
 
         Raises
         ------
         InputError
-            If it is not one, or damaged.
+            If the folder is no run folder, or damaged.
         """
         return cls.of_result(Result.read(folder, "the folder of an earlier run"), Path(folder))
 
     @classmethod
     def of_result(cls, result: Result, folder: Path) -> Earlier:
-        """What the result of a run's folder holds.
+        """Return the estimates of a result.
 
         Raises
         ------
         InputError
-            If it is damaged.
+            If a value is not finite.
         """
         both = {**result.parameters, **result.derived}
         # The optimum solves the equations of the trajectory in the folder, not the corrected value.
@@ -84,8 +88,10 @@ class Earlier:
 
     @classmethod
     def of(cls, solution: Solution) -> Earlier:
-        """What was just found."""
-        collocation, nuisance, places_m = solution.collocation, {}, {}
+        """Return the estimates of a solution."""
+        collocation = solution.collocation
+        nuisance = {}
+        places_m = {}
         for part in solution.parts:
             segment = part.segment
             name = segment.experiment.name
@@ -97,12 +103,12 @@ class Earlier:
         return cls(Path(), values, nuisance, places_m, collocation.substeps)
 
     def started(self, problem: Problem) -> Problem:
-        """The problem with what was found as its guesses, clipped to its bounds.
+        """Return the problem with these estimates as its guesses, clipped to its bounds.
 
         Raises
         ------
         InputError
-            If no estimated parameter has a name that was found.
+            If no estimated parameter has a name among the values.
         """
         free = problem.parameters.free
         known = {i: self.values[i.name] for i in free if i.name in self.values}
@@ -116,7 +122,7 @@ class Earlier:
         return replace(problem, parameters=problem.parameters.with_guess(guesses))
 
     def placed(self, collocation: Collocation) -> Collocation:
-        """The problem with markers that are to be placed where they were found."""
+        """Return the discretised problem with estimated markers starting at the earlier places."""
         places_m = []
         for segment in collocation.segments:
             here = segment.places_m(segment.guess_phi)
@@ -126,17 +132,21 @@ class Earlier:
         return collocation.placed_at(places_m)
 
     def _known_places(self, segment: Segment) -> dict[int, Array]:
+        """Return earlier places (3,) of those markers of a segment whose places are estimated, by
+        index.
+        """
         places_m = self.places_m.get(segment.experiment.name, {})
         names = segment.experiment.markers.names
         estimated = segment.chart.estimated.tolist()
         return {m: places_m[names[m]] for m in estimated if names[m] in places_m}
 
     def nuisance_of(self, collocation: Collocation) -> tuple[Array, int]:
-        """Return p at the guess with the nuisance parameters that were found, and how many were.
+        """Return p at the guess with the earlier nuisance parameters, and the number of these.
 
-        Places are those of the problem.
+        Places of markers are those of the discretised problem.
         """
-        p, matches = collocation.guess_p, 0
+        p = collocation.guess_p
+        matches = 0
         for segment in collocation.segments:
             for place, entry in zip(segment.local.places, segment.nuisance.entries, strict=True):
                 name = f"{segment.experiment.name}: {entry.label}"
@@ -146,10 +156,10 @@ class Earlier:
         return p, matches
 
     def variables(self, collocation: Collocation) -> Array | None:
-        """Simulated variables z at the guess with the nuisance parameters that were found.
+        """Return the variables z of a simulation at the guess with the earlier nuisance parameters.
 
-        None where there are none, or the simulation fails: the guess is all that is known then.
-        Places are those of the problem.
+        None if no nuisance parameter or place matches, or if the simulation fails. Places of
+        markers are those of the discretised problem.
         """
         p, matches = self.nuisance_of(collocation)
         matches += sum(len(self._known_places(segment)) for segment in collocation.segments)

@@ -16,7 +16,8 @@ Combined intervals
 Checks
     `identifiability` and `scale` describe what the data determine. `diagnostics` analyses the
     residuals of each marker. `relaxation`, `routine_probes` and `probes` relax assumptions and
-    refit parts of the data. `hypothesis`, `plausible`, `modal`, `cameras` and `causes` test
-    hypotheses of misspecification. `trust` combines everything into a verdict with the messages of
-    `concern`.
+    refit parts of the data. Misspecification hypotheses (`hypothesis`) are generated without
+    simulation by `plausible` and `placement_causes`, with natural modes by `modal`, for depth
+    cameras by `cameras`, and after a fit by `causes` and `wrench_causes`. `trust` combines
+    everything into a verdict with the messages of `concern`.
 """

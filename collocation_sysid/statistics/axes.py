@@ -9,7 +9,7 @@ AxesOrder = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 def _other_axes() -> Iterator[tuple[str, AxesOrder]]:
-    """Yield every order and signs of three axes but the given ones, with their description."""
+    """Yield every order and signs of three axes except the identity, with their description."""
     for order in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             if order != (0, 1, 2) or min(signs) < 0:

@@ -40,7 +40,8 @@ REFITS = 3
 # Many variants are tried of one mistake: each must fit so many times better than others.
 ONE_OF_MANY = 1.05
 # Of the body's diagonal: equilibria may deform it so far, and no grasped body is so far off.
-DEFORMED, FAR_OFF = 0.1, 0.3
+DEFORMED = 0.1
+FAR_OFF = 0.3
 
 
 def doubts(
@@ -72,7 +73,8 @@ def doubts(
 
 def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield other axes of the tracks that bring them far nearer to the undeformed body."""
-    markers, body = experiment.markers, experiment.body
+    markers = experiment.markers
+    body = experiment.body
     places_m = markers.observe(experiment.rigid_positions(experiment.t_s))
     size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
 
@@ -149,7 +151,8 @@ class ModalComparison:
 
     def unlike(self) -> Iterator[Hypothesis]:
         """Yield that the tracks are far from where any stiffness has them, if they are."""
-        misfit_m, size_m = self.misfit_m(self.given), self.sway.size_m
+        misfit_m = self.misfit_m(self.given)
+        size_m = self.sway.size_m
         strength = misfit_m / (FAR_OFF * size_m)
         if strength > 1:
             data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}

@@ -1,4 +1,6 @@
-"""Contradictions between a body, its grasps and obstacles: loose parts, bodies inside solids."""
+"""Misspecification hypotheses about the placement of a body: loose parts, and bodies inside
+obstacles.
+"""
 
 from __future__ import annotations
 
@@ -17,32 +19,42 @@ from .hypothesis import Hypothesis
 
 # Nodes deeper in a solid than this share of the body's diagonal are inside it; that share of all
 # nodes cannot be.
-DEEP, MOST_INSIDE = 0.01, 0.5
+DEEP = 0.01
+MOST_INSIDE = 0.5
 
 
 def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield what of a body is held by nothing, and obstacles that contain most of it."""
+    """Yield hypotheses about parts of a body that no grasp holds, and about obstacles that
+    contain most of it.
+    """
     yield from _loose_parts(experiment)
     for obstacle in experiment.obstacles:
         yield from _containing(experiment, obstacle)
 
 
 def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield that no grasp holds some parts of the mesh, where one holds others."""
-    cells, count = experiment.body.cells, len(experiment.body.nodes_m)
+    """Yield the hypothesis that the mesh has unconnected parts, some of which no grasp holds."""
+    cells = experiment.body.cells
+    count = len(experiment.body.nodes_m)
     first = np.repeat(cells[:, 0], cells.shape[1] - 1)
     edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
     _, labels = connected_components(edges, directed=False)
     parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
-    held = [labels[grasp.nodes] for grasp in experiment.gripping]
-    loose = ~np.isin(parts, np.concatenate(held)) if held else np.zeros(len(parts), dtype=bool)
+    grasped_labels = [labels[grasp.nodes] for grasp in experiment.gripping]
+    loose = (
+        ~np.isin(parts, np.concatenate(grasped_labels))
+        if grasped_labels
+        else np.zeros(len(parts), dtype=bool)
+    )
     if loose.any() and not experiment.tendons:
         data = {"parts": len(parts), "loose": int(loose.sum()), "nodes": int(sizes[loose].max())}
         yield Hypothesis("mesh-parts", f"'{experiment.name}'", data, strength=float(count))
 
 
 def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
-    """Yield that an obstacle contains most of the undeformed body at the first time."""
+    """Yield the hypothesis that an obstacle contains most of the undeformed body at the
+    first time.
+    """
     nodes_m = experiment.rigid_positions(experiment.t_s[:1])[
         0, : len(experiment.body.nodes.points_m)
     ]
@@ -59,7 +71,9 @@ def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothes
 
 
 def _gaps_m(obstacle: Obstacle, points_m: Array) -> Array:
-    """Return how far outside an obstacle points (n, 3) of its frame are (n,) [m]."""
+    """Return the signed distances (n,) of points (n, 3) in an obstacle's frame from its
+    surface [m], negative inside.
+    """
     point = ca.SX.sym("point", 3)
     gap = ca.Function("gap", [point], [obstacle.shape.gap(point)])
     return np.asarray(gap.map(len(points_m))(points_m.T), dtype=np.float64).ravel()

@@ -173,7 +173,8 @@ def steps(experiment: Experiment) -> Iterator[Hypothesis]:
 
 def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesis]:
     """Yield a step of all markers together that the poses do not have."""
-    tracks_m, sigma_m = experiment.markers.positions_m, experiment.markers.sigma_m
+    tracks_m = experiment.markers.positions_m
+    sigma_m = experiment.markers.sigma_m
     complete = np.isfinite(tracks_m).all(axis=(1, 2))
     # A gap hides a step: samples around it are taken as neighbours.
     rows = np.flatnonzero(complete)
@@ -187,12 +188,14 @@ def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesi
 
 
 # Of the body's diagonal and of the noise: markers that move less may be still.
-STILL_OF_SIZE, STILL_SIGMAS = 0.01, 6.0
+STILL_OF_SIZE = 0.01
+STILL_SIGMAS = 6.0
 
 
 def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield that markers move on a body that starts at rest and that nothing moves."""
-    t_s, grasps = experiment.t_s, experiment.grasps
+    t_s = experiment.t_s
+    grasps = experiment.grasps
     if experiment.start != "equilibrium" or experiment.actuators or experiment.obstacles:
         return
     held = (grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps)
@@ -200,7 +203,8 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
     loads = [experiment.node_forces_n(t_s), experiment.tied_mass_kg(t_s)]
     if not grasps or not all(held) or any(_changes(each) for each in (*motions, *loads)):
         return
-    markers, size_m = experiment.markers, float(np.ptp(experiment.body.nodes_m, axis=0).max())
+    markers = experiment.markers
+    size_m = float(np.ptp(experiment.body.nodes_m, axis=0).max())
     there = markers.present.sum(axis=0) >= FEWEST_SAMPLES
     if not there.any():
         return

@@ -1,9 +1,9 @@
 """Misspecification hypotheses for measured wrenches: signs, axes, units, frames, points, clocks.
 
-A measured wrench is compared with the reaction of a fit to the markers alone, which a wrong wrench
-cannot distort. Every usual mistake is undone in turn. Tares are allowed for by their priors. Where
-neither a density nor a load is known, the predicted wrench is known up to one positive factor,
-which is then estimated in each comparison.
+A measured wrench is compared with the prediction of a fit to the markers alone, which a wrong
+wrench cannot distort. Each common mistake is corrected in turn. Tares are allowed for by their
+priors. Where neither a density nor a load is known, the predicted wrench is known up to one
+positive factor, which is estimated in each comparison.
 """
 
 from __future__ import annotations
@@ -27,15 +27,21 @@ from .axes import OTHER_AXES
 from .hypothesis import Hypothesis, Trial
 
 # Residuals up to so many standard deviations need no cause; what is right leaves so much less.
-MISFIT, BETTER = 1.3, 1.5
+MISFIT = 1.3
+BETTER = 1.5
 # The prediction is of no use where the markers themselves are fitted worse than this, in sigmas.
 MARKERS_MISFIT = 3.0
 MOST_SWEEPS = 40
 # Of the fit before a solve: the samples, its sweeps and its tolerance.
-CHECKED_SAMPLES, CHECKED_SWEEPS, CHECKED_TOLERANCE = 100, 15, 1e-2
+CHECKED_SAMPLES = 100
+CHECKED_SWEEPS = 15
+CHECKED_TOLERANCE = 1e-2
 # Clocks may be off by this share of a recording.
-LATEST, SHIFTS = 0.25, 60
-FORCES, TORQUES, BOTH = slice(0, 3), slice(3, 6), slice(0, 6)
+LATEST = 0.25
+SHIFTS = 60
+FORCES = slice(0, 3)
+TORQUES = slice(3, 6)
+BOTH = slice(0, 6)
 # What forces, and torques, are written in by mistake.
 UNITS = (
     (
@@ -53,19 +59,21 @@ UNITS = (
 # Offsets of so many standard deviations of the tare's prior are no tare of a zeroed sensor.
 FAR_TARE = 3.0
 # A calibration is good to this share, and a point to this distance; less gives no concern.
-SAME_GAIN, SAME_POINT_M = 0.05, 0.005
+SAME_GAIN = 0.05
+SAME_POINT_M = 0.005
 # Mistakes with numbers to fit, or with many variants, must fit so many times better than others.
-FITTED, ONE_OF_MANY = 1.5, 1.05
+FITTED = 1.5
+ONE_OF_MANY = 1.05
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A description of a wrench under trial.
+    """Description of a wrench to be tested.
 
     Attributes
     ----------
     wrench : Wrench
-        The samples as they would be without the mistake.
+        Samples as they would be without the mistake.
     tare : float
         Standard deviation of each tare, in standard deviations of the noise; inf for a free tare.
     """
@@ -75,23 +83,23 @@ class _Trial:
 
 
 def wrench_causes(solution: Solution) -> list[Hypothesis]:
-    """Return what is likely described wrongly of the wrenches after a fit; empty where they fit."""
+    """Return hypotheses about wrongly described wrenches after a fit; empty if the wrenches fit."""
     if not any(map(_misses, solution.parts)):
         return []
-    seen = [s for s in solution.collocation.segments if s.experiment.markers.samples]
+    with_markers = [s for s in solution.collocation.segments if s.experiment.markers.samples]
     return _of_parts(
-        _from_markers(solution.collocation, seen, ReducedSpace(max_iterations=MOST_SWEEPS))
+        _from_markers(solution.collocation, with_markers, ReducedSpace(max_iterations=MOST_SWEEPS))
     )
 
 
 def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
-    """Return what is likely described wrongly of the wrenches before any solve.
+    """Return hypotheses about wrongly described wrenches before any solve.
 
-    The first samples of the experiments with markers and wrenches are fitted by their markers
-    alone. Nothing is said where that fit does not explain the markers.
+    The first samples of the experiments with markers and wrenches are fitted to their markers
+    alone. Empty where that fit does not explain the markers.
     """
-    seen = [s for s in collocation.segments if s.sensors and s.experiment.markers.samples]
-    shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in seen]
+    with_both = [s for s in collocation.segments if s.sensors and s.experiment.markers.samples]
+    shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
     if not shorter:
         return []
     beginning = replace(collocation, experiments=shorter)
@@ -101,6 +109,7 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
 
 
 def _misses(part: Part) -> bool:
+    """Whether the residuals of a wrench exceed the noise."""
     # They are behind the markers.
     pairs = zip(part.segment.sensors, part.looked[1:], strict=False)
     return any(
@@ -110,7 +119,7 @@ def _misses(part: Part) -> bool:
 
 
 def _markers_misfit(part: Part) -> float:
-    """Root mean square of the markers' residuals in standard deviations."""
+    """Return the root mean square of the markers' residuals in standard deviations."""
     residuals = part.segment.markers.residuals(part.looked[0], part.phi)
     return float(
         np.sqrt(np.sum(residuals**2) / max(1, 3 * part.segment.experiment.markers.samples))
@@ -120,53 +129,69 @@ def _markers_misfit(part: Part) -> float:
 def _from_markers(
     collocation: Collocation, seen: Sequence[Segment], method: ReducedSpace
 ) -> list[Part]:
-    """Return the experiments as their markers alone have them; none where there is no such fit."""
+    """Return experiments fitted to their markers alone, with the nuisance parameters of the
+    wrenches at zero; empty if the fit fails.
+    """
     if not seen:
         return []
-    blind = [without_sensors(segment.experiment) for segment in seen]
+    without_wrenches = [without_sensors(segment.experiment) for segment in seen]
     try:
-        solution = method(replace(collocation, experiments=blind))
+        solution = method(replace(collocation, experiments=without_wrenches))
     except (InputError, SimulationError):
         return []
     solution.unless_interrupted()
-    found = []
+    parts = []
     for segment, part in zip(seen, solution.parts, strict=True):
-        known = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
-        phi = np.array([known.get(name, 0.0) for name in segment.nuisance.names])
-        found.append(Part(segment, part.q, phi, part.x))
-    return found
+        values = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
+        phi = np.array([values.get(name, 0.0) for name in segment.nuisance.names])
+        parts.append(Part(segment, part.q, phi, part.x))
+    return parts
 
 
 def _of_parts(parts: Sequence[Part]) -> list[Hypothesis]:
-    found: list[Hypothesis] = []
+    """Return the hypotheses for all wrench sensors of experiments fitted to their markers alone."""
+    hypotheses: list[Hypothesis] = []
     for part in parts:
         forced = part.motion.forced
         for sensor in part.segment.sensors:
-            found += _OneSensor(part, sensor, forced).causes()
-    return found
+            hypotheses += _OneSensor(part, sensor, forced).causes()
+    return hypotheses
 
 
 class _OneSensor:
-    """The comparison of one sensor with the reaction that is predicted from the markers.
+    """Comparison of one wrench sensor with the prediction from the markers.
 
     Attributes
     ----------
     scale_known : bool
-        Whether densities or loads determine how large the predicted reaction is.
+        Whether densities or loads determine the size of the prediction.
+
+    Parameters
+    ----------
+    part : Part
+        The experiment, fitted to its markers alone.
+    sensor : WrenchReading
+        Measurement model of the sensor.
+    forced : Forced
+        Predicted reaction forces.
     """
 
     scale_known: bool
 
     def __init__(self, part: Part, sensor: WrenchReading, forced: Forced) -> None:
         segment = part.segment
-        self.part, self.sensor, self.forced = part, sensor, forced
+        self.part = part
+        self.sensor = sensor
+        self.forced = forced
         blind = without_sensors(segment.experiment)
         self.scale_known = not segment.body.mass_slopes or blind.knows_a_force
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
         self.given = _Trial(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
 
     def causes(self) -> Iterator[Hypothesis]:
-        """Yield the mistakes without which the wrench fits far better."""
+        """Iterate over the hypotheses without which the wrench fits far better; if it fits,
+        over those about a large tare.
+        """
         misfit = self.misfit(self.given)
         if misfit > MISFIT:
             yield from Trial(misfit, self.misfit, BETTER, least=1.0).of(self._mistakes())
@@ -174,21 +199,27 @@ class _OneSensor:
             yield from self._large_tare()
 
     def _large_tare(self) -> Iterator[Hypothesis]:
-        """Yield that the offset which a fit needs is far beyond the prior of the tare."""
+        """Yield the hypothesis that the tare of the fit is far beyond its prior."""
         tare = self.given.tare
         if not tare:
             return
         measured, predicted = self._scaled_by_sigma(_Trial(self.given.wrench, 0.0))
         factor = 1.0 if self.scale_known else _slope(measured, predicted)
-        apart = measured - factor * predicted
-        there = np.isfinite(apart).any(axis=0)
-        largest = np.abs(np.nanmean(apart[:, there], axis=0)).max() / tare if there.any() else 0.0
+        differences = measured - factor * predicted
+        is_measured = np.isfinite(differences).any(axis=0)
+        largest = (
+            np.abs(np.nanmean(differences[:, is_measured], axis=0)).max() / tare
+            if is_measured.any()
+            else 0.0
+        )
         if largest > FAR_TARE:
             of = f"the wrench of '{self.part.segment.experiment.name}'"
             yield Hypothesis("wrench-tare", of, strength=float(largest / FAR_TARE))
 
     def misfit(self, trial: _Trial) -> float:
-        """Return the root mean square of the residuals in standard deviations."""
+        """Return the root mean square of the residuals of a description in standard
+        deviations; infinite without samples.
+        """
         measured, predicted = self._scaled_by_sigma(trial)
         if not np.isfinite(measured).any():
             return np.inf
@@ -196,14 +227,19 @@ class _OneSensor:
         return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
 
     def _scaled_by_sigma(self, trial: _Trial) -> tuple[Array, Array]:
-        """Return samples and prediction (S, 6) in sigmas, without tares; NaN in the same places."""
-        wrench, sigmas = trial.wrench, trial.wrench.sigmas
+        """Return samples and prediction (S, 6) over the noise, without tares; NaN in the
+        same places.
+        """
+        wrench = trial.wrench
+        sigmas = trial.wrench.sigmas
         predicted = np.where(wrench.present, self._predicted(wrench), np.nan) / sigmas
         measured = np.where(np.isfinite(predicted), wrench.values / sigmas, np.nan)
         return _without_tare(measured, trial.tare), _without_tare(predicted, trial.tare)
 
     def _predicted(self, wrench: Wrench) -> Array:
-        """Return the predicted wrench (S, 6) at the times, in the frame and about the point."""
+        """Return the predicted wrench (S, 6) at the times, in the frame and about the point
+        of a wrench; cached.
+        """
         at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
         if at not in self._known:
             phi = np.zeros(self.part.segment.nuisance.size)
@@ -211,7 +247,9 @@ class _OneSensor:
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:
-        """Return the positive factor by which the samples in some columns fit best; NaN if none."""
+        """Return the positive factor with which the samples of some columns fit best; NaN
+        if there is none.
+        """
         measured, predicted = self._scaled_by_sigma(self.given)
         slope = _slope(measured[:, columns], predicted[:, columns])
         # A common factor cannot be told where the scale is unknown, that of one kind can.
@@ -221,9 +259,10 @@ class _OneSensor:
         return 1 / slope if slope > 0 else np.nan
 
     def _point_shift_m(self) -> Array:
-        """Return the shift (3,) of the torques' point with which they fit best; zero if unknown.
+        """Return the shift (3,) of the torques' reference point with which they fit best [m]; zero
+        if unknown.
 
-        About a point farther by d, a torque is smaller by d × f.
+        About a point shifted by d, a torque is smaller by d × f.
         """
         measured, predicted = self._scaled_by_sigma(self.given)
         if not np.isfinite(measured[:, TORQUES]).any():
@@ -241,13 +280,16 @@ class _OneSensor:
         slopes = np.stack(
             [_without_tare(by_shift[:, k], self.given.tare) for k in range(3)], axis=2
         )
-        apart = (measured - factor * predicted)[:, TORQUES]
-        there = np.isfinite(apart)
-        return np.linalg.lstsq(factor * slopes[there], apart[there], rcond=1e-6)[0]
+        differences = (measured - factor * predicted)[:, TORQUES]
+        is_measured = np.isfinite(differences)
+        return np.linalg.lstsq(factor * slopes[is_measured], differences[is_measured], rcond=1e-6)[
+            0
+        ]
 
     def _mistakes(self) -> Iterator[Hypothesis]:
-        """Yield each usual mistake with the description that undoes it."""
-        of, wrench = f"the wrench of '{self.part.segment.experiment.name}'", self.given.wrench
+        """Yield each common mistake with the description that corrects it."""
+        of = f"the wrench of '{self.part.segment.experiment.name}'"
+        wrench = self.given.wrench
 
         def hypothesis(code: str, without: Wrench, handicap: float = 1.0, **data) -> Hypothesis:
             return Hypothesis(code, of, data, replace(self.given, wrench=without), handicap)
@@ -296,24 +338,31 @@ class _OneSensor:
 
 
 def _without_tare(values: Array, tare: float) -> Array:
-    """Return columns (S, c) in sigmas without offsets that a tare of so many sigmas explains."""
-    there = np.isfinite(values)
-    held = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
-    return values - np.nansum(values, axis=0) / np.maximum(there.sum(axis=0) + held, 1e-12)
+    """Return columns (S, c) over the noise, without the offsets that a tare of so many
+    standard deviations explains.
+    """
+    is_measured = np.isfinite(values)
+    prior_weight = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
+    return values - np.nansum(values, axis=0) / np.maximum(
+        is_measured.sum(axis=0) + prior_weight, 1e-12
+    )
 
 
 def _slope(measured: Array, predicted: Array) -> float:
-    """Return the factor of the prediction that is nearest to the samples."""
+    """Return the factor of the prediction that fits the samples best; NaN if the prediction
+    is zero.
+    """
     square = float(np.nansum(predicted**2))
     return float(np.nansum(measured * predicted)) / square if square else np.nan
 
 
 def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
-    """Return the wrench with other columns, and their noise, which is no smaller than stated."""
+    """Return the wrench with some columns multiplied; their noise is not decreased."""
     values: Array = np.array(wrench.values)
     values[:, columns] *= factor
     larger = max(1.0, abs(factor))
-    of_forces, of_torques = columns.start == 0, columns.stop == 6
+    of_forces = columns.start == 0
+    of_torques = columns.stop == 6
     return replace(
         wrench,
         values=values,

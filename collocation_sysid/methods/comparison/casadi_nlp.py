@@ -1,8 +1,9 @@
-"""Other NLP solvers that come with CasADi, by the name of their plugin: "casadi:sqpmethod" …
+"""Further NLP solvers of CasADi, by the name of their plugin: "casadi:sqpmethod" and
+"casadi:sleqp".
 
-They get the same NLP and the same derivatives as interior point. A plugin asks for its functions
-by names of its own, of which only some are options: all are put into its cache of functions, where
-it looks before it derives them, which it could not from callbacks.
+They get the same NLP and the same derivatives as interior point. A plugin requests its functions by
+names of its own, of which only some are options: all are put into its cache of functions, so that
+it does not try to derive them, which is impossible for callbacks.
 
 ============  ==================================================================================
 sqpmethod     SQP; its QPs by PIQP, an interior-point solver for sparse convex QPs
@@ -10,8 +11,9 @@ sleqp         trust-region SLP-EQP: an LP finds the active set, then conjugate g
               differ, and some end a little short of the tolerance
 ============  ==================================================================================
 
-Neither knows of the band structure in time: for problems of a few thousand variables, to compare.
-Those in `REFUSED` do not work on this NLP, or need a library that CasADi does not bring.
+Neither uses the band structure in time: use them for problems of a few thousand variables, to
+compare. `REFUSED` lists solvers that do not work on this NLP or need a library that CasADi does not
+contain.
 """
 
 from __future__ import annotations
@@ -35,32 +37,33 @@ from ..solution import Solution, Status, Watch
 Hessian = Literal["gauss-newton", "exact"]
 
 PREFIX = "casadi:"
-# Largest constraint of an answer that a solver calls one, and largest violation of the optimality
-# conditions of the best iterate where it could not get on; in the scaling of the NLP.
-FEASIBLE, ACCEPTABLE = 1e-6, 1e-5
+# Largest constraint of a solution, in the scaling of the NLP.
+FEASIBLE = 1e-6
+# Largest violation of the optimality conditions with which a stalled solve is acceptable.
+ACCEPTABLE = 1e-5
 
 
 @dataclass(frozen=True)
 class CasadiSolver(Options):
-    """What CasADi's other solvers share; each says what its plugin asks for and says.
+    """Base class of CasADi's solvers; subclasses define the functions and statuses of their plugin.
 
     Attributes
     ----------
     functions : mapping
         Outputs, as `NlpFunctions` names them, of the functions by the plugin's names.
     statuses : mapping
-        Its return status in our words.
+        `Status` by the plugin's return status.
     hessian : {"gauss-newton", "exact"}
-        Second derivatives: the loss's only, which are convex, or all of the Lagrangian's. The
-        QPs of sqpmethod have to be convex.
+        Second derivatives: those of the loss only, which are convex, or all of the Lagrangian's.
+        The QPs of sqpmethod must be convex.
     tolerance : float
-        The solver's own, on feasibility and optimality in the scaling of the NLP.
+        The solver's tolerance of feasibility and optimality, in the scaling of the NLP.
     max_iterations : int
-        Iterations after which it ends.
+        Largest number of iterations.
     max_time_s : float
-        Seconds after which it ends; looked at once an iteration.
+        Largest computing time in seconds; checked once per iteration.
     casadi : mapping
-        Further options of the plugin by name; they win over the ones above.
+        Further options of the plugin by name; they override the ones above.
     """
 
     functions: ClassVar[Mapping[str, str]]
@@ -86,19 +89,28 @@ class CasadiSolver(Options):
         plugin = self.name.removeprefix(PREFIX)
         with recorder.stopwatch.building():
             program = collocation.made_explicit()
-        settings = _curvature(program, self.hessian), self._settings, self.statuses
-        judged = partial(_judged, collocation)
-        return nlpsol.solve(recorder, program, start, plugin, *settings, judged)
+        return nlpsol.solve(
+            recorder,
+            program,
+            start=start,
+            plugin=plugin,
+            hessian=_curvature(program, self.hessian),
+            settings=self._settings,
+            statuses=self.statuses,
+            judged=partial(_judged, collocation),
+        )
 
     def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
+        """Return the options of the plugin with its cache of functions."""
         cache = {n: functions.function(n, *o.split()) for n, o in self.functions.items()}
         settings = {"cache": cache, **self._own_settings()}
         for name, value in self.casadi.items():
-            both = isinstance(value, Mapping) and isinstance(settings.get(name), Mapping)
-            settings[name] = settings[name] | value if both else value
+            are_mappings = isinstance(value, Mapping) and isinstance(settings.get(name), Mapping)
+            settings[name] = settings[name] | value if are_mappings else value
         return settings
 
     def _own_settings(self) -> dict[str, Any]:
+        """Return the options of the plugin that follow from those of the method."""
         raise NotImplementedError
 
 
@@ -188,10 +200,14 @@ REFUSED: dict[str, str] = {
 
 
 def why_not(name: str) -> str | None:
-    """Why there is no method of this name, if it is "casadi:" with a plugin that is not offered."""
+    """Return the reason why a solver of CasADi is not offered.
+
+    None for names that do not begin with "casadi:" and for solvers that are offered.
+    """
     if not name.startswith(PREFIX) or name.removeprefix(PREFIX) in PLUGINS:
         return None
-    plugin, offered = name.removeprefix(PREFIX), ", ".join(PREFIX + known for known in PLUGINS)
+    plugin = name.removeprefix(PREFIX)
+    offered = ", ".join(PREFIX + known for known in PLUGINS)
     if plugin in REFUSED:
         return f"found {name!r}, which is not offered: {REFUSED[plugin]}. Expected one of {offered}"
     close = difflib.get_close_matches(plugin, PLUGINS, n=1)
@@ -200,18 +216,18 @@ def why_not(name: str) -> str | None:
 
 
 def _judged(collocation: Collocation, status: Status, z: Array, multipliers: Array) -> Status:
-    """What a solver says of its answer, after a look at the NLP's own functions there."""
+    """Return the status of a solution, checked by the constraints and optimality of the NLP."""
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)
         return status if violation <= FEASIBLE else Status.INFEASIBLE
-    stuck = status in (Status.STALLED, Status.NUMERICAL_FAILURE)
-    if stuck and collocation.kkt_residual(z, multipliers) <= ACCEPTABLE:
+    is_stalled = status in (Status.STALLED, Status.NUMERICAL_FAILURE)
+    if is_stalled and collocation.kkt_residual(z, multipliers) <= ACCEPTABLE:
         return Status.ACCEPTABLE
     return status
 
 
 def _curvature(collocation: Collocation, hessian: Hessian) -> HessianValues:
-    """The Hessian's values as `NlpFunctions` wants them."""
+    """Return the function that writes the Hessian's values, for `NlpFunctions`."""
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
         collocation.hessian_values(z, weight, multipliers if hessian == "exact" else None, out)

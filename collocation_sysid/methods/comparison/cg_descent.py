@@ -26,25 +26,26 @@ ValueAndGradient = Callable[[Array], tuple[float, Array]]
 
 @dataclass(frozen=True)
 class CgDescentOptions:
-    """Options, by the papers' letters in brackets.
+    """Options, with the letters of the papers in parentheses.
 
     Attributes
     ----------
     tolerance : float
         Largest entry of the gradient at the end.
     max_iterations : int
+        Largest number of iterations.
     decrease, curvature : float
-        Of the Wolfe conditions (δ, σ).
+        Constants of the Wolfe conditions (δ, σ).
     rounding : float
-        Relative error of the value (ε): values within it count as equal.
+        Relative error of the value (ε): values within it are considered equal.
     memory : float
         Decay of the average size of the value (Δ).
     switch : float
         Relative change of the value below which only the approximate conditions count (ω).
     truncation : float
-        Of β from below (η).
+        Lower bound of β (η).
     max_trials : int
-        Evaluations of one line search.
+        Largest number of evaluations of one line search.
     """
 
     tolerance: float = 1e-6
@@ -60,25 +61,42 @@ class CgDescentOptions:
 
 Ending = Literal["converged", "iteration-limit", "stopped", "line-search", "not-finite"]
 
-# Share of the start in the first step, of the last step where the value is sampled for the next,
-# and the growth of a step where that tells nothing (ψ0, ψ1, ψ2).
-FIRST, SAMPLED, GROWTH = 0.01, 0.1, 2.0
-# Relative change of the value below which it is not sampled: rounding would speak.
+# First step size over the size of the start (ψ0).
+FIRST = 0.01
+# Step size at which the value is sampled, over the last step size (ψ1).
+SAMPLED = 0.1
+# Growth of the step size if that sample is not convex (ψ2).
+GROWTH = 2.0
+# Relative change of the value below which it is not sampled, because rounding would dominate.
 SMALL_CHANGE = 1e-12
-# Where an interval is cut, what it must at least shrink by, and the growth of a bracket (θ, γ, ρ).
-CUT, SHRINK, EXPANSION = 0.5, 0.66, 5.0
+# Where an interval is cut (θ).
+CUT = 0.5
+# Largest ratio of an interval to the previous one (γ).
+SHRINK = 0.66
+# Growth of a bracket (ρ).
+EXPANSION = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class CgState:
-    """One iterate, as a callback sees it.
+    """One iterate, the argument of a callback.
 
     Attributes
     ----------
     iteration : int
-    x, value, gradient : the iterate
-    direction : (n,) along which it was reached, from `slope`, the derivative at step 0
+        Number of the iterate; 0 is the start.
+    x : (n,) array
+        Variables.
+    value : float
+        Value of the function.
+    gradient : (n,) array
+        Gradient.
+    direction : (n,) array
+        Direction of the step that led to the iterate.
+    slope : float
+        Derivative along it at step 0.
     step : float
+        Step size.
     """
 
     iteration: int
@@ -92,7 +110,21 @@ class CgState:
 
 @dataclass(frozen=True, eq=False)
 class CgResult:
-    """Where the minimisation ended."""
+    """Result of a minimisation.
+
+    Attributes
+    ----------
+    x : (n,) array
+        Last variables.
+    value : float
+        Value of the function.
+    gradient : (n,) array
+        Gradient.
+    iterations, evaluations : int
+        Numbers of iterations, and of evaluations of the gradient.
+    ending : str
+        Reason for the end.
+    """
 
     x: Array
     value: float
@@ -119,17 +151,22 @@ def minimise(
     Parameters
     ----------
     fun_and_grad : callable
-        Value and gradient (n,) at x; an infinite value where x is out of the domain.
-    x0 : (n,) ndarray
+        Function that returns value and gradient (n,) at x; an infinite value where x is out of the
+        domain.
+    x0 : (n,) array
+        Initial variables.
     options : CgDescentOptions, optional
+        Options.
     callback : callable, optional
-        Called with the start and every iterate; a true answer stops.
+        Function that is called with the start and every iterate; it stops the minimisation by
+        returning true.
     value : callable, optional
-        The value alone, where that is cheaper.
+        Function that returns the value alone, if that is cheaper.
 
     Returns
     -------
     CgResult
+        Last iterate and the reason for the end.
     """
     options = options or CgDescentOptions()
     counted = _Counted(fun_and_grad, value)
@@ -137,11 +174,14 @@ def minimise(
     f, g = counted(x)
 
     def ended(ending: Ending, iterations: int) -> CgResult:
+        """Return the last iterate as the result."""
         return CgResult(x, f, g, iterations, counted.evaluations, ending)
 
     if not (np.isfinite(f) and np.isfinite(g).all()):
         return ended("not-finite", 0)
-    d, step, change = -g, 0.0, np.inf
+    d = -g
+    step = 0.0
+    change = np.inf
     average = _Average(options)
     if callback is not None and callback(CgState(0, x, f, g, d, 0.0, 0.0)):
         return ended("stopped", 0)
@@ -150,18 +190,22 @@ def minimise(
             return ended("converged", k)
         average.add(f)
         line = _Line(counted, x, f, g, d, average.error, average.approximate, options)
-        found = line.search(_first_step(x, f, g) if k == 0 else _next_step(line, step, change))
-        if found is None and line.slope > -float(g @ g) * (1 - 1e-12):  # once down the gradient
+        trial = line.search(_first_step(x, f, g) if k == 0 else _next_step(line, step, change))
+        if trial is None and line.slope > -float(g @ g) * (1 - 1e-12):  # once down the gradient
             d = -g
             line = _Line(counted, x, f, g, d, average.error, average.approximate, options)
-            found = line.search(_first_step(x, f, g))
-        if found is None:
+            trial = line.search(_first_step(x, f, g))
+        if trial is None:
             return ended("line-search", k)
-        change = abs(found.value - f)
+        change = abs(trial.value - f)
         average.judge(change)
-        step, slope = found.step, line.slope
-        y, before = found.gradient - g, g
-        x, f, g = x + step * d, found.value, found.gradient
+        step = trial.step
+        slope = line.slope
+        y = trial.gradient - g
+        before = g
+        x = x + step * d
+        f = trial.value
+        g = trial.gradient
         reached_along = d
         d = _direction(d, before, g, y, options.truncation)
         state = CgState(k + 1, x, f, g, reached_along, slope, step)
@@ -173,17 +217,17 @@ def minimise(
 
 
 def _direction(d: Array, before: Array, g: Array, y: Array, truncation: float) -> Array:
-    """The next direction; after a step without curvature, steepest descent."""
-    along = float(d @ y)
-    if along <= 0:
+    """Return the next direction; the steepest descent after a step without positive curvature."""
+    curvature = float(d @ y)
+    if curvature <= 0:
         return -g
-    beta = float((y - 2 * d * (float(y @ y) / along)) @ g) / along
+    beta = float((y - 2 * d * (float(y @ y) / curvature)) @ g) / curvature
     size = float(np.linalg.norm(d)) * min(truncation, float(np.linalg.norm(before)))
     return -g + max(beta, -1 / size) * d
 
 
 def _first_step(x: Array, f: float, g: Array) -> float:
-    """I0."""
+    """Return the step size of the first line search, rule I0."""
     steepest = float(np.abs(g).max())
     if x.any():
         return FIRST * float(np.abs(x).max()) / steepest
@@ -191,36 +235,47 @@ def _first_step(x: Array, f: float, g: Array) -> float:
 
 
 def _next_step(line: _Line, last: float, change: float) -> float:
-    """I1, the minimum of a parabola through a sample of the value, or I2."""
+    """Return the initial step size of a later line search: I1 (parabola through a sample of
+    the value) or I2.
+    """
     if change > SMALL_CHANGE * abs(line.value):
-        tried = SAMPLED * last
-        value = line.value_at(tried)
-        bend = value - line.value - tried * line.slope
-        if value <= line.value and bend > 0:
-            return -line.slope * tried**2 / (2 * bend)
+        sample_step = SAMPLED * last
+        value = line.value_at(sample_step)
+        curvature = value - line.value - sample_step * line.slope
+        if value <= line.value and curvature > 0:
+            return -line.slope * sample_step**2 / (2 * curvature)
     return GROWTH * last
 
 
 class _Counted:
-    """The function, with a count of its evaluations."""
+    """Function with a count of the evaluations of its gradient."""
 
     def __init__(
         self, fun_and_grad: ValueAndGradient, value: Callable[[Array], float] | None
     ) -> None:
-        self._fun_and_grad, self._value = fun_and_grad, value
+        self._fun_and_grad = fun_and_grad
+        self._value = value
         self.evaluations = 0
 
     def __call__(self, x: Array) -> tuple[float, Array]:
+        """Return value and gradient at x."""
         self.evaluations += 1
         return self._fun_and_grad(x)
 
     def value(self, x: Array) -> float:
+        """Return the value at x."""
         return self(x)[0] if self._value is None else self._value(x)
 
 
 @dataclass
 class _Average:
-    """The average size C of the values so far, which says what rounding may do to one."""
+    """Average size C of the values so far, from which the effect of rounding is estimated.
+
+    Attributes
+    ----------
+    approximate : bool
+        Whether only the approximate Wolfe conditions count.
+    """
 
     options: CgDescentOptions
     weight: float = 0.0
@@ -228,22 +283,24 @@ class _Average:
     approximate: bool = False
 
     def add(self, value: float) -> None:
+        """Update the average with a value."""
         self.weight = 1 + self.options.memory * self.weight
         self.size += (abs(value) - self.size) / self.weight
 
     def judge(self, change: float) -> None:
-        """From small changes on, only the approximate Wolfe conditions count."""
+        """Switch to the approximate Wolfe conditions after a small change of the value."""
         if change <= self.options.switch * self.size:
             self.approximate = True
 
     @property
     def error(self) -> float:
+        """Estimated rounding error of the value."""
         return self.options.rounding * self.size
 
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """The function along the line at one step."""
+    """Function along the line at one step size: value, derivative (`slope`) and gradient."""
 
     step: float
     value: float
@@ -252,7 +309,7 @@ class _Probe:
 
 
 class _Found(Exception):
-    """A trial that satisfies the Wolfe conditions."""
+    """Exception that ends a line search with a trial that satisfies the Wolfe conditions."""
 
     def __init__(self, trial: _Probe) -> None:
         super().__init__()
@@ -260,11 +317,11 @@ class _Found(Exception):
 
 
 class _Exhausted(Exception):
-    """No more trials are allowed."""
+    """Exception that ends a line search after the largest number of trials."""
 
 
 class _Line:
-    """The function along one direction, and the search for a step."""
+    """Line search along one direction."""
 
     def __init__(
         self,
@@ -277,7 +334,10 @@ class _Line:
         approximate: bool,
         options: CgDescentOptions,
     ) -> None:
-        self.function, self.x, self.value, self.direction = function, x, value, direction
+        self.function = function
+        self.x = x
+        self.value = value
+        self.direction = direction
         self.slope = float(gradient @ direction)
         self.start = _Probe(0.0, value, self.slope, gradient)
         self.limit = value + error
@@ -286,10 +346,13 @@ class _Line:
         self.trials = 0
 
     def value_at(self, step: float) -> float:
+        """Return the value at a step size."""
         return self.function.value(self.x + step * self.direction)
 
     def search(self, step: float) -> _Probe | None:
-        """A step that satisfies the Wolfe conditions (L0 … L3), or None."""
+        """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step
+        size; None if none is found.
+        """
         try:
             a, b = self._bracket(step)
             while True:
@@ -299,13 +362,21 @@ class _Line:
                     if not low.step < middle < high.step:
                         return None  # no number lies between
                     low, high = self._update(low, high, middle)
-                a, b = low, high
+                a = low
+                b = high
         except _Found as found:
             return found.trial
         except _Exhausted:
             return None
 
     def _try(self, step: float) -> _Probe:
+        """Evaluate a trial; raise `_Found` if it satisfies the Wolfe conditions.
+
+        Raises
+        ------
+        _Exhausted
+            After too many trials.
+        """
         if self.trials >= self.options.max_trials:
             raise _Exhausted
         self.trials += 1
@@ -318,17 +389,18 @@ class _Line:
         return trial
 
     def _is_enough(self, trial: _Probe) -> bool:
-        """T1 or T2."""
-        decrease, curvature = self.options.decrease, self.options.curvature
+        """Return whether a trial satisfies the Wolfe conditions T1 or T2."""
+        decrease = self.options.decrease
+        curvature = self.options.curvature
         if not trial.slope >= curvature * self.slope:
             return False
         if (2 * decrease - 1) * self.slope >= trial.slope and trial.value <= self.limit:
             return True
-        fallen = trial.value - self.value <= decrease * trial.step * self.slope
-        return fallen and not self.approximate
+        is_decreased = trial.value - self.value <= decrease * trial.step * self.slope
+        return is_decreased and not self.approximate
 
     def _bracket(self, step: float) -> tuple[_Probe, _Probe]:
-        """B0 … B3: an interval at whose ends the slopes have opposite signs."""
+        """Return an interval at whose ends the slopes have opposite signs, rules B0 … B3."""
         low = self.start
         while True:
             trial = self._try(step)
@@ -336,10 +408,11 @@ class _Line:
                 return low, trial
             if not trial.value <= self.limit:
                 return self._cut(self.start, trial)
-            low, step = trial, EXPANSION * step
+            low = trial
+            step = EXPANSION * step
 
     def _update(self, a: _Probe, b: _Probe, step: float) -> tuple[_Probe, _Probe]:
-        """U0 … U3: a smaller interval, if `step` is in it."""
+        """Return a smaller interval, if `step` is within it, rules U0 … U3."""
         if not a.step < step < b.step:
             return a, b
         trial = self._try(step)
@@ -350,7 +423,9 @@ class _Line:
         return self._cut(a, trial)
 
     def _cut(self, a: _Probe, b: _Probe) -> tuple[_Probe, _Probe]:
-        """U3: between a low point that goes down and a high one there is one that goes up."""
+        """Return an interval with an ascending end, from a low descending point and a high
+        one, rule U3.
+        """
         while True:
             trial = self._try((1 - CUT) * a.step + CUT * b.step)
             if trial.slope >= 0:
@@ -361,7 +436,7 @@ class _Line:
                 b = trial
 
     def _double_secant(self, a: _Probe, b: _Probe) -> tuple[_Probe, _Probe]:
-        """S1 … S4."""
+        """Return a smaller interval by two secant steps, rules S1 … S4."""
         step = _secant(a, b)
         low, high = self._update(a, b, step)
         if high.step == step:
@@ -372,6 +447,7 @@ class _Line:
 
 
 def _secant(a: _Probe, b: _Probe) -> float:
+    """Return the zero of the linear interpolation of both slopes; NaN if they are equal."""
     if a.slope == b.slope:
         return np.nan
     return (a.step * b.slope - b.step * a.slope) / (b.slope - a.slope)

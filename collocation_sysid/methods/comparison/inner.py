@@ -1,9 +1,9 @@
-"""Inner solvers: minimise a merit function for one ρ, by gradients alone or by Newton steps.
+"""Inner solvers: minimise a merit function for one ρ, by gradients or by Newton steps.
 
-The methods of first order work in scaled variables s, z_i = z_i(s_i / √d_i) with d the diagonal of
-the Gauss–Newton Hessian at the start: columns of J by the parameters are thousands of times as
-long as those by a position. Conjugate gradients know no bounds; where there are two,
-z = middle + half · sin(s) keeps within them smoothly.
+First-order methods use scaled variables s, z_i = z_i(s_i / √d_i) with d the diagonal of the
+Gauss–Newton Hessian at the start: columns of J for parameters are thousands of times as long as
+those for positions. Conjugate gradients do not support bounds; variables with two bounds are mapped
+smoothly, z = middle + half · sin(s).
 """
 
 from __future__ import annotations
@@ -45,14 +45,19 @@ def minimise(
 
     Parameters
     ----------
-    inner : name of the solver
+    inner : str
+        Name of the solver.
     merit : Merit
-    z : (variables,) ndarray
+        Merit function.
+    z : (variables,) array
+        Initial variables.
     tolerance : float
         Largest entry of the projected gradient ∂m/∂z at the end.
     max_iterations : int
+        Largest number of iterations.
     report : callable
-        Called with every iterate z, its value and its projected gradient; may raise to end it.
+        Function that is called with every iterate z, its value and its projected gradient; an
+        exception ends the minimisation.
 
     Returns
     -------
@@ -78,6 +83,7 @@ def minimise(
         return follow.converged
 
     def each(intermediate_result: OptimizeResult) -> None:
+        """Stop SciPy's solver once the tolerance is reached."""
         if follow(intermediate_result.x):
             raise StopIteration
 
@@ -98,13 +104,18 @@ def minimise(
 
 
 class _Follower:
-    """Reports iterates of the scaled problem, and tells when the gradient is small."""
+    """Callback that reports iterates of the scaled problem and checks convergence."""
 
     def __init__(self, scaled: _Scaled, tolerance: float, report: Report) -> None:
-        self.scaled, self.tolerance, self.report = scaled, tolerance, report
+        self.scaled = scaled
+        self.tolerance = tolerance
+        self.report = report
         self.converged = False
 
     def __call__(self, s: Array) -> bool:
+        """Report the iterate s (free variables,), and return whether its gradient is within
+        the tolerance.
+        """
         z, value, gradient = self.scaled.at(s)
         self.scaled.ceiling = STEEP * abs(value) + 1e-300
         projected = self.scaled.projected(s, z, gradient)
@@ -114,10 +125,21 @@ class _Follower:
 
 
 class _Scaled:
-    """A merit function of the free variables, scaled and, for a smooth map, without bounds."""
+    """Merit function of the scaled free variables s, without bounds if they are mapped smoothly.
+
+    Attributes
+    ----------
+    start : (free,) array
+        Initial s, zeros.
+    bounds : Bounds
+        Bounds of s.
+    ceiling : float
+        Value that replaces an infinite merit, for solvers that interpolate values.
+    """
 
     def __init__(self, merit: Merit, z: Array, smooth: bool) -> None:
-        self.merit, self.z = merit, z.copy()
+        self.merit = merit
+        self.z = z.copy()
         problem = merit.problem
         self.free = np.flatnonzero(problem.free)
         _, jacobian = problem.constraints_and_jacobian(z)
@@ -125,13 +147,15 @@ class _Scaled:
         diagonal = loss + merit.rho * (jacobian.power(2).sum(axis=0))
         diagonal = diagonal[self.free]
         self.unit = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
-        lower, upper = problem.lower[self.free], problem.upper[self.free]
+        lower = problem.lower[self.free]
+        upper = problem.upper[self.free]
         self.bounds = Bounds((lower - z[self.free]) / self.unit, (upper - z[self.free]) / self.unit)
         self.mapped = np.flatnonzero(np.isfinite(lower) | np.isfinite(upper)) if smooth else []
         at = z[self.free][self.mapped]
         low = np.maximum(lower[self.mapped], at - FAR)
         high = np.minimum(upper[self.mapped], at + FAR)
-        self.middle, self.half = (low + high) / 2, (high - low) / 2
+        self.middle = (low + high) / 2
+        self.half = (high - low) / 2
         # At a bound the slope is zero: nothing would ever leave it.
         share = np.clip((at - self.middle) / self.half, -0.999, 0.999)
         self.angle = np.arcsin(share)
@@ -140,45 +164,46 @@ class _Scaled:
         self._last: tuple[Array, Array, float, Array] | None = None
 
     def z_of(self, s: Array) -> Array:
-        """All variables."""
+        """Return all variables (variables,) from s."""
         z = self.z.copy()
-        moved = z[self.free] + self.unit * s
-        moved[self.mapped] = self.middle + self.half * np.sin(self._angles(s))
-        z[self.free] = moved
+        free_values = z[self.free] + self.unit * s
+        free_values[self.mapped] = self.middle + self.half * np.sin(self._angles(s))
+        z[self.free] = free_values
         return z
 
     def _angles(self, s: Array) -> Array:
+        """Return the angles of the sine map at s."""
         return self.angle + (self.unit * s)[self.mapped] / (self.half * np.cos(self.angle))
 
     def _slopes(self, s: Array) -> Array:
-        """Slopes dz / (unit ds)."""
+        """Return dz / (unit ds) (free,)."""
         slopes = np.ones(len(s))
         slopes[self.mapped] = np.cos(self._angles(s)) / np.cos(self.angle)
         return slopes
 
     def at(self, s: Array) -> tuple[Array, float, Array]:
-        """The point z, m and ∇m; the last point is remembered."""
+        """Return z, m and ∇m at s; the result of the last s is stored."""
         if self._last is None or not np.array_equal(self._last[0], s):
             z = self.z_of(s)
             self._last = (s.copy(), z, *self.merit.value_and_gradient(z))
         return self._last[1:]
 
     def value(self, s: Array) -> float:
-        """The value m."""
+        """Return m at s."""
         return self.merit.value(self.z_of(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """The value m and ∂m/∂s."""
+        """Return m and ∂m/∂s (free,) at s."""
         _, value, gradient = self.at(s)
         return value, gradient[self.free] * self.unit * self._slopes(s)
 
     def finite_value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """The same, high and flat where the merit is infinite."""
+        """Return m and ∂m/∂s; a large value and zeros where the merit is infinite."""
         value, gradient = self.value_and_gradient(s)
         return (value, gradient) if np.isfinite(value) else (self.ceiling, np.zeros(len(s)))
 
     def projected(self, s: Array, z: Array, gradient: Array) -> Array:
-        """The gradient by z without pushes against a bound."""
+        """Return ∂m/∂z (variables,) with zeros at active bounds."""
         projected = self.merit.problem.projected(z, gradient)
         projected[self.free] *= np.minimum(np.abs(self._slopes(s)), 1.0)
         return projected

@@ -1,11 +1,12 @@
 """Damped Newton steps on a merit function, by one banded Cholesky factorisation each.
 
-The step solves (H + ρ JᵀJ + μ I) dz = −∇m, where H is the Hessian of the loss (Gauss–Newton, as
-Levenberg and Marquardt have it), or of the Lagrangian with the multipliers y + ρ g (Newton), which
-replaces it near the answer where that is positive definite. Timesteps couple to few neighbours,
-so that the positions' part is a band; the parameters q and φ border it and take their step from
-the Schur complement, a bounded least-squares problem in a few variables. μ follows the ratio of
-actual to predicted decrease (H. B. Nielsen, "Damping parameter in Marquardt's method", 1999).
+The step solves (H + ρ JᵀJ + μ I) dz = −∇m, where H is the Hessian of the loss (Gauss–Newton, as in
+the method of Levenberg and Marquardt), or of the Lagrangian with the multipliers y + ρ g (Newton),
+which replaces it near the solution where it is positive definite. Time steps are coupled to few
+neighbours, so that the block of the positions is banded; the parameters q and φ border it, and
+their step follows from the Schur complement, a bounded least-squares problem in a few variables. μ
+follows the ratio of actual to predicted decrease (H. B. Nielsen, "Damping parameter in Marquardt's
+method", 1999).
 """
 
 from __future__ import annotations
@@ -29,11 +30,18 @@ from .merit import Merit, Unconstrained
 
 # The band and its factor may take this much memory [bytes].
 MOST_MEMORY = 8e9
-# First damping, its bounds, and the least share of a predicted decrease that is accepted.
-DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-13, 1e12
+# First damping.
+DAMPING = 1e-3
+# Smallest damping.
+LEAST_DAMPING = 1e-13
+# Largest damping: beyond it the minimisation ends.
+MOST_DAMPING = 1e12
+# Smallest share of the predicted decrease with which a step is accepted.
 ACCEPTED = 1e-3
-# Longest step of a parameter (for φ, of its reach), and steps short enough for the full Hessian.
-REACH, LOCAL = 1.0, 0.1
+# Longest step of a parameter (of φ, over its reach).
+REACH = 1.0
+# Longest step of a parameter after which the full Hessian is used.
+LOCAL = 0.1
 # Predicted decreases below this share of the merit's value are lost in its rounding.
 ROUNDING = 1e-12
 
@@ -50,20 +58,26 @@ def minimise(
     Parameters
     ----------
     merit : Merit
-    z : (variables,) ndarray
+        Merit function.
+    z : (variables,) array
+        Initial variables.
     tolerance : float
         Largest entry of the projected gradient at the end.
     max_iterations : int
-        Accepted steps.
+        Largest number of accepted steps.
     report : callable
-        Called with every iterate, its value and its projected gradient; may raise to end it.
+        Function that is called with every iterate, its value and its projected gradient; an
+        exception ends the minimisation.
 
     Returns
     -------
     bool
-        Whether the tolerance was reached, as far as rounding lets one tell.
+        Whether the tolerance was reached; false if rounding prevents it.
     """
-    damping, growth, local, order = DAMPING, 2.0, False, []
+    damping = DAMPING
+    growth = 2.0
+    is_local = False
+    order = []
     point = _Point.at(merit, z)
     for count in range(max_iterations + 1):
         report(point.z, point.value, point.projected)
@@ -71,7 +85,7 @@ def minimise(
             return True
         if count == max_iterations:
             break
-        system = _system(merit, point, local, order)
+        system = _system(merit, point, is_local, order)
         while True:
             step = system.step(damping)
             if step is None and system.exact:
@@ -89,20 +103,23 @@ def minimise(
                     break
                 decrease = point.value - merit.value(trial)
                 if decrease >= ACCEPTED * predicted:
-                    after, ratio = _Point.at(merit, trial), decrease / predicted
+                    after = _Point.at(merit, trial)
+                    ratio = decrease / predicted
                     break
-            damping, growth = damping * growth, 2 * growth
+            damping = damping * growth
+            growth = 2 * growth
             if damping > MOST_DAMPING:
                 return False
         damping = max(damping * max(1 / 5, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
-        local = float(np.abs(step[merit.problem.bounded]).max(initial=0.0)) <= LOCAL
-        growth, point = 2.0, after
+        is_local = float(np.abs(step[merit.problem.bounded]).max(initial=0.0)) <= LOCAL
+        growth = 2.0
+        point = after
     return False
 
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A merit function with its derivatives; the matrix is overwritten by the next point's."""
+    """Merit function with its derivatives at z; the matrix is overwritten by the next point's."""
 
     z: Array
     value: float
@@ -113,6 +130,7 @@ class _Point:
 
     @classmethod
     def at(cls, merit: Merit, z: Array) -> _Point:
+        """Return the merit function and its derivatives at z."""
         rows, jacobian = merit.problem.constraints_and_jacobian(z)
         gradient = merit.gradient(z, rows, jacobian)
         projected = merit.problem.projected(z, gradient)
@@ -125,6 +143,19 @@ class _Point:
 
 
 def _system(merit: Merit, point: _Point, exact: bool, order: list[Index]) -> _System:
+    """Return the quadratic model at a point.
+
+    Parameters
+    ----------
+    merit : Merit
+        Merit function.
+    point : _Point
+        Point with its derivatives.
+    exact : bool
+        Whether the Hessian is that of the Lagrangian, else that of the loss.
+    order : list
+        Order of the band's columns, appended when it is first computed.
+    """
     weights = merit.estimate(point.rows) if exact else np.zeros_like(point.rows)
     with merit.problem.stopwatch.evaluating():
         hessian = merit.problem.nlp.hessian(point.z, 1.0, weights)
@@ -135,9 +166,10 @@ def _system(merit: Merit, point: _Point, exact: bool, order: list[Index]) -> _Sy
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The quadratic model of a merit function at z.
+    """Quadratic model of a merit function at z.
 
-    `order` holds the order of the band's columns once one is found.
+    `order` is an empty list until the order of the band's columns is computed; it is shared by all
+    models.
     """
 
     problem: Unconstrained
@@ -150,18 +182,25 @@ class _System:
     order: list[Index]
 
     def predicted_decrease(self, step: Array) -> float:
-        """Decrease of the undamped model."""
-        along = self.jacobian @ step
-        bend = float(step @ (self.hessian @ step)) + self.rho * float(along @ along)
-        return -float(self.gradient @ step) - bend / 2
+        """Return the decrease of the model by a step (variables,), without damping."""
+        constraint_change = self.jacobian @ step
+        curvature = float(step @ (self.hessian @ step)) + self.rho * float(
+            constraint_change @ constraint_change
+        )
+        return -float(self.gradient @ step) - curvature / 2
 
     def step(self, damping: float) -> Array | None:
-        """Step of all variables, or None where the damped matrix is not positive definite."""
+        """Return the damped step (variables,); None if the damped matrix is not positive
+        definite.
+        """
         with self.problem.stopwatch.solving(), one_blas_thread():
             return self._step(damping)
 
     def _step(self, damping: float) -> Array | None:
-        positions, border, band = self._positions, self.problem.bounded, self._band.copy("F")
+        """Return the damped step, see `step`."""
+        positions = self._positions
+        border = self.problem.bounded
+        band = self._band.copy("F")
         band[0] += damping
         if not cholesky_in_place(band):
             return None
@@ -169,25 +208,30 @@ class _System:
         (order,) = self.order
         solved = np.empty_like(right)
         solved[order] = _pbtrs(band, right[order], lower=1)[0].reshape(right.shape)
-        by_p, alone = solved[:, :-1], solved[:, -1]
+        by_p = solved[:, :-1]
+        position_step = solved[:, -1]
         schur = self._corner - self._mixed.T @ by_p + damping * np.eye(len(border))
         step = np.zeros(len(self.z))
         if len(border):
-            slope = self.gradient[border] - self._mixed.T @ alone
-            of_p = self._bounded_step((schur + schur.T) / 2, slope)
+            reduced_gradient = self.gradient[border] - self._mixed.T @ position_step
+            of_p = self._bounded_step((schur + schur.T) / 2, reduced_gradient)
             if of_p is None:
                 return None
             step[border] = of_p
-        step[positions] = -alone - by_p @ step[border]
+        step[positions] = -position_step - by_p @ step[border]
         return step
 
     def _bounded_step(self, schur: Array, slope: Array) -> Array | None:
-        """Minimise ½ dᵀ S d + sᵀ d over the parameters' steps d within bounds and reach."""
+        """Minimise ½ dᵀ S d + sᵀ d over the parameters' steps d within bounds and reach.
+
+        Return None if S is not positive definite.
+        """
         try:
             factor = cholesky(schur, lower=True)
         except np.linalg.LinAlgError:
             return None
-        border, problem = self.problem.bounded, self.problem
+        border = self.problem.bounded
+        problem = self.problem
         reach = problem.nlp.reach_p
         places = np.where(border < problem.nlp.nq, border, border - len(self.z) + len(reach))
         reach = REACH * reach[places]
@@ -201,36 +245,48 @@ class _System:
 
     @cached_property
     def _positions(self) -> Index:
+        """Indices of the free positions in z."""
         free = self.problem.free.copy()
         free[self.problem.bounded] = False
         return np.flatnonzero(free)
 
     @cached_property
     def _parts(self) -> tuple[sp.csc_array, Array]:
-        """Columns of J by the positions, and by the parameters."""
+        """Columns of J for the positions (sparse) and for the parameters (dense)."""
         of_x = sp.csc_array(self.jacobian[:, self._positions])
         return of_x, self.jacobian[:, self.problem.bounded].toarray()
 
     @cached_property
     def _mixed(self) -> Array:
+        """Block (positions, parameters) of the matrix."""
         of_x, of_p = self._parts
         rows = sp.csr_array(self.hessian)[self._positions]
         return self.rho * (of_x.T @ of_p) + rows[:, self.problem.bounded].toarray()
 
     @cached_property
     def _corner(self) -> Array:
-        of_p, border = self._parts[1], self.problem.bounded
+        """Block (parameters, parameters) of the matrix."""
+        of_p = self._parts[1]
+        border = self.problem.bounded
         return self.rho * of_p.T @ of_p + self.hessian[border][:, border].toarray()
 
     @cached_property
     def _square(self) -> sp.coo_array:
-        of_x, positions = self._parts[0], self._positions
+        """Block (positions, positions) of the matrix, without damping."""
+        of_x = self._parts[0]
+        positions = self._positions
         curved = sp.csr_array(self.hessian)[positions][:, positions]
         return sp.coo_array(self.rho * (of_x.T @ of_x) + curved)
 
     @cached_property
     def _band(self) -> Array:
-        """(half-bandwidth + 1, n) lower band of the positions' part."""
+        """Lower band (half-bandwidth + 1, n) of the positions' block.
+
+        Raises
+        ------
+        InputError
+            If it needs more memory than `MOST_MEMORY`.
+        """
         with self.problem.stopwatch.solving():
             square = self._square
             if not len(self.order):
@@ -240,7 +296,8 @@ class _System:
             place[order] = np.arange(len(place))
             rows, columns = (place[i] for i in square.coords)
             lower = rows >= columns
-            rows, columns = rows[lower], columns[lower]
+            rows = rows[lower]
+            columns = columns[lower]
             width = int((rows - columns).max(initial=0)) + 1
             if (needed := 16.0 * width * len(place)) > MOST_MEMORY:
                 raise InputError(
@@ -256,7 +313,7 @@ class _System:
 
 
 def _narrow_order(square: sp.coo_array) -> Index:
-    """Order of the positions that makes a narrow band."""
+    """Return an order of the positions that makes the band narrow."""
     order = reverse_cuthill_mckee(sp.csr_array(square), symmetric_mode=True).astype(np.int64)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))

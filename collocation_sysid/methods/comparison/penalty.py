@@ -1,20 +1,20 @@
-"""Penalty and augmented Lagrangian: slack in the dynamics at a price ρ, with multipliers or not.
+"""Penalty method and augmented Lagrangian: violations of the equations of motion cost ρ/2 ‖g‖².
 
     minimise   L(z) + yᵀ g(z) + ρ/2 ‖g(z)‖²
 
-in stages, each started from the last answer. The penalty method, as in the paper, keeps y = 0 for
-one ρ or a rising sequence of them. A finite ρ always leaves some slack: forces −g that no robot
-applied, which fall as 1/ρ and bias the parameters while they last.
+in stages, each started from the previous solution. The penalty method, as in the paper, has y = 0
+and one ρ or an increasing sequence. A finite ρ always leaves a violation: forces −g that no robot
+applied, which decrease as 1/ρ and bias the parameters.
 
-The augmented Lagrangian learns the multipliers, y ← y + ρ g, so that ρ need not become large: it
-rises only where the slack ‖g‖ did not fall well. Stages are solved to tolerances that tighten with
-the slack (J. Nocedal and S. Wright, Numerical Optimization, 2nd ed., framework 17.3 and algorithm
-17.4; the rule for ρ is that of ALGENCAN, R. Andreani et al., SIAM J. Optim. 18, 2007: the fixed
-sequence of LANCELOT expects rows of order one, and would make ρ larger than the multipliers need).
-Converges to the optimum of interior point and of the reduced space.
+The augmented Lagrangian updates the multipliers, y ← y + ρ g, so that ρ need not become large: it
+increases only where the violation ‖g‖ did not decrease enough. Stages are solved to tolerances that
+decrease with the violation (J. Nocedal and S. Wright, Numerical Optimization, 2nd ed., framework
+17.3 and algorithm 17.4; the rule for ρ is that of ALGENCAN, R. Andreani et al., SIAM J. Optim. 18,
+2007: the fixed sequence of LANCELOT expects constraints of order one, and would make ρ larger than
+the multipliers need). It converges to the optimum of interior point and reduced space.
 
-The answer counts as converged where the gradient is within `tolerance` and the slack within
-`violation`; the message says how much of it is left.
+A solution is converged if the gradient is within `tolerance` and the violation within `violation`;
+the message states the violation.
 """
 
 from __future__ import annotations
@@ -33,29 +33,34 @@ from ..solution import Solution, Status, Watch
 from .inner import FIRST_ORDER, Inner, minimise
 from .merit import Merit, Unconstrained
 
-# ρ rises where a stage leaves more than this share of the slack, and the augmented Lagrangian ends
-# where not even the largest ρ leaves less than the second.
-FALL, STUCK = 0.25, 0.9
-# Its gradient wanted of the first stage, and of a later one over that of the one before.
-FIRST_GRADIENT, TIGHTER = 1e-3, 0.1
-# Iterations between lines of the history; those of first order are many and cheap.
-EVERY, EVERY_OF_FIRST_ORDER = 1, 20
+# ρ increases if a stage leaves more than this share of the violation.
+FALL = 0.25
+# The augmented Lagrangian ends if the largest ρ leaves more than this share of the violation.
+STUCK = 0.9
+# Tolerance of its first stage: largest entry of the gradient.
+FIRST_GRADIENT = 1e-3
+# Tolerance of a later stage over that of the previous one.
+TIGHTER = 0.1
+# Iterations between entries of the history.
+EVERY = 1
+# The same for first-order methods, whose iterations are many and cheap.
+EVERY_OF_FIRST_ORDER = 20
 # Rounding leaves about this much of the gradient for every unit of curvature, of the loss or ρ.
 ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
 class Slack:
-    """How far a point is from satisfying the equations of motion.
+    """Violation of the equations of motion at a point.
 
     Attributes
     ----------
     newtons : float
-        Largest residual.
+        Largest residual [N].
     relative : float
-        The same over the largest force in the balance.
+        Largest residual over the largest force in the equations.
     scaled : float
-        Largest row of g, grasps included.
+        Largest entry of g, prescribed displacements included.
     """
 
     newtons: float = np.inf
@@ -63,21 +68,26 @@ class Slack:
     scaled: float = np.inf
 
     def __str__(self) -> str:
+        """Return the violation in words, for messages."""
         return f"slack of {self.newtons:.2g} N ({self.relative:.1g} of the largest force)"
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A merit function, the gradient wanted of its minimum, and what was reached.
+    """One minimisation with fixed ρ and y: its merit function, and its result once it has ended.
 
     Attributes
     ----------
     merit : Merit
-    wanted, gradient : float
-        Largest entry of the merit's projected gradient.
+        Merit function.
+    wanted : float
+        Tolerance: largest entry of the merit's projected gradient.
+    gradient : float
+        The same at the end of the stage; infinite before.
     reached : bool
-        Whether it is small enough, which rounding decides at large ρ.
+        Whether the minimum was reached, as far as rounding allows at large ρ.
     slack : Slack
+        Violation at the end of the stage.
     """
 
     merit: Merit
@@ -89,32 +99,32 @@ class Stage:
 
 @dataclass(frozen=True)
 class Stages(Options):
-    """Base of both methods: a climb of ρ, and the budget.
+    """Base class of both methods: the increase of ρ, and limits.
 
     Attributes
     ----------
     inner : {"cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"}
-        What minimises the merit function: Hager and Zhang's conjugate gradients as in the paper,
-        SciPy's, a quasi-Newton method, or damped Newton steps with a sparse factorisation, which
-        alone get anywhere near a minimum at large ρ.
+        Solver that minimises the merit function: the conjugate gradients of Hager and Zhang as in
+        the paper, those of SciPy, a quasi-Newton method, or damped Newton steps with a sparse
+        factorisation, the only ones that come near a minimum at large ρ.
     rho : float
-        First ρ; loss and rows are in the scaling of the NLP, where both are of order one.
+        First ρ; loss and constraints are in the scaling of the NLP, where both are of order one.
     rho_max : float
         Last ρ.
     rho_factor : float
-        Factor by which ρ rises.
+        Factor by which ρ increases.
     inner_iterations : int
-        Most iterations of a stage.
+        Largest number of iterations of a stage.
     tolerance : float
-        Largest entry of the gradient at the end, in the scaling of the NLP, or 1e-14 of ρ plus the
-        loss's largest curvature: rounding hides less.
+        Largest entry of the gradient at the end, in the scaling of the NLP; not less than 1e-14
+        times the sum of ρ and the loss's largest curvature, because of rounding.
     violation : float
-        Slack that an answer may leave, over the largest force in the balance. A stage that
-        ends within it ends the solve.
+        Largest violation of the equations of motion at the end, over the largest force in them. A
+        stage that ends within it ends the solve.
     max_iterations : int
-        Iterations of all stages together.
+        Largest number of iterations of all stages together.
     max_time_s : float
-        Seconds after which it ends.
+        Largest computing time in seconds.
     """
 
     inner: Inner = "levenberg-marquardt"
@@ -136,9 +146,10 @@ class Stages(Options):
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
-        """Solve the NLP, see `Method`; lines of the history count inner iterations.
+        """Solve the NLP, see `Method`; entries of the history count inner iterations.
 
-        Held nodes of the answer are put where their grasps are, and the slack counted there.
+        Grasped nodes of the solution have their prescribed positions, where its violation is
+        evaluated.
 
         Raises
         ------
@@ -151,34 +162,43 @@ class Stages(Options):
 
     @property
     def last_rho(self) -> float:
-        """Where ρ ends."""
+        """Largest ρ of the solve."""
         return self.rho_max
 
     @property
     def first_gradient(self) -> float:
-        """What is wanted of the first stage."""
+        """Tolerance of the first stage."""
         return self.tolerance
 
     def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
-        """What follows a stage that ended at z, given the slack of the one before.
+        """Return the next stage.
+
+        Parameters
+        ----------
+        stage : Stage
+            Stage that has ended.
+        before : Slack
+            Violation at the end of the stage before it.
+        z : (variables,) array
+            Variables at its end.
 
         Raises
         ------
         Ended
-            Where nothing is to be gained.
+            If further stages would not improve the solution.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Penalty(Stages):
-    """The dynamics are not imposed but paid for, as in the paper.
+    """The equations of motion are not constraints, but violations are penalised, as in the paper.
 
     Attributes
     ----------
     schedule : {"geometric", "progress", "constant"}
-        How ρ goes from `rho` to `rho_max`: by `rho_factor` after every stage, or only after those
-        that left more than a quarter of the slack, or not at all.
+        How ρ increases from `rho` to `rho_max`: by `rho_factor` after every stage, only after
+        stages that left more than a quarter of the violation, or not at all.
     """
 
     name: ClassVar[str] = "penalty"
@@ -191,23 +211,27 @@ class Penalty(Stages):
 
     @property
     def last_rho(self) -> float:
-        """Where ρ ends."""
+        """Largest ρ of the solve."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
     def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
-        """The same with a larger ρ."""
+        """Return the next stage, with a larger ρ if the schedule says so, see
+        `Stages.following`.
+        """
         rho = stage.merit.rho
-        stuck = self.schedule != "progress" or stage.slack.relative > FALL * before.relative
-        if stuck and rho >= self.last_rho:
+        is_increase_due = (
+            self.schedule != "progress" or stage.slack.relative > FALL * before.relative
+        )
+        if is_increase_due and rho >= self.last_rho:
             if stage.reached:
-                minimum = "The merit is at its minimum but the dynamics do not hold; raise rho_max."
-                raise Ended(Status.STALLED, minimum)
+                message = "The merit is at its minimum but the dynamics do not hold; raise rho_max."
+                raise Ended(Status.STALLED, message)
             raise Ended(
                 Status.ITERATION_LIMIT,
                 f"The last stage ended before its minimum, with a gradient of {stage.gradient:.2g};"
                 " raise inner_iterations or choose another inner solver.",
             )
-        if stuck or stage.reached:
+        if is_increase_due or stage.reached:
             rho = min(self.rho_factor * rho, self.last_rho)
         return Stage(replace(stage.merit, rho=rho), self.tolerance)
 
@@ -220,15 +244,20 @@ class AugmentedLagrangian(Stages):
 
     @property
     def first_gradient(self) -> float:
-        """What is wanted of the first stage."""
+        """Tolerance of the first stage."""
         return max(FIRST_GRADIENT, self.tolerance)
 
     def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
-        """The next with the multipliers of the last, and a larger ρ where it left much slack."""
-        rho, wanted, slack = stage.merit.rho, stage.wanted, stage.slack
-        within = slack.relative <= self.violation
-        last = rho >= self.rho_max or within
-        if last and wanted <= self.tolerance and slack.scaled > STUCK * before.scaled:
+        """Return the next stage with updated multipliers, and a larger ρ if much violation remains.
+
+        See `Stages.following`.
+        """
+        rho = stage.merit.rho
+        wanted = stage.wanted
+        slack = stage.slack
+        is_feasible = slack.relative <= self.violation
+        is_last = rho >= self.rho_max or is_feasible
+        if is_last and wanted <= self.tolerance and slack.scaled > STUCK * before.scaled:
             if stage.reached:
                 raise Ended(Status.STALLED, "rho_max does not make the dynamics hold.")
             raise Ended(
@@ -236,18 +265,21 @@ class AugmentedLagrangian(Stages):
                 f"The last stage ended with a gradient of {stage.gradient:.2g}, short of its "
                 f"tolerance {wanted:.2g}; another inner solver may get farther.",
             )
-        if not within and slack.scaled > FALL * before.scaled:
+        if not is_feasible and slack.scaled > FALL * before.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
         merit = replace(stage.merit, rho=rho, multipliers=stage.merit.estimate(rows))
-        return Stage(merit, max(0.0 if within else TIGHTER * wanted, self.tolerance))
+        return Stage(merit, max(0.0 if is_feasible else TIGHTER * wanted, self.tolerance))
 
 
 class _PenaltyClimb:
-    """A solve in stages: the last iterate, which is the best as the merit falls, and the budget."""
+    """State of a solve in stages: last iterate, which is the best as the merit decreases,
+    and counts.
+    """
 
     def __init__(self, options: Stages, recorder: Recorder, start: Array | None) -> None:
-        self.options, self.recorder = options, recorder
+        self.options = options
+        self.recorder = recorder
         self.problem = Unconstrained(recorder.collocation, recorder.stopwatch)
         nlp = self.problem.nlp
         began = self.problem.began(recorder.start(start))
@@ -257,29 +289,33 @@ class _PenaltyClimb:
         no_weights = np.zeros(nlp.constraints)
         merit = Merit(self.problem, options.rho, no_weights)
         self.stage = Stage(merit, options.first_gradient)
-        self.iterations, self.gradient = 0, np.inf
+        self.iterations = 0
+        self.gradient = np.inf
         curvature = nlp.hessian(self.z, 1.0, no_weights).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
         self._every = EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
 
     def run(self) -> tuple[Status, str]:
-        """Stage after stage.
+        """Solve one stage after the other; return status and message.
 
         Raises
         ------
         Ended
+            If no further progress is possible or a limit is reached.
         """
-        options, before = self.options, Slack()
+        options = self.options
+        before = Slack()
         while True:
-            done = self._minimise()
-            within = done.slack.relative <= options.violation
-            if done.reached and within and done.wanted <= options.tolerance:
+            ended_stage = self._minimise()
+            is_feasible = ended_stage.slack.relative <= options.violation
+            if ended_stage.reached and is_feasible and ended_stage.wanted <= options.tolerance:
                 said = "Converged: gradient and slack are within their tolerances."
                 return Status.CONVERGED, said
-            self.stage, before = options.following(done, before, self.z), done.slack
+            self.stage = options.following(ended_stage, before, self.z)
+            before = ended_stage.slack
 
     def solution(self, status: Status, why: str) -> Solution:
-        """The last iterate as an answer of the given collocation."""
+        """Return the last iterate as a solution of the given problem."""
         merit = self.stage.merit
         estimate = merit.estimate(self.problem.constraint_values(self.z))
         return self.recorder.solution(
@@ -292,22 +328,28 @@ class _PenaltyClimb:
         )
 
     def _minimise(self) -> Stage:
-        """The stage, as far as it goes from the last iterate.
+        """Minimise the merit of the present stage from the last iterate, and return the stage with
+        its result.
 
-        Where ρ or the loss is so curved that rounding hides the gradient wanted, it may be larger.
+        The tolerance is larger where ρ or the curvature of the loss makes rounding dominate.
 
         Raises
         ------
         Ended
-            Where the budget is spent.
+            If a limit of iterations or time is reached.
         """
-        stage, options, recorder = self.stage, self.options, self.recorder
+        stage = self.stage
+        options = self.options
+        recorder = self.recorder
         tolerance = max(stage.wanted, ROUNDING * (stage.merit.rho + self._curvature))
-        before, done = self.iterations, 0
+        before = self.iterations
+        done = 0
 
         def report(z: Array, value: float, projected: Array) -> None:
+            """Store an iterate, add it to the history now and then, and check the limits."""
             nonlocal done
-            self.z, self.gradient = z, float(np.abs(projected).max(initial=0.0))
+            self.z = z
+            self.gradient = float(np.abs(projected).max(initial=0.0))
             self.iterations = before + done
             if (done % self._every == 0 and done > 0) or not recorder.history:
                 self._record()
@@ -324,12 +366,17 @@ class _PenaltyClimb:
         return replace(stage, gradient=self.gradient, reached=reached, slack=self._slack())
 
     def _record(self) -> None:
-        nlp, z = self.problem.given, self.problem.answer(self.z)
+        """Add the last iterate to the history."""
+        nlp = self.problem.given
+        z = self.problem.answer(self.z)
         self.recorder.line(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
 
     def _slack(self) -> Slack:
-        """How far the answer is from satisfying the equations of motion."""
-        nlp, z = self.problem.given, self.problem.answer(self.z)
+        """Return the violation at the last iterate, with grasped nodes at their prescribed
+        positions.
+        """
+        nlp = self.problem.given
+        z = self.problem.answer(self.z)
         newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.violations_n(z))
         rows = self.problem.constraint_values(self.z)
         scaled = float(np.abs(rows).max(initial=0.0))

@@ -1,17 +1,18 @@
-"""Single shooting: simulate at the parameters, compare with the markers, improve the parameters.
+"""Single shooting: simulate at the parameters, compare with the measurements, improve the
+parameters.
 
-The peers' way, as a baseline: the only variables are the parameters p = (q, φ), and every
-evaluation of the loss is a simulation with the collocation scheme, so that the optimum is that of
-the other methods. Its slope comes
+This is the usual method in the literature, as a baseline: the only variables are the parameters p =
+(q, φ), and every evaluation of the loss is a simulation with the collocation scheme, so that the
+optimum is that of the other methods. The gradient is computed
 
-- "forward": from the sensitivities Z = dx/dp, solved beside the trajectory, for Gauss–Newton
-  steps in a trust region (SciPy's `least_squares`, "dogbox": steps of at most one in each
-  parameter's logarithm at first);
-- "adjoint": from one sweep backward in time for the multipliers y of c_xᵀ y = −∂L/∂x, as
-  dL/dp = ∂L/∂p + yᵀ ∂c/∂p whatever the number of parameters, for SciPy's L-BFGS-B.
+- "forward": from the sensitivities Z = dx/dp, solved with the trajectory, for Gauss–Newton steps in
+a trust region (SciPy's `least_squares`, "dogbox": steps of at most one in each parameter's
+logarithm at first);
+- "adjoint": from one sweep backward in time for the multipliers y of c_xᵀ y = −∂L/∂x, as dL/dp =
+∂L/∂p + yᵀ ∂c/∂p for any number of parameters, for SciPy's L-BFGS-B.
 
-Where a trial cannot be simulated its loss is infinite: the trust region shrinks to a quarter of
-the step, and the line search goes back to a quarter. At the guess there is nothing to go back to.
+If a trial cannot be simulated, its loss is infinite: the trust region shrinks to a quarter of the
+step, and the line search returns to a quarter. A failure at the guess ends the solve.
 """
 
 from __future__ import annotations
@@ -49,13 +50,13 @@ class Shooting(Options):
     gradient : {"forward", "adjoint"}
         Forward sensitivities and Gauss–Newton, or adjoint gradients and L-BFGS-B.
     tolerance : float
-        Largest slope by a parameter's logarithm: of half the squared residuals in standard
-        deviations (forward), of their mean (adjoint). Forward also ends at a step this short
-        against the way from the guess.
+        Largest derivative by a parameter's logarithm: of half the squared residuals in standard
+        deviations (forward), of their mean (adjoint). Forward also ends at a step this small
+        relative to the distance from the guess.
     max_iterations : int
-        Simulations; those that fail count.
+        Largest number of simulations; those that fail count.
     max_time_s : float
-        No simulation is begun after this time.
+        No simulation begins after this time, in seconds.
     """
 
     name: ClassVar[str] = "shooting"
@@ -69,19 +70,23 @@ class Shooting(Options):
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
-        """Solve the NLP, see `Method`; lines of the history are simulations better than all before.
+        """Solve the NLP, see `Method`; entries of the history are simulations better than all
+        before.
 
-        Of a start only the parameters matter. Where their simulation fails, the status says so
-        and the positions are carried rigidly by the grasp.
+        Only the parameters of `start` are used. If their simulation fails, the status says so and
+        the positions are those of a rigid motion with the grasp.
         """
         recorder = Recorder(self.name, collocation, watch, self.max_time_s)
         search = _Search(self, recorder, start)
         status, message = recorder.search(search.run)
-        best, shots = search.best, search.shots
+        best = search.best
+        shots = search.shots
         if best is None:
-            z, multipliers = completed(collocation, search.first), np.zeros(collocation.constraints)
+            z = completed(collocation, search.first)
+            multipliers = np.zeros(collocation.constraints)
         else:
-            z, multipliers = best.z, None
+            z = best.z
+            multipliers = None
         if best is not None and search.failed:
             failed = f"{search.failed} of {shots} simulations failed"
             recorder.notes.append(f"{failed}; the search went back each time")
@@ -89,12 +94,12 @@ class Shooting(Options):
 
 
 def simulated(collocation: Collocation, p: Array, stopwatch: Stopwatch | None = None) -> Array:
-    """Variables z at the parameters p = (q, φ), with simulated positions.
+    """Return variables z (variables,) at the parameters p = (q, φ), with simulated positions.
 
     Raises
     ------
     SimulationError
-        Naming the step that failed.
+        If a simulation fails; it names the time step.
     """
     positions, failure = marched(collocation, p, stopwatch=stopwatch)
     if failure is not None:
@@ -105,12 +110,21 @@ def simulated(collocation: Collocation, p: Array, stopwatch: Stopwatch | None = 
 def adjoint_gradient(
     collocation: Collocation, z: Array, stopwatch: Stopwatch | None = None
 ) -> Array:
-    """Total derivative (np,) of the objective by p along the equations of motion, at simulated z.
+    """Return the total derivative (np,) of the objective by p along the equations of motion.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Problem.
+    z : (variables,) array
+        Variables with simulated positions.
+    stopwatch : Stopwatch, optional
+        Stopwatch that measures the sweep.
 
     Raises
     ------
     SimulationError
-        Where a timestep's equations are singular.
+        If the equations of a time step are singular.
     """
     multipliers = constraint_multipliers(collocation, z, stopwatch)
     slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
@@ -119,7 +133,15 @@ def adjoint_gradient(
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """A simulation: its objective, and residuals with slopes or the gradient of the objective."""
+    """Simulation at parameters p: variables z, objective, and derivatives.
+
+    Attributes
+    ----------
+    residual : (m,) array
+        Residuals in standard deviations; empty with adjoint gradients.
+    slope : array
+        Derivatives (m, np) of the residuals or, with adjoint gradients, (np,) of the objective.
+    """
 
     p: Array
     z: Array
@@ -129,10 +151,21 @@ class _Shot:
 
 
 class _Search:
-    """Counts, remembers and reports simulations for SciPy's optimisers."""
+    """Search by SciPy's optimisers, which counts and records simulations.
+
+    Attributes
+    ----------
+    shots, failed : int
+        Numbers of all and of failed simulations.
+    last, best : _Shot or None
+        Last and best simulation that succeeded; None before the first.
+    horizon : Horizon or None
+        Linearised problem; None with adjoint gradients.
+    """
 
     def __init__(self, options: Shooting, recorder: Recorder, start: Array | None) -> None:
-        self.options, self.recorder = options, recorder
+        self.options = options
+        self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.lower, self.upper = collocation.bounds_p
         first = collocation.guess_p if start is None else collocation.parameters_of(start)
@@ -146,7 +179,7 @@ class _Search:
             self.horizon = Horizon(collocation, rows, stopwatch=recorder.stopwatch)
 
     def run(self) -> tuple[Status, str]:
-        """Search; the status, and a sentence with what SciPy said.
+        """Search, and return the status and a sentence with SciPy's message.
 
         Raises
         ------
@@ -161,7 +194,8 @@ class _Search:
     # Optimisers -------------------------------------------------------------------------------
 
     def _gauss_newton(self) -> tuple[Status, str]:
-        found = least_squares(
+        """Minimise by SciPy's `least_squares`."""
+        result = least_squares(
             self._residual,
             np.zeros(len(self.first)),  # then the trust region starts at one
             self._slope,  # pyright: ignore[reportArgumentType]
@@ -172,21 +206,26 @@ class _Search:
             ftol=ROUNDING,
             gtol=self.options.tolerance,
         )
-        status = Status.ITERATION_LIMIT if found.status == 0 else Status.CONVERGED
-        return status, f"{status.sentence} (SciPy: {found.message})"
+        status = Status.ITERATION_LIMIT if result.status == 0 else Status.CONVERGED
+        return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _residual(self, step: Array) -> Array:
+        """Return the residuals after a step from the first parameters; infinite if the
+        simulation fails.
+        """
         shot = self._try(self.first + step)
         assert self.best is not None
         return np.full(len(self.best.residual), np.inf) if shot is None else shot.residual
 
     def _slope(self, step: Array) -> Array:
+        """Return the derivatives of the residuals after a step from the first parameters."""
         shot = self._try(self.first + step)
         assert shot is not None  # SciPy asks where the residuals were finite
         return shot.slope
 
     def _quasi_newton(self) -> tuple[Status, str]:
-        found = minimize(
+        """Minimise by SciPy's L-BFGS-B."""
+        result = minimize(
             self._objective,
             self.first,
             method="L-BFGS-B",
@@ -201,15 +240,19 @@ class _Search:
             },
         )
         assert self.best is not None
-        p, slope = self.best.p, self.best.slope
+        p = self.best.p
+        slope = self.best.slope
         projected = np.clip(p - slope, self.lower, self.upper) - p
-        flat = np.abs(projected).max() <= max(FLAT, self.options.tolerance)
-        status = Status.ACCEPTABLE if flat else Status.STALLED
-        if found.success:
+        is_flat = np.abs(projected).max() <= max(FLAT, self.options.tolerance)
+        status = Status.ACCEPTABLE if is_flat else Status.STALLED
+        if result.success:
             status = Status.CONVERGED
-        return status, f"{status.sentence} (SciPy: {found.message})"
+        return status, f"{status.sentence} (SciPy: {result.message})"
 
     def _objective(self, p: Array) -> tuple[float, Array]:
+        """Return the objective and its gradient at p; those of a steep parabola if the
+        simulation fails.
+        """
         shot = self._try(p)
         if shot is not None:
             return shot.objective, shot.slope
@@ -223,7 +266,13 @@ class _Search:
     # Simulations ------------------------------------------------------------------------------
 
     def _try(self, p: Array) -> _Shot | None:
-        """The shot at p, simulated unless it is the last; None where it fails."""
+        """Return the simulation at p, which is not repeated if it is the last; None if it fails.
+
+        Raises
+        ------
+        Ended
+            If a simulation fails as close to the best as the tolerance.
+        """
         if self.last is not None and np.array_equal(p, self.last.p):
             return self.last
         try:
@@ -240,6 +289,15 @@ class _Search:
         return shot
 
     def _shoot(self, p: Array) -> _Shot:
+        """Simulate at p with derivatives, and record it if it is the best.
+
+        Raises
+        ------
+        Ended
+            If a limit of simulations or time is reached.
+        SimulationError
+            If the simulation fails.
+        """
         if self.shots and self.shots >= self.options.max_iterations:
             raise Ended(Status.ITERATION_LIMIT)
         if self.shots and self.recorder.late:

@@ -1,4 +1,9 @@
-"""Motions of the grasp that make the error bars of the next recording small."""
+"""Experiment design: motions of the gripper that make the uncertainty of the next recording small.
+
+`designing` searches for the best motion (`design`), `information` predicts the uncertainty of a
+motion, `motion` parametrises motions, `limits` describes what the robot may do, `search` is the
+optimiser, and `folder` and `page` write and show the result.
+"""
 
 from .designing import Design, DesignOptions, design
 from .information import Criterion

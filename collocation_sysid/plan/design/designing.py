@@ -1,4 +1,7 @@
-"""The motion whose recording makes the error bars smallest, within limits and over a prior of θ."""
+"""Search for the motion with the smallest error bars, within limits and over a prior of θ.
+
+Use `design`.
+"""
 
 from __future__ import annotations
 
@@ -37,24 +40,25 @@ Say = Callable[[str], None]
 # it least.
 FORBIDDEN = 1e3
 # Motions that are tried to first order, which takes milliseconds each, for each simulated one.
-TO_FIRST_ORDER, NEWS = 10, 500
+TO_FIRST_ORDER = 10
+NEWS = 500
 MOST_GIGABYTES = 1.0
 
 
 @dataclass(frozen=True)
 class DesignOptions(Options):
-    """How a motion is sought.
+    """Options of the search for a motion.
 
     Attributes
     ----------
     evaluations : int
-        How many motions are simulated; ten times as many are tried to first order before.
+        Number of motions that are simulated; ten times as many are evaluated to first order before.
     pairs : int
-        How many pairs of draws from the prior.
+        Number of pairs of draws from the prior.
     spread : float
         Factor by which guesses without a prior may be wrong.
     waves : int
-        How many waves each of the six coordinates has.
+        Number of waves of each of the six coordinates.
     seed : int
         Seed of the search and of the draws.
     """
@@ -66,7 +70,8 @@ class DesignOptions(Options):
     seed: Count = 0
 
 
-WORST, USUAL = Criterion(), DesignOptions()
+WORST = Criterion()
+USUAL = DesignOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +80,12 @@ class Bars:
 
     Attributes
     ----------
-    values : of parameters and moduli at the middle of the prior
-    relative : their standard errors over these
-    lowest, highest : of the relative errors over the draws of θ
+    values : mapping of str to float
+        Parameters and moduli at the middle of the prior.
+    relative : mapping of str to float
+        Their standard errors over these.
+    lowest, highest : mapping of str to float
+        Smallest and largest relative errors over the draws of θ.
     """
 
     values: Mapping[str, float]
@@ -87,7 +95,7 @@ class Bars:
 
     @classmethod
     def of(cls, errors: list[Errors]) -> Bars:
-        """From those at the draws, the middle first."""
+        """Return the error bars from those at the draws, the middle first."""
         each = [error.relative for error in errors]
         lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
         return cls(errors[0].values, each[0], lowest, highest)
@@ -95,28 +103,35 @@ class Bars:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A motion with what it is predicted to tell.
+    """Designed motion with its predicted uncertainty.
 
     Attributes
     ----------
     recording : FutureRecording
+        Recording to be made.
     motion : HandMotion
+        Motion of the hand.
     experiment : Experiment
-        What is to be recorded, with the simulated markers in place of measured ones.
+        Experiment to be recorded, with simulated markers instead of measured ones.
     predicted : Trajectory
-        Simulated at the middle of the prior.
+        Simulation at the middle of the prior.
     criterion : Criterion
+        Criterion that was minimised.
     before : Bars or None
-        Of the recordings there are, where they count, else of the problem's own motion.
+        Error bars of the existing recordings, if they are used, else of the problem's own motion;
+        None if that could not be simulated.
     after : Bars
-        Of the new recording, and those there are where they count.
+        Error bars with the new recording, and with the existing ones if they are used.
     added : bool
-        Whether the recordings there are count.
+        Whether the existing recordings are used.
     limits : Limits
-    shares : by name of a limit, largest value over what is allowed
+        Limits of the robot.
+    shares : mapping of str to float
+        Largest value over the limit, by name of the limit.
     best : Best
-        How the search went.
-    draws : number of θ
+        Result of the search.
+    draws : int
+        Number of draws of θ.
     """
 
     recording: FutureRecording
@@ -134,31 +149,36 @@ class Design:
 
     @property
     def poses(self) -> PoseSequence:
-        """Those of the hand."""
+        """Poses of the hand."""
         return self.experiment.grasps[0].poses
 
     @property
     def reached(self) -> list[str]:
-        """Names of the limits that hold the motion back."""
+        """Names of the limits that the motion reaches."""
         return [name for name, share in self.shares.items() if share > REACHED]
 
     @property
     def size(self) -> float:
-        """The error bar that was made small."""
+        """Relative error bar that was minimised."""
         return float(np.exp(self.best.value))
 
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """How good a motion is.
+    """Objective of the search: size of the error bars of a motion.
 
     Attributes
     ----------
     recording : FutureRecording
+        Recording to be designed.
     limits : Limits
+        Limits of the robot.
     criterion : Criterion
-    draws : list of (nq,) q, the middle of the prior first
-    known : (nq, nq) information of the recordings there are
+        Criterion.
+    draws : list of (nq,) array
+        Draws of q, the middle of the prior first.
+    known : (nq, nq) array
+        Information of the existing recordings.
     """
 
     recording: FutureRecording
@@ -169,17 +189,17 @@ class Judge:
 
     @cached_property
     def bounds(self) -> Bounds:
-        """The limits about the start."""
+        """Limits relative to the initial position."""
         return self.recording.bounds(self.limits)
 
     @cached_property
     def constants(self) -> ThetaMap:
-        """Of the body."""
+        """Map from q to the constants of the body."""
         recording = self.recording
         return ThetaMap(recording.problem.parameters, recording.template.body)
 
     def motion(self, coefficients: Array) -> HandMotion:
-        """The motion of any coefficients, within the limits."""
+        """Return the motion of any coefficients, scaled to the limits."""
         recording = self.recording
         free = HandMotion.of(
             coefficients,
@@ -190,30 +210,36 @@ class Judge:
         return self.bounds.within(free)
 
     def errors(self, information: Array | float, q: Array) -> Errors:
-        """Of the recordings there are, and of one more."""
+        """Return the error bars at q with the existing recordings and additional
+        information (nq, nq).
+        """
         parameters = self.recording.problem.parameters
         return Errors.of(self.known + information, parameters, self.constants, q)
 
     def first_guess(self, options: DesignOptions, say: Say) -> Best:
-        """Where to begin: the best to first order.
+        """Return the best motion to first order, as a start of the search.
 
-        Nowhere where a wrench is measured too, or that would take too much memory.
+        The result has no coefficients if a wrench is measured too, the memory would be too large,
+        or the simulation fails.
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
             return Best()
-        middle, count = self.draws[0], TO_FIRST_ORDER * options.evaluations
+        middle = self.draws[0]
+        count = TO_FIRST_ORDER * options.evaluations
         try:
             linear = LinearRecording.of(self.recording, middle)
         except SimulationError:
             return Best()
 
         def told(number: int, size: float) -> None:
+            """Report the progress now and then."""
             if number % NEWS == 0:
                 size = 100 * np.exp(size)
                 say(f"to first order: {number} of {count} motions, {size:.3g} %")
 
         def value(coefficients: Array, _: float) -> float:
+            """Return the logarithm of the error bar to first order."""
             information = linear.information(self.motion(coefficients))
             return self.criterion.log_size(self.errors(information, middle))
 
@@ -221,21 +247,29 @@ class Judge:
         return search(value, size, count, options.seed, told)
 
     def value(self, coefficients: Array, bar: float) -> float:
-        """The logarithm of the error bar, or `FORBIDDEN` and more where a rule is broken.
+        """Return the logarithm of the error bar; `FORBIDDEN` or more if a simulation fails or a
+        view is left.
 
-        A motion that is beyond the bar at the middle of the prior is judged by that alone.
+        If the value at the middle of the prior exceeds `bar`, the other draws are not simulated.
+
+        Parameters
+        ----------
+        coefficients : (d,) array
+            Coefficients of the motion.
+        bar : float
+            Bound beyond which the value need not be exact.
         """
         experiment = self.recording.experiment(self.recording.poses(self.motion(coefficients)))
         sizes = []
         for q in self.draws:
             try:
-                told = self.recording.told(experiment, q)
+                result = self.recording.told(experiment, q)
             except SimulationError as failure:
-                gone = (failure.time_s - experiment.t_s[0]) / experiment.duration_s
-                return FORBIDDEN * (3 - min(1.0, gone))
-            if (beyond := self.limits.out_of_view(told.markers_m)) > 0:
-                return FORBIDDEN * (1 + beyond / (1 + beyond))
-            sizes.append(self.criterion.log_size(self.errors(told.information, q)))
+                simulated_share = (failure.time_s - experiment.t_s[0]) / experiment.duration_s
+                return FORBIDDEN * (3 - min(1.0, simulated_share))
+            if (excess := self.limits.out_of_view(result.markers_m)) > 0:
+                return FORBIDDEN * (1 + excess / (1 + excess))
+            sizes.append(self.criterion.log_size(self.errors(result.information, q)))
             if len(sizes) == 1 and sizes[0] > bar:
                 break
         return self.criterion.over_draws(sizes)
@@ -253,33 +287,39 @@ def design(
     watch: Watch | None = None,
     say: Say = lambda _: None,
 ) -> Design:
-    """Find the motion of the grasp that makes the error bars smallest.
+    """Find the motion of the grasp that minimises the error bars.
 
     Parameters
     ----------
     problem : Problem
-        Whose experiment says body, grasp, markers, noise and nuisance parameters, and where the
-        hand starts: at its first pose.
+        Problem with an experiment that defines body, grasp, markers, noise, nuisance parameters and
+        the initial pose of the hand.
     limits : Limits
+        Limits of the robot.
     duration_s : float
-    criterion, options
+        Duration of the motion [s].
+    criterion : Criterion
+        Criterion to minimise.
+    options : DesignOptions
+        Options of the search.
     experiment : str, optional
-        Its name; the first that is not static by default.
+        Name of the experiment; the first that is not static by default.
     add : bool
-        Identify the parameters from the recordings there are first; the new one is to complete
-        them, and θ is drawn about the answer as its error bars say. Otherwise they do not count,
-        and θ is drawn about the guesses.
+        Whether the new recording complements the existing ones: the parameters are then estimated
+        from these first, and θ is drawn around the estimates according to their error bars.
+        Otherwise the existing recordings are not used, and θ is drawn around the guesses.
     watch : callable, optional
-        Called with the number of motions tried and the logarithm of the smallest error bar.
+        Function that is called with the number of motions and the logarithm of the smallest error
+        bar.
     say : callable, optional
-        Called with what is being done now.
+        Function that is called with the present activity.
 
     Raises
     ------
     InputError
         For a problem without guesses, an experiment that cannot be designed, limits that exclude
-        the start, unknown names, where the recordings cannot be fitted, and where no motion that
-        was tried keeps the body simulable and the markers in view.
+        the start, unknown names, recordings that cannot be fitted, and if no motion keeps the body
+        simulable and the markers in view.
     """
     if not 0 < duration_s < np.inf:
         raise InputError(
@@ -301,8 +341,10 @@ def design(
     criterion.require_known(judge.errors(0.0, draws[0]))
     first = judge.first_guess(options, say)
     say("seeking a motion")
-    tried = 1 if first.interrupted else options.evaluations
-    best = search(judge.value, HandMotion.size(options.waves), tried, options.seed, watch, first.at)
+    evaluations = 1 if first.interrupted else options.evaluations
+    best = search(
+        judge.value, HandMotion.size(options.waves), evaluations, options.seed, watch, first.at
+    )
     best.interrupted |= first.interrupted
     if best.at is None or best.value >= FORBIDDEN:
         raise InputError(_no_motion(best), problem.path)
@@ -311,12 +353,13 @@ def design(
 
 
 def _designed(judge: Judge, best: Best, add: bool) -> Design:
-    """The best motion with its error bars."""
+    """Return the design with the best motion and its error bars."""
     assert best.at is not None
-    recording, motion = judge.recording, judge.motion(best.at)
+    recording = judge.recording
+    motion = judge.motion(best.at)
     experiment = recording.experiment(recording.poses(motion))
-    told = [recording.told(experiment, q) for q in judge.draws]
-    after = _bars(judge, told)
+    results = [recording.told(experiment, q) for q in judge.draws]
+    after = _bars(judge, results)
     problem = recording.problem
     values = problem.parameters.values(judge.draws[0])
     predicted = simulate(experiment, values, problem.scheme, substeps=problem.first_substeps)
@@ -353,12 +396,13 @@ def _before(judge: Judge, add: bool) -> Bars | None:
 
 
 def _bars(judge: Judge, told: list[SimulatedMotion]) -> Bars:
+    """Return the error bars from the motion's information at all draws."""
     pairs = zip(told, judge.draws, strict=True)
     return Bars.of([judge.errors(each.information, q) for each, q in pairs])
 
 
 def _from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
-    """Draws of q about the answer, and the information of the recordings."""
+    """Return draws of q around the estimate, and the information (nq, nq) of the recordings."""
     solution = solve(problem)
     solution.unless_interrupted()
     if not solution.status.converged:
@@ -371,14 +415,15 @@ def _from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Arr
     constants = ThetaMap(problem.parameters, problem.experiments[0].body)
     errors = Errors.of(known, problem.parameters, constants, solution.q)
     # Where they tell next to nothing of a parameter, as far about the answer as about a guess.
-    most = np.log(options.spread)
+    largest_deviation = np.log(options.spread)
     deviations = np.sqrt(np.diag(errors.covariance))
-    shrunk = np.minimum(1.0, most / deviations)
-    root = shrunk[:, None] * np.linalg.cholesky(errors.covariance)
+    factors = np.minimum(1.0, largest_deviation / deviations)
+    root = factors[:, None] * np.linalg.cholesky(errors.covariance)
     return both_sides(problem.parameters, solution.q, root, options.pairs, options.seed), known
 
 
 def _chosen(problem: Problem, name: str | None) -> Experiment:
+    """Return the experiment with a name, or the first that is not static for None."""
     moving = [each for each in problem.experiments if not each.static]
     if not moving:
         raise InputError("every experiment is static; expected one that moves", problem.path)
@@ -390,6 +435,7 @@ def _chosen(problem: Problem, name: str | None) -> Experiment:
 
 
 def _require_guesses(problem: Problem) -> None:
+    """Raise `InputError` if a parameter has no guess."""
     if names := problem.parameters.unguessed:
         key = f"parameters.{names[0]}"
         raise InputError(
@@ -401,6 +447,7 @@ def _require_guesses(problem: Problem) -> None:
 
 
 def _no_motion(best: Best) -> str:
+    """Return why no motion was found."""
     tried = f"none of the {len(best.history)} motions that were tried"
     if best.value >= 2 * FORBIDDEN:
         return (

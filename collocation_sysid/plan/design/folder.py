@@ -1,4 +1,6 @@
-"""The folder of a design: the poses, what they are predicted to tell, and a problem to record."""
+"""Folder of a design: the poses, their predicted measurements, and a problem file for the
+recording.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,12 @@ from ...tree import as_json, content
 from .designing import Bars, Design
 from .page import pictures
 
-DESIGN_FILE, POSES_FILE, MARKERS_FILE = "design.json", "poses.csv", "predicted_markers.csv"
-WRENCH_FILE, PROBLEM_FILE, FILM_FILE = "predicted_wrench.csv", "problem.toml", "motion.gif"
+DESIGN_FILE = "design.json"
+POSES_FILE = "poses.csv"
+MARKERS_FILE = "predicted_markers.csv"
+WRENCH_FILE = "predicted_wrench.csv"
+PROBLEM_FILE = "problem.toml"
+FILM_FILE = "motion.gif"
 NAME = "designed"
 SCHEMA = 1
 FRAMES_PER_SECOND = 25.0
@@ -55,12 +61,23 @@ HEAD = """\
 def write_design(
     design: Design, folder: str | Path, with_film: bool = True, say: Callable[[str], None] = print
 ) -> Path:
-    """Write the folder, whole or not at all, and return it.
+    """Write the folder of a design atomically, and return its path.
+
+    Parameters
+    ----------
+    design : Design
+        Design.
+    folder : str or Path
+        Folder, which may contain an earlier design; that is replaced.
+    with_film : bool
+        Whether to render the motion as a film.
+    say : callable
+        Function that is called with the present activity.
 
     Raises
     ------
     InputError
-        If there is anything but an earlier design.
+        If the folder contains anything but an earlier design.
     """
     target = Path(folder)
     with run_folder(target, mark=DESIGN_FILE, what="design") as place:
@@ -84,8 +101,9 @@ def write_design(
 
 
 def as_dict(design: Design) -> dict[str, Any]:
-    """What design.json holds."""
-    search, limits = design.best, design.limits
+    """Return the content of design.json."""
+    search = design.best
+    limits = design.limits
     return {
         "schema": SCHEMA,
         "experiment": design.recording.template.name,
@@ -116,6 +134,7 @@ def as_dict(design: Design) -> dict[str, Any]:
 
 
 def _bars(bars: Bars) -> dict[str, Any]:
+    """Return error bars for JSON."""
     return {
         name: {
             "value": value,
@@ -131,45 +150,54 @@ def _bars(bars: Bars) -> dict[str, Any]:
 
 
 def _of_gripper(design: Design) -> PoseSequence:
-    """The poses as the robot has them: of its gripper, where the problem says how it holds."""
-    origin, name = design.recording.problem.origin, design.recording.template.name
+    """Return the poses of the gripper if the problem states its transform to the body, else
+    of the body.
+    """
+    origin = design.recording.problem.origin
+    name = design.recording.template.name
     if origin is None:
         return design.poses
     sections = ProblemFile.model_validate(tomllib.loads(origin.text)).experiment
     (section,) = (section for section in sections if section.name == name)
-    if (moved := section.grasps[0].gripper_to_body) is None:
+    if (transform := section.grasps[0].gripper_to_body) is None:
         return design.poses
-    turn = Rotation.from_quat(moved.quaternion_xyzw)
-    body_in_gripper = RigidTransform.from_components(moved.position_m, turn)
+    rotation = Rotation.from_quat(transform.quaternion_xyzw)
+    body_in_gripper = RigidTransform.from_components(transform.position_m, rotation)
     return design.poses.after(body_in_gripper.inv().as_matrix())
 
 
 def _content(design: Design, folder: Path) -> dict[str, Any]:
-    """The problem of the designed recording, and of those there are where they count."""
-    origin, recording = design.recording.problem.origin, design.recording
+    """Return the problem file for the designed recording, with the existing ones if they
+    are used.
+    """
+    origin = design.recording.problem.origin
+    recording = design.recording
     assert origin is not None
-    described = completed(tomllib.loads(origin.text))
-    described.pop("experiment_defaults", None)
-    places = origin.path.resolve().parent, folder
-    described |= {key: _seen_from(described[key], *places) for key in ("object", "experiment")}
-    tables = described["experiment"]
+    problem_table = completed(tomllib.loads(origin.text))
+    problem_table.pop("experiment_defaults", None)
+    old_folder = origin.path.resolve().parent
+    for key in ("object", "experiment"):
+        problem_table[key] = _seen_from(problem_table[key], old_folder, folder)
+    tables = problem_table["experiment"]
     names = [each.get("name") for each in tables]
     new = deepcopy(tables[names.index(recording.template.name)])
-    taken = {*names} if design.added else set()
-    free = (f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2))
-    new["name"] = next(name for name in free if name not in taken)
-    described["experiment"] = [*(tables if design.added else []), _designed(new)]
+    used_names = {*names} if design.added else set()
+    candidate_names = (f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2))
+    new["name"] = next(name for name in candidate_names if name not in used_names)
+    problem_table["experiment"] = [*(tables if design.added else []), _designed(new)]
     for item in recording.problem.parameters.free:
         if is_mode(item.name):
             continue
-        stated = described["parameters"].get(item.name)
+        stated = problem_table["parameters"].get(item.name)
         guess = {"guess": design.after.values[item.name]}
-        described["parameters"][item.name] = (stated if isinstance(stated, dict) else {}) | guess
-    return described
+        problem_table["parameters"][item.name] = (
+            stated if isinstance(stated, dict) else {}
+        ) | guess
+    return problem_table
 
 
 def _designed(table: dict[str, Any]) -> dict[str, Any]:
-    """An experiment's table with the files of the design."""
+    """Return an experiment's table with the files of the design; the table is modified."""
     for key in OF_TIME:
         table.pop(key, None)
     grasp = table["grasp"][0] if isinstance(table["grasp"], list) else table["grasp"]
@@ -186,15 +214,20 @@ def _designed(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _of_design(wrench: dict[str, Any]) -> dict[str, Any]:
-    """A wrench's table with the file of the design, which is in newtons and of the mesh."""
+    """Return a wrench's table with the file of the design, which refers to the mesh and is
+    in newtons.
+    """
     parts = wrench.get("symmetry", 1)
     sigmas = {key: wrench[key] / parts for key in ("sigma_n", "sigma_nm") if key in wrench}
-    kept = {key: value for key, value in wrench.items() if key not in OF_TABLE}
-    return kept | sigmas | {"file": WRENCH_FILE}
+    remaining = {key: value for key, value in wrench.items() if key not in OF_TABLE}
+    return remaining | sigmas | {"file": WRENCH_FILE}
 
 
 def _seen_from(value: Any, old: Path, new: Path) -> Any:
-    """A table of a problem, its files named from another folder; columns are no files."""
+    """Return a table of a problem with file names relative to another folder.
+
+    Names of columns are not file names.
+    """
     if isinstance(value, list):
         return [_seen_from(each, old, new) for each in value]
     if not isinstance(value, dict):

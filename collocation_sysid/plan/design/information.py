@@ -1,19 +1,21 @@
-"""What a recording would tell of the shared parameters q, were the hand to make a motion.
+"""Predicted information of a future recording about the shared parameters q, for a given motion.
 
-The recording is simulated with the scheme that is to fit it. With S the slopes of its residuals,
-by q and by its nuisance parameters φ, and A = SᵀS + the priors of φ, its information is what is
-left of q when φ is estimated beside it, A_qq − A_qφ A_φφ⁻¹ A_φq. Informations of recordings add.
+The recording is simulated with the scheme that will be used to fit it. With the slopes S of its
+residuals with respect to q and its nuisance parameters φ, and A = SᵀS + the priors of φ, its
+information is the Schur complement A_qq − A_qφ A_φφ⁻¹ A_φq. The information of several recordings
+adds up.
 
-What small motions tell, to first order, takes a few simulations in place of one for each motion: a
-body that hangs at rest answers small motions of its hand as a linear system that does not change
-in time, and so do the slopes of what is measured by the parameters. One pulse of each coordinate
-tells the answer to all: with p a pulse, c_j a coordinate at the samples and g the answer to p,
+For small motions, a few simulations predict the information of all motions to first order: a body
+hanging at rest responds to small motions of its hand as a linear time-invariant system, and so do
+the slopes of the measurements. One pulse of each coordinate gives the response to all: with a pulse
+p, a coordinate c_j at the samples and the response g to p,
 
     c(t) ≈ Σ c_j p(t − t_j),   S(t) ≈ S_0(t) + Σ c_j g(t − t_j).
 
-Large turns and large strains are beyond it. It tells where a search may begin, not how it ends.
+This is not valid for large rotations and strains; it is used for the start of a search, not for its
+result.
 
-How small the error bars are is one number, the logarithm of a relative error bar.
+The size of the error bars is one number, the logarithm of a relative error bar.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ Over = Literal["mean", "worst"]
 
 @dataclass(frozen=True)
 class Criterion:
-    """What is to be small.
+    """Criterion that a design minimises.
 
     Attributes
     ----------
@@ -56,15 +58,10 @@ class Criterion:
         The largest error bar, their root mean square, or the size of their joint ellipsoid: the
         geometric mean of its half axes.
     names : tuple of str
-        Parameters and derived moduli that count; every estimated parameter by default. Of one
+        Parameters and derived moduli that count; every estimated parameter by default. For one
         alone all kinds are the same.
     over : {"mean", "worst"}
-        Over draws of θ: of the geometric mean, or of the largest.
-
-    Raises
-    ------
-    InputError
-        For an unknown kind.
+        Over draws of θ: the geometric mean, or the largest.
     """
 
     kind: Kind = "worst"
@@ -76,7 +73,7 @@ class Criterion:
         require_among(self.over, get_args(Over), None, "--over")
 
     def log_size(self, errors: Errors) -> float:
-        """The logarithm of the error bar that is to be small."""
+        """Return the logarithm of the error bar that is minimised."""
         slopes = errors.slopes_of(self.names)
         covariance = slopes @ errors.covariance @ slopes.T
         if self.kind == "D":
@@ -85,15 +82,12 @@ class Criterion:
         return 0.5 * float(np.log(variances.max() if self.kind == "worst" else variances.mean()))
 
     def over_draws(self, sizes: Sequence[float]) -> float:
-        """One number of those at several θ."""
+        """Return one value from those at several θ."""
         return float(np.max(sizes) if self.over == "worst" else np.mean(sizes))
 
     def require_known(self, errors: Errors) -> None:
-        """Refuse names that are not estimated, and for "D" those that follow from one another.
-
-        Raises
-        ------
-        InputError
+        """Raise `InputError` for names that are not estimated, and for "D" those that
+        depend on each other.
         """
         for name in self.names:
             require_among(name, errors.slopes, None, "--for", "some")
@@ -113,10 +107,14 @@ class Errors:
 
     Attributes
     ----------
-    covariance : (nq, nq) of q
-    values : by name, parameters that are estimated, and derived moduli
-    slopes : by name, (nq,) relative change of each by q
-    estimated : number of parameters, the first of the names
+    covariance : (nq, nq) array
+        Covariance of q.
+    values : dict of str to float
+        Estimated parameters, followed by derived moduli, by name.
+    slopes : dict of str to (nq,) array
+        Relative change of each with q.
+    estimated : int
+        Number of estimated parameters, the first of the names.
     """
 
     covariance: Array
@@ -128,35 +126,48 @@ class Errors:
     def of(
         cls, information: Array, parameters: Parameters, constants: ThetaMap, q: Array
     ) -> Errors:
-        """From the information (nq, nq) of all recordings; priors of the parameters join it.
+        """Return the errors from the information (nq, nq) of all recordings and the priors of q.
 
-        No error bar becomes larger than `UNDETERMINED` times a parameter: that much is as good as
-        nothing, and the sizes of motions that tell nothing can be compared.
+        No error bar exceeds `UNDETERMINED` times the parameter, so that motions without information
+        can be compared.
+
+        Parameters
+        ----------
+        information : (nq, nq) array
+            Information of all recordings.
+        parameters : Parameters
+            Parameters with their priors.
+        constants : ThetaMap
+            Map from q to the body's constants, for derived moduli.
+        q : (nq,) array
+            Parameters in the solver's coordinates.
         """
         sizes = relative_slopes(parameters, q)
         prior = parameters.prior(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
         units = 1 / np.sqrt(np.diag(information) + prior)
         scaled = units[:, None] * (information + np.diag(prior)) * units
         covariance = units[:, None] * np.linalg.inv(scaled) * units
-        values, slopes = dict[str, float](), dict[str, Array]()
+        values = dict[str, float]()
+        slopes = dict[str, Array]()
         for item, c, slope in zip(parameters.free, q, np.diag(sizes), strict=True):
             if not is_mode(item.name):
-                values[item.name], slopes[item.name] = item.value(float(c)), slope
-        told = len(values)
+                values[item.name] = item.value(float(c))
+                slopes[item.name] = slope
+        estimated_count = len(values)
         derived = Derived.of([constants], q)
-        moving = {name: by_q for name, by_q in derived.by_q.items() if by_q.any()}
-        values |= {name: derived.values[name] for name in moving}
-        slopes |= {name: by_q / derived.values[name] for name, by_q in moving.items()}
-        return cls(covariance, values, slopes, told)
+        varying = {name: by_q for name, by_q in derived.by_q.items() if by_q.any()}
+        values |= {name: derived.values[name] for name in varying}
+        slopes |= {name: by_q / derived.values[name] for name, by_q in varying.items()}
+        return cls(covariance, values, slopes, estimated_count)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
-        """(k, nq) of those names, of the estimated parameters where there are none."""
+        """Return the slopes (k, nq) of names; of all estimated parameters if names is empty."""
         chosen = names or list(self.slopes)[: self.estimated]
         return np.array([self.slopes[name] for name in chosen])
 
     @property
     def relative(self) -> dict[str, float]:
-        """Standard errors over values, by name."""
+        """Standard errors relative to the values, by name."""
         return {
             name: float(np.sqrt(slope @ self.covariance @ slope))
             for name, slope in self.slopes.items()
@@ -164,10 +175,10 @@ class Errors:
 
 
 def draws_about(parameters: Parameters, spread: float, pairs: int, seed: int) -> list[Array]:
-    """Draws (nq,) of q: the middle, then pairs on either side of it.
+    """Return draws (nq,) of q: the middle, followed by pairs on either side of it.
 
-    A parameter with a prior is drawn from that. Others lie about their guess: logarithms within a
-    standard deviation of ln `spread`, linear ones of `spread` − 1 times their typical size.
+    A parameter with a prior is drawn from it. Others are drawn around their guess: logarithms with
+    a standard deviation of ln `spread`, linear ones with `spread` − 1 times their typical size.
     """
     middle = parameters.guess_q.copy()
     deviation = np.array(
@@ -183,13 +194,28 @@ def draws_about(parameters: Parameters, spread: float, pairs: int, seed: int) ->
 def both_sides(
     parameters: Parameters, middle: Array, root: Array, pairs: int, seed: int
 ) -> list[Array]:
-    """The middle of a normal distribution of q, and draws on either side, within the bounds."""
+    """Return the middle of a normal distribution of q and pairs of draws on either side, within
+    bounds.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Parameters with their bounds.
+    middle : (nq,) array
+        Mean.
+    root : (nq, nq) array
+        Square root of the covariance.
+    pairs : int
+        Number of pairs.
+    seed : int
+        Seed of the random numbers.
+    """
     rng = np.random.default_rng(seed)
-    ways = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
+    deviations = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
     lower, upper = parameters.bounds_q
-    inside = 1e-3 * np.minimum(upper - lower, 1.0)
-    draws = [middle, *(middle + sign * way for way in ways for sign in (1, -1))]
-    return [np.clip(q, lower + inside, upper - inside) for q in draws]
+    margin = 1e-3 * np.minimum(upper - lower, 1.0)
+    draws = [middle, *(middle + sign * way for way in deviations for sign in (1, -1))]
+    return [np.clip(q, lower + margin, upper - margin) for q in draws]
 
 
 # Newton's last step over the body's size: what is left of it is ten thousand times less.
@@ -201,9 +227,10 @@ MOST_SAMPLES = 100_000
 
 
 def shared_information(fit: LinearisedFit) -> Array:
-    """(nq, nq) of the shared parameters, with the others free but for their priors.
+    """Return the information (nq, nq) of the measurements about the shared parameters.
 
-    That of the measurements alone: priors of the shared parameters are left out.
+    Nuisance parameters are eliminated with their priors; priors of the shared parameters are not
+    included.
     """
     alone = least_squares(fit).marginal(fit.shared)
     return alone.information - np.diag(fit.prior_slope[: fit.shared] ** 2)
@@ -211,12 +238,14 @@ def shared_information(fit: LinearisedFit) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedMotion:
-    """A motion as it was simulated at one q.
+    """Result of a simulated motion at one q.
 
     Attributes
     ----------
-    information : (nq, nq)
-    markers_m : (T, M, 3)
+    information : (nq, nq) array
+        Information about the shared parameters.
+    markers_m : (T, M, 3) array
+        Marker positions [m].
     """
 
     information: Array
@@ -225,16 +254,16 @@ class SimulatedMotion:
 
 @dataclass(frozen=True, eq=False)
 class FutureRecording:
-    """The recording to come: all of it but the motion.
+    """Recording to be designed: everything except the motion.
 
     Attributes
     ----------
     problem : Problem
-        With its scheme and parameters.
+        Problem with scheme and parameters.
     template : Experiment
-        Body, grasp, markers, loads and nuisance parameters are those of this one.
+        Experiment with the same body, grasp, markers, loads and nuisance parameters.
     duration_s : float
-        Rounded to whole samples.
+        Duration, rounded to whole samples [s].
     """
 
     problem: Problem
@@ -249,6 +278,7 @@ class FutureRecording:
             raise error.located(self.problem.path, f"experiment '{self.template.name}'") from error
 
     def _check(self) -> None:
+        """Raise `InputError` if a motion cannot be designed for the experiment."""
         template = self.template
         if template.static:
             raise InputError("is static; expected one that moves, to design a motion for")
@@ -271,38 +301,38 @@ class FutureRecording:
 
     @property
     def samples(self) -> int:
-        """Number of the samples of markers."""
+        """Number of samples of the markers."""
         return round(self.duration_s / self.template.timestep_s) + 1
 
     @cached_property
     def since_start_s(self) -> Array:
-        """(T,) times of the samples."""
+        """Times (T,) of the samples since the start [s]."""
         return np.asarray(np.arange(self.samples) * self.template.timestep_s, dtype=np.float64)
 
     @cached_property
     def start(self) -> tuple[Array, Array]:
-        """(3, 3), (3,) rotation and translation of the first pose."""
+        """Rotation (3, 3) and translation (3,) [m] of the first pose."""
         rotations, translations = self.template.rigid_motion(self.template.t_s[:1])
         return rotations[0], translations[0]
 
     @cached_property
     def hand_m(self) -> Array:
-        """(3,) the middle of the grasped nodes, undeformed."""
+        """Centre (3,) of the grasped nodes in the undeformed body [m]."""
         (grasp,) = self.template.grasps
         return np.asarray(self.template.body.nodes_m[grasp.nodes].mean(axis=0), dtype=np.float64)
 
     def bounds(self, limits: Limits) -> Bounds:
-        """The limits of the hand about where it starts."""
+        """Return the limits of the hand relative to its initial position."""
         rotation, translation = self.start
         return limits.about(rotation @ self.hand_m + translation)
 
     def highest_hz(self, limits: Limits) -> float:
-        """No wave is faster.
+        """Return the highest frequency of a wave.
 
         Raises
         ------
         InputError
-            If the samples could not tell it from a slower one.
+            If it exceeds half the sampling rate.
         """
         rate_hz = 1 / self.template.timestep_s
         if (limits.frequency_hz or 0.0) > rate_hz / 2:
@@ -316,16 +346,18 @@ class FutureRecording:
 
     @cached_property
     def pose_times_s(self) -> Array:
-        """(P,) times of the poses since the start, several a sample."""
+        """Times (P,) of the poses since the start [s], several per sample."""
         count = POSES_PER_SAMPLE * (self.samples - 1) + 1
         return np.linspace(0.0, self.since_start_s[-1], count)
 
     def poses(self, motion: HandMotion) -> PoseSequence:
-        """The poses of a motion."""
+        """Return the poses of a motion."""
         return self.carried(motion.derivatives(self.pose_times_s)[0])
 
     def carried(self, coordinates: Array) -> PoseSequence:
-        """The poses at `pose_times_s` from the hand's shift and rotation vector then, (P, 6)."""
+        """Return the poses at `pose_times_s` from translation and rotation vector (P, 6) of
+        the hand.
+        """
         rotation, translation = self.start
         turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(rotation)
         hand = rotation @ self.hand_m + translation + coordinates[:, :3]
@@ -333,8 +365,9 @@ class FutureRecording:
         return PoseSequence(self.pose_times_s + self.template.t_s[0], placed, turned.as_quat())
 
     def experiment(self, poses: PoseSequence) -> Experiment:
-        """What would be recorded, without a measurement yet: all markers at the origin."""
-        template, (grasp,) = self.template, self.template.grasps
+        """Return the future experiment with given poses; markers are placeholders at the origin."""
+        template = self.template
+        (grasp,) = self.template.grasps
         t_s = self.since_start_s + template.t_s[0]
         nowhere = np.zeros((len(t_s), len(template.markers.names), 3))
         return replace(
@@ -345,30 +378,30 @@ class FutureRecording:
         )
 
     def told(self, experiment: Experiment, q: Array) -> SimulatedMotion:
-        """What the experiment tells at q.
+        """Return information and marker positions of an experiment simulated at q.
 
         Raises
         ------
         SimulationError
-            Where it cannot be simulated to its end.
+            If the simulation does not reach the end.
         """
         fit, x = self.fit(experiment, q)
         positions = x[:: self.problem.first_substeps].reshape(len(experiment.t_s), -1, 3)
         return SimulatedMotion(shared_information(fit), experiment.markers.observe(positions))
 
     def program(self, experiment: Experiment) -> Collocation:
-        """The equations of motion of one experiment."""
+        """Return the nonlinear program of one experiment."""
         problem = self.problem
         fitted = replace(experiment, validation=False) if experiment.validation else experiment
         return Collocation([fitted], problem.parameters, problem.scheme, problem.first_substeps)
 
     def fit(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
-        """The experiment simulated at q, with the slopes of all residuals; and x (N, 3n) [m].
+        """Return the linearised fit of an experiment simulated at q, and its positions (N, 3n) [m].
 
         Raises
         ------
         SimulationError
-            Where it cannot be simulated to its end.
+            If the simulation does not reach the end.
         """
         alone = self.program(experiment)
         (segment,) = alone.segments
@@ -386,7 +419,9 @@ class FutureRecording:
 
 
 def _anew(wrench: Wrench | None, t_s: Array) -> Wrench | None:
-    """A sensor that measures at its own rate, over other times, what it did."""
+    """Return the sensor with its own rate over other times; zeros where it measures. None
+    for None.
+    """
     if wrench is None:
         return None
     rate_hz = (len(wrench.t_s) - 1) / max(np.ptp(wrench.t_s), 1e-300)
@@ -406,15 +441,18 @@ CENTRE = 2
 
 @dataclass(frozen=True, eq=False)
 class LinearRecording:
-    """The answers of a recording to a pulse of each coordinate, at one q.
+    """Response of a recording to a pulse of each coordinate, at one q.
 
     Attributes
     ----------
     recording : FutureRecording
+        Recording to be designed.
     rest : LinearisedFit
-        Without any motion.
-    answers : (6, frequencies, 3M, p) their transforms, to a pulse of height one
-    length : int, of the transforms
+        Linearised fit without any motion.
+    answers : (6, frequencies, 3M, p) array
+        Fourier transforms of the change of the slopes, for a pulse of height one.
+    length : int
+        Length of the transforms.
     """
 
     recording: FutureRecording
@@ -424,18 +462,19 @@ class LinearRecording:
 
     @staticmethod
     def gigabytes(recording: FutureRecording) -> float:
-        """Memory that the answers take."""
+        """Return the memory of the responses [GB]."""
         (segment,) = recording.program(recording.template).segments
         markers = 3 * len(recording.template.markers.names)
         return 6 * 16e-9 * recording.samples * markers * len(segment.places)
 
     @classmethod
     def of(cls, recording: FutureRecording, q: Array) -> LinearRecording:
-        """Seven simulations.
+        """Return the response at q (nq,), from seven simulations.
 
         Raises
         ------
         SimulationError
+            If a simulation does not reach the end.
         """
         still = recording.fit(recording.experiment(_pulse(recording, np.zeros(6))), q)[0]
         (at_rest,) = still.blocks
@@ -450,20 +489,22 @@ class LinearRecording:
         return cls(recording, still, np.array(answers), length)
 
     def information(self, motion: HandMotion) -> Array:
-        """(nq, nq) of the shared parameters, see `shared_information`."""
+        """Return the information (nq, nq) of a motion about the shared parameters, see
+        `shared_information`.
+        """
         recording = self.recording
         course = motion.derivatives(recording.since_start_s)[0]
         # What was simulated is highest at a sample before which a motion from rest is nothing yet.
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
-        whole = np.einsum("fk,kfcp->fcp", of_course, self.answers)
+        transform = np.einsum("fk,kfcp->fcp", of_course, self.answers)
         (rest,) = self.rest.blocks
-        change = np.fft.irfft(whole, self.length, axis=0)[: recording.samples]
+        change = np.fft.irfft(transform, self.length, axis=0)[: recording.samples]
         slope = rest.slope + change.reshape(rest.slope.shape)
         return shared_information(replace(self.rest, blocks=(replace(rest, slope=slope),)))
 
 
 def _pulse(recording: FutureRecording, heights: Array) -> PoseSequence:
-    """Poses with a pulse of each coordinate, of these heights (6,)."""
+    """Return poses with a pulse of each coordinate, of given heights (6,) in metres and radians."""
     t_s = recording.pose_times_s
     since = t_s / recording.template.timestep_s - CENTRE
     share = np.nan_to_num(np.asarray(PULSE(since), dtype=np.float64))

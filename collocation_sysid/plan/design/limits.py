@@ -1,4 +1,6 @@
-"""What a robot may do and cameras see: limits.toml, and motions scaled until they keep to it."""
+"""Limits of the robot and views of the cameras (limits.toml), and scaling of motions to
+satisfy them.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ REACHED = 0.98
 
 
 class CameraSection(Section):
-    """A camera, by the cone that it sees."""
+    """A camera, described by its cone of view."""
 
     position_m: Vector = Field(description="Place [x, y, z] in the poses' world.")
     looks_at_m: Vector = Field(description="A point [x, y, z] in the middle of its picture.")
@@ -34,6 +36,7 @@ class CameraSection(Section):
 
     @model_validator(mode="after")
     def _looks_somewhere(self) -> CameraSection:
+        """Raise `ValueError` if the camera has no direction."""
         if self.position_m == self.looks_at_m:
             raise ValueError("looks_at_m is position_m; expected another point")
         return self
@@ -72,6 +75,7 @@ class Limits(Section):
 
     @model_validator(mode="after")
     def _possible(self) -> Limits:
+        """Raise `ValueError` for corners in the wrong order, or too few cameras."""
         for key in ("workspace_m", "markers_box_m"):
             corners = getattr(self, key)
             if corners is not None and not (np.array(corners[0]) < corners[1]).all():
@@ -101,7 +105,7 @@ class Limits(Section):
             raise explain(error, content, file, cls) from error
 
     def about(self, hand_m: Array) -> Bounds:
-        """The limits of a hand that starts at a place (3,) in the poses' world.
+        """Return the limits of a hand that starts at a position (3,) in the poses' world [m].
 
         Raises
         ------
@@ -123,9 +127,10 @@ class Limits(Section):
         return Bounds(self, low, high)
 
     def out_of_view(self, markers_m: Array) -> float:
-        """How far markers (T, M, 3) leave what is seen: zero where all are in view.
+        """Return how far markers (T, M, 3) [m] leave the views; zero if all are in view.
 
-        Metres beyond the box over its diagonal, or radians beyond a camera's cone.
+        Distances beyond the box are relative to its diagonal; those beyond a camera's cone are
+        angles [rad]. The largest is returned.
         """
         worst = 0.0
         if self.markers_box_m is not None:
@@ -139,21 +144,26 @@ class Limits(Section):
 
 
 def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
-    """(…) angle [rad] by which points (…, 3) are outside a camera's cone, negative inside."""
-    place = np.array(camera.position_m)
-    ray, axis = points_m - place, np.array(camera.looks_at_m) - place
-    along = ray @ axis / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(axis) + 1e-300)
-    return np.arccos(np.clip(along, -1.0, 1.0)) - np.radians(camera.field_of_view_deg) / 2
+    """Return the angles (…) [rad] by which points (…, 3) are outside a camera's cone;
+    negative inside.
+    """
+    position_m = np.array(camera.position_m)
+    ray = points_m - position_m
+    axis = np.array(camera.looks_at_m) - position_m
+    cosine = ray @ axis / (np.linalg.norm(ray, axis=-1) * np.linalg.norm(axis) + 1e-300)
+    return np.arccos(np.clip(cosine, -1.0, 1.0)) - np.radians(camera.field_of_view_deg) / 2
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Limits of a hand that starts at a given place.
+    """Limits of a hand with a known initial position.
 
     Attributes
     ----------
     limits : Limits
-    low_m, high_m : (3,) how far it may go from its start, along each axis
+        Limits.
+    low_m, high_m : (3,) array
+        Corners of the workspace relative to the initial position [m].
     """
 
     limits: Limits
@@ -162,9 +172,13 @@ class Bounds:
 
     @property
     def reach(self) -> tuple[Array, Array, Array]:
-        """Size, rate and rate of the rate, each of shifts [m] and turns [rad]."""
-        limits, farthest = self.limits, np.maximum(-self.low_m, self.high_m).max()
-        angular_rate, growth = limits.angular_speed_deg_s, limits.angular_acceleration_deg_s2
+        """Largest values (2,), first and second derivatives, each of translation [m] and
+        rotation [rad].
+        """
+        limits = self.limits
+        farthest = np.maximum(-self.low_m, self.high_m).max()
+        angular_rate = limits.angular_speed_deg_s
+        growth = limits.angular_acceleration_deg_s2
         return (
             np.array([farthest, np.radians(limits.rotation_deg)]),
             np.array([limits.speed_m_s, np.radians(angular_rate)]),
@@ -172,11 +186,14 @@ class Bounds:
         )
 
     def shares(self, motion: HandMotion) -> dict[str, float]:
-        """Largest values of a motion as shares of what is allowed, by the limits' names."""
+        """Return the largest values of a motion as shares of the limits, by name of the limit."""
         course = motion.derivatives(motion.grid_s)
         return self._of_shift(*course) | self._of_turn(*course)
 
     def _of_shift(self, *course: Array) -> dict[str, float]:
+        """Return the shares of the translation's limits, from coordinates and derivatives
+        (T, 6).
+        """
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
         return {
@@ -186,23 +203,27 @@ class Bounds:
         }
 
     def _of_turn(self, *course: Array) -> dict[str, float]:
-        turn, limits = course[0][:, 3:], self.limits
+        """Return the shares of the rotation's limits, from coordinates and derivatives (T, 6)."""
+        turn = course[0][:, 3:]
+        limits = self.limits
         largest = map(_largest, (turn, *angular_motion(*(each[:, 3:] for each in course))))
         names = "rotation_deg", "angular_speed_deg_s", "angular_acceleration_deg_s2"
         pairs = zip(names, largest, strict=True)
         return {name: np.degrees(peak) / getattr(limits, name) for name, peak in pairs}
 
     def within(self, motion: HandMotion) -> HandMotion:
-        """The motion with its shifts, and its turns, made so small that every limit is kept.
+        """Return the motion with translations and rotations reduced so that every limit is
+        satisfied.
 
-        What keeps to all of them is left as it is. Peaks of shifts are proportional to their
-        scale, those of turns nearly.
+        A motion that satisfies all limits is unchanged. Peaks of translations are proportional to
+        their scale, those of rotations nearly.
         """
         course = motion.derivatives(motion.grid_s)
         shift = WITHIN / max(WITHIN, *self._of_shift(*course).values())
         return motion.scaled(shift, self._turn_scale(course))
 
     def _turn_scale(self, course: tuple[Array, Array, Array]) -> float:
+        """Return the factor of the rotations."""
         scale = 1.0
         while (largest := max(self._of_turn(*(scale * c for c in course)).values())) > WITHIN:
             scale *= TIGHTER * WITHIN / largest
@@ -210,4 +231,5 @@ class Bounds:
 
 
 def _largest(vectors: Array) -> float:
+    """Return the largest norm of vectors (T, 3)."""
     return float(np.linalg.norm(vectors, axis=1).max())

@@ -24,8 +24,9 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 
-# The window rises within this share of its length, and it lasts for this share of the motion.
+# Smallest and largest share of the window in which it rises.
 RISE = 0.15, 0.5
+# Smallest and largest share of the motion for which the window is open.
 ACTIVE = 0.6, 1.0
 # Periods in the whole motion of the slowest wave.
 FEWEST_PERIODS = 0.4
@@ -38,18 +39,20 @@ PER_WAVE = 4
 
 @dataclass(frozen=True, eq=False)
 class HandMotion:
-    """Shift and rotation vector of a hand over time, from rest to rest.
+    """Translation and rotation vector of a hand over time, from rest to rest.
 
     Attributes
     ----------
     duration_s : float
+        Duration of the motion [s].
     active_s, rise_s : float
-        How long the window is open, and how long it rises and falls.
-    amplitude : (6, k)
-        Of the k waves of x, y, z [m] and of the rotation vector's x, y, z [rad].
-    first_hz, last_hz : (6, k)
-        Their frequencies at the beginning and at the end of the window.
-    phase_rad : (6, k)
+        Durations of the window, and of its rise and fall [s].
+    amplitude : (6, k) array
+        Amplitudes of the k waves of x, y, z [m] and of the rotation vector's x, y, z [rad].
+    first_hz, last_hz : (6, k) array
+        Frequencies at the beginning and at the end of the window.
+    phase_rad : (6, k) array
+        Phases.
     """
 
     duration_s: float
@@ -68,17 +71,19 @@ class HandMotion:
         highest_hz: float,
         reach: tuple[Array, Array, Array],
     ) -> HandMotion:
-        """The motion of coefficients without bounds, all of which are about as large as one.
+        """Return the motion for unbounded coefficients whose expected magnitude is one.
 
         Parameters
         ----------
-        coefficients : (2 + 24 k,)
+        coefficients : (2 + 24 k,) array
+            Coefficients.
         duration_s : float
+            Duration of the motion [s].
         highest_hz : float
-            No wave is faster.
-        reach : (2,), (2,), (2,)
-            Of shifts and of turns:
-            largest size, its rate and the rate of that; a wave alone has at most these.
+            Highest frequency of a wave.
+        reach : tuple of three (2,) arrays
+            Largest value, first and second derivative of translation [m] and rotation [rad]; each
+            wave alone satisfies them.
         """
         rise, active = (
             low + (high - low) * _unit(u)
@@ -89,13 +94,13 @@ class HandMotion:
         first_hz, last_hz = (np.exp(low + (high - low) * _unit(u)) for u in (first, last))
         angular = 2 * np.pi * np.maximum(first_hz, last_hz)
         size, rate, rate_of_rate = (np.repeat(each, 3)[:, None] for each in reach)
-        most = np.minimum(size, np.minimum(rate / angular, rate_of_rate / angular**2))
+        largest_amplitude = np.minimum(size, np.minimum(rate / angular, rate_of_rate / angular**2))
         active_s = float(active * duration_s)
         return cls(
             duration_s,
             active_s,
             float(rise * active_s),
-            most * np.tanh(share),
+            largest_amplitude * np.tanh(share),
             first_hz,
             last_hz,
             np.pi * phase,
@@ -103,30 +108,34 @@ class HandMotion:
 
     @staticmethod
     def size(waves: int) -> int:
-        """Number of coefficients of a motion with so many waves of each coordinate."""
+        """Return the number of coefficients of a motion with `waves` waves per coordinate."""
         return OWN + PER_WAVE * 6 * waves
 
     def scaled(self, shift: float = 1.0, turn: float = 1.0) -> HandMotion:
-        """The same motion with shifts and rotation vectors so many times as large."""
+        """Return the motion with translations multiplied by `shift` and rotation vectors by
+        `turn`.
+        """
         factors = np.repeat([shift, turn], 3)[:, None]
         return replace(self, amplitude=factors * self.amplitude)
 
     @cached_property
     def grid_s(self) -> Array:
-        """Times so dense that between them nothing is larger."""
+        """Times [s] that resolve all peaks of the motion."""
         fastest = max(self.first_hz.max(), self.last_hz.max(), 0.5 / self.rise_s)
         points = FEWEST_POINTS + POINTS_PER_PERIOD * fastest * self.duration_s
         return np.linspace(0.0, self.duration_s, int(points))
 
     def derivatives(self, t_s: ArrayLike) -> tuple[Array, Array, Array]:
-        """Coordinates (T, 6) and their first and second derivatives at times from 0 on."""
+        """Return coordinates (T, 6) and their first and second derivatives at times from 0 [s]."""
         t = np.asarray(t_s, dtype=float)
         window, rate, curvature = self._window(t)
         t = t[:, None, None]
         change = (self.last_hz - self.first_hz) / self.active_s
         angle = 2 * np.pi * (self.first_hz * t + change * t**2 / 2) + self.phase_rad
-        angular, growth = 2 * np.pi * (self.first_hz + change * t), 2 * np.pi * change
-        sine, cosine = np.sin(angle), np.cos(angle)
+        angular = 2 * np.pi * (self.first_hz + change * t)
+        growth = 2 * np.pi * change
+        sine = np.sin(angle)
+        cosine = np.cos(angle)
         first = angular * cosine
         second = growth * cosine - angular**2 * sine
         wave, wave_rate, wave_curvature = (
@@ -139,7 +148,10 @@ class HandMotion:
         )
 
     def _window(self, t: Array) -> tuple[Array, Array, Array]:
-        """(T, 1) the window and its derivatives: 10 u³ − 15 u⁴ + 6 u⁵ up, and the same down."""
+        """Return the window (T, 1) and its first two derivatives.
+
+        It rises as 10 u³ − 15 u⁴ + 6 u⁵ and falls likewise.
+        """
         rising = t <= self.active_s / 2
         u = np.clip(np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0)
         slope = np.where(rising, 1.0, -1.0) / self.rise_s
@@ -150,22 +162,26 @@ class HandMotion:
 
 
 def angular_motion(r: Array, rate: Array, curvature: Array) -> tuple[Array, Array]:
-    """Angular velocity and acceleration (T, 3) of exp(r), from r and its derivatives (T, 3)."""
+    """Return angular velocity and acceleration (T, 3) of exp(r), from r and its derivatives
+    (T, 3).
+    """
     angle = np.linalg.norm(r, axis=1)
     a, b, a_slope, b_slope = (each[:, None] for each in _jacobian_factors(angle))
-    along = np.einsum("ti,ti->t", r, rate)[:, None]
+    projection = np.einsum("ti,ti->t", r, rate)[:, None]
     across = np.cross(r, rate)
-    twice, drive = np.cross(r, across), np.cross(r, curvature)
-    velocity = rate + a * across + b * twice
+    double_cross = np.cross(r, across)
+    drive = np.cross(r, curvature)
+    velocity = rate + a * across + b * double_cross
     acceleration = curvature + a * drive + b * (np.cross(rate, across) + np.cross(r, drive))
-    return velocity, acceleration + along * (a_slope * across + b_slope * twice)
+    return velocity, acceleration + projection * (a_slope * across + b_slope * double_cross)
 
 
 def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
-    """The left Jacobian's a and b, and their slopes over the angle, da/dθ / θ and db/dθ / θ."""
+    """Return a and b of the left Jacobian, and (da/dθ)/θ and (db/dθ)/θ, at angles (T,) [rad]."""
     small = angle < 1e-2
     x = np.where(small, 1.0, angle)
-    sine, cosine = np.sin(x), np.cos(x)
+    sine = np.sin(x)
+    cosine = np.cos(x)
     exact = (
         (1 - cosine) / x**2,
         (x - sine) / x**3,
@@ -183,5 +199,5 @@ def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _unit(u: Array | float) -> Array:
-    """From any number to one between 0 and 1; of a normal one, evenly spread but for the ends."""
+    """Return numbers between 0 and 1 from any numbers; nearly uniform for normal ones."""
     return 0.5 * (1 + np.tanh(0.8 * np.asarray(u)))

@@ -1,4 +1,4 @@
-"""What people see of a design: the motion, and the error bars before and after."""
+"""Presentation of a design: the motion, and the error bars before and after."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .motion import angular_motion
 
 
 def design_summary(design: Design, folder: Path) -> list[Shown]:
-    """A design on one screen."""
+    """Return a design on one screen, as lines and tables."""
     tried = len(design.best.history)
     interrupted = Line(f"interrupted: the best of {tried} motions", "check")
     return [
@@ -40,8 +40,11 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
 
 
 def _table(design: Design) -> Table:
+    """Return the table of error bars before and after."""
     heads = ("", "value", "error before", "error after", "over the draws", "times smaller")
-    before, after, rows = design.before, design.after, []
+    before = design.before
+    after = design.after
+    rows = []
     for name, relative in after.relative.items():
         earlier = before.relative[name] if before is not None else np.nan
         rows.append(
@@ -58,13 +61,14 @@ def _table(design: Design) -> Table:
 
 
 def _percent(share: float) -> str:
+    """Return a relative error as text; empty for NaN."""
     if np.isnan(share):
         return ""
     return f"{100 * share:.3g} %" if share < 10 else "not told"
 
 
 def _meaning(design: Design) -> str:
-    """What the columns are."""
+    """Return an explanation of the columns."""
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
     if design.added:
@@ -76,7 +80,7 @@ def _meaning(design: Design) -> str:
 
 
 def pictures(design: Design) -> dict[str, Figure]:
-    """All of them, by file name."""
+    """Return the figures of a design by file name."""
     return {"motion": motion_picture(design), "error_bars": error_bars_picture(design)}
 
 
@@ -84,7 +88,8 @@ def motion_picture(design: Design) -> Figure:
     """Draw shift and rotation vector over time, and how much of each limit they use."""
     figure = new_figure(PAGE_MM, 100)
     shift, turn, speed, growth = figure.subplots(2, 2, sharex=True).ravel()
-    t_s, limits = design.motion.grid_s, design.limits
+    t_s = design.motion.grid_s
+    limits = design.limits
     place, rate, curvature = design.motion.derivatives(t_s)
     angular = angular_motion(place[:, 3:], rate[:, 3:], curvature[:, 3:])
     for axis, colour in zip(range(3), CYCLE, strict=False):

@@ -1,8 +1,8 @@
-"""Search for the smallest value of a function that costs much and has no slopes.
+"""Minimisation of an expensive function without derivatives.
 
-Draws at random first, then the evolution strategy with covariance adaptation, of which only the
-diagonal is adapted (sep-CMA-ES: Hansen, The CMA evolution strategy: a tutorial, 2016, and Ros and
-Hansen 2008): that learns in a few hundred evaluations, and knows only the order of values.
+Random samples are followed by an evolution strategy that adapts the diagonal of a covariance
+(sep-CMA-ES: Hansen, The CMA evolution strategy: a tutorial, 2016, and Ros and Hansen 2008). It
+converges in a few hundred evaluations and uses only the order of values. Use `search`.
 """
 
 from __future__ import annotations
@@ -28,14 +28,18 @@ Watch = Callable[[int, float], None]
 
 @dataclass(eq=False)
 class Best:
-    """The best there is, also while the search goes on.
+    """Best point of a search, updated while the search runs.
 
     Attributes
     ----------
-    at : (d,) or None before the first evaluation
+    at : (d,) array or None
+        Best coefficients; None before the first evaluation.
     value : float
-    history : list of the smallest value after each evaluation
+        Smallest value; infinite before the first evaluation.
+    history : list of float
+        Smallest value after each evaluation.
     interrupted : bool
+        Whether Ctrl-C ended the search.
     """
 
     at: Array | None = None
@@ -52,25 +56,40 @@ def search(
     watch: Watch | None = None,
     start: Array | None = None,
 ) -> Best:
-    """Minimise a function of coefficients that are about as large as one.
+    """Minimise a function of coefficients whose expected magnitude is one.
 
-    Ctrl-C ends the search and keeps the best.
+    Ctrl-C ends the search; the result is the best point so far.
 
     Parameters
     ----------
     value : callable
-        Of (d,) coefficients, and a number beyond which its result need only be larger than that.
-    dimension, evaluations, seed
+        Function of coefficients (d,) and of a bound; beyond the bound its result need not be exact,
+        only larger than the bound.
+    dimension : int
+        Number of coefficients d.
+    evaluations : int
+        Largest number of evaluations.
+    seed : int
+        Seed of the random numbers.
     watch : callable, optional
-    start : (d,), optional
-        Where to begin, in place of the best of draws.
+        Function that is called with the number of evaluations and the smallest value.
+    start : (d,) array, optional
+        Initial coefficients; by default the best of random samples.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the search is interrupted before the first evaluation.
     """
-    best, rng = Best(), np.random.default_rng(seed)
+    best = Best()
+    rng = np.random.default_rng(seed)
 
     def evaluated(at: Array, bar: float) -> float:
+        """Evaluate coefficients, and update the best point."""
         size = value(at, bar)
         if best.at is None or size < best.value:
-            best.at, best.value = at, size
+            best.at = at
+            best.value = size
         best.history.append(best.value)
         if watch is not None:
             watch(len(best.history), best.value)
@@ -100,11 +119,20 @@ def search(
 
 
 class Strategy:
-    """Mean, deviations and paths of sep-CMA-ES, with the tutorial's constants."""
+    """State of sep-CMA-ES: mean, deviations and paths, with the constants of the tutorial.
+
+    Parameters
+    ----------
+    mean : (d,) array
+        Initial mean.
+    deviation : float
+        Initial standard deviation.
+    """
 
     def __init__(self, mean: Array, deviation: float) -> None:
         n = len(mean)
-        self.mean, self.deviation = mean.copy(), deviation
+        self.mean = mean.copy()
+        self.deviation = deviation
         self.offspring = 4 + int(3 * np.log(n))
         weights = np.log((self.offspring + 1) / 2) - np.log(np.arange(self.offspring // 2) + 1)
         self.weights = weights / weights.sum()
@@ -117,25 +145,32 @@ class Strategy:
         several = 2 * (effective - 2 + 1 / effective) / ((n + 2) ** 2 + effective)
         self.c_mu = min(1 - self.c_one, faster * several)
         self.usual = np.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
-        self.variances, self.path, self.drift = np.ones(n), np.zeros(n), np.zeros(n)
+        self.variances = np.ones(n)
+        self.path = np.zeros(n)
+        self.drift = np.zeros(n)
 
     def point(self, step: Array) -> Array:
-        """Where a draw (d,) from the unit normal distribution leads."""
+        """Return the coefficients (d,) of a sample (d,) of the unit normal distribution."""
         return self.mean + self.deviation * np.sqrt(self.variances) * step
 
     def learn(self, steps: Array) -> None:
-        """Move towards the best of the draws (offspring, d), which come first."""
+        """Update mean, deviation and variances from samples (offspring, d), sorted from
+        best to worst.
+        """
         best = steps[: len(self.weights)]
         scale = np.sqrt(self.variances)
-        way = self.weights @ best
-        self.mean = self.mean + self.deviation * scale * way
-        c, r = self.c_path, self.c_rank
-        self.path = (1 - c) * self.path + np.sqrt(c * (2 - c) * self.effective) * way
+        mean_step = self.weights @ best
+        self.mean = self.mean + self.deviation * scale * mean_step
+        c = self.c_path
+        r = self.c_rank
+        self.path = (1 - c) * self.path + np.sqrt(c * (2 - c) * self.effective) * mean_step
         length = float(np.linalg.norm(self.path))
-        steady = length < (1.4 + 2 / (len(way) + 1)) * self.usual * np.sqrt(2)
-        pushed = np.sqrt(r * (2 - r) * self.effective) * scale * way
-        self.drift = (1 - r) * self.drift + steady * pushed
+        is_path_short = length < (1.4 + 2 / (len(mean_step) + 1)) * self.usual * np.sqrt(2)
+        drift_step = np.sqrt(r * (2 - r) * self.effective) * scale * mean_step
+        self.drift = (1 - r) * self.drift + is_path_short * drift_step
         spread = self.weights @ (scale * best) ** 2
-        kept = 1 - self.c_one - self.c_mu
-        self.variances = kept * self.variances + self.c_one * self.drift**2 + self.c_mu * spread
+        previous_weight = 1 - self.c_one - self.c_mu
+        self.variances = (
+            previous_weight * self.variances + self.c_one * self.drift**2 + self.c_mu * spread
+        )
         self.deviation *= float(np.exp(min(1.0, c / self.damping * (length / self.usual - 1))))

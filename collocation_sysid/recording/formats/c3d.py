@@ -14,9 +14,14 @@ from ...errors import InputError
 from .tracks import Choose, RawTracks
 from .units import stated_unit
 
+# Second byte of every C3D file.
 _KEY = 0x50
+# Bytes of a block, the unit of addresses in the file.
 _BLOCK = 512
-_DEC, _SGI = 85, 86  # processor types whose numbers are not as Intel's
+# Processor types with other number formats than Intel's.
+_DEC = 85
+_SGI = 86
+# Largest frame number that the header's 16 bits can hold.
 _COUNTER_LIMIT = 65535
 # On damaged files ezc3d may crash, which a process of its own survives.
 _WORKER = r"""
@@ -35,7 +40,21 @@ def recognises(content: bytes) -> bool:
 
 
 def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
-    """Read a C3D file; ezc3d gives NaN for points with a negative residual."""
+    """Read a C3D file; points with a negative residual are missing (NaN, by ezc3d).
+
+    Parameters
+    ----------
+    path : str or Path
+    content : bytes
+        Content of that file.
+    choose : Choose
+        Picks the markers.
+
+    Raises
+    ------
+    InputError
+        If ezc3d is not installed, or the file is damaged or inconsistent.
+    """
     if find_spec("ezc3d") is None:
         raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
     points_stated, frames_stated = _stated_counts(content)
@@ -73,9 +92,12 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
 
 
 def _stated_counts(content: bytes) -> tuple[int, int | None]:
-    """Points and frames by the header; no frames where they are too many for its counter.
+    """Return the numbers of points and frames in the header; None frames if the counter overflowed.
 
-    Of a file that is cut short ezc3d returns what is left, so the size is compared here.
+    Raises
+    ------
+    InputError
+        If the file is shorter than these numbers require: ezc3d would silently return the rest.
     """
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):
@@ -102,7 +124,7 @@ def _stated_counts(content: bytes) -> tuple[int, int | None]:
 
 
 def _labels(parameters: Mapping[str, NDArray]) -> list[str]:
-    """Labels of the points; those beyond the 255th stand in LABELS2, LABELS3 …"""
+    """Return the labels of the points; those beyond the 255th are in LABELS2, LABELS3 …"""
     keys = [key for key in parameters if key.startswith("LABELS")]
     ordered = sorted(keys, key=lambda key: int(key.removeprefix("LABELS") or 1))
     return [str(label).strip() for key in ordered for label in parameters[key]]

@@ -1,7 +1,8 @@
-"""Quantities over time in a table: columns found by what is measured, and by the unit they name.
+"""Quantities over time in tables: columns are recognised by name and unit.
 
-This project writes ``t_s`` and ``fz_n``; machines write ``Time (s)``, ``Load [kN]``, ``Weg in mm``.
-In a table of the first kind every column is to be known; the second kind has others besides.
+The project's own tables have names such as ``t_s`` and ``fz_n``, and every column must be known.
+Tables of machines have names such as ``Time (s)``, ``Load [kN]``, ``Weg in mm``, and may have
+further columns.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from .units import expected_units, si_factor
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a column may hold.
+    """A quantity that a column may hold.
 
     Parameters
     ----------
     key : str
-        What its column is called here, before the unit.
+        Name of its column in the project's own tables, without the unit.
     dimension : str
-        Of `UNITS`.
+        Key of `UNITS`.
     unit : str
-        The SI unit, as the names of columns have it.
+        SI unit, as it is written in the names of columns.
     words : str
-        Any of which machines call it.
+        Words, separated by blanks, of which machines use one in the column's name.
     """
 
     key: str
@@ -42,7 +43,7 @@ class Quantity:
 
     @property
     def column(self) -> str:
-        """The name of its column here."""
+        """Name of its column in the project's own tables, with the unit."""
         return f"{self.key}_{self.unit}"
 
 
@@ -78,15 +79,15 @@ _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Quantities of a table in SI.
+    """Quantities of a table in SI units.
 
     Attributes
     ----------
     grid : Grid
-        Its cells.
+        Cells of the table.
     t_s : (T,) array
     values : dict
-        (T,) array by the key of each quantity that is there, NaN where missing.
+        (T,) array by the key of each quantity that the table has, NaN where missing.
     """
 
     grid: Grid
@@ -110,20 +111,21 @@ def read_columns(
     path : str or Path
     wanted : sequence of Quantity
     mapped : mapping, optional
-        The column of a quantity, by its key; of the time too. A unit that the file does not state
-        may follow it, as in "Load (N)". Recognised by name where nothing is given.
+        Column name by a quantity's key; "t" for the time. A unit that the file does not state may
+        follow the name, as in "Load (N)". Other columns are not looked for if a quantity besides
+        the time is mapped; without mapping, columns are recognised by name.
     blank_allowed : bool
         Whether cells may be blank.
     timed : bool
-        Whether there must be times; else rows count as seconds where there are none.
+        Whether times are required; otherwise rows are numbered in seconds if there are no times.
     all_of : bool
-        Whether each of `wanted` must be there.
+        Whether each of `wanted` is required; otherwise one is enough.
 
     Raises
     ------
     InputError
-        If a column is missing, repeated, unknown, without unit or with one of something else, a
-        cell is not a number, or time does not increase; the line is named.
+        If a column is missing, repeated, unknown, without unit or with a wrong one, a cell is not a
+        number, or time does not increase; the line is named.
     """
     grid = read_grid(decode(read_bytes(path)))
     if "t_s" in grid.columns and not mapped:
@@ -147,7 +149,7 @@ def read_columns(
 def _places(
     grid: Grid, wanted: Sequence[Quantity], mapped: Mapping[str, str]
 ) -> dict[str, tuple[int, float]]:
-    """The column of each quantity that is there, and its unit in SI."""
+    """Return column index and factor to SI of each quantity that the table has, by its key."""
     quantities = {quantity.key: quantity for quantity in (TIME, *wanted)}
     for key in mapped:
         if key not in quantities:
@@ -164,28 +166,36 @@ def _places(
 
 
 def _mapped(grid: Grid, quantity: Quantity, name: str) -> tuple[int, float]:
-    bare, stated = name_and_unit(name)
-    there = name if name in grid.columns else bare
-    if grid.columns.count(there) != 1:
-        fault = "is there twice" if there in grid.columns else "is not there"
+    """Return index and factor to SI of the column that the user names for a quantity."""
+    bare, unit_of_user = name_and_unit(name)
+    column = name if name in grid.columns else bare
+    if grid.columns.count(column) != 1:
+        fault = "is there twice" if column in grid.columns else "is not there"
         raise grid.refusal(
             f"columns.{quantity.key} is {name!r}, which {fault}; the columns are "
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
-    unit = name_and_unit(there)[1] or stated
-    if quantity in (STRAIN, STRESS) and _words(there) & _DEFORMED:
+    unit = name_and_unit(column)[1] or unit_of_user
+    if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
         raise grid.refusal(
-            f"column {there} is of the deformed specimen; expected engineering "
+            f"column {column} is of the deformed specimen; expected engineering "
             f"{quantity.key}, by the undeformed length or area"
         )
     factor = None if unit is None else si_factor(unit, quantity.dimension)
     if factor is None:
-        raise _other_unit(grid, there, unit, quantity)
-    return grid.columns.index(there), factor
+        raise _other_unit(grid, column, unit, quantity)
+    return grid.columns.index(column), factor
 
 
 def column_of(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
-    """The one column that is called so and has such a unit; None if nothing is called so."""
+    """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
+    name fits.
+
+    Raises
+    ------
+    InputError
+        If several columns fit, or a name fits but its unit does not.
+    """
     units = {
         k: name_and_unit(column)[1]
         for k, column in enumerate(grid.columns)
@@ -205,13 +215,16 @@ def column_of(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
 
 
 def _is_called(column: str, quantity: Quantity) -> bool:
+    """Return whether the name of a column, without its unit, fits a quantity."""
     name, _ = name_and_unit(column)
     called = _words(name) & set(quantity.words.split())
     return name.lower() == quantity.key or bool(called and not _words(name) & _DEFORMED)
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
-    """The parts of a column's name: ("Load", "kN") of "Load (kN)"."""
+    """Return the parts of a column's name: ("Load", "kN") of "Load (kN)"; the unit is None without
+    one.
+    """
     parts = _NAMED.fullmatch(column)
     if parts is None:
         return column, None
@@ -219,6 +232,7 @@ def name_and_unit(column: str) -> tuple[str, str | None]:
 
 
 def _words(name: str) -> set[str]:
+    """Return the lower-case words of a name."""
     return set(re.findall(r"[^\W\d_]+", name.lower()))
 
 
@@ -226,6 +240,7 @@ def _words(name: str) -> set[str]:
 
 
 def _refuse_unknown(grid: Grid, wanted: Sequence[Quantity], all_of: bool) -> None:
+    """Raise an `InputError` if a column holds no known quantity."""
     known = {quantity.key for quantity in KNOWN}
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
@@ -236,6 +251,7 @@ def _refuse_unknown(grid: Grid, wanted: Sequence[Quantity], all_of: bool) -> Non
 def _other_columns(
     grid: Grid, wanted: Sequence[Quantity], all_of: bool, why: str = ""
 ) -> InputError:
+    """Return the error for a table without the wanted columns; `why` is added to its message."""
     expected = ", ".join(quantity.column for quantity in wanted)
     needed = [
         f"; a {quantity.key} needs {size} of the undeformed specimen"
@@ -250,6 +266,7 @@ def _other_columns(
 
 
 def _other_unit(grid: Grid, column: str, unit: str | None, quantity: Quantity) -> InputError:
+    """Return the error for a column without a unit, or with a unit of another dimension."""
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
     return grid.refusal(

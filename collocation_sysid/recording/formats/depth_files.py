@@ -1,4 +1,6 @@
-"""Depth images and clouds of points from files, all files of a folder, or a topic of a log."""
+"""Depth images and clouds of points from files, from all files of a folder, or from a topic of a
+log.
+"""
 
 from __future__ import annotations
 
@@ -32,24 +34,33 @@ from .logs import Address, Log, opened, require_topic
 from .text import decode, read_bytes, read_grid, times_of
 from .topics import by_time
 
-# What a pixel of a PNG counts where nothing else is said, as depth cameras usually do.
+# Depth of one count of an integer image if none is stated [m], as is usual for depth cameras.
 USUAL_COUNT_M = 1e-3
-IMAGES, CLOUDS = (".png", ".exr"), (".ply", ".pcd", ".npy", ".xyz")
-# The topic beside those of a camera's images that says how it projects; topics of rectified ones.
-CAMERA, RECTIFIED = "camera_info", re.compile(r"(?<![a-z])rect(ified)?(?![a-z])")
+# Endings of files with images, and with clouds of points.
+IMAGES = (".png", ".exr")
+CLOUDS = (".ply", ".pcd", ".npy", ".xyz")
+# Name of the topic with the camera model, beside the topics of the camera's images.
+CAMERA = "camera_info"
+# Part of the names of topics with rectified images.
+RECTIFIED = re.compile(r"(?<![a-z])rect(ified)?(?![a-z])")
+# Names of the columns of normals.
 NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 
 
 @dataclass(frozen=True, eq=False)
 class DepthFile:
-    """What a file, or a folder, says of depth.
+    """Depth data of a file or a folder: either images or clouds.
 
     Attributes
     ----------
-    images_m : sequence of (rows, columns), of a camera; or
-    clouds_m : list of (P, 3) or (P, 6), with normals
-    t_s : (S,) or None where it says no times
-    matrix, pose, distortion : of the camera, where it says these
+    images_m : sequence of (rows, columns)
+        Depth images; empty for clouds.
+    clouds_m : list of (P, 3) or (P, 6)
+        Clouds of points, with normals where known; empty for images.
+    t_s : (S,) or None
+        Sample times; None if they are not stated.
+    matrix, pose, distortion : array or None
+        Camera model; None where it is not stated.
     """
 
     images_m: Sequence[Array]
@@ -62,7 +73,9 @@ class DepthFile:
 
 @dataclass(frozen=True, eq=False)
 class _Messages(Sequence[Array]):
-    """Images of messages, each made when it is asked for: many do not fit into the memory."""
+    """Images of messages, decoded when they are accessed, as all of them may not fit into
+    memory.
+    """
 
     messages: Sequence[Any]
     count_m: float | None
@@ -83,17 +96,18 @@ def read_depth(
 
     Parameters
     ----------
+    path : Path
     count_m : float, optional
-        What an integer of an image counts; as the file says, or a millimetre, by default.
+        Depth of one count of an integer image; by default as stated in the file, or a millimetre.
     length_m : float
-        The unit of clouds.
-    known : of "matrix" and "distortion"
-        What of the camera is known: it is not read from a log.
+        Unit of clouds.
+    known : container of str
+        "matrix" and "distortion" if they are known otherwise; they are then not read from a log.
 
     Raises
     ------
     InputError
-        If it is none of these, is damaged, or a package is missing that reads it.
+        If it is none of these, is damaged, or a package that reads it is missing.
     """
     if (address := Address.of(path)) is not None:
         with located(path):
@@ -106,23 +120,25 @@ def read_depth(
         known = ", ".join(_READERS)
         raise InputError(f"is a {kind or 'file without an ending'}; expected one of {known}", path)
     try:
-        found = _READERS[kind](path)
+        content = _READERS[kind](path)
     except InputError as error:
         raise error.located(path) from error
     except (Exception, SystemExit) as error:
         raise InputError(f"cannot be read ({reason(error)}); expected {kind}", path) from error
-    if isinstance(found, DepthFile):
-        return found
+    if isinstance(content, DepthFile):
+        return content
     if kind in CLOUDS:
-        return DepthFile([], [_cloud(found, path, length_m)])
+        return DepthFile([], [_cloud(content, path, length_m)])
     with located(path):
-        return DepthFile([_in_metres(found, count_m)], [])
+        return DepthFile([_in_metres(content, count_m)], [])
 
 
 def _topic(
     path: Path, address: Address, count_m: float | None, length_m: float, known: Container[str]
 ) -> DepthFile:
-    """Messages in the order of their times, and the camera that the log has beside them."""
+    """Return the messages of a topic in the order of their times, and the camera model beside
+    them.
+    """
     with opened(address.log, address.episode) as log:
         require_topic(log, address.topic)
         t_s, messages = by_time(list(log.messages(address.topic)), log.start_ns)
@@ -135,7 +151,9 @@ def _topic(
     if "images" not in kind:
         clouds = [_cloud(_of_columns(columns_of(each)), path, length_m) for each in messages]
         return DepthFile([], clouds, t_s)
-    images, matrix, distortion = _Messages(messages, count_m, path), None, None
+    images = _Messages(messages, count_m, path)
+    matrix = None
+    distortion = None
     if camera is not None:
         rectified = RECTIFIED.search(address.topic.lower()) is not None
         with located(f"{address.log}#{camera[0]}"):
@@ -147,7 +165,9 @@ def _topic(
 
 
 def _camera_beside(log: Log, topic: str) -> tuple[str, Any] | None:
-    """Topic and message of the first camera_info in a topic's namespace or above."""
+    """Return topic and first message of the camera_info in a topic's namespace or above; None
+    without it.
+    """
     above = [str(each) for each in PurePosixPath(topic).parents]
     names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
     if (name := next((each for each in names if each in log.topics), None)) is None:
@@ -157,6 +177,7 @@ def _camera_beside(log: Log, topic: str) -> tuple[str, Any] | None:
 
 
 def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
+    """Read all files of a folder, which must be of one kind; times.csv has their times."""
     files = sorted(each for each in path.iterdir() if each.suffix.lower() in (*IMAGES, *CLOUDS))
     if not files:
         raise InputError(f"has no {', '.join((*IMAGES, *CLOUDS))}; expected images or clouds", path)
@@ -175,6 +196,7 @@ def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
 
 
 def _in_metres(image: Array, count_m: float | None) -> Array:
+    """Return depths [m] of an image (rows, columns) of counts or metres."""
     if image.ndim != 2:
         raise InputError(f"has the shape {image.shape}; expected one channel of depths")
     if image.dtype.kind in "iu":
@@ -183,6 +205,7 @@ def _in_metres(image: Array, count_m: float | None) -> Array:
 
 
 def _cloud(points: Array, path: Path, length_m: float) -> Array:
+    """Return points (P, 3) or (P, 6) in metres; an `InputError` for another shape."""
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
@@ -194,6 +217,7 @@ def _cloud(points: Array, path: Path, length_m: float) -> Array:
 
 
 def _npz(path: Path) -> DepthFile:
+    """Read depth_m, depth_counts or points_m, and the camera model, from a NumPy archive."""
     arrays = load_arrays(path)
     names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
     if len(names) != 1:
@@ -206,8 +230,8 @@ def _npz(path: Path) -> DepthFile:
         values = values * float(arrays.get("count_m", USUAL_COUNT_M))
     samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
     clouded = names[0] == "points_m"
-    known = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
-    return DepthFile([] if clouded else samples, samples if clouded else [], *known)
+    camera = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
+    return DepthFile([] if clouded else samples, samples if clouded else [], *camera)
 
 
 @contextmanager
@@ -228,6 +252,7 @@ def _standard_error_silenced() -> Iterator[None]:
 
 
 def _exr(path: Path) -> Array:
+    """Read the depths [m] of an OpenEXR image."""
     try:
         library = import_module("OpenEXR")
     except ImportError as missing:
@@ -243,12 +268,14 @@ def _exr(path: Path) -> Array:
 
 
 def _of_columns(columns: Mapping[str, Array]) -> Array:
+    """Return points (P, 3), or (P, 6) with normals, from named columns."""
     if not {*"xyz"} <= {*columns}:
         raise InputError(f"has the columns {', '.join(columns)}; expected x, y and z among them")
     return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
 
 
 def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
+    """Append the columns of normals to points (P, 3), if there are any."""
     for names in NORMALS:
         if set(names) <= set(columns):
             return np.column_stack([points, *(columns[name] for name in names)])
@@ -256,7 +283,9 @@ def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
 
 
 def _pcd(path: Path) -> Array:
-    raw, head = path.read_bytes(), dict[str, list[str]]()
+    """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary."""
+    raw = path.read_bytes()
+    head = dict[str, list[str]]()
     begins = 0
     while "DATA" not in head:
         ends = raw.find(b"\n", begins)

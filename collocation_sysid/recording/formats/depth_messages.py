@@ -1,7 +1,7 @@
-"""Messages of depth cameras: images, clouds of points, and how a camera projects.
+"""Messages of depth cameras: images, clouds of points, and camera models.
 
-As ROS has them in sensor_msgs, and Foxglove in RawImage and CameraCalibration, of the same fields.
-They are known by what they hold.
+Supported are the messages of ROS (sensor_msgs) and of Foxglove (RawImage, CameraCalibration), which
+have the same fields. Messages are recognised by their fields.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PACKED = np.dtype([("kind", "<i4"), ("scale", "<f4"), ("shift", "<f4")])
 
 
 def depth_in(message: Any) -> str:
-    """What of depth a message holds, in words; empty if nothing."""
+    """Return the kind of depth data in a message as text; empty if there is none."""
     if hasattr(message, "point_step") and hasattr(message, "fields"):
         return "clouds of points"
     if getattr(message, "encoding", None) in ENCODINGS and hasattr(message, "step"):
@@ -38,17 +38,25 @@ def depth_in(message: Any) -> str:
 
 
 def is_camera(message: Any) -> bool:
-    """Whether it says how a camera projects."""
+    """Return whether a message holds a camera model."""
     return all(_told(message, name) is not None for name in "kpd") and len(_told(message, "k")) == 9
 
 
 def matrix_of(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
-    """Matrix (3, 3) of a camera whose images have so many rows and columns.
+    """Return the matrix (3, 3) of the camera model in a message.
+
+    Parameters
+    ----------
+    message : message
+    rectified : bool
+        Whether the images are rectified; then the projection matrix is taken.
+    shape : (int, int)
+        Rows and columns of the images.
 
     Raises
     ------
     InputError
-        If it tells of images of another size, or of a part of one.
+        If the model is for images of another size, or for a part of an image.
     """
     size = [getattr(message, name, 0) for name in ("height", "width")]
     binned = [getattr(message, f"binning_{axis}", 0) for axis in "xy"]
@@ -61,39 +69,41 @@ def matrix_of(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
             f"{offset} on, beside images of {shape[1]} x {shape[0]}; expected one of whole images "
             "of that size: state camera.matrix"
         )
-    whole = np.asarray(_told(message, "p"), dtype=float)
-    if rectified and whole.size == 12 and whole.any():
-        return whole.reshape(3, 4)[:, :3]
+    projection = np.asarray(_told(message, "p"), dtype=float)
+    if rectified and projection.size == 12 and projection.any():
+        return projection.reshape(3, 4)[:, :3]
     return np.asarray(_told(message, "k"), dtype=float).reshape(3, 3)
 
 
 def distortion_of(message: Any, rectified: bool) -> Array:
-    """What the lens of a camera bends; nothing in rectified images.
+    """Return the distortion coefficients of the camera model; empty for rectified images.
 
     Raises
     ------
     InputError
-        If the lens is none of Brown and Conrady's.
+        If the lens model is not that of Brown and Conrady with at most five coefficients.
     """
-    bent = np.asarray(_told(message, "d"), dtype=float)
-    if rectified or not bent.any():
+    coefficients = np.asarray(_told(message, "d"), dtype=float)
+    if rectified or not coefficients.any():
         return np.zeros(0)
     kind = getattr(message, "distortion_model", "plumb_bob")
-    if kind != "plumb_bob" or len(bent) > 5:
+    if kind != "plumb_bob" or len(coefficients) > 5:
         raise InputError(
-            f"has the lens {kind} with {len(bent)} numbers; expected plumb_bob with five: take the "
-            "topic of rectified images, or state camera.distortion"
+            f"has the lens {kind} with {len(coefficients)} numbers; expected plumb_bob with five: "
+            "take the topic of rectified images, or state camera.distortion"
         )
-    return bent
+    return coefficients
 
 
 def _told(message: Any, name: str) -> Any:
-    """ROS 1 and Foxglove write what ROS 2 has in small letters in capital ones."""
+    """Return a field of a message, None without it; ROS 1 and Foxglove use capitals for ROS 2's
+    names.
+    """
     return getattr(message, name, getattr(message, name.upper(), None))
 
 
 def image_of(message: Any) -> Any:
-    """The pixels (rows, columns) of an image: integers that count, or metres."""
+    """Return the pixels (rows, columns) of an image: integer counts, or metres."""
     if not hasattr(message, "encoding"):
         return _unpacked(str(message.format), _bytes(message))
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
@@ -102,6 +112,19 @@ def image_of(message: Any) -> Any:
 
 
 def _unpacked(kind: str, data: bytes) -> Any:
+    """Return the pixels of a compressed image: counts, or metres for compressed 32FC1.
+
+    Parameters
+    ----------
+    kind : str
+        Format that the message states.
+    data : bytes
+
+    Raises
+    ------
+    InputError
+        If it is no PNG.
+    """
     packed = "compressedDepth" in kind
     try:
         counts = png(BytesIO(data[_PACKED.itemsize :] if packed else data))
@@ -120,7 +143,9 @@ def _unpacked(kind: str, data: bytes) -> Any:
 
 
 def png(source: Path | BytesIO) -> Any:
-    """The counts (rows, columns) of a PNG."""
+    """Return the counts (rows, columns) of a PNG with 16 bits and one channel; else an
+    `InputError`.
+    """
     from PIL.Image import open as opened
 
     image = opened(source)
@@ -130,7 +155,7 @@ def png(source: Path | BytesIO) -> Any:
 
 
 def columns_of(message: Any) -> dict[str, Array]:
-    """The columns (P,) of a cloud by name."""
+    """Return the columns (P,) of a cloud of points by name, as floats."""
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     fields = list(message.fields)
     try:
@@ -143,10 +168,10 @@ def columns_of(message: Any) -> dict[str, Array]:
             }
         )
     except (KeyError, ValueError) as error:
-        told = ", ".join(f"{each.name} of type {each.datatype}" for each in fields)
+        columns = ", ".join(f"{each.name} of type {each.datatype}" for each in fields)
         raise InputError(
-            f"has the columns {told} in points of {message.point_step} bytes; expected each once, "
-            "of types 1 to 8, within these"
+            f"has the columns {columns} in points of {message.point_step} bytes; expected each "
+            "once, of types 1 to 8, within these"
         ) from error
     rows = _rows(message, message.row_step, message.point_step)
     points = np.frombuffer(rows.tobytes(), form)
@@ -154,8 +179,18 @@ def columns_of(message: Any) -> dict[str, Array]:
 
 
 def _rows(message: Any, step: int, size: int) -> Any:
-    """(rows, columns × size) bytes, without what fills the rows up."""
-    data, height = np.frombuffer(_bytes(message), "u1"), message.height
+    """Return the bytes (rows, columns × size) of a message, without the padding of its rows.
+
+    Parameters
+    ----------
+    message : message
+    step : int
+        Bytes from row to row.
+    size : int
+        Bytes of a pixel or point.
+    """
+    data = np.frombuffer(_bytes(message), "u1")
+    height = message.height
     if len(data) != height * step or step < message.width * size:
         raise InputError(
             f"has {len(data)} bytes in a message; expected {height} rows of {message.width} times "
@@ -165,5 +200,5 @@ def _rows(message: Any, step: int, size: int) -> Any:
 
 
 def _bytes(message: Any) -> bytes:
-    """What a message holds; as text where it is JSON."""
+    """Return the data of a message; JSON messages have it in base64."""
     return b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)

@@ -1,8 +1,8 @@
 """Logs of robots: ROS 1 and 2 bags, MCAP files, and LeRobot datasets.
 
-Where a file is expected, a topic of a log may stand: ``run.mcap#/wrench``. It is read as the table
-that `topics` makes of its messages. More may follow, each after a ``#``: two frames, as in
-``run.mcap#/tf#base>tool``, a robot's description, and the episode of a dataset.
+In place of a file, a topic of a log may be given, as in ``run.mcap#/wrench``; it is read as the
+table that `topics` makes of its messages. Further parts follow after a ``#`` each: two frames, as
+in ``run.mcap#/tf#base>tool``, a robot's description, and the episode of a dataset.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NEEDS = "reading logs needs {}: pip install 'collocation-sysid[logs]'"
 
 @dataclass(frozen=True)
 class Address:
-    """A topic of a log, and how it is to be read.
+    """A topic of a log, and options for reading it.
 
     Attributes
     ----------
@@ -39,13 +39,13 @@ class Address:
         File, or folder of a bag or of a dataset.
     topic : str
     frames : tuple of (parent, child) or None
-        The pose of the second in the first is meant.
+        Frames of a transform: the pose of the child in the parent is read.
     robot : Path or None
-        URDF file, from the log's folder, which makes poses of joints' positions.
+        URDF file, relative to the log's folder, that converts joint positions to poses.
     unit : {"rad", "deg"} or None
-        Of the positions of joints that turn.
+        Unit of joint angles; None for the log's own.
     episode : int or None
-        Of a dataset.
+        Episode of a dataset, counted from 0.
     """
 
     log: Path
@@ -57,36 +57,37 @@ class Address:
 
     @classmethod
     def of(cls, path: str | Path) -> Address | None:
-        """What a path means; None if it is that of a file or of nothing.
+        """Return the address that a path states; None for the path of an existing file or without a
+        log.
 
         Raises
         ------
         InputError
-            If what follows the topic is none of what may.
+            If a part behind the topic is not understood.
         """
         log, mark, rest = str(path).partition(MARK)
         if not mark or Path(path).exists() or not Path(log).exists():
             return None
         topic, *more = rest.split(MARK)
-        kept: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         for part in more:
             if ">" in part:
                 parent, _, child = part.partition(">")
-                kept["frames"] = parent.strip(), child.strip()
+                options["frames"] = parent.strip(), child.strip()
             elif part.lower().endswith((".urdf", ".xml")):
-                kept["robot"] = Path(log).parent / part
+                options["robot"] = Path(log).parent / part
             elif part in UNITS:
-                kept["unit"] = part
+                options["unit"] = part
             elif part.isdecimal():
-                kept["episode"] = int(part)
+                options["episode"] = int(part)
             else:
                 expected = "two frames PARENT>CHILD, a robot.urdf, rad or deg, or an episode"
                 raise InputError(f"found {part!r} behind the topic; expected {expected}")
-        return cls(Path(log), topic, **kept)
+        return cls(Path(log), topic, **options)
 
 
 def stored_files(path: str | Path) -> list[Path]:
-    """The files on disk that a path leads to, those of a log where it names a topic."""
+    """Return the files on disk that a path refers to: those of the log if it names a topic."""
     address = Address.of(path)
     place = Path(path) if address is None else address.log
     if address is not None and place.is_dir():
@@ -101,9 +102,10 @@ class Log(Protocol):
     ----------
     topics : dict of name to (type, number of messages)
     start_ns : int
-        When the first message was recorded; times of today in seconds are not exact as floats.
+        When the first message was recorded; an integer, as floats lack the precision for present
+        dates.
     unit : str or None
-        Of the positions of joints, of `UNITS`, where all such logs have the same.
+        Unit of joint angles ("rad" or "deg") if the format prescribes one.
     """
 
     topics: dict[str, tuple[str, int]]
@@ -111,18 +113,24 @@ class Log(Protocol):
     unit: str | None
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield when each was recorded [ns], and the message; its fields are attributes."""
+        """Yield the time of recording [ns] and the message, whose fields are attributes."""
         ...
 
 
 @contextmanager
 def opened(path: Path, episode: int | None = None) -> Iterator[Log]:
-    """A log, by its content; of a dataset an episode.
+    """Open a log, whose format is recognised by its content.
+
+    Parameters
+    ----------
+    path : Path
+    episode : int, optional
+        Episode of a dataset; the only one by default.
 
     Raises
     ------
     InputError
-        If it is none, is damaged, or a package that reads it is missing.
+        If it is no log, is damaged, or a package that reads it is missing.
     """
     for each in (path, *(path.iterdir() if path.is_dir() else ())):
         require_regular(each)
@@ -147,33 +155,21 @@ def opened(path: Path, episode: int | None = None) -> Iterator[Log]:
 
 
 def require_topic(log: Log, topic: str) -> None:
-    """Refuse a topic that is not there.
-
-    Raises
-    ------
-    InputError
-        With the one that was probably meant.
-    """
+    """Raise an `InputError` with the most similar topic if a log does not have a topic."""
     if topic not in log.topics:
         there = ", ".join(log.topics)
         raise InputError(f"there is no topic {topic!r}; it has {there}{hint_at(topic, log.topics)}")
 
 
 def require_packages(*modules: str) -> None:
-    """Refuse to go on where a package is missing.
-
-    Raises
-    ------
-    InputError
-        Saying how to install it.
-    """
+    """Raise an `InputError` with installation instructions if a package is missing."""
     for module in modules:
         if find_spec(module) is None:
             raise InputError(_NEEDS.format(module))
 
 
 class _Bag:
-    """A ROS bag, through rosbags."""
+    """A ROS bag, read through rosbags."""
 
     unit: str | None = "rad"
 
@@ -252,12 +248,17 @@ class _Json:
 
 @dataclass
 class _Dataset:
-    """A LeRobot dataset: the topics are its features, the messages the frames of an episode.
+    """A LeRobot dataset: its topics are the features, its messages the frames of an episode.
 
     Attributes
     ----------
+    path : Path
     episode : int or None
-        Of which messages are; the only one where there is one.
+        Episode to read; None for the only one.
+    topics, start_ns, unit
+        See `Log`.
+    names : mapping of topic to list of str
+        Names of the numbers of each feature.
     """
 
     path: Path
@@ -302,7 +303,7 @@ class _Dataset:
 
 
 def _names(feature: Any, name: str) -> list[str]:
-    """What the numbers of a feature are called; older datasets have them one level deeper."""
+    """Return the names of the numbers of a feature; older datasets nest them in a dictionary."""
     names = feature.get("names")
     while isinstance(names, dict):
         names = next(iter(names.values()), None)

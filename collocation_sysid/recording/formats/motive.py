@@ -1,9 +1,10 @@
-"""Motive CSV (OptiTrack): line 1 of keys and values (Export Frame Rate, Length Units …), then rows
-Type, Name, ID, and Rotation or Position above the columns; blank cells where a marker is hidden.
+"""Motive CSV (OptiTrack): marker tracks below several rows of header.
 
-Columns of Type "Marker" are measured. Those of "Rigid Body Marker" are where Motive's solved rigid
-body would have them, so they are taken only for markers that have no measured columns. Bodies,
-bones and their rotations are skipped; unlabelled markers are taken only if they are asked for.
+Line 1 has keys and values (Export Frame Rate, Length Units …); then come rows Type, Name, ID, and
+Rotation or Position above the columns; cells are blank where a marker is hidden. Columns of Type
+"Marker" are measured. Those of "Rigid Body Marker" are predictions of Motive's rigid-body fit, so
+they are taken only for markers without measured columns. Bodies, bones and their rotations are
+skipped; unlabelled markers are taken only on request.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ _RATES = ("Export Frame Rate", "Capture Frame Rate")
 
 @dataclass(frozen=True)
 class _Columns:
-    """The Type of a marker's columns, and where x, y and z stand."""
+    """Type of a marker's columns, and the indices of its columns of x, y and z."""
 
     kind: str
     places: tuple[int, int, int]
 
 
 def read(text: str, choose: Choose) -> RawTracks:
-    """Read a Motive CSV file."""
+    """Read a Motive CSV file; `choose` picks the markers."""
     rows = separated_rows(text, ",")
     first = rows[0]
     pairs = zip(first.cells[::2], first.cells[1::2], strict=False)
@@ -72,16 +73,27 @@ def read(text: str, choose: Choose) -> RawTracks:
 
 
 def _heads(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
-    """Type, name, quantity and axis of every column; older files do not say which row is which."""
+    """Return type, name, quantity and axis of every column.
+
+    Older files do not label the rows of the header; the first two are then types and names.
+    """
     width = len(axes.cells)
     padded = [(row.cells + [""] * width)[:width] for row in above]
-    said = {cells[1]: cells for cells in padded}
-    types, names = said.get("Type", padded[0]), said.get("Name", padded[1])
+    labelled = {cells[1]: cells for cells in padded}
+    types = labelled.get("Type", padded[0])
+    names = labelled.get("Name", padded[1])
     return list(zip(types, names, padded[-1], axes.cells, strict=True))
 
 
 def _marker_columns(heads: Sequence[tuple[str, str, str, str]], line: int) -> dict[str, _Columns]:
-    """The columns of every marker by its name, measured ones before solved ones."""
+    """Return the columns of every marker by its name; measured columns have priority over fitted
+    ones.
+
+    Raises
+    ------
+    InputError
+        If two markers have one name, or a marker lacks an axis.
+    """
     by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):
         if not kind.endswith(_MEASURED) or quantity != "Position":

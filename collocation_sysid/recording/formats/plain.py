@@ -1,8 +1,8 @@
-"""Plain CSV, this project's own, with a row of column names.
+"""Plain CSV of marker tracks, the project's own format, with a row of column names.
 
-Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres. Long: t_s, marker, and
-x_m, y_m, z_m (or _cm, _mm, _in; or x, y, z and a unit given); a marker without a row at a time is
-missing there. In both a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place.
+Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres. Long: t_s, marker, and x_m,
+y_m, z_m (or _cm, _mm, _in; or x, y, z and a given unit); a marker without a row at a time is
+missing there. In both, a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place.
 """
 
 from __future__ import annotations
@@ -19,21 +19,35 @@ from .units import METRES_PER_UNIT
 
 
 def read(text: str, choose: Choose) -> RawTracks:
-    """Read a plain CSV file, wide or long."""
+    """Read a plain CSV file, wide or long; `choose` picks the markers."""
     table = read_grid(text)
     return (_read_long if "marker" in table.columns else _read_wide)(table, choose)
 
 
 def _read_wide(table: Grid, choose: Choose) -> RawTracks:
+    """Read a table with three columns for each marker."""
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
     places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
-    said = {"zeros_are_missing": False, "default_unit": "m"}
-    return tracks(table, labels, places, choose(labels), place["t_s"], **said)
+    return tracks(
+        table,
+        labels,
+        places,
+        choose(labels),
+        place["t_s"],
+        zeros_are_missing=False,
+        default_unit="m",
+    )
 
 
 def _wide_labels(table: Grid) -> list[str]:
-    """Names of the markers in the file, in the order of their first columns."""
+    """Names of the markers in the file, in the order of their first columns.
+
+    Raises
+    ------
+    InputError
+        If a column is missing, unknown or repeated, or there is no marker.
+    """
     header = table.columns
     labels = dict.fromkeys(
         column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
@@ -58,6 +72,7 @@ def _wide_labels(table: Grid) -> list[str]:
 
 
 def _read_long(table: Grid, choose: Choose) -> RawTracks:
+    """Read a table with one row for each marker and time."""
     axes, unit = _long_layout(table)
     of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
     if "" in of_row:
@@ -78,7 +93,9 @@ def _read_long(table: Grid, choose: Choose) -> RawTracks:
 
 
 def _long_layout(table: Grid) -> tuple[list[str], str | None]:
-    """The columns of x, y and z, and the unit in their names."""
+    """Return the names of the columns of x, y and z, and the unit in these names; None
+    without one.
+    """
     for unit in (None, *METRES_PER_UNIT):
         axes = [f"{axis}_{unit}" if unit else axis for axis in "xyz"]
         if sorted(table.columns) == sorted(["t_s", "marker", *axes]):

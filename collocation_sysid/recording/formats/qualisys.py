@@ -1,7 +1,7 @@
-"""Qualisys TSV: lines of a key and its values (NO_OF_FRAMES, FREQUENCY, MARKER_NAMES …), then
-tab-separated frames, with or without Frame and Time columns and a line that names the columns.
+"""Qualisys TSV: marker tracks as tab-separated frames below lines of keys and values.
 
-The file does not state its unit of length.
+The keys are NO_OF_FRAMES, FREQUENCY, MARKER_NAMES …; frames come with or without Frame and Time
+columns and a line of column names. The file does not state its unit of length.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")
 
 
 def read(text: str, choose: Choose) -> RawTracks:
-    """Read a Qualisys TSV file."""
+    """Read a Qualisys TSV file; `choose` picks the markers."""
     rows = tab_rows(text)
     count = next((k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])), len(rows))
     above = {row.cells[0]: row for row in rows[:count]}
@@ -31,16 +31,38 @@ def read(text: str, choose: Choose) -> RawTracks:
     leading = _leading_columns(frames, 3 * len(labels))
     if frames and _names_columns(frames[0]):
         del frames[0]
-    said = {"unit_key": "a Qualisys TSV (QTM writes mm)"}
-    return framed(header, "NO_OF_FRAMES", "FREQUENCY", leading, labels, frames, choose, **said)
+    return framed(
+        header,
+        "NO_OF_FRAMES",
+        "FREQUENCY",
+        leading,
+        labels,
+        frames,
+        choose,
+        unit_key="a Qualisys TSV (QTM writes mm)",
+    )
 
 
 def _names_columns(row: Row) -> bool:
+    """Return whether a row holds column names instead of numbers."""
     return any(re.match(r"[A-Za-z]", cell) and cell.lower() != "nan" for cell in row.cells[:3])
 
 
 def _leading_columns(frames: list[Row], coordinates: int) -> list[str]:
-    """The columns before the first coordinate, by their names, else by their number."""
+    """Return the names of the columns before the first coordinate: Frame and Time, or none.
+
+    Parameters
+    ----------
+    frames : list of Row
+        Rows of numbers, perhaps with a row of names first.
+    coordinates : int
+        Number of columns of coordinates.
+
+    Raises
+    ------
+    InputError
+        If the number of cells fits neither.
+    """
     if not frames:
         return []
     first = frames[0]

@@ -1,6 +1,6 @@
-"""Text files as tables: reading rows of cells below column names, and turning cells into numbers.
+"""Text files as tables: rows of cells below column names, and numbers from cells.
 
-Messages name lines; whoever reads a file adds its path.
+Messages name lines; readers of files add the path, see `of_file`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from .units import UNITS, si_factor
 
 P = ParamSpec("P")
 T = TypeVar("T")
-# Nothing measured is larger, and products of two such numbers are still numbers.
+# Largest accepted number: no measurement is larger, and products of two such numbers are finite.
 LARGEST = 1e100
 _ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
-_CONTROL, _SEPARATOR = re.compile("[\x01-\x08\x0e-\x1f]"), re.compile("[,;\t]")
+_CONTROL = re.compile("[\x01-\x08\x0e-\x1f]")
+_SEPARATOR = re.compile("[,;\t]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _POINTED = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
@@ -40,7 +41,7 @@ _EMPTY = "is empty; expected a line of column names, then rows of numbers"
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """The stripped cells of one line, which is counted from 1."""
+    """The stripped cells of one line, and the line's number, counted from 1."""
 
     line: int
     cells: list[str]
@@ -48,20 +49,26 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Rows of equal length below column names."""
+    """Rows of equal length below column names; `names_line` is the line of the names, counted from
+    1.
+    """
 
     columns: list[str]
     rows: list[Row]
     names_line: int = 1
 
     def refusal(self, message: str, row: int | None = None) -> InputError:
-        """What is wrong with a row, or with the names of the columns."""
+        """Return an `InputError` about a row, by its index, or about the column names if `row` is
+        None.
+        """
         line = self.names_line if row is None else self.rows[row].line
         return InputError(message, where=f"line {line}")
 
 
 def of_file(read: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
-    """A reader of a file, with the path in its messages."""
+    """Decorate a reader whose first argument is a path, so that its `InputError`s name that
+    path.
+    """
 
     @wraps(read)
     def reader(path: Any, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -72,7 +79,7 @@ def of_file(read: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any,
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return a file's content; of a topic of a log that of the table that it is.
+    """Return the content of a file; for a topic of a log, the content of an equivalent CSV file.
 
     Raises
     ------
@@ -89,12 +96,12 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def decode(content: bytes) -> str:
-    """Return the text that a file's content is: UTF-8, or as Windows and its machines write it.
+    """Decode text in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
 
     Raises
     ------
     InputError
-        If it is empty, or no text.
+        If it is empty, or not text.
     """
     text = next(filter(None, (_decoded(content, encoding) for encoding in _ENCODINGS)), None)
     if text is None and content:
@@ -105,7 +112,7 @@ def decode(content: bytes) -> str:
 
 
 def _decoded(content: bytes, encoding: str) -> str | None:
-    """The text in an encoding; None where it is none."""
+    """Decode text in an encoding; None if it is not text in that encoding."""
     if encoding == "utf-16" and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return None
     try:
@@ -120,9 +127,20 @@ def _decoded(content: bytes, encoding: str) -> str | None:
 
 
 def separated_rows(text: str, separator: str | None = None) -> list[Row]:
-    """Rows of a file with this between its cells, or what most lines have; blank ones are skipped.
+    """Return the rows of separated text; blank rows are skipped.
 
-    Where that is no comma and no number has a point, the commas of numbers are points.
+    Decimal commas become points if the separator is no comma and no number has a point.
+
+    Parameters
+    ----------
+    text : str
+    separator : str, optional
+        Separator of cells; by default the semicolon or tab if most lines have one, else the comma.
+
+    Raises
+    ------
+    InputError
+        If it is no CSV text, or has no rows.
     """
     if separator is None:
         lines = text.splitlines()
@@ -153,7 +171,16 @@ def tab_rows(text: str) -> list[Row]:
 
 
 def grid(columns: list[str], rows: list[Row], names_line: int = 1) -> Grid:
-    """Return rows as wide as their column names; blank columns at the end of all rows are cut.
+    """Return a table of rows that are as wide as their column names.
+
+    Blank columns at the end of all rows are cut.
+
+    Parameters
+    ----------
+    columns : list of str
+    rows : list of Row
+    names_line : int
+        Line of the column names, counted from 1.
 
     Raises
     ------
@@ -174,15 +201,15 @@ def grid(columns: list[str], rows: list[Row], names_line: int = 1) -> Grid:
 
 
 def read_grid(text: str) -> Grid:
-    """Return a file of separated cells with a row of column names.
+    """Return a table from text of separated cells with a row of column names.
 
-    What a machine writes above the names is left out; units in a row of their own are joined to
-    the names, as in "Load (N)".
+    Lines above the names are skipped; units in a row of their own are joined to the names, as in
+    "Load (N)".
 
     Raises
     ------
     InputError
-        If it is none, has no rows, or rows of different lengths.
+        If it is no such text, has no rows, or rows of different lengths.
     """
     rows = separated_rows(text)
     # The names are above the first row that holds several cells, of numbers only.
@@ -200,6 +227,7 @@ def read_grid(text: str) -> Grid:
 
 
 def _is_unit(cell: str) -> bool:
+    """Return whether a cell may be a unit: blank, in brackets, or a known unit."""
     bare = cell.strip("()[]")
     bracketed = cell in (f"({bare})", f"[{bare}]")
     return not bare or bracketed or any(si_factor(bare, dimension) for dimension in UNITS)
@@ -209,7 +237,15 @@ def _is_unit(cell: str) -> bool:
 
 
 def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
-    """The cells of some columns as (rows, columns); NaN where blank.
+    """Return the cells of some columns as numbers (rows, columns); NaN where blank.
+
+    Parameters
+    ----------
+    grid : Grid
+    columns : sequence of int
+        Indices of the columns.
+    blank_allowed : bool
+        Whether cells may be blank.
 
     Raises
     ------
@@ -225,15 +261,23 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
             except ValueError:
                 value = math.inf
             if abs(value) > LARGEST or (math.isnan(value) and not blank_allowed):
-                wanted = "a number or a blank cell" if blank_allowed else "a number"
+                expected = "a number or a blank cell" if blank_allowed else "a number"
                 name = grid.columns[column]
-                raise grid.refusal(f"column {name} holds '{excerpt(cell)}'; expected {wanted}", i)
+                raise grid.refusal(f"column {name} holds '{excerpt(cell)}'; expected {expected}", i)
             values[i, j] = value
     return values
 
 
 def times_of(grid: Grid, place: int, factor: float = 1.0) -> Array:
-    """The times in a column.
+    """Return the times (rows,) in a column.
+
+    Parameters
+    ----------
+    grid : Grid
+    place : int
+        Index of the column.
+    factor : float
+        Factor from the column's unit to seconds.
 
     Raises
     ------
@@ -252,7 +296,13 @@ def is_number(cell: str) -> bool:
 
 
 def written_number(text: str) -> float:
-    """A number as files write it; a `ValueError` for 1_000 and ١, which are so in Python only."""
+    """Return the number in a text.
+
+    Raises
+    ------
+    ValueError
+        If it is no number, or one in a notation of Python only, such as 1_000 or ١.
+    """
     if "_" in text or not text.isascii():
         raise ValueError(f"found {text!r}")
     return float(text)

@@ -1,6 +1,6 @@
-"""What topics of a log can serve as, and the tables that their messages make.
+"""Topics of a robot's log: what each can be used for, and conversion of messages to tables.
 
-Messages are known by what they hold, not by the names of their types: a wrench has a force and a
+Messages are recognised by their fields, not by the names of their types: a wrench has a force and a
 torque, a marker a name and a point, a pose a point and a quaternion.
 """
 
@@ -37,14 +37,15 @@ _POINTS = ("pose.pose.position", "pose.position", "position", "translation", "po
 _NAMES = ("marker_name", "name", "id", "ns", "child_frame_id")
 _NUMBERS = {"fluid_pressure": "pressure_pa", "range": "range_m", "data": "data", "value": "value"}
 _LISTS = ("transforms", "markers", "poses", "points", "objects", "rigidbodies")
-# A clock that is off by more is another one, such as a simulation's.
+# Largest difference of stamp and recording time on one clock [ns], a day: otherwise the stamp is of
+# another clock, such as a simulation's.
 SAME_CLOCK_NS = 86_400 * 10**9
-# Joints go beyond their limits by no more [rad or m].
+# Largest excess of a joint over its limits [rad or m]: noise of its sensor.
 SLACK = 0.01
-# So many messages tell what a topic is.
+# Number of first messages from which the use of a topic is recognised.
 _FIRST = 20
 
-# What follows the name of the topic of frames that do not move.
+# Ending of the name of the topic with fixed frames.
 STATIC = "_static"
 
 Row = dict[str, float]
@@ -54,17 +55,19 @@ Edges = dict[tuple[str, str], dict[float, tuple[float, ...]]]
 
 @dataclass(frozen=True)
 class LogTopic:
-    """A topic, and what it could serve as.
+    """A topic of a log, and its possible uses.
 
     Attributes
     ----------
     name, type : str
     messages : int
+        Number of messages.
     rate_hz : float or None
+        Rate of the first messages; None for fewer than two.
     serves : str
-        In words; empty where nothing here reads it.
+        Possible uses in words; empty if the topic cannot be used.
     write : tuple of str
-        What to write in a problem file in place of a file, one for each way to read it.
+        Text to write in a problem file in place of a file, one for each way to read the topic.
     """
 
     name: str
@@ -76,33 +79,34 @@ class LogTopic:
 
 
 def listed_topics(path: str | Path) -> list[LogTopic]:
-    """What is in a log.
+    """Return the topics of a log.
 
     Raises
     ------
     InputError
-        If it is none, is damaged, or a package that reads it is missing.
+        If the path is no log, the log is damaged, or a package that reads it is missing.
     """
     with opened(Path(path), episode=0) as log:
         return [_told(log, Path(path), name) for name in log.topics]
 
 
 def table(address: Address) -> bytes:
-    """A topic as the CSV file that it could have been; times count from the log's first message.
+    """Return the content of a CSV file equivalent to a topic; times count from the log's first
+    message.
 
     Raises
     ------
     InputError
-        If the topic is not there, holds nothing that is known here, or it takes frames or a robot's
-        description to read it.
+        If the topic does not exist or holds no known data, or if frames or a robot's description
+        are needed and missing.
     """
     with opened(address.log, address.episode) as log:
         require_topic(log, address.topic)
         messages = list(log.messages(address.topic))
         if not messages:
             raise InputError(f"the topic {address.topic} has no messages")
-        if held := depth_in(messages[0][1]):
-            raise InputError(f"the topic {address.topic} holds {held}; expected one of numbers")
+        if kind := depth_in(messages[0][1]):
+            raise InputError(f"the topic {address.topic} holds {kind}; expected one of numbers")
         if _is_transforms(messages[0][1]):
             return _written(POSE, *_chained(_frames(log, messages, address.topic), address))
         times, ordered = by_time(messages, log.start_ns)
@@ -122,11 +126,22 @@ def table(address: Address) -> bytes:
 
 
 def _told(log: Log, path: Path, name: str) -> LogTopic:
+    """Return the description of a topic from its first messages.
+
+    Parameters
+    ----------
+    log : Log
+    path : Path
+        Path of the log.
+    name : str
+        Name of the topic.
+    """
     kind, count = log.topics[name]
     first = list(islice(log.messages(name), _FIRST))
     span = first[-1][0] - first[0][0] if len(first) > 1 else 0
     rate = 1e9 * (len(first) - 1) / span if span > 0 else None
-    serves, write = "", [f"{path.name}#{name}"]
+    serves = ""
+    write = [f"{path.name}#{name}"]
     if first and _is_transforms(first[0][1]):
         chains = moving_chains(_frames(log, log.messages(name), name))
         serves = "poses of one frame in another" if chains else "frames that do not move"
@@ -136,7 +151,8 @@ def _told(log: Log, path: Path, name: str) -> LogTopic:
     elif first and (held := depth_in(first[0][1])):
         serves = f"{held}: [[experiment.depth]]"
     elif first and is_camera(first[0][1]):
-        serves, write = "the camera's matrix, for the depth images beside it", []
+        serves = "the camera's matrix, for the depth images beside it"
+        write = []
     elif first:
         messages = [message for _, message in first]
         by_namespace = has_namespaces(messages)
@@ -148,6 +164,7 @@ def _told(log: Log, path: Path, name: str) -> LogTopic:
 
 
 def _served(columns: set[str], message: Any) -> str:
+    """Return the possible uses of messages with these columns, in words."""
     if not columns:
         return ""
     if columns == {*POSE}:
@@ -167,14 +184,26 @@ def _served(columns: set[str], message: Any) -> str:
 
 
 def by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Any]]:
-    """Times, and messages in their order; of several at a time the first."""
+    """Return the times (S,) [s] of messages, and the messages in this order; duplicates in time are
+    cut.
+
+    Parameters
+    ----------
+    messages : list of (int, message)
+        Times of recording [ns], and messages.
+    start_ns : int
+        Time of recording of the log's first message.
+    """
     t_s = np.array([time_s(message, at_ns, start_ns) for at_ns, message in messages])
     times, first = np.unique(t_s, return_index=True)
     return times, [messages[k][1] for k in first]
 
 
 def time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
-    """When a message was measured; when it was recorded where it does not say."""
+    """Return the time of measurement of a message, or of its recording if it has no stamp [s].
+
+    The time counts from the log's first message, or is absolute if the stamp is of another clock.
+    """
     first = next(iter(_items(message)), None)
     stamps = (_at(message, "header.stamp"), _at(message, "timestamp"), _at(first, "header.stamp"))
     stamped_ns = next((_nanoseconds(each) for each in stamps if each is not None), 0)
@@ -185,7 +214,9 @@ def time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
 
 
 def _nanoseconds(stamp: Any) -> int:
-    """Of a stamp in whole seconds and nanoseconds, whatever these are called."""
+    """Return a stamp of seconds and nanoseconds, under any of the usual field names, in
+    nanoseconds.
+    """
     counted = {10**9: ("sec", "seconds", "secs"), 1: ("nanosec", "nsec", "nanos", "nsecs")}
     return sum(
         factor * int(next((getattr(stamp, name) for name in names if hasattr(stamp, name)), 0))
@@ -196,7 +227,7 @@ def _nanoseconds(stamp: Any) -> int:
 def _row(message: Any, *, by_namespace: bool) -> Row:
     """Return the numbers of a message by their columns.
 
-    With `by_namespace` the names of markers have that of their namespace in front.
+    With `by_namespace` the names of markers begin with their namespace.
     """
     wrench = _at(message, "wrench") or message
     if _is_vector(force := _at(wrench, "force")):
@@ -219,6 +250,7 @@ def _row(message: Any, *, by_namespace: bool) -> Row:
 
 
 def _pose(message: Any) -> tuple[float, ...] | None:
+    """Return position and quaternion (x, y, z, w) of a message; None if it has no pose."""
     for position, rotation in _POSES:
         if hasattr(turned := _at(message, rotation), "w"):
             return *_vector(_at(message, position)), *_vector(turned), turned.w
@@ -226,7 +258,9 @@ def _pose(message: Any) -> tuple[float, ...] | None:
 
 
 def _points(message: Any, *, by_namespace: bool) -> dict[str, tuple[float, ...]]:
-    """Places by name: one, or those of the first list that has some."""
+    """Return positions by name: of a single point, or of the items of the first list that has
+    some.
+    """
     if _is_vector(one := _at(message, "point")):
         return {_at(message, "header.frame_id") or "point": _vector(one)}
     items = enumerate(_items(message))
@@ -235,39 +269,46 @@ def _points(message: Any, *, by_namespace: bool) -> dict[str, tuple[float, ...]]
 
 
 def _items(message: Any) -> Any:
-    """The first list of a message that holds what may have places."""
+    """Return the first list in a message whose items may have positions; empty if there is none."""
     lists = (_at(message, name) for name in _LISTS)
     return next((each for each in lists if each is not None and len(each)), ())
 
 
 def _place(item: Any) -> tuple[float, ...] | None:
+    """Return the position of an item of a list; None if it has none."""
     if _is_vector(item):
         return _vector(item)
     return next((_vector(p) for name in _POINTS if _is_vector(p := _at(item, name))), None)
 
 
 def _called(item: Any, index: int, *, by_namespace: bool) -> str:
+    """Return the name of an item of a list; its number, counted from 1, if it has none."""
     names = (_at(item, name) for name in _NAMES)
     name = str(next((name for name in names if name not in (None, "")), index + 1))
     return f"{namespace}/{name}" if by_namespace and (namespace := _at(item, "ns")) else name
 
 
 def has_namespaces(messages: Iterable[Any]) -> bool:
-    """Whether markers of several namespaces are in these messages, which may number them alike."""
+    """Return whether the messages hold markers of several namespaces, whose names may be the
+    same.
+    """
     return len({_at(item, "ns") for each in messages for item in _items(each)} - {None, ""}) > 1
 
 
 def _at(message: Any, path: str) -> Any:
+    """Return the nested field at a dotted path; None if it does not exist."""
     for name in path.split("."):
         message = getattr(message, name, None)
     return message
 
 
 def _is_vector(value: Any) -> bool:
+    """Return whether a value has the fields x, y and z."""
     return all(hasattr(value, axis) for axis in AXES)
 
 
 def _vector(value: Any) -> tuple[float, ...]:
+    """Return the fields x, y and z as numbers."""
     return tuple(float(getattr(value, axis)) for axis in AXES)
 
 
@@ -275,11 +316,12 @@ def _vector(value: Any) -> tuple[float, ...]:
 
 
 def _is_transforms(message: Any) -> bool:
+    """Return whether a message places one frame in another."""
     return _at(message, "transforms") is not None or _child(message) is not None
 
 
 def _child(transform: Any) -> tuple[str, str] | None:
-    """The frame that a transform places a child in, and that child."""
+    """Return the parent and the child frame of a transform; None if the message is no transform."""
     child = _at(transform, "child_frame_id")
     parent = _at(transform, "parent_frame_id") or _at(transform, "header.frame_id")
     is_one = child and parent and _pose(transform) and not hasattr(transform, "twist")
@@ -287,7 +329,10 @@ def _child(transform: Any) -> tuple[str, str] | None:
 
 
 def _edges(messages: Iterable[tuple[int, Any]], start_ns: int) -> Edges:
-    """Poses by time of each child in its parent; of several at a time the first."""
+    """Return poses of child frames in their parents, by (parent, child) and time [s].
+
+    Of several poses at a time the first is kept.
+    """
     edges: Edges = {}
     for at_ns, message in messages:
         for each in _at(message, "transforms") or [message]:
@@ -298,7 +343,7 @@ def _edges(messages: Iterable[tuple[int, Any]], start_ns: int) -> Edges:
 
 
 def _frames(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
-    """Return the poses of a topic's transforms, and of the fixed ones of its static topic."""
+    """Return the poses of a topic's transforms and of the fixed transforms in its static topic."""
     still = log.messages(topic + STATIC) if topic + STATIC in log.topics else ()
     fixed = {
         edge: {0.0: next(iter(of.values()))} for edge, of in _edges(still, log.start_ns).items()
@@ -307,9 +352,9 @@ def _frames(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
 
 
 def moving_chains(edges: Edges) -> list[tuple[str, str]]:
-    """Return pairs of a root and each frame that moves in it; frames that carry none come first.
+    """Return pairs of a root frame and each frame that moves in it; leaf frames come first.
 
-    A root is a frame that is placed in no other one.
+    A root is a frame that has no parent.
     """
     above = {child: parent for parent, child in edges}
     moving = {child for (_, child), poses in edges.items() if len(poses) > 1}
@@ -325,9 +370,14 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
 
 
 def _chained(edges: Edges, address: Address) -> tuple[Array, Array]:
-    """Return times and poses of one frame in another, through all between them.
+    """Return times (T,) and poses (T, 7) of one frame in another, through all frames between them.
 
-    At the times of the one that is told most often; the others are interpolated along screws.
+    The times are those of the most frequent transform; others are interpolated along screw motions.
+
+    Raises
+    ------
+    InputError
+        If no frame moves between them, or there is no common time.
     """
     require_packages("pytransform3d")
     from pytransform3d.trajectories import pqs_from_transforms, transforms_from_pqs
@@ -337,13 +387,14 @@ def _chained(edges: Edges, address: Address) -> tuple[Array, Array]:
 
     parent, child = _between(edges, address)
     path = _path(edges, parent, child)
-    told = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]
-    if not told:
+    moving = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]
+    if not moving:
         raise InputError(f"nothing moves between {parent} and {child}; leave poses out instead")
-    first, last = max(t[0] for t in told), min(t[-1] for t in told)
-    times = max((t[(t >= first) & (t <= last)] for t in told), key=len)
+    first = max(t[0] for t in moving)
+    last = min(t[-1] for t in moving)
+    times = max((t[(t >= first) & (t <= last)] for t in moving), key=len)
     if not len(times):
-        raise InputError(f"the frames between {parent} and {child} are told at no common time")
+        raise InputError(f"the frames between {parent} and {child} have no common time")
     manager = Manager(check=False)
     for edge in path:
         at_s = np.array(sorted(edges[edge]))
@@ -358,6 +409,9 @@ def _chained(edges: Edges, address: Address) -> tuple[Array, Array]:
 
 
 def _between(edges: Mapping[tuple[str, str], Any], address: Address) -> tuple[str, str]:
+    """Return the parent and the child frame that an address asks for; an `InputError` if not
+    there.
+    """
     frames = list(dict.fromkeys(frame for edge in edges for frame in edge))
     if address.frames is None:
         if len(edges) == 1:
@@ -375,7 +429,13 @@ def _between(edges: Mapping[tuple[str, str], Any], address: Address) -> tuple[st
 
 
 def _path(edges: Mapping[tuple[str, str], Any], parent: str, child: str) -> list[tuple[str, str]]:
-    """The edges from one frame up to where it meets the other, and down to that."""
+    """Return the edges on the path from one frame through the common ancestor to the other.
+
+    Raises
+    ------
+    InputError
+        If the frames are not connected.
+    """
     above = {child: (parent, child) for parent, child in edges}
 
     def up(frame: str) -> list[tuple[str, str]]:
@@ -385,7 +445,8 @@ def _path(edges: Mapping[tuple[str, str], Any], parent: str, child: str) -> list
             frame = above[frame][0]
         return passed
 
-    ours, theirs = up(child), up(parent)
+    ours = up(child)
+    theirs = up(parent)
     path = [edge for edge in (*ours, *theirs) if (edge in ours) != (edge in theirs)]
     roots = {(each[-1][0] if each else frame) for each, frame in ((ours, child), (theirs, parent))}
     if not path or len(roots) > 1:
@@ -394,7 +455,18 @@ def _path(edges: Mapping[tuple[str, str], Any], parent: str, child: str) -> list
 
 
 def _of_joints(columns: list[str], values: Array, address: Address, unit: str | None) -> Array:
-    """Poses of a robot's link by the positions of its joints, in radians and metres."""
+    """Return poses (T, 7) of a robot's link from joint positions (T, joints), by its URDF file.
+
+    Parameters
+    ----------
+    columns : list of str
+        Names of the joints.
+    values : (T, joints) array
+        Positions; angles in `unit`, displacements in metres.
+    address : Address
+    unit : {"rad", "deg"} or None
+        None raises an `InputError`.
+    """
     require_packages("pytransform3d")
     from pytransform3d.transformations import pq_from_transform
     from pytransform3d.urdf import UrdfTransformManager
@@ -434,6 +506,7 @@ def _of_joints(columns: list[str], values: Array, address: Address, unit: str | 
 
 
 def _has_joint(robot: Any, name: str) -> bool:
+    """Return whether a robot has a joint of this name."""
     try:
         robot.get_joint_limits(name)
     except KeyError:
@@ -442,7 +515,7 @@ def _has_joint(robot: Any, name: str) -> bool:
 
 
 def _refuse_beyond(name: str, angle: float, limits: tuple[float, float], address: Address) -> None:
-    """The library would put the joint at its limit instead."""
+    """Raise an `InputError` if a joint is beyond its limits: the library would silently clip it."""
     if not limits[0] - SLACK <= angle <= limits[1] + SLACK:
         hint = "" if address.unit else "; are these degrees? Then #deg belongs behind the topic"
         raise InputError(
@@ -452,7 +525,7 @@ def _refuse_beyond(name: str, angle: float, limits: tuple[float, float], address
 
 
 def _written(columns: Any, t_s: Array, values: Array) -> bytes:
-    """A table as text; what is missing is blank."""
+    """Return a table as CSV text; NaN becomes a blank cell."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("t_s", *columns))

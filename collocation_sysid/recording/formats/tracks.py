@@ -1,4 +1,6 @@
-"""Tracks as a file has them, before units and names, and how tables of frames hold them."""
+"""Marker tracks as they are in a file, before units and names are converted, and tables of
+frames.
+"""
 
 from __future__ import annotations
 
@@ -19,25 +21,25 @@ class RawTracks:
     Parameters
     ----------
     labels : sequence of str
-        Of the M markers chosen.
+        Labels of the M chosen markers.
     coordinates : (T, M, 3) array
         In the file's unit, NaN where a cell is blank.
     unit : str or None
-        The unit of length that the file states.
+        Unit of length that the file states.
     unit_key : str
-        Where it does, or would; for messages.
+        Place in the file where the unit is stated, or would be; for messages.
     t_s : (T,) array or None
         Times of a time column.
     rate_hz : float or None
-        The frame rate that the file states.
+        Frame rate that the file states.
     rate_key : str
-        Where it does, or would; for messages.
+        Place in the file where the rate is stated, or would be; for messages.
     zeros_are_missing : bool
-        Whether a sample at exactly (0, 0, 0) is how the format marks a lost one.
+        Whether the format marks a lost sample by (0, 0, 0).
     default_unit : str or None
-        The unit where neither file nor user states one: only for this project's own CSV.
+        Unit if neither file nor user states one: only for this project's own CSV.
     notes : tuple of str
-        What was assumed.
+        Assumptions that were made.
     """
 
     labels: Sequence[str]
@@ -53,10 +55,12 @@ class RawTracks:
 
 
 class Choose(Protocol):
-    """Picks markers by the labels of a file, before any of their cells is read."""
+    """A function that picks markers by the labels of a file, before any of their cells is read."""
 
     def __call__(self, labels: Sequence[str], aside: Collection[str] = ()) -> list[int]:
-        """Return the indices of the labels wanted; those `aside` only if they are asked for."""
+        """Return the indices of the chosen labels; those in `aside` only if they are requested by
+        name.
+        """
         ...
 
 
@@ -68,20 +72,20 @@ def tracks(
     time: int | None,
     **stated: Any,
 ) -> RawTracks:
-    """Tracks of a table with a row for each frame.
+    """Return the tracks of a table with a row for each frame.
 
     Parameters
     ----------
     table : Grid
     labels : sequence of str
     places : sequence of (int, int, int)
-        The columns of x, y and z by marker.
+        Indices of the columns of x, y and z, by marker.
     chosen : sequence of int
-        Markers to take.
+        Indices of the markers to read.
     time : int or None
-        The column of the times, if there is one.
+        Index of the column of times, if there is one.
     **stated
-        What else the file says, see `RawTracks`.
+        Further fields of `RawTracks`.
     """
     cells = numbers(table, [column for k in chosen for column in places[k]], blank_allowed=True)
     return RawTracks(
@@ -94,7 +98,7 @@ def tracks(
 
 @dataclass(frozen=True)
 class Header:
-    """What a file states above its frames.
+    """Statements of a file above its frames.
 
     Attributes
     ----------
@@ -104,7 +108,7 @@ class Header:
     stated: Mapping[str, tuple[str, int]]
 
     def number(self, key: str) -> float | None:
-        """The number that a key states; None where it is blank.
+        """Return the number that a key states; None if it is blank or missing.
 
         Raises
         ------
@@ -124,7 +128,18 @@ class Header:
         return value
 
     def compare(self, key: str, count: int, what: str, line: int | None = None) -> None:
-        """Raise an `InputError` if it states another count than there is."""
+        """Raise an `InputError` if the number stated by a key differs from `count`.
+
+        Parameters
+        ----------
+        key : str
+        count : int
+            Actual number.
+        what : str
+            What is counted, for the message.
+        line : int, optional
+            Line for the message; that of the key by default.
+        """
         stated = self.number(key)
         if stated is not None and stated != count:
             message = f"{key} is {stated:g}, but {count} {what} are there; is the file cut short?"
@@ -141,7 +156,7 @@ def framed(
     choose: Choose,
     **stated: Any,
 ) -> RawTracks:
-    """Tracks of a table of frames: some columns, then x, y and z of each marker.
+    """Return the tracks of a table of frames: leading columns, then x, y and z of each marker.
 
     Parameters
     ----------
@@ -149,12 +164,17 @@ def framed(
     counted, rate : str
         Keys of the number of frames, and of their rate.
     leading : sequence of str
-        Columns before those of the markers.
+        Names of the columns before those of the markers; "Time" is the time.
     labels : sequence of str
     frames : list of Row
     choose : Choose
     **stated
-        What else the file says, see `RawTracks`.
+        Further fields of `RawTracks`.
+
+    Raises
+    ------
+    InputError
+        If the header's counts or a row disagree with the table.
     """
     chosen = choose(labels)
     table = grid([*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")], frames)

@@ -1,4 +1,4 @@
-"""TRC, the tab-separated track files of Cortex and OpenSim.
+"""TRC: marker tracks in the tab-separated files of Cortex and OpenSim.
 
 Line 1 PathFileType; lines 2 and 3 the header's keys and values (DataRate, NumFrames, NumMarkers,
 Units …); line 4 Frame#, Time and the marker names, line 5 X1, Y1, Z1 …; then a row for each frame.
@@ -16,7 +16,7 @@ _KEYS = ("DataRate", "NumFrames", "NumMarkers", "Units")
 
 
 def read(text: str, choose: Choose) -> RawTracks:
-    """Read a TRC file."""
+    """Read a TRC file; `choose` picks the markers."""
     rows = [row for row in tab_rows(text) if any(row.cells)]
     if len(rows) < 5:
         raise InputError("ends within the header of a TRC file", where=f"line {rows[-1].line}")
@@ -36,5 +36,14 @@ def read(text: str, choose: Choose) -> RawTracks:
             where=f"line {names.line}",
         )
     header.compare("NumMarkers", len(labels), "marker names", names.line)
-    leading, said = ["Frame#", "Time"], {"unit": unit, "unit_key": "Units"}
-    return framed(header, "NumFrames", "DataRate", leading, labels, frames, choose, **said)
+    return framed(
+        header,
+        "NumFrames",
+        "DataRate",
+        ["Frame#", "Time"],
+        labels,
+        frames,
+        choose,
+        unit=unit,
+        unit_key="Units",
+    )

@@ -1,4 +1,4 @@
-"""Units: how files spell them, and what they are in SI."""
+"""Units: their spellings in files, and their factors to SI."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ _SPELLINGS = {word: unit for unit, words in _WORDS.items() for word in words}
 
 
 def si_factor(unit: str, dimension: str) -> float | None:
-    """What a unit is times SI; None if it is no unit of that dimension."""
+    """Return the factor from a unit to SI; None if it is no unit of that dimension, a key of
+    `UNITS`.
+    """
     bare = unit.replace("·", "").replace("*", "").replace(" ", "").replace("μ", "µ")
     known = UNITS[dimension]
     if bare not in known and dimension == "length":
@@ -41,13 +43,20 @@ def si_factor(unit: str, dimension: str) -> float | None:
 
 
 def expected_units(unit: str, dimension: str) -> str:
-    """What to write in place of a unit that is none of this dimension."""
+    """Return the expected units of a dimension as text, for messages about another unit."""
     mass = dimension == "force" and unit.lower() in _MASSES
     return f"{'a unit of force, ' if mass else ''}one of {', '.join(UNITS[dimension])}"
 
 
 def stated_unit(text: str, where: str) -> str | None:
-    """Return the unit that a file's own words mean; None where it leaves them blank.
+    """Return the unit of length ("m", "cm", "mm", "in") that a file's text names; None if it is
+    blank.
+
+    Parameters
+    ----------
+    text : str
+    where : str
+        Place in the file, for messages.
 
     Raises
     ------
@@ -63,7 +72,7 @@ def stated_unit(text: str, where: str) -> str | None:
 
 
 def refuse_unknown_unit(length_unit: str | None) -> None:
-    """Raise an `InputError` if a given unit is not among `METRES_PER_UNIT`."""
+    """Raise an `InputError` if a unit of length is neither None nor a key of `METRES_PER_UNIT`."""
     if length_unit is not None and length_unit not in METRES_PER_UNIT:
         raise InputError(
             f"length_unit is {length_unit!r}; expected one of {', '.join(METRES_PER_UNIT)}"

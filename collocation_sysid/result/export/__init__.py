@@ -1,4 +1,11 @@
-"""The identified body for other simulators: a table of targets, and folders that hold it."""
+"""Export of the identified body to other simulators.
+
+`export_run` writes the files of a target in `TARGETS`, `verify_export` runs the target and compares
+its prediction with that of this package. One module per simulator: `mujoco`, `newton`, `usd`,
+`sofa`,
+`febio` and `calculix`. For all of them, `identified` reads the body from a run folder, `target`
+describes what a simulator can express, and `solids` converts obstacles.
+"""
 
 from __future__ import annotations
 
@@ -31,20 +38,26 @@ TARGETS: dict[str, Target] = {
 
 
 def export_run(body: Identified, to: str, folder: str | Path) -> Exported:
-    """Write a body for a target: its files, ``identified.json``, and the poses of its grasps.
+    """Write a body for a target: its files, ``identified.json``, and the poses of its grasps and
+    obstacles.
 
     Parameters
     ----------
     body : Identified
     to : str
-        A name in `TARGETS`.
+        Name of a target in `TARGETS`.
     folder : str or Path
-        Appears whole or not at all; an earlier export there is replaced.
+        Written completely or not at all; an earlier export there is replaced.
+
+    Returns
+    -------
+    Exported
+        The files, and what the target cannot express.
 
     Raises
     ------
     InputError
-        For an unknown target, a body that it cannot express, or a folder with other files.
+        For an unknown target, a body that the target cannot express, or a folder with other files.
     """
     exported = target_named(to).export(body)
     with run_folder(folder, mark=NUMBERS, what="export") as place:
@@ -58,7 +71,15 @@ def export_run(body: Identified, to: str, folder: str | Path) -> Exported:
 
 
 def verify_export(body: Identified, to: str, folder: str | Path) -> Sequence[Comparison]:
-    """Predict in the target itself what was exported, and compare with our prediction.
+    """Run an export in the target itself, and compare its predictions with those of this package.
+
+    Parameters
+    ----------
+    body : Identified
+    to : str
+        Name of a target in `TARGETS`.
+    folder : str or Path
+        Folder of `export_run`; the target runs in a temporary copy.
 
     Raises
     ------
@@ -76,7 +97,7 @@ def verify_export(body: Identified, to: str, folder: str | Path) -> Sequence[Com
 
 
 def comparison_table(name: str, compared: Sequence[Comparison]) -> Table:
-    """What a simulator predicts beside what we do."""
+    """Return the table of predictions of the simulator `name` and of this package."""
     rows = []
     for each in compared:
         values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
@@ -85,12 +106,12 @@ def comparison_table(name: str, compared: Sequence[Comparison]) -> Table:
 
 
 def target_named(name: str) -> Target:
-    """A target of the table.
+    """Return the target in `TARGETS` called `name`.
 
     Raises
     ------
     InputError
-        If there is none of that name.
+        If there is no target of that name.
     """
     if name not in TARGETS:
         known = ", ".join(TARGETS)

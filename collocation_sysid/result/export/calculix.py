@@ -1,6 +1,7 @@
-"""CalculiX: an input deck of the body at rest in its grasp, under gravity, on what it touches.
+"""CalculiX: an input deck of the body at rest under gravity, in its grasp and in contact with
+obstacles.
 
-Of a static recording it has a step for each sample.
+For a static recording the deck has one step for each sample, else one for the first sample.
 """
 
 from __future__ import annotations
@@ -20,25 +21,26 @@ from .solids import Wall, walls
 from .target import Comparison, Exported, Holds, at_rest, heading, longest
 
 DECK = "body.inp"
+# Time after which a run of CalculiX is stopped.
 LONGEST_S = 600.0
-# Corners of a tetrahedron's sides as numbered there.
+# Corners of the sides of a tetrahedron in the order of CalculiX.
 SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
-# Of U = Σ (J − 1)^2i / D_i beyond the first: a zero is taken for a very stiff term.
+# Constant D_i that removes a term of U = Σ (J − 1)^2i / D_i: zero would mean a very stiff term.
 NO_TERM = 1e20
-# C_i of Arruda and Boyce's series.
 HOLDS = Holds({}, instead="", mass_damping="", forces="", quadratic=True)
+# Coefficients C_i of the series of Arruda and Boyce.
 _CHAINS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 
 def export(body: Identified) -> Exported:
-    """The deck of one static step, as large as the loads are."""
+    """Return the input deck, with what CalculiX cannot express."""
     static = body.experiment.static
     limits = replace(HOLDS, motion=static, drives=static).lost(body)
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
     for k, region in enumerate(body.regions):
-        card, lost = _material(region, linear)
-        limits += [f"{region.name}: {lost}"] if lost else []
+        card, limitation = _material(region, linear)
+        limits += [f"{region.name}: {limitation}"] if limitation else []
         materials += (
             f"*MATERIAL,NAME=M{k}\n{card}*DENSITY\n{_fields(region.density_kg_m3)}\n"
             f"*SOLID SECTION,ELSET=E{k},MATERIAL=M{k}\n"
@@ -55,25 +57,31 @@ def export(body: Identified) -> Exported:
         mesh += f"*ELEMENT,TYPE={kind},ELSET=E{k}\n" + "".join(f"{line}\n" for line in lines)
     mesh += "".join(f"*ELSET,ELSET=BODY\nE{k}\n" for k in range(len(body.regions)))
     head = heading(body, limits, "** ")
-    touched, steps = walls(body), ""
+    obstacles = walls(body)
+    steps = ""
     for t_s in _times_s(body):
-        steps += _step(body, touched, t_s, linear)
-    return Exported({DECK: f"{head}{mesh}{materials}{_walls(body, touched)}{steps}"}, tuple(limits))
+        steps += _step(body, obstacles, t_s, linear)
+    return Exported(
+        {DECK: f"{head}{mesh}{materials}{_walls(body, obstacles)}{steps}"}, tuple(limits)
+    )
 
 
 def _times_s(body: Identified) -> Array:
-    """Of each step."""
+    """Return the time of each step: all samples of a static recording, else the first one."""
     return body.experiment.t_s[: None if body.experiment.static else 1]
 
 
 def _walls(body: Identified, touched: Sequence[Wall]) -> str:
-    """What is touched: a tetrahedron under each facet, none of whose nodes is free."""
+    """Return the obstacles as cards: a tetrahedron under each facet, all of whose nodes are
+    prescribed.
+    """
     deck = ""
-    tetrahedra, numbers = body.body.mesh.tetrahedra, np.arange(len(body.body.cells)) + 1
+    tetrahedra = body.body.mesh.tetrahedra
+    cell_numbers = np.arange(len(body.body.cells)) + 1
     faces = {
         tuple(sorted(corners)): f"{number},S{side}"
         for side, places in enumerate(SIDES, start=1)
-        for corners, number in zip(tetrahedra[:, places].tolist(), numbers, strict=True)
+        for corners, number in zip(tetrahedra[:, places].tolist(), cell_numbers, strict=True)
     }
     for k, wall in enumerate(touched):
         deck += f"*NODE,NSET=W{k}\n"
@@ -97,18 +105,32 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> str:
 
 
 def _step(body: Identified, touched: Sequence[Wall], t_s: float, linear: bool) -> str:
-    """Grasped nodes and obstacles where they are then, gravity, and what else pulls."""
-    moved = [body.experiment.grasped([t_s])[1][0] - body.nodes_m]
-    moved += [wall.points_m(t_s) - wall.start_m for wall in touched]
-    rows = np.concatenate(moved)
-    held = np.argwhere(np.isfinite(rows))
-    boundary = "".join(f"{n + 1},{a + 1},{a + 1},{_fields(float(rows[n, a]))}\n" for n, a in held)
+    """Return one step: prescribed nodes and obstacles at their places at `t_s`, gravity, and node
+    loads.
+
+    Parameters
+    ----------
+    body : Identified
+    touched : sequence of Wall
+        The obstacles.
+    t_s : float
+        Time of the sample.
+    linear : bool
+        Whether the analysis is geometrically linear.
+    """
+    displacements_m = [body.experiment.grasped([t_s])[1][0] - body.nodes_m]
+    displacements_m += [wall.points_m(t_s) - wall.start_m for wall in touched]
+    rows = np.concatenate(displacements_m)
+    prescribed = np.argwhere(np.isfinite(rows))
+    boundary = "".join(
+        f"{n + 1},{a + 1},{a + 1},{_fields(float(rows[n, a]))}\n" for n, a in prescribed
+    )
     prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n" for k in range(len(touched)))
-    pulled = np.argwhere(body.loads_n)
-    loads = "".join(f"{n + 1},{a + 1},{_fields(float(body.loads_n[n, a]))}\n" for n, a in pulled)
+    loaded = np.argwhere(body.loads_n)
+    loads = "".join(f"{n + 1},{a + 1},{_fields(float(body.loads_n[n, a]))}\n" for n, a in loaded)
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
-    way = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
-    weight = f"*DLOAD\nBODY,GRAV,{_fields(pull)},{_fields(*way)}\n" if pull else ""
+    direction = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
+    weight = f"*DLOAD\nBODY,GRAV,{_fields(pull)},{_fields(*direction)}\n" if pull else ""
     return (
         f"*STEP,INC=1000{'' if linear else ',NLGEOM'}\n*STATIC\n{'1.,1.' if linear else '0.1,1.'}\n"
         + (f"*BOUNDARY\n{boundary}" if boundary else "")
@@ -118,57 +140,75 @@ def _step(body: Identified, touched: Sequence[Wall], t_s: float, linear: bool) -
 
 
 def _fields(*values: float) -> str:
-    """Numbers of a line: what is past 20 characters of one is cut off, and be it the exponent."""
+    """Return numbers for a line of the deck, separated by commas.
+
+    CalculiX cuts off a number after 20 characters, even within its exponent.
+    """
     return ",".join(f"{float(value):.12g}" for value in values)
 
 
 def _material(region: IdentifiedRegion, linear: bool) -> tuple[str, str]:
-    """The card of a material, and what it does not say."""
+    """Return the card of a material, and a sentence on what the card does not express ("" if
+    nothing).
+
+    `linear` says whether the analysis is geometrically linear.
+    """
     c: Mapping[str, float] = region.constants
     volume = 2 / region.kappa_pa
     if region.material in ("st-venant-kirchhoff", "linear"):
-        lost = ""
+        limitation = ""
         if region.material == "linear" and not linear:
-            lost = "beside large strains the linear material becomes St. Venant and Kirchhoff's"
-        return f"*ELASTIC\n{_fields(region.young_pa, region.poisson)}\n", lost
+            limitation = (
+                "beside large strains the linear material becomes St. Venant and Kirchhoff's"
+            )
+        return f"*ELASTIC\n{_fields(region.young_pa, region.poisson)}\n", limitation
     if region.material == "mooney-rivlin":
-        values = c["c10_pa"], c["c01_pa"], volume
-        return f"*HYPERELASTIC,MOONEY-RIVLIN\n{_fields(*values)}\n", ""
+        numbers = _fields(c["c10_pa"], c["c01_pa"], volume)
+        return f"*HYPERELASTIC,MOONEY-RIVLIN\n{numbers}\n", ""
     if region.material in ("yeoh", "gent"):
         if region.material == "yeoh":
-            factors, lost = (c["c10_pa"], c["c20_pa"], c["c30_pa"]), ""
+            factors = (c["c10_pa"], c["c20_pa"], c["c30_pa"])
+            limitation = ""
         else:
-            mu, room = c["mu_pa"], c["gent_limit"]
-            factors = mu / 2, mu / (4 * room), mu / (6 * room**2)
-            lost = (
-                f"Gent's energy is a series of three terms: right for Ī₁ − 3 well below {room:.4g}"
+            mu = c["mu_pa"]
+            limit = c["gent_limit"]
+            factors = mu / 2, mu / (4 * limit), mu / (6 * limit**2)
+            limitation = (
+                f"Gent's energy is a series of three terms: right for Ī₁ − 3 well below {limit:.4g}"
             )
-        values = *factors, volume, NO_TERM, NO_TERM
-        return f"*HYPERELASTIC,YEOH\n{_fields(*values)}\n", lost
+        numbers = _fields(factors[0], factors[1], factors[2], volume, NO_TERM, NO_TERM)
+        return f"*HYPERELASTIC,YEOH\n{numbers}\n", limitation
     if region.material == "arruda-boyce":
         stretch = c["chain_stretch"]
         slope = sum(
             2 * a / stretch ** (2 * i - 2) * i * 3 ** (i - 1) for i, a in enumerate(_CHAINS, 1)
         )
-        values = c["mu_pa"] / slope, stretch, volume
-        return f"*HYPERELASTIC,ARRUDA-BOYCE\n{_fields(*values)}\n", (
+        numbers = _fields(c["mu_pa"] / slope, stretch, volume)
+        return f"*HYPERELASTIC,ARRUDA-BOYCE\n{numbers}\n", (
             "its energy of the volume is ½ κ ((J² − 1)/2 − ln J), ours ½ κ (J − 1)²: the same at "
             "small changes of volume"
         )
-    values = region.mu_pa / 2, volume
-    return f"*HYPERELASTIC,NEO HOOKE\n{_fields(*values)}\n", (
+    numbers = _fields(region.mu_pa / 2, volume)
+    return f"*HYPERELASTIC,NEO HOOKE\n{numbers}\n", (
         f"{region.material} becomes the neo-Hookean of Ī₁ with ½ κ (J − 1)²: the same λ and μ at "
         "small strain, another stress from the second order of the strain on"
     )
 
 
 def verify(body: Identified, folder: Path) -> list[Comparison]:
-    """The largest displacement at rest, from `ccx`.
+    """Run CalculiX (`ccx`), and compare the largest displacement at rest and the forces of
+    obstacles.
+
+    Parameters
+    ----------
+    body : Identified
+    folder : Path
+        Folder with the deck, into which CalculiX writes its files.
 
     Raises
     ------
     InputError
-        If it is not installed, fails, or takes too long.
+        If it is not installed, fails, or takes longer than `LONGEST_S`.
     """
     program = shutil.which("ccx")
     if program is None:
@@ -181,34 +221,55 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     except subprocess.TimeoutExpired:
         raise InputError(f"CalculiX took more than {LONGEST_S:g} s", folder / DECK) from None
     times = _times_s(body)
-    theirs, pushed = _last_printed(folder / "body.dat", len(body.nodes_m), len(times))
+    theirs, their_forces = _last_printed(folder / "body.dat", len(body.nodes_m), len(times))
     if theirs is None:
-        said = [x for x in ended.stdout.splitlines() if "ERROR" in x] or [
+        messages = [x for x in ended.stdout.splitlines() if "ERROR" in x] or [
             "no displacements written"
         ]
-        raise InputError(f"CalculiX failed: {said[0].strip()}", folder / DECK)
+        raise InputError(f"CalculiX failed: {messages[0].strip()}", folder / DECK)
     (*_, ours), (*_, forces) = at_rest(body, len(times))
-    sag_m, apart_m = longest(ours), longest(theirs - ours)
-    share = f" ({apart_m / sag_m:.2%} of it)" if sag_m else ""
-    remark = f"no node is further than {apart_m:.3g} m apart{share}"
+    sag_m = longest(ours)
+    difference_m = longest(theirs - ours)
+    share = f" ({difference_m / sag_m:.2%} of it)" if sag_m else ""
+    remark = f"no node is further than {difference_m:.3g} m apart{share}"
     what = "at rest" if len(times) == 1 else f"at {times[-1]:g} s"
-    told = [Comparison(f"largest displacement {what}", longest(theirs), sag_m, "m", remark)]
-    for each, push, force in zip(body.obstacles, pushed, forces, strict=True):
-        size_n, own_n = float(np.linalg.norm(push)), float(np.linalg.norm(force))
-        told.append(Comparison(f"force of {each.name} {what}", size_n, own_n, "N"))
-    return told
+    comparisons = [Comparison(f"largest displacement {what}", longest(theirs), sag_m, "m", remark)]
+    for each, push, force in zip(body.obstacles, their_forces, forces, strict=True):
+        their_n = float(np.linalg.norm(push))
+        our_n = float(np.linalg.norm(force))
+        comparisons.append(Comparison(f"force of {each.name} {what}", their_n, our_n, "N"))
+    return comparisons
 
 
 def _last_printed(file: Path, count: int, steps: int) -> tuple[Array | None, Array]:
-    """(n, 3) displacements and (o, 3) forces at the end; None where it did not get there."""
+    """Return the displacements (n, 3) [m] and obstacle forces (o, 3) [N] at the end of the last
+    step.
+
+    Parameters
+    ----------
+    file : Path
+        The .dat file of CalculiX.
+    count : int
+        Number n of nodes of the body.
+    steps : int
+        Number of steps of the deck.
+
+    Returns
+    -------
+    displacements : (n, 3), or None if the last step was not completed
+    forces : (o, 3), with no rows if the file is missing
+    """
     if not file.is_file():
         return None, np.zeros((0, 3))
-    table, forces, time = np.full((count, 3), np.nan), [], 0.0
+    table = np.full((count, 3), np.nan)
+    forces = []
+    time = 0.0
     for line in file.read_text().splitlines():
         words = line.split()
         if "time" in words:
             if float(words[-1]) > time:
-                time, forces = float(words[-1]), []
+                time = float(words[-1])
+                forces = []
         elif len(words) == 3:
             forces.append([float(word) for word in words])
         elif len(words) == 4 and words[0].isdigit():

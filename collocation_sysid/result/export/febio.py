@@ -1,4 +1,6 @@
-"""FEBio: a model file of the 4.0 format, the body loaded by gravity in its grasp."""
+"""FEBio: a model file of format 4.0 of the body under gravity, in its grasp and in contact with
+obstacles.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ HOLDS = Holds(
 
 
 def export(body: Identified) -> Exported:
-    """A static step, over which the weight grows."""
+    """Return the model of a static step with growing loads, and what FEBio cannot express."""
     limits = HOLDS.lost(body)
     materials = "".join(_material(k, region, limits) for k, region in enumerate(body.regions, 1))
     if body.loads_n.any():
@@ -45,14 +47,14 @@ def export(body: Identified) -> Exported:
         "<Control><analysis>STATIC</analysis><time_steps>10</time_steps>"
         "<step_size>0.1</step_size></Control>\n"
     )
-    touched = walls(body)
-    for wall in range(len(touched)):
+    obstacles = walls(body)
+    for wall in range(len(obstacles)):
         materials += (
             f'<material id="{len(body.regions) + wall + 1}" name="wall_{wall}" type="rigid body">'
             "<density>1</density></material>\n"
         )
-    xml += f"<Material>\n{materials}</Material>\n{_mesh(body, touched)}{_boundary(body)}"
-    xml += _touching(touched)
+    xml += f"<Material>\n{materials}</Material>\n{_mesh(body, obstacles)}{_boundary(body)}"
+    xml += _touching(obstacles)
     # A body load pushes against the vector that it is given.
     against = numbers(-body.experiment.gravity_m_s2, ",")
     xml += (
@@ -65,11 +67,15 @@ def export(body: Identified) -> Exported:
 
 
 def _material(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
+    """Return the XML of the material numbered `number` from 1; limitations are appended to
+    `limits`.
+    """
     kind, values, uncoupled = _law(region, limits)
     inner = "".join(f"<{tag}>{value!r}</{tag}>" for tag, value in values.items())
     if uncoupled:
         inner += f"<k>{region.kappa_pa!r}</k><pressure_model>{SQUARE}</pressure_model>"
-    density, name = f"<density>{region.density_kg_m3!r}</density>", f'name="{region.name}"'
+    density = f"<density>{region.density_kg_m3!r}</density>"
+    name = f'name="{region.name}"'
     if not region.branches:
         return f'<material id="{number}" {name} type="{kind}">{density}{inner}</material>\n'
     branches = "".join(
@@ -88,7 +94,11 @@ def _material(number: int, region: IdentifiedRegion, limits: list[str]) -> str:
 
 
 def _law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, float], bool]:
-    """Type of the material, its constants, and whether it is split in shape and volume."""
+    """Return the type of a material, its constants, and whether it is uncoupled into shape and
+    volume.
+
+    Limitations are appended to `limits`.
+    """
     c = region.constants
     if region.material == "mooney-rivlin":
         return HOLDS.materials[region.material], {"c1": c["c10_pa"], "c2": c["c01_pa"]}, True
@@ -99,6 +109,9 @@ def _law(region: IdentifiedRegion, limits: list[str]) -> tuple[str, dict[str, fl
 
 
 def _mesh(body: Identified, touched: Sequence[Wall]) -> str:
+    """Return the XML of nodes, elements, sets and prescribed displacements of the body and the
+    obstacles.
+    """
     solids, facets = _walls(body, touched)
     xml = '<Mesh>\n<Nodes name="nodes">\n'
     for k, point in enumerate(body.nodes_m, 1):
@@ -110,9 +123,9 @@ def _mesh(body: Identified, touched: Sequence[Wall]) -> str:
         for cell, nodes in zip(region.cells, body.body.cells[region.cells] + 1, strict=True):
             xml += f'<elem id="{cell + 1}">{",".join(map(str, nodes))}</elem>\n'
         xml += "</Elements>\n"
-    for axis, held in zip("xyz", body.held.T, strict=True):
-        if held.any():
-            nodes = ",".join(map(str, np.flatnonzero(held) + 1))
+    for axis, is_prescribed in zip("xyz", body.held.T, strict=True):
+        if is_prescribed.any():
+            nodes = ",".join(map(str, np.flatnonzero(is_prescribed) + 1))
             xml += f'<NodeSet name="held_{axis}">{nodes}</NodeSet>\n'
     xml += facets
     domains = "".join(
@@ -120,10 +133,11 @@ def _mesh(body: Identified, touched: Sequence[Wall]) -> str:
         for name in [r.name for r in body.regions] + [f"wall_{k}" for k in range(len(touched))]
     )
     maps = ""
-    for axis, held, way in zip("xyz", body.held.T, body.moved_m.T, strict=True):
-        if way.any():
+    for axis, is_prescribed, displacement in zip("xyz", body.held.T, body.moved_m.T, strict=True):
+        if displacement.any():
             rows = "".join(
-                f'<node lid="{i}">{float(v)!r}</node>' for i, v in enumerate(way[held], 1)
+                f'<node lid="{i}">{float(v)!r}</node>'
+                for i, v in enumerate(displacement[is_prescribed], 1)
             )
             maps += f'<NodeData name="moved_{axis}" node_set="held_{axis}">{rows}</NodeData>\n'
     data = f"<MeshData>\n{maps}</MeshData>\n" if maps else ""
@@ -131,23 +145,29 @@ def _mesh(body: Identified, touched: Sequence[Wall]) -> str:
 
 
 def _boundary(body: Identified) -> str:
-    """Held where they are, or moved to where another grasp holds them."""
+    """Return the XML of the prescribed displacements: zero, or the way to where a second grasp
+    holds the nodes.
+    """
     conditions = ""
-    for axis, held, way in zip("xyz", body.held.T, body.moved_m.T, strict=True):
+    for axis, is_prescribed, displacement in zip("xyz", body.held.T, body.moved_m.T, strict=True):
         where = f'name="hold_{axis}" node_set="held_{axis}"'
-        if way.any():
+        if displacement.any():
             conditions += (
                 f'<bc {where} type="prescribed displacement"><dof>{axis}</dof>'
                 f'<value lc="1" type="map">moved_{axis}</value></bc>\n'
             )
-        elif held.any():
+        elif is_prescribed.any():
             conditions += f'<bc {where} type="zero displacement"><{axis}_dof>1</{axis}_dof></bc>\n'
     return f"<Boundary>\n{conditions}</Boundary>\n"
 
 
 def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
-    """Nodes and cells of what is touched, a tetrahedron under each facet; surfaces that touch."""
-    solids, facets = "", ""
+    """Return the XML of the obstacles' nodes and elements, and that of the contact surfaces.
+
+    Each obstacle has a tetrahedron under each facet.
+    """
+    solids = ""
+    facets = ""
     corners = body.body.mesh.surface
     for k, wall in enumerate(touched):
         nodes = "".join(
@@ -169,6 +189,7 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
 
 
 def _rows(tag: str, rows: Index, after: int = 0) -> str:
+    """Return XML elements called `tag`, one for each row, numbered from `after` + 1."""
     return "".join(
         f'<{tag} id="{k}">{",".join(map(str, row))}</{tag}>\n'
         for k, row in enumerate(rows.tolist(), after + 1)
@@ -176,8 +197,13 @@ def _rows(tag: str, rows: Index, after: int = 0) -> str:
 
 
 def _touching(touched: Sequence[Wall]) -> str:
-    """What is touched comes from where it does not touch, and pushes in proportion to the depth."""
-    driven, contacts = "", ""
+    """Return the XML of the obstacles' motion and contact; "" without obstacles.
+
+    An obstacle begins where it does not touch the body and moves to its place. Its pressure is
+    proportional to the penetration.
+    """
+    driven = ""
+    contacts = ""
     for k, wall in enumerate(touched):
         fixed = "".join(f"<{dof}_dof>1</{dof}_dof>" for dof in ("Ru", "Rv", "Rw"))
         driven += f'<rigid_bc type="rigid_fixed"><rb>wall_{k}</rb>{fixed}</rigid_bc>\n'

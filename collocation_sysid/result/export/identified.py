@@ -1,7 +1,8 @@
-"""An identified body, read back from a run: what every export is made of.
+"""Identified body of a run folder, the input of every export.
 
-The body is placed as its grasp holds it at the first sample, carried rigidly and so undeformed;
-simulators hold the grasped nodes there, or move them on from there.
+The body is undeformed and placed rigidly as its grasp holds it at the first sample. Simulators keep
+the
+grasped nodes there, or move them on from there.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from ..replay import Replay, read_arrays, reading_run
 
 @dataclass(frozen=True)
 class Branch:
-    """A branch of the memory: its share of the long-term stiffness, and its relaxation time."""
+    """Viscoelastic branch: share of the long-term stiffness, and relaxation time [s]."""
 
     name: str
     share: float
@@ -38,20 +39,25 @@ class Branch:
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedRegion:
-    """A part of the body and its constants.
+    """Part of the body with its constants.
 
     Attributes
     ----------
     name : str
-        "body" for what no region claims.
-    cells : (k,) numbers of its cells
+        Name of the region; "body" for elements outside all regions.
+    cells : (k,)
+        Indices of its elements.
     material : str
-    constants : mapping of name to value, of the material
+        Name of the material.
+    constants : mapping of name to value
+        Constants of the material.
     lambda_pa, mu_pa, young_pa, poisson : float
-        At rest and small strain, of the long-term energy.
+        Elastic constants at rest and small strain, of the long-term energy.
     density_kg_m3 : float
     damping : str
+        Name of the damping law.
     gamma_r_s, gamma_m_1_s : float
+        Stiffness-proportional and mass-proportional damping, see the glossary.
     branches : tuple of Branch
     """
 
@@ -71,16 +77,25 @@ class IdentifiedRegion:
 
     @property
     def kappa_pa(self) -> float:
-        """Bulk modulus."""
+        """Bulk modulus κ = λ + ⅔ μ."""
         return self.lambda_pa + 2 / 3 * self.mu_pa
 
 
 def alone(experiment: Experiment) -> Experiment:
-    """The experiment without obstacles, which targets have beside the body if at all."""
-    body, t_s = experiment.body, experiment.t_s
+    """Return an experiment without its obstacles, which simulators have as separate objects.
+
+    Measurements are replaced by one placeholder marker, because there may be none on the body.
+
+    Raises
+    ------
+    InputError
+        If the body then has no initial equilibrium, because only obstacles support it.
+    """
+    body = experiment.body
+    t_s = experiment.t_s
     own = len(body.nodes.points_m)
     started = {
-        name: None if (given := getattr(experiment, name)) is None else given[:own]
+        name: None if (positions_m := getattr(experiment, name)) is None else positions_m[:own]
         for name in ("start_positions_m", "start_velocities_m_s")
     }
     # Nothing here looks at measurements, of which there may be none but of what was touched.
@@ -97,22 +112,27 @@ def alone(experiment: Experiment) -> Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A body as a run identified it, in the grasp of one of its recordings.
+    """Body as a run identified it, in the grasp of one of its recordings.
 
     Attributes
     ----------
     title : str
+        Title of the problem.
     verdict : str
+        Verdict of the run.
     warnings : tuple of str
-        What to know before these numbers are used anywhere else.
+        Reasons not to use the numbers without care.
     parameters : mapping of name to ReportedEstimate
     body : Body
-    theta : (k,) its constants
+    theta : (k,)
+        Constants of the body.
     experiment : Experiment
-        With gravity and grasps as they were found.
-    rolled_out_m : (T, n, 3) our prediction at the samples, or None
-    touching : Experiment, optional
-        The same with what the body may touch, where that was found to be; frictions are numbers.
+        The recording with corrected gravity and grasps, and without obstacles.
+    rolled_out_m : (T, n, 3) or None
+        Forward simulation of this package at the samples.
+    touching : Experiment or None
+        The recording with its obstacles, whose friction coefficients are numbers; None without
+        obstacles.
     """
 
     title: str
@@ -129,13 +149,14 @@ class Identified:
     def read(
         cls, run: str | Path, experiment: str | None = None, allow_code: bool = False
     ) -> Identified:
-        """Read a run folder.
+        """Read the body from a run folder.
 
         Parameters
         ----------
         run : str or Path
+            A run folder.
         experiment : str, optional
-            A recording that was fitted; the first by default.
+            Name of a fitted experiment; the first by default.
         allow_code : bool
             Whether Python files that the problem names may run.
 
@@ -181,13 +202,14 @@ class Identified:
             body = segment.body
             if replay.undeformed_m.shape != body.nodes.points_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
-        corrected, rolled_out_m = segment.corrected(phi), replay.rolled_out_positions_m
-        touched = tuple(
+        corrected = segment.corrected(phi)
+        rolled_out_m = replay.rolled_out_positions_m
+        obstacles = tuple(
             replace(o, friction=values[o.friction]) if isinstance(o.friction, str) else o
             for o in corrected.obstacles
         )
-        touching = corrected.with_obstacles(touched) if touched else None
-        if touched:
+        touching = corrected.with_obstacles(obstacles) if obstacles else None
+        if obstacles:
             with located(folder):
                 corrected = alone(corrected)
             body = corrected.body
@@ -206,7 +228,7 @@ class Identified:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """What it may touch."""
+        """Obstacles with which the body may come into contact."""
         return () if self.touching is None else self.touching.obstacles
 
     @property
@@ -216,60 +238,68 @@ class Identified:
 
     @cached_property
     def nodes_m(self) -> Array:
-        """(n, 3) undeformed, as the grasp holds the body at the first sample."""
+        """Undeformed nodes (n, 3), placed as the grasp holds the body at the first sample."""
         return self.experiment.rigid_positions([self.start_s])[0]
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:
-        """(n, 3) which coordinates are held at the first sample."""
+        """Whether a node's coordinate has a prescribed displacement at the first sample (n, 3)."""
         return self.experiment.held([self.start_s])[0]
 
     @cached_property
     def held_m(self) -> Array:
-        """(n, 3) where, NaN where a coordinate is free."""
+        """Prescribed coordinates (n, 3) at the first sample, NaN where a coordinate is free."""
         return self.experiment.grasped([self.start_s])[1][0]
 
     @property
     def grasped(self) -> NDArray[np.bool_]:
-        """(n,) which nodes are held along all axes at the first sample."""
+        """Whether a node is prescribed along all axes at the first sample (n,)."""
         return np.asarray(self.held.all(axis=1))
 
     @cached_property
     def moved_m(self) -> Array:
-        """(n, 3) how far held coordinates are from where the first grasp has the body, else 0."""
+        """Prescribed coordinates minus `nodes_m` (n, 3), and 0 where a coordinate is free.
+
+        It is not zero where a second grasp holds nodes elsewhere than the rigidly placed body has
+        them.
+        """
         return np.nan_to_num(self.held_m - self.nodes_m)
 
     @property
     def quadratic(self) -> bool:
-        """Whether its elements have nodes on their edges."""
+        """Whether the elements have nodes on their edges."""
         return self.body.element.nodes == 10
 
     @cached_property
     def tied_kg(self) -> Array:
-        """(n,) point masses at the first sample."""
+        """Point masses attached to the nodes (n,) at the first sample."""
         return self.experiment.tied_mass_kg([self.start_s])[0]
 
     @cached_property
     def node_mass_kg(self) -> Array:
-        """(n,) of the body, lumped, without what is tied to it."""
+        """Lumped mass of the body at each node (n,), without point masses."""
         return self.body.mass_of_dofs(self.theta)[::3]
 
     @cached_property
     def mass_kg(self) -> Array:
-        """(n,) with what is tied to it."""
+        """Lumped mass at each node (n,), with point masses."""
         return self.node_mass_kg + self.tied_kg
 
     @cached_property
     def loads_n(self) -> Array:
-        """(n, 3) on the nodes at the first sample besides the body's own weight."""
+        """Forces on the nodes (n, 3) at the first sample, with the weight of point masses but not
+        of the body.
+        """
         weight = self.tied_kg[:, None] * self.experiment.gravity_m_s2
         return self.experiment.node_forces_n([self.start_s])[0] + weight
 
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
-        """The parts of the body."""
-        body, regions = self.body, []
-        lame, shares = body.lame(self.theta), body.split(self.theta)
+        """Parts of the body with their constants."""
+        body = self.body
+        regions = []
+        lame = body.lame(self.theta)
+        shares = body.split(self.theta)
         densities = body.densities(self.theta)
         for part, share, density in zip(body.parts, shares, densities, strict=True):
             values = {c.name: float(v) for c, v in zip(part.constants, share, strict=True)}
@@ -296,8 +326,9 @@ class Identified:
         return tuple(regions)
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, for a file."""
-        e, body = self.experiment, self.body
+        """Return everything as a dictionary for a JSON file."""
+        e = self.experiment
+        body = self.body
         names = (
             "value",
             "combined_std_error",
@@ -355,7 +386,7 @@ class Identified:
 
 
 def _warnings(result: Result) -> tuple[str, ...]:
-    """Why not to trust the numbers as they are."""
+    """Return reasons not to use the numbers without care: verdict, bounds, averaged fields."""
     warnings = []
     if not result.converged:
         warnings.append("the run did not converge")

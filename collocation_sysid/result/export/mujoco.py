@@ -1,4 +1,4 @@
-"""MuJoCo: a flex of tetrahedra, each node a body on three slides, grasps as mocap bodies."""
+"""MuJoCo: a flex of tetrahedra whose nodes are bodies on three slides; grasps are mocap bodies."""
 
 from __future__ import annotations
 
@@ -23,16 +23,18 @@ from .solids import Primitive, grown
 from .target import Comparison, Exported, Holds, attribute, heading, linear_cells, numbers
 
 MODEL = "body.xml"
-# Before, a first frequency was 10 % (3.3 to 3.8, 3.17) to 33 % (3.10, 3.12) too high.
+# Oldest major version: with 3.3 to 3.8 and 3.17 the first natural frequency is 10 % too high, with
+# 3.10 and 3.12 33 %.
 SINCE = 4
-# Share of the largest step at which explicit damping and elasticity are stable.
+# Timestep over the largest one at which explicit damping and elasticity are stable.
 SAFE = 0.5
 # Half the thickness of the skin that collides, in mean edges.
 SKIN = 0.02
-# Mass of the body that carries grasped nodes, over that of the whole: so that they do not move it.
+# Mass of the body that carries grasped nodes over that of the specimen: the nodes do not move it.
 HEAVY = 1e3
-# How far nodes are moved to see the stiffness, in mean edges.
+# Displacement of nodes in the differences for the stiffness, in mean edges.
 PROBE = 1e-5
+# Steps of a verified motion: some minutes.
 MOST_STEPS = 2_000_000
 HOLDS = Holds(
     {"st-venant-kirchhoff": "flex"},
@@ -50,12 +52,12 @@ HOLDS = Holds(
 
 
 def export(body: Identified) -> Exported:
-    """The model, with the state at the first sample as its key "start".
+    """Return the model, whose key "start" is the state at the first sample.
 
     Raises
     ------
     InputError
-        For grasps that hold single axes, or not throughout.
+        For grasps that hold single axes, or not during the whole recording.
     """
     for k, grasp in enumerate(body.experiment.grasps, start=1):
         if grasp.axes != "xyz" or not grasp.holds(body.experiment.t_s).all():
@@ -83,32 +85,39 @@ def export(body: Identified) -> Exported:
 
 
 def _grasps(body: Identified) -> str:
-    """Of each a free body that carries its nodes, and the hand that it is welded to.
+    """Return the XML of each grasp: a mocap body, and the free body welded to it that carries the
+    nodes.
 
-    Nodes of an elastic flex may not ride on a mocap body.
+    The second body is needed because nodes of an elastic flex cannot be attached to a mocap body.
     """
-    lines, mass, size = "", body.node_mass_kg.sum() * HEAVY, np.ptp(body.nodes_m, axis=0).max()
-    turning = float(mass * size**2)
+    lines = ""
+    mass = body.node_mass_kg.sum() * HEAVY
+    size = np.ptp(body.nodes_m, axis=0).max()
+    inertia = float(mass * size**2)
     for k, grasp in enumerate(body.experiment.grasps):
         position, turn = _pose(grasp, body.start_s)
         at = f'pos="{numbers(position)}" quat="{numbers(turn)}"'
         lines += (
             f'<body name="hand{k}" mocap="true" {at}/>\n<body name="grasp{k}" {at} gravcomp="1">'
             f'<freejoint/><inertial pos="0 0 0" mass="{float(mass)!r}" '
-            f'diaginertia="{turning!r} {turning!r} {turning!r}"/></body>\n'
+            f'diaginertia="{inertia!r} {inertia!r} {inertia!r}"/></body>\n'
         )
     return lines
 
 
 def _obstacles(body: Identified, step_s: float) -> str:
-    """Of each a mocap body with its solid, as hard as the step allows, and its friction.
+    """Return the XML of each obstacle: a mocap body, as stiff as the step `step_s` allows, with
+    friction.
 
-    It is as much smaller as the flex has a skin, so that they touch where ours do.
+    Each solid is smaller by the thickness of the flex's skin, so that contact begins at the true
+    surface.
     """
-    lines, skin = "", SKIN * _edge_m(body)
+    lines = ""
+    skin = SKIN * _edge_m(body)
     for k, each in enumerate(body.obstacles):
         position, turn = _pose(each, body.start_s)
-        rubs, geom = float(each.friction), _geom(grown(each.shape, -skin))
+        rubs = float(each.friction)
+        geom = _geom(grown(each.shape, -skin))
         lines += (
             f'<body name="obstacle{k}" mocap="true" pos="{numbers(position)}" '
             f'quat="{numbers(turn)}"><geom name={attribute(each.name)} {geom} '
@@ -119,7 +128,7 @@ def _obstacles(body: Identified, step_s: float) -> str:
 
 
 def _geom(solid: Solid) -> str:
-    """Type, place and size."""
+    """Return the XML attributes of a solid: type, size and placement."""
     shape = Primitive.of(solid)
     turn = numbers(shape.turn.as_quat(scalar_first=True))
     size = numbers(shape.size_m) if len(shape.size_m) else "0 0 1"
@@ -127,6 +136,9 @@ def _geom(solid: Solid) -> str:
 
 
 def _welds(body: Identified, step_s: float) -> str:
+    """Return the XML of the constraints between the mocap bodies and the bodies that carry grasped
+    nodes.
+    """
     return "".join(
         f'<weld body1="hand{k}" body2="grasp{k}" relpose="0 0 0 1 0 0 0" '
         f'solref="{2 * step_s!r} 1" solimp="0.9999 0.9999 0.001"/>\n'
@@ -135,29 +147,32 @@ def _welds(body: Identified, step_s: float) -> str:
 
 
 def _pose(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
-    """Position and quaternion wxyz."""
+    """Return position (3,) [m] and quaternion (w, x, y, z) of a grasp or obstacle at a time."""
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(Rotation.from_matrix(rotations[0]).as_quat(), 1)
 
 
 def _nodes(body: Identified) -> str:
-    """Every node that is free as a body on three slides."""
-    lines, mass = "", body.mass_kg
+    """Return the XML of the free nodes, each a body on three slides."""
+    lines = ""
+    mass = body.mass_kg
     for n in np.flatnonzero(~body.grasped):
-        slides = "".join(
+        joints = "".join(
             f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1")
         )
-        turning = max(1e-6 * float(mass[n]), 1e-12)  # a node does not turn, but must have some
+        inertia = max(1e-6 * float(mass[n]), 1e-12)  # a node does not turn, but must have some
         lines += (
             f'<body name="node{n}" pos="{numbers(body.nodes_m[n])}">'
             f'<inertial pos="0 0 0" mass="{float(mass[n])!r}" '
-            f'diaginertia="{turning!r} {turning!r} {turning!r}"/>{slides}</body>\n'
+            f'diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>{joints}</body>\n'
         )
     return lines
 
 
 def _flexes(body: Identified) -> str:
-    """A flex for each region: nodes in the frame of what carries them, and cells."""
+    """Return the XML of a flex for each region: node positions relative to their bodies, and
+    elements.
+    """
     names = np.array([f"node{n}" for n in range(len(body.nodes_m))], dtype=object)
     places = np.zeros_like(body.nodes_m)
     for k, grasp in enumerate(body.experiment.grasps):
@@ -178,12 +193,13 @@ def _flexes(body: Identified) -> str:
 
 
 def _edge_m(body: Identified) -> float:
+    """Return the mean edge length of the mesh."""
     ends = body.body.nodes_m[body.body.mesh.edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 
 
 def _start(body: Identified) -> str:
-    """Displacements and velocities at the first sample, as we simulate it."""
+    """Return the XML of the state at the first sample: simulated displacements and velocities."""
     free = ~body.grasped
     shape = body.nodes_m if body.rolled_out_m is None else body.rolled_out_m[0]
     started = body.experiment.start_velocities_m_s
@@ -196,7 +212,7 @@ def _start(body: Identified) -> str:
 
 
 def _step_s(body: Identified) -> float:
-    """A step at which MuJoCo's explicit forces are stable, that divides the samples evenly."""
+    """Return a timestep that divides the sampling interval and keeps the integration stable."""
     state = body.body.nodes_m.reshape(1, -1)
     at = body.body.linearise(state, np.zeros_like(state), body.theta)
     stiffness = body.body.pattern.matrix(-at.by_position[0])
@@ -212,12 +228,13 @@ def _step_s(body: Identified) -> float:
 
 
 def verify(body: Identified, folder: Path) -> list[Comparison]:
-    """The first natural frequency, and a motion predicted anew.
+    """Run MuJoCo, and compare the first natural frequency and, if there is a motion, the
+    deformation.
 
     Raises
     ------
     InputError
-        If MuJoCo is missing or refuses the model.
+        If MuJoCo is missing, too old, or refuses the model.
     """
     mujoco = _mujoco()
     try:
@@ -231,6 +248,13 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
 
 
 def _mujoco() -> ModuleType:
+    """Return the module mujoco.
+
+    Raises
+    ------
+    InputError
+        If it is missing or older than version `SINCE`.
+    """
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -246,9 +270,15 @@ def _mujoco() -> ModuleType:
 
 
 def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
-    """Of the undeformed body: MuJoCo's by differences of its forces, and ours."""
-    data, free, grasps = mujoco.MjData(model), ~body.grasped, len(body.experiment.grasps)
-    probe, count = PROBE * _edge_m(body), 3 * int(free.sum())
+    """Return the first natural frequency of the undeformed body in MuJoCo and here [Hz].
+
+    MuJoCo's stiffness is found by central differences of its forces.
+    """
+    data = mujoco.MjData(model)
+    free = ~body.grasped
+    grasps = len(body.experiment.grasps)
+    probe = PROBE * _edge_m(body)
+    count = 3 * int(free.sum())
     columns = np.zeros((count, count))
     for column in range(count):
         ends = []
@@ -271,8 +301,17 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
 
 
 def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
-    """The recording: how far nodes move besides rigidly, in MuJoCo and in our simulation."""
-    e, free = body.experiment, ~body.grasped
+    """Return the RMS deformation over the recording in MuJoCo and here [m].
+
+    Deformation is the distance from the rigidly moved body.
+
+    Raises
+    ------
+    InputError
+        If more than `MOST_STEPS` steps are needed.
+    """
+    e = body.experiment
+    free = ~body.grasped
     data = mujoco.MjData(model)
     model.eq_active0[:] = 0
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -289,17 +328,24 @@ def _motion(body: Identified, mujoco: ModuleType, model: Any) -> Comparison:
     theirs = np.array(shapes) + body.nodes_m[free]
     assert body.rolled_out_m is not None
     ours = body.rolled_out_m[:, free]
-    carried = e.rigid_positions(e.t_s)[:, free]
-    size_m, apart_m = _rms(ours - carried), _rms(theirs - ours)
-    share = f", {apart_m / size_m:.2%} of it" if size_m else ""
-    remark = f"they are {apart_m:.3g} m apart (RMS){share}"
+    rigid_m = e.rigid_positions(e.t_s)[:, free]
+    size_m = _rms(ours - rigid_m)
+    difference_m = _rms(theirs - ours)
+    share = f", {difference_m / size_m:.2%} of it" if size_m else ""
+    remark = f"they are {difference_m:.3g} m apart (RMS){share}"
     what = "RMS deformation over the recording"
-    return Comparison(what, _rms(theirs - carried), size_m, "m", remark)
+    return Comparison(what, _rms(theirs - rigid_m), size_m, "m", remark)
 
 
 def _drive(body: Identified, mujoco: ModuleType, data: Any, step: tuple[float, float]) -> None:
-    """Put what carries the grasped nodes where it is, on its way to where it is a step later."""
-    (t_s, step_s), last_s, turning = step, float(body.experiment.t_s[-1]), np.zeros(3)
+    """Set pose and velocity of the bodies that carry grasped nodes, and the pose of obstacles, in
+    `data`.
+
+    `step` is the time and the timestep [s]; velocities lead to the pose one step later.
+    """
+    t_s, step_s = step
+    last_s = float(body.experiment.t_s[-1])
+    turning = np.zeros(3)
     for k, grasp in enumerate(body.experiment.grasps):
         here, there = (_pose(grasp, min(at_s, last_s)) for at_s in (t_s, t_s + step_s))
         mujoco.mju_subQuat(turning, there[1], here[1])
@@ -310,4 +356,5 @@ def _drive(body: Identified, mujoco: ModuleType, data: Any, step: tuple[float, f
 
 
 def _rms(way: Array) -> float:
+    """Return the root mean square length of vectors (…, 3)."""
     return float(np.sqrt((way**2).sum(axis=-1).mean()))

@@ -1,4 +1,4 @@
-"""Newton: a Python module that builds the soft mesh from the numbers beside it."""
+"""Newton: a Python module that builds the soft mesh from a JSON file beside it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HOLDS = Holds(
     roundings=False,
     faces=False,
 )
-# Of a shape there; planes without end.
+# Size arguments of each shape in Newton; zeros mean an infinite plane.
 SIZES = {
     "plane": ("width", "length"),
     "sphere": ("radius",),
@@ -90,12 +90,14 @@ def model(device=None):
 
 
 def export(body: Identified) -> Exported:
-    """The module, and its numbers in ``body.json``.
+    """Return the module ``body.py`` and its numbers ``body.json``.
 
-    The elastic constants are those of `SolverVBD`, whose energy is the stable neo-Hookean one of λ
-    and μ (Smith, de Goes & Kim 2018).
+    The elastic constants are those of Newton's `SolverVBD`, whose energy is the stable neo-Hookean
+    one of
+    λ and μ (Smith, de Goes & Kim 2018).
     """
-    cells, constants = [], []
+    cells = []
+    constants = []
     for region, own in zip(body.regions, linear_cells(body), strict=True):
         cells.append(own)
         # Its damping stress is 4 k Ė, ours γ_r (2 μ Ė + λ tr Ė): alike where the volume stays.
@@ -110,7 +112,7 @@ def export(body: Identified) -> Exported:
         "positions are single precision",
     ]
     k_mu, k_lambda, k_damp = np.concatenate(constants).T
-    numbers = {
+    data = {
         "nodes_m": np.where(body.held, body.held_m, body.nodes_m),
         "cells": np.concatenate(cells),
         "k_mu": k_mu,
@@ -126,12 +128,13 @@ def export(body: Identified) -> Exported:
     }
     files = {
         MODULE: heading(body, limits, "# ") + _BUILD,
-        NUMBERS: json.dumps(content(numbers)) + "\n",
+        NUMBERS: json.dumps(content(data)) + "\n",
     }
     return Exported(files, tuple(limits))
 
 
 def _obstacle(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
+    """Return the data of an obstacle at time `t_s` for the JSON file."""
     shape = Primitive.of(obstacle.shape)
     place_m, turn = shape.placed(obstacle, t_s)
     sizes = shape.size_m if len(shape.size_m) else np.zeros(2)

@@ -1,4 +1,4 @@
-"""SOFA: a scene of the body in its grasp, implicit Euler with Rayleigh's damping."""
+"""SOFA: a scene of the body in its grasp, with implicit Euler integration and Rayleigh damping."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ HOLDS = Holds(
 
 
 def export(body: Identified) -> Exported:
-    """The scene.
+    """Return the scene.
 
     Raises
     ------
@@ -59,11 +59,12 @@ def export(body: Identified) -> Exported:
     if (body.held.any(axis=1) != body.grasped).any():
         raise InputError("a grasp holds single axes, which the scene for SOFA does not take")
     region = body.regions[0]
-    limits, force = [*HOLDS.lost(body), VERSIONS], _law(region)
+    limits = [*HOLDS.lost(body), VERSIONS]
+    force = _law(region)
     if (np.abs(body.moved_m) > 1e-9).any():
         limits.append("grasps beside the first hold the body undeformed, not where they hold it")
     mass = numbers(body.mass_kg)
-    held = " ".join(map(str, np.flatnonzero(body.grasped)))
+    grasped = " ".join(map(str, np.flatnonzero(body.grasped)))
     cells = " ".join(map(str, body.body.cells.ravel()))
     x = '<?xml version="1.0"?>\n' + heading(body, limits, "<!-- ", " -->")
     x += f'<Node name="root" dt="{body.experiment.timestep_s / 4!r}" '
@@ -77,12 +78,17 @@ def export(body: Identified) -> Exported:
     x += f'tetrahedra="{cells}"/>\n<TetrahedronSetGeometryAlgorithms template="Vec3d"/>\n'
     x += '<MechanicalObject template="Vec3d"/>\n'
     x += f'<DiagonalMass vertexMass="{mass}"/>\n{force}\n{_obstacles(body)}'
-    x += f'<FixedProjectiveConstraint indices="{held}"/>\n</Node>\n</Node>\n'
+    x += f'<FixedProjectiveConstraint indices="{grasped}"/>\n</Node>\n</Node>\n'
     return Exported({SCENE: x}, tuple(limits))
 
 
 def _obstacles(body: Identified) -> str:
-    """Penalties on nodes, in proportion to their depth; it begins half of δ further out."""
+    """Return the XML of contact penalties on the nodes, proportional to the penetration.
+
+    The surface of the obstacle is moved outwards by half the width δ of the pressure law, so that
+    the
+    force is about the same at a given gap.
+    """
     lines = ""
     for wall in walls(body):
         shape = Primitive.of(grown(wall.obstacle.shape, wall.width_m / 2))
@@ -99,6 +105,7 @@ def _obstacles(body: Identified) -> str:
 
 
 def _law(region: IdentifiedRegion) -> str:
+    """Return the XML of the elastic material."""
     if region.material == "linear":
         return (
             '<TetrahedronFEMForceField method="small" '

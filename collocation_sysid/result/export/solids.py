@@ -1,4 +1,6 @@
-"""What a body may touch as simulators have it: simple shapes, or facets."""
+"""Obstacles as simulators represent them: simple shapes (`Primitive`), or facets (`Facets`,
+`Wall`).
+"""
 
 from __future__ import annotations
 
@@ -17,23 +19,27 @@ from ...recording import Capsule, Cuboid, Cylinder, Obstacle, Plane, Solid, Sphe
 from ...recording.solids import name_of
 from .identified import Identified
 
-# Facets of what is round are so wide [rad].
+# Smallest and largest width of the facets of round surfaces [rad].
 FACET_RAD = np.pi / 36, np.pi / 12
-# Sheets for planes are so many times as long as the body.
+# Side of the square that represents a plane, over the extent of the body.
 SHEET = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """A plane, sphere, box, cylinder or capsule in the frame of its obstacle.
+    """Plane, sphere, box, cylinder or capsule in the frame of its obstacle.
 
     Attributes
     ----------
     kind : str
-    size_m : (k,) radius, and half the length between the ends; of a box half of each side
-    place_m : (3,) its middle, of a plane a point
+        "plane", "sphere", "box", "cylinder" or "capsule".
+    size_m : (k,)
+        Radius, then half the length between the ends; half of each side for a box; empty for a
+        plane.
+    place_m : (3,)
+        Centre; for a plane a point on it.
     turn : Rotation
-        By which its z axis is the axis, or the normal of a plane.
+        Rotation of the z axis to the axis of the shape, or to the normal of a plane.
     """
 
     kind: str
@@ -43,8 +49,9 @@ class Primitive:
 
     @classmethod
     def of(cls, solid: Solid) -> Primitive:
-        """That of a solid; roundings of edges are left out."""
-        kind, turn = name_of(solid).removesuffix("_m"), Rotation.identity()
+        """Return the primitive of a solid; rounded edges are left out."""
+        kind = name_of(solid).removesuffix("_m")
+        turn = Rotation.identity()
         if isinstance(solid, Plane):
             return cls(kind, np.zeros(0), solid.point_m, _upright(solid.normal))
         if isinstance(solid, Sphere):
@@ -57,17 +64,21 @@ class Primitive:
         return cls(kind, size, solid.ends_m.mean(axis=0), _upright(way))
 
     def placed(self, obstacle: Obstacle, t_s: float) -> tuple[Array, Rotation]:
-        """Where it is in the world, and turned how."""
+        """Return position (3,) [m] and rotation in the world at a time."""
         (rotation,), (place,) = obstacle.poses.at([t_s])
         return place + rotation @ self.place_m, Rotation.from_matrix(rotation) * self.turn
 
 
 def _upright(axis: Array) -> Rotation:
+    """Return a rotation of the z axis to a vector (3,)."""
     return Rotation.align_vectors(axis[None], np.array([[0.0, 0.0, 1.0]]))[0]
 
 
 def grown(solid: Solid, by_m: float) -> Solid:
-    """With its surface so much further out; inwards at most by half of what it is wide."""
+    """Return a solid whose surface is further out by `by_m`; negative inwards.
+
+    Inwards the surface moves at most by half of the solid's smallest half width.
+    """
     if isinstance(solid, Plane):
         return replace(solid, point_m=solid.point_m + by_m * solid.normal)
     by_m = max(by_m, -float(Primitive.of(solid).size_m.min()) / 2)
@@ -84,12 +95,14 @@ def grown(solid: Solid, by_m: float) -> Solid:
 
 @dataclass(frozen=True, eq=False)
 class Facets:
-    """The surface of a solid in flat facets, and a point behind all of them.
+    """Surface of a solid as flat facets, with a point behind all of them.
 
     Attributes
     ----------
-    points_m : (p, 3) of which the last is behind
-    triangles : (f, 3) anticlockwise as seen from outside
+    points_m : (p, 3)
+        Corners, and as the last point the one behind all facets.
+    triangles : (f, 3)
+        Point indices, counter-clockwise as seen from outside.
     """
 
     points_m: Array
@@ -97,10 +110,21 @@ class Facets:
 
     @classmethod
     def of(cls, solid: Solid, about_m: Array, size_m: float, depth_m: float) -> Facets:
-        """All of them; of a plane a square about a point and so long.
+        """Return the facets of a solid; of a plane a square.
 
-        Where it is round, the middles of facets are so deep beneath it as their corners are out of
-        it; at the width of facets that this may have.
+        On round surfaces the middles of facets are as deep below the surface as their corners are
+        above it,
+        by `depth_m` or as the allowed facet widths `FACET_RAD` permit.
+
+        Parameters
+        ----------
+        solid : Solid
+        about_m : (3,)
+            Centre of the square for a plane.
+        size_m : float
+            Side of the square for a plane.
+        depth_m : float
+            Allowed distance between facets and surface.
         """
         if isinstance(solid, Plane):
             corners = solid.outline(about_m, size_m)[0][:4]
@@ -114,22 +138,23 @@ class Facets:
         return cls(np.vstack([points, behind]), triangles.reshape(-1, 3))._outwards()
 
     def depth_m(self, places_m: Array) -> float:
-        """How far the deepest of places (n, 3) is inside; 0 where none is."""
+        """Return the penetration [m] of the deepest of points (n, 3); 0 if all are outside."""
         return max(0.0, -float(self._above(places_m).max(axis=0).min()))
 
     def towards(self, places_m: Array) -> Facets:
-        """Those with any of these places (n, 3) before them."""
-        seen = (self._above(places_m) > 0).any(axis=1)
-        used, triangles = np.unique(self.triangles[seen], return_inverse=True)
+        """Return the facets that have at least one of the points (n, 3) in front of them."""
+        is_facing = (self._above(places_m) > 0).any(axis=1)
+        used, triangles = np.unique(self.triangles[is_facing], return_inverse=True)
         return Facets(self.points_m[[*used, -1]], triangles.reshape(-1, 3))
 
     def _above(self, places_m: Array) -> Array:
-        """(f, n) how far places are before the plane of each."""
+        """Return the distance (f, n) [m] of points (n, 3) in front of the plane of each facet."""
         corners = self.points_m[self.triangles]
         normals = _normals(corners)
         return normals @ places_m.T - np.einsum("fk,fk->f", corners[:, 0], normals)[:, None]
 
     def _outwards(self) -> Facets:
+        """Return the facets with triangles ordered counter-clockwise as seen from outside."""
         corners = self.points_m[self.triangles]
         inwards = np.einsum("fk,fk->f", self.points_m[-1] - corners[:, 0], _normals(corners)) > 0
         order = np.where(inwards[:, None], [2, 1, 0], [0, 1, 2])
@@ -137,54 +162,73 @@ class Facets:
 
 
 def _normals(corners: Array) -> Array:
+    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3)."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
 def _extremes(shape: Primitive, rounding_m: float, depth_m: float) -> Array:
-    """(p, 3) points of a solid that are the farthest along some direction."""
+    """Return points (p, 3) of a solid that are the furthest along some direction; their hull is the
+    solid.
+
+    Parameters
+    ----------
+    shape : Primitive
+    rounding_m : float
+        Radius of rounded edges.
+    depth_m : float
+        Allowed distance between the hull and the surface.
+    """
     radius_m = rounding_m if shape.kind == "box" else shape.size_m[0]
     wide = float(np.clip(4 * np.sqrt(depth_m / max(radius_m, depth_m)), *FACET_RAD))
     count = int(np.ceil(np.pi / wide))
     middles = (np.arange(2 * count) + 0.5) * np.pi / count
-    turned, steep = np.meshgrid(middles, middles[:count])
-    turned, steep = turned.ravel(), steep.ravel()
-    level = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=1)
-    along = np.cos(steep)[:, None] * [0.0, 0.0, 1.0]
-    way, longer = np.sin(steep)[:, None] * level + along, 1 + wide**2 / 16
+    azimuth, inclination = np.meshgrid(middles, middles[:count])
+    azimuth = azimuth.ravel()
+    inclination = inclination.ravel()
+    level = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1)
+    axial = np.cos(inclination)[:, None] * [0.0, 0.0, 1.0]
+    direction = np.sin(inclination)[:, None] * level + axial
+    stretch = 1 + wide**2 / 16
     if shape.kind == "box":
-        core = np.sign(way) * (shape.size_m - rounding_m)
+        core = np.sign(direction) * (shape.size_m - rounding_m)
     elif shape.kind == "cylinder":
-        core = longer * (radius_m - rounding_m) * level
-        core = core + np.sign(along) * (shape.size_m[1] - rounding_m)
+        core = stretch * (radius_m - rounding_m) * level
+        core = core + np.sign(axial) * (shape.size_m[1] - rounding_m)
     else:
         rounding_m = radius_m
-        core = np.sign(along) * (shape.size_m[1] if shape.kind == "capsule" else 0.0)
-    places = core + longer * rounding_m * way
+        core = np.sign(axial) * (shape.size_m[1] if shape.kind == "capsule" else 0.0)
+    places = core + stretch * rounding_m * direction
     return np.unique(shape.place_m + shape.turn.apply(places).round(12), axis=0)
 
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """An obstacle as facets, at which the pressure is proportional to the depth.
+    """Obstacle as facets whose contact pressure is proportional to the penetration.
 
-    That is as ours is inside: the surface is half of δ further out, and twice as stiff.
+    To match the pressure law of this package inside the obstacle, the surface is half of its width
+    δ
+    further out, and twice as stiff.
 
     Attributes
     ----------
     obstacle : Obstacle
-        Whose friction is a number.
+        Obstacle whose friction coefficient is a number.
     facets : Facets
-        In its frame.
-    back_m : (3,) from where it is at the first sample to where it does not touch
-    start_m : (p, 3) its facets' points there, in the world
+        Facets in the obstacle's frame.
+    back_m : (3,)
+        Displacement from the place at the first sample to one without contact.
+    start_m : (p, 3)
+        Points of the facets at the place without contact, in the world.
     nodes, cells : int
-        How many are numbered before its own: the body's, and those of walls before it.
+        Numbers of nodes and cells of the body and of earlier walls, which precede those of this
+        wall.
     stiffness_pa_m, node_n_m : float
-        Of the surface, and as much for each of its nodes.
+        Contact stiffness per area, and for each node.
     width_m : float
-        δ.
-    faces : (k,) rows of the mesh's surface that may touch it
+        Width δ of the pressure law.
+    faces : (k,)
+        Indices of the boundary triangles that may touch the obstacle.
     """
 
     obstacle: Obstacle
@@ -199,70 +243,88 @@ class Wall:
     faces: Index
 
     def points_m(self, t_s: float) -> Array:
-        """(p, 3) of its facets in the world."""
+        """Return the points of the facets (p, 3) in the world at a time."""
         (rotation,), (place,) = self.obstacle.poses.at([t_s])
         return self.facets.points_m @ rotation.T + place
 
     @property
     def triangles(self) -> Index:
-        """(f, 3) numbers of nodes of its facets."""
+        """Node indices of the facets (f, 3)."""
         return self.facets.triangles + self.nodes
 
     @property
     def tetrahedra(self) -> Index:
-        """(f, 4) numbers of nodes of a tetrahedron under each facet."""
+        """Node indices (f, 4) of a tetrahedron under each facet."""
         inner = np.full((len(self.triangles), 1), self.nodes + len(self.start_m) - 1)
         return np.hstack([self.triangles[:, [0, 2, 1]], inner])
 
 
 def walls(body: Identified) -> tuple[Wall, ...]:
-    """What a body may touch; facets that always turn away from it are left out."""
+    """Return the obstacles of a body as walls; facets that never face the body are left out."""
     if body.touching is None:
         return ()
-    times, shape = body.touching.t_s, body.touching.rigid_positions([body.start_s])
+    times = body.touching.t_s
+    shape = body.touching.rigid_positions([body.start_s])
     made: list[Wall] = []
-    nodes, cells = len(body.nodes_m), len(body.body.cells)
+    nodes = len(body.nodes_m)
+    cells = len(body.body.cells)
     for obstacle, contact in zip(body.obstacles, contacts(body.touching), strict=True):
-        law, (depth_m, normal) = contact.contact, contact.deepest(shape.ravel())
+        law = contact.contact
+        depth_m, normal = contact.deepest(shape.ravel())
         rotations, places = obstacle.poses.at(times)
-        carried = body.experiment.rigid_positions(times)
-        ends = np.stack([carried.min(axis=1), carried.max(axis=1)], axis=2) - places[..., None]
+        rigid_m = body.experiment.rigid_positions(times)
+        ends = np.stack([rigid_m.min(axis=1), rigid_m.max(axis=1)], axis=2) - places[..., None]
         corners = np.array([list(product(*each)) for each in ends])
-        seen = np.einsum("tki,tij->tkj", corners, rotations).reshape(-1, 3)
-        size_m = SHEET * float(np.ptp(seen, axis=0).max())
+        box_m = np.einsum("tki,tij->tkj", corners, rotations).reshape(-1, 3)
+        size_m = SHEET * float(np.ptp(box_m, axis=0).max())
         area_m2 = law.surface.area_m2
         stiffness = 2 * float(np.average(law.stiffness_at(body.theta), weights=area_m2))
         width_m = float(np.average(law.widths_m, weights=area_m2))
         solid = grown(obstacle.shape, width_m / 2)
-        facets = Facets.of(solid, seen.mean(axis=0), size_m, width_m / 2)
+        facets = Facets.of(solid, box_m.mean(axis=0), size_m, width_m / 2)
         faces = law.surface.faces
         touching = np.unique(body.body.nodes.on_faces(body.body.mesh.surface[faces]))
         # Nodes may be deeper than the points at which ours are pushed.
         back_m = -max(depth_m, 0.0) * normal
-        nearest = (carried[0, touching] - places[0] - back_m) @ rotations[0]
+        nearest = (rigid_m[0, touching] - places[0] - back_m) @ rotations[0]
         back_m -= facets.depth_m(nearest) * normal
         of_node = stiffness * float(area_m2.sum()) / len(touching)
         shown = facets.towards(
-            np.concatenate([seen, seen[: len(corners[0])] - back_m @ rotations[0]])
+            np.concatenate([box_m, box_m[: len(corners[0])] - back_m @ rotations[0]])
         )
         start_m = shown.points_m @ rotations[0].T + places[0] + back_m
-        law_of = stiffness, of_node, width_m, faces
-        made.append(Wall(obstacle, shown, back_m, start_m, nodes, cells, *law_of))
-        nodes, cells = nodes + len(start_m), cells + len(shown.triangles)
+        made.append(
+            Wall(
+                obstacle,
+                shown,
+                back_m=back_m,
+                start_m=start_m,
+                nodes=nodes,
+                cells=cells,
+                stiffness_pa_m=stiffness,
+                node_n_m=of_node,
+                width_m=width_m,
+                faces=faces,
+            )
+        )
+        nodes = nodes + len(start_m)
+        cells = cells + len(shown.triangles)
     return tuple(made)
 
 
 @dataclass(frozen=True)
 class OneContact:
-    """What Newton has once for all that a soft body touches.
+    """Contact constants of Newton, which has one set for all obstacles of a soft body.
 
     Attributes
     ----------
-    friction, node_n_m : float
+    friction : float
+    node_n_m : float
+        Contact stiffness of a node.
     radius_m : float
-        Of particles: half of δ.
+        Radius of particles: half of the width δ of the pressure law.
     lost : tuple of str
-        What is said where they touch differently.
+        Sentence on obstacles that differ in these constants; empty if they agree.
     """
 
     friction: float
@@ -272,20 +334,24 @@ class OneContact:
 
     @classmethod
     def of(cls, touched: Sequence[Wall]) -> OneContact:
-        """The friction of the first, and the largest stiffness and width."""
-        told = {
+        """Return the friction of the first wall, and the largest stiffness and width; zeros without
+        walls.
+        """
+        constants = {
             "friction": [float(wall.obstacle.friction) for wall in touched],
             "stiffness": [wall.node_n_m for wall in touched],
             "width": [wall.width_m for wall in touched],
         }
-        friction, stiffness, width = (values or [0.0] for values in told.values())
+        friction, stiffness, width = (values or [0.0] for values in constants.values())
         unlike = [
-            name for name, values in told.items() if not np.allclose(values, values[:1], atol=0)
+            name
+            for name, values in constants.items()
+            if not np.allclose(values, values[:1], atol=0)
         ]
-        lost = (
+        sentence = (
             f"obstacles differ in {listed(unlike)}, of which a soft body in Newton has one: here "
             f"the first's friction {friction[0]:.4g}, with which that of each other is averaged, "
             f"and of all the largest stiffness {max(stiffness):.4g} N/m of a node and width "
             f"{max(width):.4g} m"
         )
-        return cls(friction[0], max(stiffness), max(width) / 2, (lost,) * bool(unlike))
+        return cls(friction[0], max(stiffness), max(width) / 2, (sentence,) * bool(unlike))

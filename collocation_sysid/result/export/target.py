@@ -1,4 +1,6 @@
-"""What an export is: files, what they leave out, and how the target predicts compared with us."""
+"""Description of export targets: their files, what they cannot express, and comparison of
+predictions.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,7 @@ UNTRIED = (
 
 @dataclass(frozen=True)
 class Exported:
-    """The files of an export.
+    """Files of an export.
 
     Attributes
     ----------
@@ -57,7 +59,10 @@ class Exported:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One number that the target predicts, and the same of this package."""
+    """One quantity as predicted by the target (`theirs`) and by this package (`ours`), in `unit`.
+
+    `what` names the quantity, `remark` adds a sentence.
+    """
 
     what: str
     theirs: float
@@ -67,21 +72,24 @@ class Comparison:
 
     @property
     def relative(self) -> float:
-        """How much larger theirs is, as a share of ours; NaN where ours is zero."""
+        """Relative difference (theirs − ours) / ours; NaN if ours is zero."""
         return (self.theirs - self.ours) / self.ours if self.ours else float("nan")
 
 
 @dataclass(frozen=True)
 class Target:
-    """A simulator.
+    """Simulator to which a body can be exported.
 
     Attributes
     ----------
     name : str
-        As it calls itself.
+        Name of the simulator as it writes it itself.
     export : callable
+        Returns the files for a body.
     verify : callable, optional
-        Predict with the files in a folder what the body does, in the simulator itself.
+        Runs the files of a folder in the simulator, and compares predictions; None if it cannot be
+        run
+        from here.
     """
 
     name: str
@@ -91,27 +99,32 @@ class Target:
 
 @dataclass(frozen=True)
 class Holds:
-    """What a simulator holds of a body, so that what it does not is told alike by all.
+    """Features of a body that a simulator can express; all others become limitations of an export.
 
     Attributes
     ----------
-    materials : mapping of a material's name to its own; what all others become is in `instead`
-    instead : str
-        With places for the `material` and the region's constants, as `stiffness_damping` and
-        `mass_damping` have; what these say where a body has them, empty where they are held.
+    materials : mapping of str to str
+        Names in the simulator of the materials that it has; all others become what `instead`
+        states.
+    instead, stiffness_damping, mass_damping : str
+        Sentences on other materials, and on the two kinds of damping; they may contain `{material}`
+        and
+        the names of constants of a region. Empty if the simulator expresses the damping.
     damping : str
-        The law of its own, of which nothing is said.
+        Name of the damping law that the simulator has, for which no sentence is needed.
     memory, motion, drives, quadratic : bool
-        Branches of memory; grasps that move, and what is touched; elements with nodes on their
-        edges, which are split where they are not held.
+        Whether it has viscoelastic branches, moving grasps, moving obstacles, and elements with
+        nodes on
+        their edges (which are split otherwise).
     forces : str
-        What is said where forces act on nodes, empty where they are held.
+        Sentence for forces on nodes; empty if the simulator has them.
     shapes : tuple of str
-        Of what the body may touch.
+        Kinds of `Primitive` that obstacles may have.
     roundings, faces, friction : bool
-        Of that: edges that are round; that some faces alone touch it; that it rubs.
+        Whether obstacles may have rounded edges, be limited to some faces of the body, and have
+        friction.
     tried : bool
-        Whether the simulator itself has ever read such files.
+        Whether such files have been read by the simulator itself.
     """
 
     materials: Mapping[str, str]
@@ -131,12 +144,14 @@ class Holds:
     tried: bool = True
 
     def lost(self, body: Identified) -> list[str]:
-        """What it does not hold of a body, and what was done instead."""
-        said = [*_never_held(body)]
-        said += self._lost_of_obstacles(body)
+        """Return sentences on what the simulator cannot express of a body, and what was done
+        instead.
+        """
+        sentences = [*_never_held(body)]
+        sentences += self._lost_of_obstacles(body)
         for region in body.regions:
             damped = bool(region.gamma_r_s)
-            told = [
+            templates = [
                 *[MEMORY] * (bool(region.branches) and not self.memory),
                 *[self.instead] * (region.material not in self.materials),
                 *[self.stiffness_damping] * (damped and region.damping != self.damping),
@@ -144,19 +159,22 @@ class Holds:
             ]
             at_once = 1 + sum(branch.share for branch in region.branches)
             values = {**vars(region), "at_once": at_once}
-            said += [f"{region.name}: {each.format(**values)}" for each in filter(None, told)]
+            sentences += [
+                f"{region.name}: {each.format(**values)}" for each in filter(None, templates)
+            ]
         if not self.motion:
-            said.append(MOTION)
+            sentences.append(MOTION)
         if body.quadratic and not self.quadratic:
-            said.append(LINEAR_ONLY)
+            sentences.append(LINEAR_ONLY)
         elif body.body.element.mean_dilatation:
             worst = max(region.poisson for region in body.regions)
-            said.append(MEAN_DILATATION.format(worst=worst))
+            sentences.append(MEAN_DILATATION.format(worst=worst))
         if body.experiment.forces and self.forces:
-            said.append(self.forces)
-        return said if self.tried else [*said, UNTRIED]
+            sentences.append(self.forces)
+        return sentences if self.tried else [*sentences, UNTRIED]
 
     def _lost_of_obstacles(self, body: Identified) -> Iterator[str]:
+        """Yield sentences on what the simulator cannot express of the obstacles."""
         for each in body.obstacles:
             if (kind := Primitive.of(each.shape).kind) not in self.shapes:
                 yield f"{each.name}: what the body may touch is not exported if it is a {kind}"
@@ -172,8 +190,9 @@ class Holds:
 
 
 def _never_held(body: Identified) -> Iterator[str]:
-    """What no target of ours takes."""
-    e, times = body.experiment, body.experiment.t_s
+    """Yield sentences on what none of the targets can express."""
+    e = body.experiment
+    times = body.experiment.t_s
     if e.actuators:
         yield "tendons and pressures are not exported"
     if e.air_density_kg_m3:
@@ -187,13 +206,23 @@ def _never_held(body: Identified) -> Iterator[str]:
 
 
 def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
-    """Our equilibria at so many samples, without what exports leave out.
+    """Return the equilibria of this package at the first samples, without the loads that exports
+    omit.
+
+    Parameters
+    ----------
+    body : Identified
+    samples : int
+        Number of samples; more than one for static recordings only.
 
     Returns
     -------
-    (T, n, 3) how far they move the nodes, and (T, o, 3) the forces of obstacles on the body
+    moved_m : (T, n, 3)
+        Displacements of the nodes from `Identified.nodes_m`.
+    forces_n : (T, o, 3)
+        Forces of each obstacle on the body.
     """
-    whole = replace(
+    experiment = replace(
         body.touching or body.experiment,
         tendons=(),
         pressures=(),
@@ -201,12 +230,12 @@ def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
         air_density_kg_m3="none",
     )
     if samples > 1:
-        states = simulate(whole, body.theta).positions_m[:samples].reshape(samples, -1)
+        states = simulate(experiment, body.theta).positions_m[:samples].reshape(samples, -1)
     else:
-        states = rest_state(whole, body.theta)[None]
+        states = rest_state(experiment, body.theta)[None]
     # In statics what slides is the way since the sample before.
     ways = np.diff(states, axis=0, prepend=states[:1])
-    forces = Forces.of(whole, whole.t_s[:samples], body.theta).total(states, ways)
+    forces = Forces.of(experiment, experiment.t_s[:samples], body.theta).total(states, ways)
     on_nodes = forces.reshape(samples, -1, 3)
     on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]
     moved_m = states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m
@@ -214,12 +243,14 @@ def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
 
 
 def longest(way_m: Array) -> float:
-    """How far what moves farthest moves, of (n, 3)."""
+    """Return the largest length of displacements (n, 3)."""
     return float(np.linalg.norm(way_m, axis=1).max())
 
 
 def linear_cells(body: Identified) -> list[Index]:
-    """(k, 4) of each region; quadratic cells are split on the same nodes."""
+    """Return the linear tetrahedra (k, 4) of each region; quadratic ones are split on the same
+    nodes.
+    """
     if not body.quadratic:
         return [body.body.cells[region.cells] for region in body.regions]
     eight = split_in_eight(body.body.mesh).tetrahedra.reshape(-1, 8, 4)
@@ -227,12 +258,15 @@ def linear_cells(body: Identified) -> list[Index]:
 
 
 def numbers(values: Iterable[float] | Array, separator: str = " ") -> str:
-    """Numbers that read back as they are."""
+    """Return numbers as text from which they are read back exactly."""
     return separator.join(repr(float(value)) for value in np.ravel(np.asarray(values)))
 
 
 def heading(body: Identified, limits: Iterable[str], start: str, end: str = "") -> str:
-    """Comment lines: what this is, and what it does not say."""
+    """Return comment lines on the body: title, warnings, limitations, and constants of each region.
+
+    Each line begins with `start` and ends with `end`, the marks of a comment in the format.
+    """
     lines = [
         f"{body.title}: as identified; SI units",
         *(f"warning: {warning}" for warning in body.warnings),

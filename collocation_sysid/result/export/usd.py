@@ -1,7 +1,7 @@
-"""OpenUSD: a tetrahedral mesh with the schemas for deformable bodies, as Newton and Isaac read it.
+"""OpenUSD: a tetrahedral mesh with the schemas for deformable bodies that Newton and Isaac read.
 
-The schemas are those of the proposal for deformables in USD physics; they know Young's modulus,
-Poisson's ratio, density and masses, and no damping, which stands in attributes of our own.
+The schemas are those of the proposal for deformables in USD physics. They have Young's modulus,
+Poisson's ratio, density and masses, and no damping, which is stored in custom attributes.
 """
 
 from __future__ import annotations
@@ -25,9 +25,14 @@ from .target import Comparison, Exported, Holds, at_rest, heading, linear_cells,
 
 STAGE = "body.usda"
 OWN = "collocationSysid"
-# To rest, in Newton: what is left of velocities after each step.
+# Factor on velocities after each step of Newton, so that the body comes to rest.
 BRAKE = 0.95
-ITERATIONS, STEPS, STEP_S = 20, 400, 2e-3
+# Iterations of the solver in each step.
+ITERATIONS = 20
+# Steps until the body is at rest.
+STEPS = 400
+# Timestep of Newton.
+STEP_S = 2e-3
 HOLDS = Holds(
     {},
     "{material} becomes whatever energy the simulator has for E and ν: Newton's is the stable "
@@ -50,7 +55,7 @@ TILT = (
     "simulator that takes its magnitude alone, and lets it point along −z, leaves that out"
 )
 UNMOVED = "the points of the body are those of the first sample: the run has no forward simulation"
-# Gravity counts as tilted from here on [°]: single precision of its direction rounds to less.
+# Angle from which gravity counts as tilted: single precision of its direction rounds to less.
 LEAST_TILT_DEG = 1e-3
 # Frames per second of a single sample, which has no rate of its own.
 SINGLE_RATE_HZ = 24.0
@@ -58,7 +63,7 @@ AXES = "nodes that are held along single axes only are free"
 
 
 def export(body: Identified) -> Exported:
-    """The stage.
+    """Return the USD stage.
 
     Raises
     ------
@@ -101,18 +106,27 @@ def export(body: Identified) -> Exported:
 
 
 def _rate_hz(t_s: Array) -> float:
-    """Time codes per second: one for each sample (T,), on average where samples are uneven."""
+    """Return the time codes per second: one for each sample (T,), on average where samples are
+    uneven.
+    """
     return (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
 
 
 def _tilt_deg(gravity_m_s2: Array) -> float:
-    """Angle between gravity (3,) and −z [°]; 0 without gravity."""
-    downwards, across = -gravity_m_s2[2], np.linalg.norm(gravity_m_s2[:2])
+    """Return the angle between gravity (3,) and −z [°]; 0 without gravity."""
+    downwards = -gravity_m_s2[2]
+    across = np.linalg.norm(gravity_m_s2[:2])
     return float(np.degrees(np.arctan2(across, downwards))) if gravity_m_s2.any() else 0.0
 
 
 def _library() -> Any:
-    """The modules of usd-core by name."""
+    """Return the modules of usd-core as attributes of one object.
+
+    Raises
+    ------
+    InputError
+        If usd-core is not installed.
+    """
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
     except ImportError as error:
@@ -122,10 +136,14 @@ def _library() -> Any:
 
 
 def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
-    """Tetrahedra, masses and materials of the body."""
-    whole = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
-    whole.AddAppliedSchema("PhysicsDeformableBodyAPI")
-    mesh, cells = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh"), linear_cells(body)
+    """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
+
+    `pxr` are the modules of `_library`; `placed_m` (n, 3) are the initial node positions.
+    """
+    body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
+    body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
+    mesh = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh")
+    cells = linear_cells(body)
     prim = mesh.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableSimAPI")
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
@@ -144,21 +162,26 @@ def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
     masses = prim.CreateAttribute("physics:masses", number.FloatArray, False)
     masses.Set(_masses_kg(body, cells).astype(np.float32))
     _token(pxr, prim, "physics:masses:elementType", "tetrahedron")
-    held = prim.CreateAttribute(f"{OWN}:graspedPoints", number.IntArray)
-    held.Set(np.flatnonzero(body.grasped).astype(np.int32))
+    grasped = prim.CreateAttribute(f"{OWN}:graspedPoints", number.IntArray)
+    grasped.Set(np.flatnonzero(body.grasped).astype(np.int32))
     names = _prim_names([region.name for region in body.regions])
     pairs = zip(body.regions, names, strict=True)
     materials = [_material(pxr, stage, region, name) for region, name in pairs]
     _bind(pxr, prim, materials[int(np.argmax([len(each) for each in cells]))])
     firsts = np.cumsum([0, *map(len, cells)])
     for k, material in enumerate(materials if len(cells) > 1 else ()):
-        numbers = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
-        told = names[k], pxr.UsdGeom.Tokens.tetrahedron, numbers, "materialBind"
-        _bind(pxr, pxr.UsdGeom.Subset.CreateGeomSubset(mesh, *told).GetPrim(), material)
+        indices = pxr.Vt.IntArray(range(firsts[k], firsts[k + 1]))
+        subset = pxr.UsdGeom.Subset.CreateGeomSubset(
+            mesh, names[k], pxr.UsdGeom.Tokens.tetrahedron, indices, "materialBind"
+        )
+        _bind(pxr, subset.GetPrim(), material)
 
 
 def _masses_kg(body: Identified, cells: list[Index]) -> Array:
-    """Of the tetrahedra."""
+    """Return the mass of each tetrahedron, region after region.
+
+    `cells` are the tetrahedra (k, 4) of each region.
+    """
     edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
     volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
     pairs = zip(body.regions, volumes, strict=True)
@@ -166,19 +189,20 @@ def _masses_kg(body: Identified, cells: list[Index]) -> Array:
 
 
 def _material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
+    """Add the material of a region to the stage under `name`, and return it."""
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
-    told = {
+    values = {
         "physics:youngsModulus": region.young_pa,
         "physics:poissonsRatio": region.poisson,
         "physics:density": region.density_kg_m3,
         f"{OWN}:gammaR_s": region.gamma_r_s,
         f"{OWN}:gammaM_1_s": region.gamma_m_1_s,
     }
-    told |= {f"{OWN}:{name}": value for name, value in region.constants.items()}
+    values |= {f"{OWN}:{name}": value for name, value in region.constants.items()}
     number = pxr.Sdf.ValueTypeNames
-    for name, value in told.items():
+    for name, value in values.items():
         prim.CreateAttribute(name, number.Float, name.startswith(OWN)).Set(float(value))
     for name, text in (("material", region.material), ("damping", region.damping)):
         prim.CreateAttribute(f"{OWN}:{name}", number.String).Set(text)
@@ -186,42 +210,50 @@ def _material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
 
 
 def _bind(pxr: Any, prim: Any, material: Any) -> None:
+    """Bind a physics material to a prim."""
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
 def _token(pxr: Any, prim: Any, name: str, text: str) -> None:
-    kind, fixed = pxr.Sdf.ValueTypeNames.Token, pxr.Sdf.VariabilityUniform
+    """Set a uniform token attribute of a prim."""
+    kind = pxr.Sdf.ValueTypeNames.Token
+    fixed = pxr.Sdf.VariabilityUniform
     prim.CreateAttribute(name, kind, False, fixed).Set(text)
 
 
 def _gripper(
     pxr: Any, stage: Any, number: int, grasp: Grasp, body: Identified, placed_m: Array
 ) -> None:
-    """A rigid body that is driven along the grasp's poses, and holds its nodes."""
+    """Add a kinematic rigid body that follows the poses of a grasp, and attach the grasped nodes to
+    it.
+
+    `number` counts grasps from 1; `placed_m` (n, 3) are the initial node positions.
+    """
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
     pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
     matrices, positions_m = grasp.poses.at(body.experiment.t_s)
     _put(pxr, gripper, positions_m, Rotation.from_matrix(matrices), body.experiment.t_s)
-    held = np.intersect1d(grasp.nodes, np.flatnonzero(body.grasped))
-    prim, types = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment"), pxr.Sdf.ValueTypeNames
+    nodes = np.intersect1d(grasp.nodes, np.flatnonzero(body.grasped))
+    prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
+    types = pxr.Sdf.ValueTypeNames
     for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
         prim.CreateRelationship(f"physics:{name}", False).SetTargets([pxr.Sdf.Path(target)])
     for name, text in (("type0", "point"), ("type1", "xform")):
         _token(pxr, prim, f"physics:{name}", text)
-    local_m = (placed_m[held] - positions_m[0]) @ matrices[0]
+    local_m = (placed_m[nodes] - positions_m[0]) @ matrices[0]
     for name, kind, values in (
-        ("indices0", types.IntArray, held.astype(np.int32)),
+        ("indices0", types.IntArray, nodes.astype(np.int32)),
         ("coords1", types.Vector3fArray, local_m.astype(np.float32)),
     ):
         prim.CreateAttribute(f"physics:{name}", kind, False).Set(values)
 
 
 def _put(pxr: Any, prim: Any, places_m: Array, turns: Rotation, t_s: Array) -> None:
-    """Place something at (T, 3) with rotations, at times (T,); by default as in the first row.
+    """Place a prim at positions (T, 3) and rotations at times (T,), by default as in the first row.
 
-    Without times, the one row is for all time.
+    With empty `t_s`, the only row holds for all time.
     """
     codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = turns.as_quat(scalar_first=True)
@@ -234,14 +266,18 @@ def _put(pxr: Any, prim: Any, places_m: Array, turns: Rotation, t_s: Array) -> N
 
 
 def _obstacle(pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: Identified) -> None:
-    """What is touched, kinematic where it moves, with its friction."""
-    shape, t_s, frame = Primitive.of(obstacle.shape), body.experiment.t_s, path
+    """Add an obstacle with its friction to the stage under `path`; it is kinematic if it moves."""
+    shape = Primitive.of(obstacle.shape)
+    t_s = body.experiment.t_s
+    frame = path
     if len(obstacle.poses.t_s) > 1:
         moving = pxr.UsdGeom.Xform.Define(stage, path)
         pxr.UsdPhysics.RigidBodyAPI.Apply(moving.GetPrim()).CreateKinematicEnabledAttr(True)
         matrices, places_m = obstacle.poses.at(t_s)
         _put(pxr, moving, places_m, Rotation.from_matrix(matrices), t_s)
-        place_m, turn, frame = shape.place_m, shape.turn, f"{path}/Shape"
+        place_m = shape.place_m
+        turn = shape.turn
+        frame = f"{path}/Shape"
     else:
         place_m, turn = shape.placed(obstacle, body.start_s)
     kinds = {"box": "Cube"}
@@ -266,19 +302,19 @@ def _obstacle(pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: Identif
 
 
 def _prim_names(names: Sequence[str]) -> list[str]:
-    """Return names that USD takes, a different one for each."""
-    found: list[str] = []
+    """Return names that USD accepts, a different one for each of `names`."""
+    unique: list[str] = []
     for name in names:
         text = re.sub(r"[^A-Za-z0-9_]", "_", name)
         text = text if re.match(r"[A-Za-z_]", text) else f"_{text}"
-        while text in found:
+        while text in unique:
             text += "_"
-        found.append(text)
-    return found
+        unique.append(text)
+    return unique
 
 
 def verify(body: Identified, folder: Path) -> list[Comparison]:
-    """The largest displacement at rest, from Newton.
+    """Run Newton on the exported stage, and compare the largest displacement at rest.
 
     Raises
     ------
@@ -290,18 +326,20 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     except ImportError as error:
         raise InputError("install Newton to verify the export: pip install newton") from error
 
-    builder, contact = newton.ModelBuilder(), OneContact.of(walls(body))
+    builder = newton.ModelBuilder()
+    contact = OneContact.of(walls(body))
     if body.obstacles:
         builder.default_particle_radius = contact.radius_m
     # Its rigid bodies would be simulated too; what they hold stands still instead.
     builder.add_usd(str(folder / STAGE), ignore_paths=["/World/Gripper_.*"])
-    held = np.flatnonzero(body.grasped)
-    for k in held:
+    grasped = np.flatnonzero(body.grasped)
+    for k in grasped:
         builder.particle_mass[k] = 0.0
     builder.color()
     model = builder.finalize(device="cpu")
     if body.obstacles:
-        model.soft_contact_ke, model.soft_contact_mu = contact.node_n_m, contact.friction
+        model.soft_contact_ke = contact.node_n_m
+        model.soft_contact_mu = contact.friction
         model.shape_material_ke.fill_(contact.node_n_m)
     pipeline = newton.CollisionPipeline(model)
     # What is touched stands still, and is nothing to solve for.
@@ -309,7 +347,9 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
         model, iterations=ITERATIONS, integrate_with_external_rigid_solver=True
     )
     before: Any = model.state()
-    after, control, contacts = model.state(), model.control(), pipeline.contacts()
+    after = model.state()
+    control = model.control()
+    contacts = pipeline.contacts()
     for _ in range(STEPS):
         pipeline.collide(before, contacts)
         solver.step(before, after, control, contacts, STEP_S)

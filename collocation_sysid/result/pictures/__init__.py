@@ -1,6 +1,15 @@
-"""Pictures of a run, one kind a module; each a function of plain arrays that returns a Figure.
+"""Pictures of a run, one kind per module; each function takes arrays and returns a Figure.
 
-Positions are in metres, drawn in millimetres; names and sizes of type are of `result.style`.
+Over time: `over_time` (markers, wrenches, custom sensors) and `spectrum`. In space: `shapes` (body
+and
+markers at several times), `mesh`, `field` (a spatially varying constant), `depth` (images of depth
+cameras) and `instability` (a buckling mode). Statistics and method: `confidence`, `search` and
+`jacobian`. `album` collects all pictures of a run and writes them; `camera` and `scene` draw bodies
+in
+space for the others.
+
+Positions are in metres and drawn in millimetres; colours and type sizes are those of
+`result.style`.
 """
 
 from .album import album, save_pictures

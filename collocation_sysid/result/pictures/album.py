@@ -1,4 +1,4 @@
-"""All pictures of a run by file name, after a solve or from its files alone."""
+"""All pictures of a run by file name, after a solve or from the files of its folder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .spectrum import spectrum
 def album(
     replays: Sequence[Replay], result: Result, truth: Mapping[str, float] | None = None
 ) -> dict[str, Figure]:
-    """All pictures of a run but that of its Jacobian, by file name.
+    """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def album(
         The experiments; the mesh is drawn with grasps and markers of the first.
     result : Result
     truth : mapping, optional
-        See `convergence`.
+        True parameters by name, see `convergence`.
     """
     names = [n for n, item in result.parameters.items() if not item.fixed and n in result.values]
     pictures = {"convergence": convergence(result.history, names, truth)} if result.history else {}
@@ -59,7 +59,9 @@ def album(
 
 
 def of_different_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figure]:
-    """Pictures by file name; one whose name is taken has a number."""
+    """Return pictures by file name; a number is appended to a name that another picture has
+    already.
+    """
     named = dict[str, Figure]()
     for text, figure in pictures:
         name = safe_name(text)
@@ -69,8 +71,11 @@ def of_different_names(pictures: Iterable[tuple[str, Figure]]) -> dict[str, Figu
 
 
 def _of_experiment(replay: Replay) -> Iterator[tuple[str, Figure]]:
-    t_s, measured = replay.t_s, replay.measured_m
-    fitted, rolled_out = _finite(replay.markers_m), _finite(replay.rolled_out_m)
+    """Yield name and picture of everything that is known of one experiment."""
+    t_s = replay.t_s
+    measured = replay.measured_m
+    fitted = _finite(replay.markers_m)
+    rolled_out = _finite(replay.rolled_out_m)
     names = replay.marker_names
     if len(names):
         yield f"tracks_{replay.name}", tracks(t_s, names, measured, fitted, rolled_out)
@@ -80,14 +85,14 @@ def _of_experiment(replay: Replay) -> Iterator[tuple[str, Figure]]:
     for k, sensed in enumerate(replay.wrenches, start=1):
         which = "" if len(replay.wrenches) == 1 else f"_{k}"
         yield f"wrench_{replay.name}{which}", readings_picture(sensed, COMPONENTS, UNITS)
-    for name, said in replay.readings.items():
-        places = said.shape[1] // 3
+    for name, values in replay.readings.items():
+        places = values.shape[1] // 3
         names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
         unit = replay.reading_units.get(name)
         units = [unit] * places if unit else []
-        yield f"reading_{replay.name}_{name}", readings_picture(said, names, units)
-    for name, seen in replay.seen.items():
-        yield f"depth_{replay.name}_{name}", depth_picture(seen)
+        yield f"reading_{replay.name}_{name}", readings_picture(values, names, units)
+    for name, points in replay.seen.items():
+        yield f"depth_{replay.name}_{name}", depth_picture(points)
     if replay.has_shapes:
         yield f"shapes_{replay.name}", shapes(replay)
         for name, figure in contact_shapes(replay).items():
@@ -95,7 +100,9 @@ def _of_experiment(replay: Replay) -> Iterator[tuple[str, Figure]]:
 
 
 def _finite(markers_m: Array | None) -> Array | None:
-    """Markers with gaps where a method or a simulation went astray."""
+    """Return markers with NaN in place of infinities, where a method or simulation diverged; None
+    for None.
+    """
     return None if markers_m is None else np.where(np.isfinite(markers_m), markers_m, np.nan)
 
 
@@ -104,8 +111,14 @@ def save_pictures(
 ) -> list[Path]:
     """Write each picture as <name>.png and return the files.
 
-    What a file name cannot hold becomes an underscore. `say` is called before each of them with a
-    text that has its number, from 1.
+    Parameters
+    ----------
+    folder : str or Path
+        An existing folder.
+    pictures : mapping of name to Figure
+        Characters that a file name cannot have become underscores.
+    say : callable, optional
+        Called before each picture with a sentence that has its number, counted from 1.
     """
     files = []
     for k, (name, figure) in enumerate(pictures.items(), start=1):
@@ -122,7 +135,8 @@ def save_pictures(
 def redraw(
     run: str | Path, folder: str | Path, say: Callable[[str], None] | None = None
 ) -> list[Path]:
-    """Write the pictures of a run folder into `folder`, all but that of the Jacobian.
+    """Write the pictures of a run folder into `folder`, all but that of the Jacobian, and return
+    the files.
 
     `say` is as in `save_pictures`.
 

@@ -1,6 +1,6 @@
-"""Bodies in space on plain axes: a parallel projection, shaded triangles, and what they hide.
+"""Parallel projection of bodies: viewing directions, shaded triangles, and hidden points.
 
-matplotlib's own 3-D axes cost tenths of a second each and leave wide margins.
+The 3-D axes of matplotlib cost tenths of a second each and leave wide margins.
 """
 
 from __future__ import annotations
@@ -15,39 +15,51 @@ from ...arrays import Array
 
 Triangles = NDArray[np.integer]
 
-# The view is turned off the plane of motion, and looks down, by these angles.
-TURN_DEG, ELEVATION_DEG = 25.0, 18.0
-# Brightness of a face turned away from the light, and the light in the camera's own axes.
+# Angle between the view and the normal of the plane of motion, to show depth.
+TURN_DEG = 25.0
+# Angle by which the view looks down.
+ELEVATION_DEG = 18.0
+# Brightness of a face turned away from the light.
 AMBIENT = 0.62
+# Direction towards the light in the axes of the camera.
 LIGHT = np.array([-0.4, 0.5, 0.8]) / np.linalg.norm([-0.4, 0.5, 0.8])
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A direction to look from.
+    """Parallel projection along a viewing direction.
 
     Attributes
     ----------
     axes : (3, 3)
-        Rows: the picture's right, the picture's top, and towards the viewer; orthonormal.
+        Orthonormal rows in the world: right and top of the picture, and towards the viewer.
     """
 
     axes: Array
 
     @classmethod
     def looking(cls, towards: ArrayLike, up: ArrayLike) -> Camera:
-        """Look from the direction `towards`, `up` being upright in the picture."""
-        near = np.asarray(towards, dtype=float)
-        near = near / np.linalg.norm(near)
-        right = np.cross(np.asarray(up, dtype=float), near)
+        """Return the camera that is in the direction `towards` (3,) from the body, with `up` (3,)
+        upright.
+        """
+        direction = np.asarray(towards, dtype=float)
+        direction = direction / np.linalg.norm(direction)
+        right = np.cross(np.asarray(up, dtype=float), direction)
         right /= np.linalg.norm(right)
-        return cls(np.array([right, np.cross(near, right), near]))
+        return cls(np.array([right, np.cross(direction, right), direction]))
 
     @classmethod
     def facing(cls, positions_m: Array, up: ArrayLike) -> Camera:
-        """Look at the plane in which a body (T, n, 3) moves most, or is widest, from aside.
+        """Return a camera that faces the plane in which a body moves most, or is widest.
 
-        The direction is level but for a glance from above.
+        The direction is horizontal, then turned by `TURN_DEG` and raised by `ELEVATION_DEG`.
+
+        Parameters
+        ----------
+        positions_m : (T, n, 3)
+            Finite positions of its nodes.
+        up : (3,)
+            Unit vector against gravity.
         """
         up = np.asarray(up, dtype=float)
         level = np.linalg.svd(up[None])[2][1:]
@@ -62,35 +74,45 @@ class Camera:
         return cls.looking(least, up).turned(TURN_DEG, up).raised(ELEVATION_DEG)
 
     def turned(self, angle_deg: float, up: ArrayLike) -> Camera:
-        """Walk around the body, about `up`."""
+        """Return the camera moved around the body by an angle [°] about `up` (3,)."""
         turn = Rotation.from_rotvec(np.radians(angle_deg) * np.asarray(up, dtype=float))
         return Camera(turn.apply(self.axes))
 
     def raised(self, angle_deg: float) -> Camera:
-        """Look from higher up."""
+        """Return the camera raised by an angle [°]; negative to look from further below."""
         angle = np.radians(angle_deg)
-        right, top, near = self.axes
-        higher = np.cos(angle) * near + np.sin(angle) * top
-        return Camera(np.array([right, np.cross(higher, right), higher]))
+        right, top, forward = self.axes
+        direction = np.cos(angle) * forward + np.sin(angle) * top
+        return Camera(np.array([right, np.cross(direction, right), direction]))
 
     def project(self, points_m: ArrayLike) -> Array:
-        """Places in the picture, (…, 3) to (…, 2) metres."""
+        """Return the positions (…, 2) [m] in the picture of points (…, 3) [m]."""
         return np.asarray(points_m) @ self.axes[:2].T
 
     def nearness(self, points_m: ArrayLike) -> Array:
-        """Distance towards the viewer, (…, 3) to (…) metres."""
+        """Return the coordinate (…) [m] of points (…, 3) [m] towards the viewer."""
         return np.asarray(points_m) @ self.axes[2]
 
     def faces(
         self, positions_m: Array, surface: Triangles
     ) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Triangles that are turned to the viewer, from far to near.
+        """Return the triangles that are turned towards the viewer, from far to near.
+
+        Parameters
+        ----------
+        positions_m : (n, 3)
+            Positions of the nodes.
+        surface : (F, 3)
+            Nodes of the triangles, counter-clockwise as seen from outside.
 
         Returns
         -------
-        polygons : (k, 3, 2) places in the picture
-        brightness : (k,) from `AMBIENT` to 1
-        chosen : (k,) which of the surface's they are
+        polygons : (k, 3, 2)
+            Corners in the picture [m].
+        brightness : (k,)
+            From `AMBIENT` to 1.
+        chosen : (k,)
+            Indices of these triangles in `surface`.
         """
         corners = positions_m[surface] @ self.axes.T
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -101,14 +123,27 @@ class Camera:
         return corners[order, :, :2], AMBIENT + (1 - AMBIENT) * light, order
 
     def hidden(self, points_m: Array, positions_m: Array, surface: Triangles) -> NDArray[np.bool_]:
-        """Which points (k, 3) lie behind the surface; NaN does not."""
+        """Return for each point (k, 3) whether it is behind the surface; False for NaN.
+
+        Parameters
+        ----------
+        points_m : (k, 3)
+        positions_m : (n, 3)
+            Positions of the nodes.
+        surface : (F, 3)
+            Nodes of the boundary triangles.
+        """
         corners = positions_m[surface] @ self.axes.T
         points = np.asarray(points_m) @ self.axes.T
         size = np.ptp(positions_m, axis=0).max()
         a, b, c = (corners[:, i, :2] for i in range(3))
         area = _cross(b - a, c - a)
         facing = area > 1e-9 * size**2
-        a, b, c, area, depth = a[facing], b[facing], c[facing], area[facing], corners[facing, :, 2]
+        a = a[facing]
+        b = b[facing]
+        c = c[facing]
+        area = area[facing]
+        depth = corners[facing, :, 2]
         behind = np.zeros(len(points), dtype=bool)
         for k, point in enumerate(points):
             place = point[:2]
@@ -116,12 +151,13 @@ class Camera:
                 [_cross(b - place, c - place), _cross(c - place, a - place)], axis=1
             ) / area[:, None]  # fmt: skip
             weights = np.column_stack([weights, 1 - weights.sum(axis=1)])
-            over = (weights >= 0).all(axis=1)
-            ahead = np.einsum("kc,kc->k", weights[over], depth[over])
+            is_inside = (weights >= 0).all(axis=1)
+            surface_depth = np.einsum("kc,kc->k", weights[is_inside], depth[is_inside])
             # A marker on the surface, or a noise's breadth below, is not hidden by it.
-            behind[k] = bool((ahead > point[2] + 0.05 * size).any())
+            behind[k] = bool((surface_depth > point[2] + 0.05 * size).any())
         return behind
 
 
 def _cross(a: Array, b: Array) -> Array:
+    """Return the cross product (…) of vectors in the plane (…, 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

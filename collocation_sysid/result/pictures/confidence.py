@@ -1,4 +1,4 @@
-"""How well parameters are known: confidence ellipses, correlations, shares of each variance."""
+"""Pictures of uncertainty: confidence ellipses, correlations, and shares of each variance."""
 
 from __future__ import annotations
 
@@ -29,24 +29,27 @@ from ..style import (
 )
 from .scene import round_length
 
-# Radius of an ellipse that holds two normal parameters with 95 %, in those of one parameter.
+# Radius of the joint 95 % region of two normal parameters over the half width of one interval.
 JOINT = float(np.sqrt(chi2.ppf(0.95, 2)) / norm.ppf(0.975))
-# A wider interval, in logarithms, is drawn to the edge of the panel only.
+# Half width of the logarithm beyond which an interval is cut off at the edge of the panel.
 WIDEST = np.log(1e3)
-# Beyond this deviation per cents measure little, and factors more.
+# Deviation of a logarithm beyond which axes show factors instead of percent.
 FACTORS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Confidence:
-    """Estimates with the uncertainty of their logarithms, those that have one.
+    """Estimates and the covariance of their logarithms, for estimates that have an uncertainty.
 
     Attributes
     ----------
     names : (k,) str
     values : (k,)
-    covariance : (k, k) of the logarithms, finite
-    quantiles : (k,) half widths of the 95 % intervals in standard deviations
+        The estimates.
+    covariance : (k, k)
+        Covariance of their logarithms, finite.
+    quantiles : (k,)
+        Half widths of the 95 % intervals in standard deviations.
     """
 
     names: Sequence[str]
@@ -56,21 +59,36 @@ class Confidence:
 
     @classmethod
     def of(cls, result: Result) -> Confidence | None:
-        """Gather what is determined: what is at a bound has no uncertainty.
+        """Return the estimates of a result that have an uncertainty; those at a bound have none.
 
-        None where there are no error bars.
+        None if the result has no error bars.
         """
-        if (found := result.uncertainty) is None:
+        if (uncertainty := result.uncertainty) is None:
             return None
-        known = np.isfinite(np.diag(found.covariance)) & np.isfinite(found.quantiles)
-        kept = np.flatnonzero(known).tolist()
-        names = [found.names[k] for k in kept]
+        known = np.isfinite(np.diag(uncertainty.covariance)) & np.isfinite(uncertainty.quantiles)
+        indices = np.flatnonzero(known).tolist()
+        names = [uncertainty.names[k] for k in indices]
         values = np.array([result.parameters[name].value for name in names])
-        return cls(names, values, found.covariance[np.ix_(kept, kept)], found.quantiles[kept])
+        return cls(
+            names,
+            values,
+            uncertainty.covariance[np.ix_(indices, indices)],
+            uncertainty.quantiles[indices],
+        )
 
 
 def ellipse(known: Confidence, i: int, j: int, points: int = 181) -> Array:
-    """Outline (points, 2) of the 95 % region of two logarithms about their estimates."""
+    """Return the outline (points, 2) of the joint 95 % region of two logarithms, about their
+    estimates.
+
+    Parameters
+    ----------
+    known : Confidence
+    i, j : int
+        Indices of the two parameters.
+    points : int
+        Number of points of the outline.
+    """
     pair = [i, j]
     angle = np.linspace(0.0, 2 * np.pi, points)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -81,15 +99,18 @@ def ellipse(known: Confidence, i: int, j: int, points: int = 181) -> Array:
 
 
 def confidence_ellipses(known: Confidence) -> Figure:
-    """Draw the 95 % region of every pair of parameters.
+    """Draw the joint 95 % region of every pair of parameters.
 
-    Axes are deviations from the estimate, in per cent, or factors where these are large; the
-    cross has the 95 % interval of each parameter alone. A thin slanted region says that the data
-    fix a combination of the two.
+    Axes are deviations from the estimate, in percent, or factors where these are large; the cross
+    is the
+    95 % interval of each parameter alone. A narrow slanted region means that the data determine
+    only a
+    combination of the two parameters.
 
     Parameters
     ----------
-    known : Confidence of two parameters at least
+    known : Confidence
+        At least two parameters.
     """
     count = len(known.names) - 1
     half = (known.quantiles * np.sqrt(np.diag(known.covariance))).tolist()
@@ -101,11 +122,13 @@ def confidence_ellipses(known: Confidence) -> Figure:
         if column > row:
             axes.set_axis_off()
             continue
-        i, j = column, row + 1
+        i = column
+        j = row + 1
         _draw_pair(axes, ellipse(known, i, j), half[i], half[j])
         dress(axes)
         axes.set(xlim=scales[i].limits, ylim=scales[j].limits)
-        last, first = row == count - 1, column == 0
+        last = row == count - 1
+        first = column == 0
         axes.set_xticks(scales[i].ticks, scales[i].labels if last else [""] * 3)
         axes.set_yticks(scales[j].ticks, scales[j].labels if first else [""] * 3)
         axes.set_xlabel(scales[i].title(known.names[i]) if last else "", fontsize=TEXT_PT)
@@ -118,6 +141,7 @@ def confidence_ellipses(known: Confidence) -> Figure:
 
 
 def _draw_pair(axes: Axes, outline: Array, wide: float, high: float) -> None:
+    """Draw a region (points, 2) and a cross of half widths `wide` and `high`."""
     axes.fill(*outline.T, facecolor=to_rgba(SKY, 0.35), edgecolor=BLUE, lw=1.0)
     for line in ([[-wide, wide], [0, 0]], [[0, 0], [-high, high]]):
         axes.plot(*line, color=BLACK, lw=0.8, solid_capstyle="butt")
@@ -125,7 +149,17 @@ def _draw_pair(axes: Axes, outline: Array, wide: float, high: float) -> None:
 
 @dataclass(frozen=True)
 class _Scale:
-    """Deviation of a logarithm from its estimate: how far it is shown, and how it reads."""
+    """Axis of a logarithm's deviation from its estimate.
+
+    Attributes
+    ----------
+    reach : float
+        Largest deviation shown, on either side.
+    ticks, labels : tuple of three
+        Deviations with a tick, and their texts.
+    unit : str
+        Text after the name of the parameter.
+    """
 
     reach: float
     ticks: tuple[float, float, float]
@@ -134,7 +168,7 @@ class _Scale:
 
     @classmethod
     def of(cls, reach: float) -> _Scale:
-        """Three round numbers within ± reach: per cents, or factors where it is wide."""
+        """Return an axis with round numbers within ± `reach`: percent, or factors if it is wide."""
         if reach > FACTORS:
             factor = round_length(np.exp(0.9 * reach))
             size = float(np.log(factor))
@@ -146,9 +180,11 @@ class _Scale:
 
     @property
     def limits(self) -> tuple[float, float]:
+        """Ends of the axis, symmetric about zero."""
         return -self.reach, self.reach
 
     def title(self, name: str) -> str:
+        """Return the label of the axis of the parameter `name`."""
         return mathematical(name) + self.unit
 
 
@@ -157,12 +193,13 @@ def correlation_matrix(known: Confidence) -> Figure:
 
     Parameters
     ----------
-    known : Confidence of two parameters at least
+    known : Confidence
+        At least two parameters.
     """
     correlation = correlation_of(known.covariance)
     count = len(known.names)
     figure = framed_figure(64, 52, 8, 7, 6, 5)
-    axes, beside = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
+    axes, bar_axes = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
     image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
     for (i, j), value in np.ndenumerate(correlation):
         axes.text(
@@ -176,7 +213,7 @@ def correlation_matrix(known: Confidence) -> Figure:
     axes.set_yticks(range(count), symbols, fontsize=TEXT_PT)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-    bar = figure.colorbar(image, cax=beside, ticks=(-1, 0, 1))
+    bar = figure.colorbar(image, cax=bar_axes, ticks=(-1, 0, 1))
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.6)
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
     return figure
@@ -187,24 +224,27 @@ def correlation_matrix(known: Confidence) -> Figure:
 LITTLE = 0.03
 OTHERS = "others"
 GREY = "#B4B4B4"
-# Of the legend: columns, and the height of a line.
+# Columns of the legend.
 LEGEND_COLUMNS = 2
+# Height of a line of the legend.
 LEGEND_LINE_MM = 3.8
 
 
 def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Draw a stacked bar for each estimate.
+    """Draw the contributions to the variance of each estimate as stacked bars.
 
     Parameters
     ----------
-    shares : mapping of estimate to mapping of source to its share of the variance
+    shares : mapping of estimate to mapping of source to share
+        Shares of the variance, from 0 to 1.
     """
     drawn = largest_first(shares, LITTLE)[: len(CYCLE)]
     rows = list(shares)[::-1]
     sources = [*drawn, OTHERS]
     legend_mm = LEGEND_LINE_MM * -(-len(sources) // LEGEND_COLUMNS) + 3
     figure = framed_figure(COLUMN_MM, 12 + legend_mm + 7 * len(rows), 14, 4, 10, legend_mm)
-    axes, left = figure.subplots(), [0.0] * len(rows)
+    axes = figure.subplots()
+    starts = [0.0] * len(rows)
     for source, colour in zip(sources, [*CYCLE[: len(drawn)], GREY], strict=True):
         widths = [
             1 - sum(shares[row].get(s, 0.0) for s in drawn)
@@ -212,10 +252,10 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
             else shares[row].get(source, 0.0)
             for row in rows
         ]
-        bars = axes.barh(range(len(rows)), widths, left=left, color=colour, label=worded(source))
+        bars = axes.barh(range(len(rows)), widths, left=starts, color=colour, label=worded(source))
         for bar in bars:  # a white line keeps neighbours apart
             bar.set(edgecolor="white", linewidth=0.4)
-        left = [a + b for a, b in zip(left, widths, strict=True)]
+        starts = [a + b for a, b in zip(starts, widths, strict=True)]
     axes.set_yticks(range(len(rows)), [mathematical(row) for row in rows])
     axes.set_xlim(0, 1)
     dress(axes, "", "share of the variance", "")

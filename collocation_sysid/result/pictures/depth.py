@@ -1,4 +1,6 @@
-"""What a depth camera saw over the surface of the body, and how far they are apart."""
+"""Points of a depth camera over outlines of the body's surface, and their distances from the
+surface.
+"""
 
 from __future__ import annotations
 
@@ -14,27 +16,34 @@ from ...arrays import Array
 from ..style import PAGE_MM, SMALL_PT, VERMILION
 
 MM_PER_INCH = 25.4
-# No panel is wider than this share of the page; titles are so high, and panels between these.
-WIDEST, TITLES, HIGH = 0.6, 0.4, (0.3, 1.0)
-# Lines are of one point for so many rows of outlines, and thinner for more.
+# Largest width of a panel, as a share of the page.
+WIDEST = 0.6
+# Height of a title [inch].
+TITLES = 0.4
+# Smallest and largest height of a panel over its width.
+HIGH = (0.3, 1.0)
+# Rows of outlines above which lines are thinner than 1 pt.
 FACES = 600
-# Points cover about this share of where they lie.
+# Share of the area of the points that their dots cover.
 COVERED = 0.3
-# The scale ends where this share of the points does.
+# Percentile of the distances at which the colour scale ends.
 SHOWN = 95
-# Outlines are shown so far beyond the points, in sizes of what these cover.
+# Distance from the points up to which outlines are shown, over the extent of the points.
 BEYOND = 0.5
 
 
 def depth_picture(seen: Array) -> Figure:
-    """Draw an image and the outlines of the surface over it, and below it how far they are apart.
+    """Draw depth images with outlines of the surface, and below them the distances from the
+    surface.
 
-    Of several samples those that have outlines are shown. Without a fit there is nothing below;
-    where no point counts only that is said.
+    The samples that have outlines are shown side by side. Without a fit there is no second row; if
+    no
+    point counts, the picture has only a sentence about that.
 
     Parameters
     ----------
-    seen : (k, 8) see `Replay.seen`
+    seen : (k, 8)
+        Rows of `Replay.seen`.
     """
     times = np.unique(seen[np.isnan(seen[:, 3]), 0])
     points = seen[np.isfinite(seen[:, 3])]
@@ -42,8 +51,8 @@ def depth_picture(seen: Array) -> Figure:
         return _sentence("no point is near enough to the body to count")
     fitted = bool(np.isfinite(points[:, 4]).any())
     axes, dot = _sheet(points, times, 1 + fitted)
-    near, far = np.percentile(points[:, 3], [1, 99])
-    depth = {"cmap": "viridis", "vmin": near, "vmax": far, "s": dot}
+    nearest, farthest = np.percentile(points[:, 3], [1, 99])
+    depth = {"cmap": "viridis", "vmin": nearest, "vmax": farthest, "s": dot}
     end = max(1e-3, 1e3 * float(np.nanpercentile(np.abs(points[:, 4]), SHOWN))) if fitted else 1.0
     behind = {"cmap": "RdBu", "vmin": -end, "vmax": end, "s": dot}
     for column, t_s in zip(axes.T, times, strict=True):
@@ -55,10 +64,10 @@ def depth_picture(seen: Array) -> Figure:
         column[0].set_title(title, fontsize=SMALL_PT)
         if fitted:
             used = here[np.isfinite(here[:, 4])]
-            left = here[~np.isfinite(here[:, 4])]
-            column[1].plot(*left[:, 1:3].T, ".", ms=1.5, color="0.7")
-            apart = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
-            scales.append((apart, "behind surface [mm]"))
+            unused = here[~np.isfinite(here[:, 4])]
+            column[1].plot(*unused[:, 1:3].T, ".", ms=1.5, color="0.7")
+            distances = _panel(column[1], used[:, 1:3], 1e3 * used[:, 4], lines, "0.6", behind)
+            scales.append((distances, "behind surface [mm]"))
             rms = np.sqrt(np.mean((1e3 * used[:, 4]) ** 2))
             column[1].set_title(f"{rms:.2g} mm RMS, {len(used):,} points", fontsize=SMALL_PT)
     for row, (scale, label) in zip(axes, scales, strict=True):
@@ -72,7 +81,7 @@ def depth_picture(seen: Array) -> Figure:
 
 
 def _sentence(text: str) -> Figure:
-    """What is said where there is nothing to draw."""
+    """Return a small figure that has only a sentence."""
     figure = Figure(figsize=(WIDEST * PAGE_MM / MM_PER_INCH, TITLES), layout="constrained")
     axes = figure.subplots()
     axes.set_axis_off()
@@ -81,8 +90,25 @@ def _sentence(text: str) -> Figure:
 
 
 def _sheet(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_], float]:
-    """Panels (rows, times) of the shape of what points cover, and the area of a point there."""
-    inch, count = PAGE_MM / MM_PER_INCH, len(times)
+    """Return panels (rows, times) with the proportions of the points' extent, and the area of a
+    dot.
+
+    Parameters
+    ----------
+    points : (P, 8)
+        Points of `Replay.seen`.
+    times : (m,)
+        Times of the samples, one column each.
+    rows : int
+
+    Returns
+    -------
+    axes : (rows, m) array of Axes
+    dot : float
+        Area of a dot [pt²], such that dots cover the share `COVERED` of the extent.
+    """
+    inch = PAGE_MM / MM_PER_INCH
+    count = len(times)
     across = min(1 / count, WIDEST)
     width, height = np.ptp(points[:, 1:3], axis=0)
     panel = across * inch * float(np.clip(height / max(width, 1e-12), *HIGH)) + TITLES
@@ -94,15 +120,32 @@ def _sheet(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_],
 def _panel(
     axes: Axes, places: Array, values: Array, lines: Array, colour: str, looks: dict[str, Any]
 ) -> PathCollection:
-    """Points and outlines; what of these is far from all points is cut off."""
+    """Draw points and outlines, and return the points; outlines far from all points are cut off.
+
+    Parameters
+    ----------
+    axes : Axes
+    places : (P, 2)
+        u and v of the points.
+    values : (P,)
+        Values that colour the points.
+    lines : (k, 2)
+        u and v of the outlines, NaN after each face.
+    colour : str
+        Colour of the outlines.
+    looks : dict
+        Further arguments of `Axes.scatter`.
+    """
     drawn = axes.scatter(*places.T, c=values, linewidths=0, zorder=1, **looks)
     # Of more faces thinner ones, or these would hide the points.
     thin = min(0.5, FACES / max(1, len(lines)))
     axes.plot(*lines.T, color=colour, linewidth=thin, zorder=2)
-    low, high = places.min(axis=0), places.max(axis=0)
+    low = places.min(axis=0)
+    high = places.max(axis=0)
     room = BEYOND * (high - low).max()
     both = np.vstack([places, lines[np.isfinite(lines).all(axis=1)]])
-    low, high = np.maximum(both.min(axis=0), low - room), np.minimum(both.max(axis=0), high + room)
+    low = np.maximum(both.min(axis=0), low - room)
+    high = np.minimum(both.max(axis=0), high + room)
     margin = 0.03 * (high - low).max()
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(high[1] + margin, low[1] - margin))
     axes.set(aspect="equal")

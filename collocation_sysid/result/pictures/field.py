@@ -1,4 +1,6 @@
-"""A constant that differs from place to place, with the ends of its interval, inside and out."""
+"""Picture of a spatially varying constant with the ends of its 95 % interval, on the surface and in
+a cut.
+"""
 
 from __future__ import annotations
 
@@ -17,28 +19,45 @@ from .camera import Camera
 from .scene import Drawn, View, draw_directions, draw_scale, sheet, width_over_height
 from .shapes import COLOURS
 
-HEAD_MM, FOOT_MM, CORNER_MM, BAR_ROOM_MM, GAP_MM, TALLEST_MM = 5.0, 8.0, 14.0, 20.0, 3.0, 55.0
+HEAD_MM = 5.0
+FOOT_MM = 8.0
+CORNER_MM = 14.0
+BAR_ROOM_MM = 20.0
+GAP_MM = 3.0
+TALLEST_MM = 55.0
 TITLES = "lower end", "estimate", "upper end"
-# From here on the data tell less and less, to where all is the prior's.
-TOLD, UNTOLD, PALEST = 0.5, 1.0, 0.8
+# Ratio of posterior to prior standard deviation above which colours fade.
+TOLD = 0.5
+# Ratio at which colours have faded completely: the data add nothing to the prior.
+UNTOLD = 1.0
+# Largest share of white, so that faded colours can still be compared.
+PALEST = 0.8
+# Colour of other regions.
 OTHERS = np.array([0.85, 0.85, 0.85])
 
 
 def field_picture(seen: Replay, name: str, values: Array) -> Figure:
-    """Draw the ends of the interval and the estimate on the body, and on a cut through it.
+    """Draw the estimate and the ends of its interval on the body, and below them on a cut through
+    it.
+
+    Colours fade to white where the posterior is hardly narrower than the prior.
 
     Parameters
     ----------
     seen : Replay
+        An experiment with this body.
     name : str
-    values : (E, 4) see `Replay.fields`
+        Name of the constant.
+    values : (E, 4)
+        Its values in each element, see `Replay.fields`.
     """
-    nodes_m, cells = seen.undeformed_m, np.asarray(seen.tetrahedra, dtype=np.int64)
+    nodes_m = seen.undeformed_m
+    cells = np.asarray(seen.tetrahedra, dtype=np.int64)
     camera = Camera.facing(nodes_m[None], seen.up)
     # An upright cut, if it is looked at from above.
     across = camera.axes[2] - (camera.axes[2] @ seen.up) * seen.up
-    near = nodes_m[cells].mean(axis=1) @ across
-    behind = np.flatnonzero(near <= np.median(near))
+    forward = nodes_m[cells].mean(axis=1) @ across
+    behind = np.flatnonzero(forward <= np.median(forward))
     rows = np.arange(len(cells)), behind
     aspect = width_over_height(camera, nodes_m)
     width = (PAGE_MM - CORNER_MM - BAR_ROOM_MM - 2 * GAP_MM) / 3
@@ -47,10 +66,11 @@ def field_picture(seen: Replay, name: str, values: Array) -> Figure:
     figure, axes = sheet(PAGE_MM, total)
     known = values[np.isfinite(values[:, 0])]
     # The ends of where nothing is told would leave no colours to what is.
-    low, high = np.quantile(known[:, 1], 0.05), np.quantile(known[:, 2], 0.95)
+    low = np.quantile(known[:, 1], 0.05)
+    high = np.quantile(known[:, 2], 0.95)
     scale = ScalarMappable((LogNorm if low > 0 else Normalize)(low, high), COLOURS)
     untold = np.clip((values[:, 3] - TOLD) / (UNTOLD - TOLD), 0.0, PALEST)[:, None]
-    none = np.zeros(len(nodes_m), dtype=bool)
+    no_nodes = np.zeros(len(nodes_m), dtype=bool)
     for row, own in enumerate(rows):
         faces, owners = boundary_of(cells[own])
         for column, (title, place) in enumerate(zip(TITLES, (1, 0, 2), strict=True)):
@@ -59,14 +79,16 @@ def field_picture(seen: Replay, name: str, values: Array) -> Figure:
             colours = scale.to_rgba(values[:, place])[:, :3]
             colours = (1 - np.nan_to_num(untold)) * colours + np.nan_to_num(untold)
             colours[np.isnan(values[:, place])] = OTHERS
-            Drawn(axes, view, faces).show(nodes_m, none, np.zeros((0, 3)), colours[own[owners]])
+            Drawn(axes, view, faces).show(nodes_m, no_nodes, np.zeros((0, 3)), colours[own[owners]])
             if row == 0:
-                middle = corner[0] + width / 2, total - HEAD_MM / 2
-                axes.text(*middle, title, ha="center", va="center", fontsize=SMALL_PT)
+                axes.text(
+                    corner[0] + width / 2, total - HEAD_MM / 2, title, ha="center", va="center",
+                    fontsize=SMALL_PT,
+                )  # fmt: skip
     place = (PAGE_MM - BAR_ROOM_MM + 4, FOOT_MM, 2.5, total - HEAD_MM - FOOT_MM - 4)
-    beside = axes.inset_axes(place, transform=axes.transData)
+    bar_axes = axes.inset_axes(place, transform=axes.transData)
     ticks = LogLocator(subs=(1.0, 2.0, 5.0)) if low > 0 else None
-    bar = figure.colorbar(scale, cax=beside, ticks=ticks, format="%.3g")
+    bar = figure.colorbar(scale, cax=bar_axes, ticks=ticks, format="%.3g")
     bar.ax.minorticks_off()
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=1.5)
     end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}

@@ -1,4 +1,4 @@
-"""The mode in which a body loses its stability, on its surface."""
+"""Picture of the mode in which a body loses its stability, on the surface of the body."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ HEAD_MM = 6.0
 FOOT_MM = 8.0
 MARGIN_MM = 14.0
 TALLEST_MM = 90.0
-# Longest displacement drawn, of the largest extent of the body.
+# Longest drawn displacement over the largest extent of the body.
 DRAWN = 0.08
 
 
 def instability_picture(lost: LostStability) -> Figure:
-    """Draw the body displaced along the mode, with the colours of its amplitude."""
+    """Draw the body displaced along the unstable mode, coloured by the mode's amplitude."""
     extent_m = float(np.ptp(lost.positions_m, axis=0).max())
     shown_m = lost.positions_m + DRAWN * extent_m * lost.mode
     camera = Camera.facing(shown_m[None], np.array([0.0, 0.0, 1.0]))

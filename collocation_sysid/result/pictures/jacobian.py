@@ -1,4 +1,4 @@
-"""The structure of the constraint Jacobian as a picture, after the paper's Fig. 3."""
+"""Picture of the structure of the constraint Jacobian, after Fig. 3 of the paper."""
 
 from __future__ import annotations
 
@@ -17,32 +17,40 @@ from ...program.collocation import Collocation
 from ...runs.check.derivatives import first_samples
 from ..style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
 
+# Timesteps shown: enough to see the band, few enough to see its blocks.
 SHOWN_STEPS = 6
-# Beyond those shown: rows of the last ones reach two steps ahead.
+# Further samples evaluated: rows of the last shown steps depend on two steps ahead.
 SPARE_SAMPLES = 4
-# Picture elements across a panel, and decades of magnitude told apart.
+# Picture elements across a panel.
 RASTER = 400
+# Decades of magnitude that the colour scale spans.
 DECADES = 6
 
 
 def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
-    """The constraint Jacobian's first timesteps, and one of its blocks, coloured by magnitude.
+    """Draw the constraint Jacobian of the first timesteps, and one of its blocks, coloured by
+    magnitude.
 
-    Left the dense columns of the parameters, beside them the block band of the positions; right
-    the last block on the diagonal of that view. Entries are scaled as in the NLP; structural
-    ones that are zero or tiny have the lightest colour.
+    At the left are the dense columns of the parameters, in the middle the block band of the
+    positions, at
+    the right the last shown block on the diagonal. Entries are scaled as in the nonlinear program;
+    structural entries that are zero or tiny have the lightest colour.
 
     Parameters
     ----------
     collocation : Collocation
         Its first experiment is shown.
     z : (variables,)
+        Variables at which the Jacobian is evaluated.
     """
     total = collocation.segments[0].grid_rows
     collocation, z = _first_steps(collocation, z)
-    segment, nq = collocation.segments[0], collocation.nq
-    first, steps = segment.dynamics.first_row, min(SHOWN_STEPS, segment.grid_rows)
-    height, width = segment.rows_per_time, segment.dofs
+    segment = collocation.segments[0]
+    nq = collocation.nq
+    first = segment.dynamics.first_row
+    steps = min(SHOWN_STEPS, segment.grid_rows)
+    height = segment.rows_per_time
+    width = segment.dofs
     rows = (steps - first) * height
     matrix = abs(collocation.jacobian(z)[:, : nq + steps * width])[:rows]
     band = matrix[:, nq:]
@@ -53,7 +61,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     figure = framed_figure(PAGE_MM, 88, 12, 13, 10.5, 6)
     widths = (0.05 * max(1, nq), 1, 0.2, 0.95, 0.01, 0.03)
     grid = figure.add_gridspec(1, 6, width_ratios=widths, wspace=0.03)
-    left, middle, right, beside = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
+    left, middle, right, bar_axes = (figure.add_subplot(grid[k]) for k in (0, 1, 3, 5))
     if nq:
         _draw(left, matrix[:, :nq], norm)
     _draw(middle, band, norm)
@@ -74,7 +82,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     for axes in (left, middle, right):
         axes.grid(False)
         axes.spines[:].set_visible(True)
-    bar = figure.colorbar(image, cax=beside)
+    bar = figure.colorbar(image, cax=bar_axes)
     bar.set_label("|entry|, scaled", fontsize=SMALL_PT)
     bar.ax.tick_params(which="both", labelsize=SMALL_PT, width=0.6)
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
@@ -82,7 +90,10 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
 
 
 def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
-    """The first timesteps alone, without nuisance: the whole Jacobian may be gigabytes."""
+    """Return collocation and variables of the first timesteps alone, without nuisance parameters.
+
+    The complete Jacobian may need gigabytes.
+    """
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
     few = [first_samples(segment.experiment, count) for segment in collocation.segments]
     short = replace(collocation, experiments=few, charts={})
@@ -92,7 +103,10 @@ def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array
 
 
 def _draw(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
-    """Draw |entries| on a raster no finer than the picture, the largest of each pixel."""
+    """Draw the magnitudes of a sparse matrix on a raster no finer than the picture.
+
+    Each raster element has the largest magnitude of its entries.
+    """
     rows, columns = matrix.shape  # type: ignore[misc]
     entries = sp.coo_array(matrix)
     raster = np.full((min(RASTER, rows), min(RASTER, columns)), -1.0)
@@ -112,7 +126,19 @@ def _draw(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
 
 
 def _tick_blocks(axes: Axes, side: str, letter: str, times: Sequence[int], size: int) -> None:
-    """Name the blocks along one side and rule lines between them."""
+    """Label the blocks of a matrix along one side, and draw lines between them.
+
+    Parameters
+    ----------
+    axes : Axes
+    side : {"x", "y"}
+    letter : str
+        Symbol of a block.
+    times : sequence of int
+        Index of each block's timestep.
+    size : int
+        Rows or columns of a block.
+    """
     labels = [f"${letter}_{{{t}}}$" for t in times]
     axes.set(**{f"{side}ticks": (np.arange(len(times)) + 0.5) * size, f"{side}ticklabels": labels})
     rule = axes.axvline if side == "x" else axes.axhline

@@ -1,4 +1,6 @@
-"""Markers and wrenches over time: measured, fitted, simulated, and what is left."""
+"""Pictures over time of markers, wrenches and custom sensors: measured, fitted, simulated,
+residual.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,9 @@ from ..style import (
 def models(
     fitted_m: Array | None, rolled_out_m: Array | None
 ) -> list[tuple[str, Array, dict[str, Any]]]:
-    """Label, markers (T, M, 3) and style of the models that are there.
+    """Return label, markers (T, M, 3) and line style of each trajectory that is not None.
 
-    The dashes of the second leave the first visible where they agree.
+    The second line is dashed, so that the first remains visible where they agree.
     """
     named = (
         ("fitted", fitted_m, {"color": BLUE, "lw": LINE_PT}),
@@ -45,8 +47,13 @@ Box = tuple[float, float, float, float]
 
 # More markers make a figure higher than a page, in which it is scaled down to illegible numbers.
 MOST_MARKERS = 3
-ROW_MM, GAP_MM, LEGEND_MM, FOOT_MM = 27.0, 6.5, 12.0, 10.0
-LEFT_MM, RIGHT_MM, BETWEEN_MM = 15.0, 2.0, 10.0
+ROW_MM = 27.0
+GAP_MM = 6.5
+LEGEND_MM = 12.0
+FOOT_MM = 10.0
+LEFT_MM = 15.0
+RIGHT_MM = 2.0
+BETWEEN_MM = 10.0
 UPPER_SHARE = 0.64
 
 
@@ -58,19 +65,22 @@ def tracks(
     rolled_out_m: Array | None = None,
     max_markers: int = MOST_MARKERS,
 ) -> Figure:
-    """Draw coordinates of markers over time, each with model minus measurement below.
+    """Draw the coordinates of markers over time, each with model minus measurement below.
 
-    The errors have one scale, so that they compare.
+    All error axes have the same scale, so that errors can be compared.
 
     Parameters
     ----------
     t_s : (T,)
-    names : M marker names
-    measured_m : (T, M, 3) NaN where missing
+        Times of the samples.
+    names : sequence of M str
+        Names of the markers.
+    measured_m : (T, M, 3)
+        Measured markers, NaN where missing.
     fitted_m, rolled_out_m : (T, M, 3) or None
-        Markers of the fitted trajectory, and of a simulation with the parameters found.
+        Fitted markers, and those of a simulation with the estimated parameters.
     max_markers : int
-        Of more markers those with the largest residuals are shown.
+        Of more markers, those with the largest residuals are shown.
     """
     drawn = models(fitted_m, rolled_out_m)
     shown = _worst_markers(measured_m, [model for _, model, _ in drawn], max_markers)
@@ -82,12 +92,14 @@ def tracks(
     errors = [1e3 * (model - measured_m)[:, shown] for _, model, _ in drawn]
     reach = max((float(np.nanmax(np.abs(e), initial=0.0)) for e in errors), default=0.0) or 1.0
     margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0
-    start, stop = t_s[0] - margin, t_s[-1] + margin
+    start = t_s[0] - margin
+    stop = t_s[-1] + margin
     dots = {"ls": "", "marker": ".", "ms": 3.5, "color": BLACK, "mec": "none", "alpha": 0.7}
     for row, marker in enumerate(shown):
         for axis, letter in enumerate("xyz"):
             upper_box, lower_box = _boxes(row, axis, height, head)
-            upper, lower = figure.add_axes(upper_box), figure.add_axes(lower_box)
+            upper = figure.add_axes(upper_box)
+            lower = figure.add_axes(lower_box)
             measured = 1e3 * measured_m[:, marker, axis]
             dress(upper, f"{names[marker]}, {letter}", "", "" if axis else "[mm]")
             dress(lower, "", "", "" if axis else "error")
@@ -108,14 +120,26 @@ def tracks(
             lower.tick_params(labelbottom=row == len(shown) - 1)
             if row == len(shown) - 1:
                 lower.set_xlabel("time [s]", fontsize=TEXT_PT)
-    place = {"loc": "upper left", "bbox_to_anchor": (0.005, 1 - 1.0 / height), "borderaxespad": 0.0}
-    said = {"title": title, "title_fontsize": TEXT_PT, "alignment": "left"}
-    legend_of_all(figure, 3, markerscale=2, **place, **said)
+    placement = {
+        "loc": "upper left",
+        "bbox_to_anchor": (0.005, 1 - 1.0 / height),
+        "borderaxespad": 0.0,
+    }
+    title_style = {"title": title, "title_fontsize": TEXT_PT, "alignment": "left"}
+    legend_of_all(figure, 3, markerscale=2, **placement, **title_style)
     return figure
 
 
 def _boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
-    """Places of a pair of axes, upper and lower, in shares of the figure."""
+    """Return the positions of an upper and a lower pair of axes, in shares of the figure.
+
+    Parameters
+    ----------
+    row, axis : int
+        Indices of the row (marker) and the column (coordinate).
+    height, head : float
+        Heights of the figure and of the space above the first row [mm].
+    """
     width = _width_mm()
     x = (LEFT_MM + axis * (width + BETWEEN_MM)) / PAGE_MM
     bottom = height - head - row * (ROW_MM + GAP_MM) - ROW_MM
@@ -127,11 +151,16 @@ def _boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
 
 
 def _width_mm() -> float:
+    """Return the width of one of the three columns."""
     return (PAGE_MM - LEFT_MM - RIGHT_MM - 2 * BETWEEN_MM) / 3
 
 
 def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> list[int]:
-    """The markers to show, in their order."""
+    """Return the indices of at most `count` markers with the largest residuals, in their original
+    order.
+
+    Residuals are those of the first model; without a model the first markers are returned.
+    """
     if measured_m.shape[1] <= count or not models_m:
         return list(range(min(count, measured_m.shape[1])))
     squares = np.nan_to_num(np.sum((models_m[0] - measured_m) ** 2, axis=2)).sum(axis=0)
@@ -151,9 +180,11 @@ def error_over_time(
     Parameters
     ----------
     t_s : (T,)
-    measured_m : (T, M, 3) NaN where missing
-        Samples at which every marker is missing leave a gap.
+        Times of the samples.
+    measured_m : (T, M, 3)
+        Measured markers, NaN where missing; samples without any marker leave a gap.
     fitted_m, rolled_out_m : (T, M, 3) or None
+        Fitted and simulated markers.
     """
     figure = framed_figure(COLUMN_MM, 52, 13, 2, 9.5, 9)
     axes = figure.subplots()
@@ -176,7 +207,9 @@ def error_over_time(
 
 
 def rms_over_markers(squares: Array) -> Array:
-    """Return the root mean square distance (T,) by squares (T, M); NaN where none is present."""
+    """Return the root mean square distance (T,) from squared distances (T, M); NaN without any
+    marker.
+    """
     present = np.isfinite(squares)
     total = np.where(present, squares, 0.0).sum(axis=1)
     with np.errstate(invalid="ignore"):
@@ -187,13 +220,16 @@ HEIGHT_MM = 42.0
 
 
 def readings_picture(said: Array, names: Sequence[str], units: Sequence[str] = ()) -> Figure:
-    """Draw the numbers that are measured, three in a row, as force above torque.
+    """Draw the numbers of a sensor over time, three in a row, as the force above the torque of a
+    wrench.
 
     Parameters
     ----------
     said : (S, 1 + 3m)
-        Time [s], and m numbers as measured, fitted and simulated, NaN where there are none.
-    names, units : (m,)
+        Time [s], and m numbers as measured, fitted and simulated; NaN where there are none.
+    names : sequence of m str
+    units : sequence of m str, or empty
+        Units of the numbers; not written if empty.
     """
     t_s, measured, fitted, rolled_out = np.split(
         said, [1, *np.cumsum([len(names)] * 2) + 1], axis=1

@@ -1,4 +1,4 @@
-"""Bodies with grasped nodes and markers on a sheet measured in millimetres of paper."""
+"""Drawing of bodies with grasped nodes and markers on a sheet with millimetres as coordinates."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from ..style import BLACK, BLUE, SMALL_PT, VERMILION, Picture
 from .camera import Camera, Triangles
 
 EDGE = "#5A6B7B"
-# Of the parts of a body in turn.
+# Colours of the parts of a body, repeated for further parts.
 SKINS = ("#B4D0EA", "#F0D3A0", "#B9DDC2", "#E2C3D9", "#D9D9A8", "#C9C3E6")
-# Of more triangles than this one would see nothing but edges.
+# Triangles above which edges are not drawn, because they would hide the faces.
 EDGED = 6000
 _DOT = {"ls": "", "marker": "o", "ms": 3.2, "mec": VERMILION, "mew": 0.7}
 _SEEN = {"ls": "", "marker": ".", "ms": 2.4, "mec": "none", "mfc": BLUE}
-# More points of depth cameras only take longer to draw.
+# Largest number of drawn points of depth cameras; more only take longer to draw.
 MOST_SEEN = 1000
 _SQUARE = {"ls": "", "marker": "s", "ms": 2.2, "mfc": BLACK, "mec": "none"}
 
 
 def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
-    """A figure with one invisible pair of axes in millimetres from the lower left corner."""
+    """Return a figure with one invisible pair of axes [mm], from the lower left corner."""
     figure = Picture(figsize=(width_mm / 25.4, height_mm / 25.4))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0, width_mm), ylim=(0, height_mm))
@@ -42,13 +42,16 @@ def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Where on the sheet, how large, and from where a body is seen.
+    """Parallel projection of a body onto the sheet, with scale and position.
 
     Attributes
     ----------
     camera : Camera
+        Viewing direction.
     mm_per_m : float
-    origin_mm : (2,) where on the sheet the origin of space is
+        Scale: millimetres on the sheet per metre in space.
+    origin_mm : (2,)
+        Position on the sheet of the origin of space.
     """
 
     camera: Camera
@@ -59,54 +62,77 @@ class View:
     def fitting(
         cls, camera: Camera, points_m: Array, room_mm: ArrayLike, corner_mm: ArrayLike
     ) -> View:
-        """Show all `points_m` (…, 3) as large as fits, in the middle of a box on the sheet."""
+        """Return the view that shows all points as large as possible in the middle of a box on the
+        sheet.
+
+        Parameters
+        ----------
+        camera : Camera
+        points_m : (…, 3)
+            Points to show; NaN is ignored.
+        room_mm, corner_mm : (2,)
+            Width and height of the box, and its lower left corner.
+        """
         low, high = _extent(camera, points_m)
-        room, corner = np.asarray(room_mm, dtype=float), np.asarray(corner_mm, dtype=float)
+        room = np.asarray(room_mm, dtype=float)
+        corner = np.asarray(corner_mm, dtype=float)
         scale = float(np.min(room / np.maximum(high - low, 1e-12)))
         return cls(camera, scale, corner + room / 2 - scale * (low + high) / 2)
 
     def shifted(self, by_mm: ArrayLike) -> View:
-        """The same elsewhere on the sheet."""
+        """Return the view moved on the sheet by `by_mm` (2,)."""
         return replace(self, origin_mm=self.origin_mm + np.asarray(by_mm))
 
     def places(self, points_m: ArrayLike) -> Array:
-        """(…, 3) to (…, 2) millimetres on the sheet."""
+        """Return the positions (…, 2) [mm] on the sheet of points (…, 3) [m]."""
         return self.origin_mm + self.mm_per_m * self.camera.project(points_m)
 
 
 def width_over_height(camera: Camera, points_m: Array) -> float:
-    """Aspect of what is to be shown."""
+    """Return the aspect ratio of points (…, 3) as the camera shows them."""
     low, high = _extent(camera, points_m)
     return float((high - low)[0] / (high - low)[1])
 
 
 def _extent(camera: Camera, points_m: Array) -> tuple[Array, Array]:
+    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture."""
     places = camera.project(points_m).reshape(-1, 2)
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
 
 
 def with_outlines(points_m: Array, outlines_m: Array | None) -> Array:
-    """Points (T, n, 3) of a body, and what of outlines (T, o, 3) is no farther than half of it."""
+    """Return points (T, n, 3) of a body joined with outlines (T, o, 3) of obstacles near it.
+
+    Outline points further away than half the body's extent are moved to that distance. Without
+    outlines
+    (None) the points alone are returned.
+    """
     if outlines_m is None:
         return points_m
-    low, high = np.nanmin(points_m, axis=1), np.nanmax(points_m, axis=1)
-    far = (high - low).max(axis=1, keepdims=True) / 2
-    near_m = np.clip(outlines_m, (low - far)[:, None], (high + far)[:, None])
-    return np.concatenate([points_m, near_m], axis=1)
+    low = np.nanmin(points_m, axis=1)
+    high = np.nanmax(points_m, axis=1)
+    margin = (high - low).max(axis=1, keepdims=True) / 2
+    clipped_m = np.clip(outlines_m, (low - margin)[:, None], (high + margin)[:, None])
+    return np.concatenate([points_m, clipped_m], axis=1)
 
 
 class Drawn:
-    """A body with its grasped nodes and markers on a sheet; it can be moved.
+    """Body with its grasped nodes and markers on a sheet, which can be updated for another sample.
 
     Parameters
     ----------
-    axes : Axes of a `sheet`
+    axes : Axes
+        Axes of a `sheet`.
     view : View
     surface : (F, 3)
-    parts : (F,) the part of the body that each triangle belongs to; one part by default
-    nodes : (F, k) the nodes of each triangle, of which grasped ones are marked; by default corners
+        Nodes of the boundary triangles.
+    parts : (F,), optional
+        Index of the part of the body of each triangle, which defines its colour; one part by
+        default.
+    nodes : (F, k), optional
+        Nodes of each triangle, of which grasped ones are marked; the corners by default.
     wire : str, optional
-        Colour of the edges of its triangles, which alone are drawn then, over all else.
+        Colour of the triangles' edges; then only these edges are drawn, above everything else.
     """
 
     def __init__(
@@ -118,10 +144,12 @@ class Drawn:
         nodes: NDArray[np.integer] | None = None,
         wire: str | None = None,
     ) -> None:
-        self.view, self.surface, self.wire = view, surface, wire
+        self.view = view
+        self.surface = surface
+        self.wire = wire
         self.nodes = surface if nodes is None else nodes
-        numbers = np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(SKINS)
-        self.skins = np.array([to_rgb(skin) for skin in SKINS])[numbers]
+        indices = np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(SKINS)
+        self.skins = np.array([to_rgb(skin) for skin in SKINS])[indices]
         self.edged = len(surface) <= EDGED
         self.skin = PolyCollection([], linewidths=0.3 if self.edged else 0.1, edgecolors=EDGE)
         self.skin.set_joinstyle("round")
@@ -144,11 +172,26 @@ class Drawn:
         outlines_m: Array | None = None,
         seen_m: Array | None = None,
     ) -> None:
-        """Show nodes (n, 3), those of them that are grasped, markers (M, 3), and outlines (o, 3).
+        """Update the drawing.
 
-        Markers that the body hides are rings; grasped nodes turned away are left out, and so are
-        points (P, 3) that depth cameras saw, where the body hides them. Triangles
-        have the colours `skins` (F, 3), by default those of their parts.
+        Markers hidden by the body are drawn as rings. Grasped nodes on faces turned away are left
+        out, and so
+        are points of depth cameras that the body hides.
+
+        Parameters
+        ----------
+        positions_m : (n, 3)
+            Positions of the nodes.
+        held : (n,) bool
+            Whether a node is grasped.
+        markers_m : (M, 3)
+            Markers, NaN where missing.
+        skins : (F, 3), optional
+            Colours of the triangles; those of their parts by default.
+        outlines_m : (o, 3), optional
+            Outlines of obstacles, NaN between lines; unchanged by default.
+        seen_m : (P, 3), optional
+            Points of depth cameras; unchanged by default.
         """
         camera = self.view.camera
         polygons, brightness, faces = camera.faces(positions_m, self.surface)
@@ -161,8 +204,8 @@ class Drawn:
         self.skin.set_facecolor(colours)
         if not self.edged:
             self.skin.set_edgecolor(colours)
-        outer = np.unique(self.nodes[faces])
-        self.grasped.set_data(*self.view.places(positions_m[outer[held[outer]]]).T)
+        visible = np.unique(self.nodes[faces])
+        self.grasped.set_data(*self.view.places(positions_m[visible[held[visible]]]).T)
         if outlines_m is not None:
             self.outlines.set_data(*self.view.places(outlines_m).T)
         if seen_m is not None:
@@ -176,7 +219,19 @@ class Drawn:
 
 
 def draw_scale(axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: float = 20.0) -> None:
-    """A bar of a round length, from `corner_mm` to the right, with its length beside it."""
+    """Draw a scale bar of a round length from `corner_mm` to the right, with its length beside it.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes of a `sheet`.
+    mm_per_m : float
+        Scale of the view.
+    corner_mm : (2,)
+        Left end of the bar.
+    longest_mm : float
+        Largest length of the bar on the sheet.
+    """
     x, y = np.asarray(corner_mm, dtype=float)
     length_m = round_length(longest_mm / mm_per_m)
     end = x + length_m * mm_per_m
@@ -185,7 +240,7 @@ def draw_scale(axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: fl
 
 
 def round_length(longest: float) -> float:
-    """Largest of 1, 2, 5 · 10ᵏ not above `longest`."""
+    """Return the largest of 1, 2, 5 · 10ᵏ that is not above `longest`, a positive number."""
     decade = 10.0 ** np.floor(np.log10(longest))
     return float(max(f * decade for f in (1, 2, 5) if f * decade <= longest * (1 + 1e-9)))
 
@@ -193,21 +248,28 @@ def round_length(longest: float) -> float:
 def draw_directions(
     axes: Axes, camera: Camera, origin_mm: ArrayLike, length_mm: float = 5.0
 ) -> None:
-    """Arrows along x, y and z, but for one that points at the viewer or away."""
+    """Draw arrows along x, y and z from `origin_mm` (2,), except an axis that points along the
+    view.
+    """
     start = np.asarray(origin_mm, dtype=float)
-    for letter, along in zip("xyz", camera.project(np.eye(3)), strict=True):
-        size = float(np.linalg.norm(along))
+    for letter, direction in zip("xyz", camera.project(np.eye(3)), strict=True):
+        size = float(np.linalg.norm(direction))
         if size < 0.2:
             continue
-        tip: Any = start + length_mm * along
+        tip: Any = start + length_mm * direction
         arrow = {"arrowstyle": "->,head_length=0.15,head_width=0.1", "lw": 0.7, "shrinkA": 0}
         axes.annotate("", tip, tuple(start), arrowprops={**arrow, "shrinkB": 0})
-        x, y = tip + 1.6 * along / size
+        x, y = tip + 1.6 * direction / size
         axes.text(x, y, letter, ha="center", va="center", fontsize=SMALL_PT)
 
 
 def key(*entries: str) -> list[Line2D]:
-    """Legend handles of "grasped", "markers", "measured", "behind the body", "seen in depth"."""
+    """Return legend handles of the named marks.
+
+    Parameters
+    ----------
+    *entries : {"grasped", "markers", "measured", "behind the body", "seen in depth"}
+    """
     styles = {
         "grasped": {**_SQUARE, "ms": 3.0},
         "behind the body": {**_DOT, "mfc": "none"},
@@ -220,13 +282,13 @@ def key(*entries: str) -> list[Line2D]:
 
 
 def skin_key(part: int, name: str) -> Line2D:
-    """Legend handle of a part of the body."""
+    """Return the legend handle of the part of the body with index `part`."""
     look: Any = {**_SQUARE, "ms": 4.0, "mec": EDGE, "mew": 0.3, "mfc": SKINS[part % len(SKINS)]}
     return Line2D([], [], label=name, **look)
 
 
 def draw_key(axes: Axes, entries: Sequence[Line2D], corner_mm: ArrayLike) -> None:
-    """One line of legend whose upper left corner is at `corner_mm`."""
+    """Draw one line of legend whose upper left corner is at `corner_mm` (2,)."""
     names = [str(entry.get_label()) for entry in entries]
     place: Any = tuple(np.asarray(corner_mm))
     box = Legend(

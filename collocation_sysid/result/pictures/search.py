@@ -1,4 +1,4 @@
-"""How a search went: the scan that it began from, and what the method went through."""
+"""Pictures of the search: the initial scan of the stiffness, and the iterations of the method."""
 
 from __future__ import annotations
 
@@ -39,15 +39,17 @@ def convergence(
     names: Sequence[str] | None = None,
     truth: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Draw marker error, loss, violation of the dynamics and parameters against iteration.
+    """Draw marker error, loss, violation of the dynamics, and parameters against the iteration
+    number.
 
     Parameters
     ----------
     history : sequence of Iteration
-    names : sequence of str
+    names : sequence of str, optional
         Parameters to draw; all by default.
     truth : mapping, optional
-        Parameters are drawn relative to these; by default to their final values.
+        True values by parameter, relative to which parameters are drawn; their final values by
+        default.
     """
     figure = framed_figure(COLUMN_MM, 132, 14, 2, 9.5, 4)
     heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
@@ -78,7 +80,7 @@ def convergence(
 
 
 def _rungs(history: Sequence[Iteration]) -> list[slice]:
-    """Stretches of the history over which the same share of the timesteps was fitted."""
+    """Return the ranges of iterations over which the same share of the timesteps was fitted."""
     shares = [iteration.share for iteration in history]
     starts = [k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]]
     return [slice(a, b) for a, b in pairwise([*starts, len(shares)])] if starts else []
@@ -87,7 +89,15 @@ def _rungs(history: Sequence[Iteration]) -> list[slice]:
 def _mark_rungs(
     panels: Sequence[Axes], history: Sequence[Iteration], rungs: Sequence[slice]
 ) -> None:
-    """Say where the fit takes in more of the recordings: loss and error rise there."""
+    """Mark the iterations at which the fit takes in more timesteps; loss and error increase there.
+
+    Parameters
+    ----------
+    panels : sequence of Axes
+    history : sequence of Iteration
+    rungs : sequence of slice
+        Ranges of `_rungs`; a single range is not marked.
+    """
     if len(rungs) < 2:
         return
     for part in rungs:
@@ -106,11 +116,13 @@ def _draw_parameters(
     names: Sequence[str],
     truth: Mapping[str, float] | None,
 ) -> None:
+    """Draw the parameters over the iterations, relative to `truth` or to their final values."""
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):
         values = np.array([iteration.parameters[name] for iteration in history], dtype=float)
-        symbol, unit = mathematical(name), unit_of(name)
+        symbol = mathematical(name)
+        unit = unit_of(name)
         reference = values[-1] if truth is None else truth[name]
         label = f"{symbol} = {values[-1]:.4g} {unit}"
         style = {"ms": 2.5, "lw": LINE_PT, "color": CYCLE[k % len(CYCLE)]}
@@ -122,7 +134,7 @@ def _draw_parameters(
 
 
 def _positive(values: Sequence[float] | Array) -> Array:
-    """Values with gaps where a logarithmic axis has no place for them."""
+    """Return values with NaN where they are not positive and finite, for a logarithmic axis."""
     array = np.asarray(values, dtype=float)
     return np.where((array > 0) & np.isfinite(array), array, np.nan)
 
@@ -131,14 +143,16 @@ HEIGHT_MM = 52
 
 
 def scan_picture(young_pa: Array, misfit: Array, best: int) -> Figure:
-    """Draw a scan of the stiffness.
+    """Draw the misfit of a scan over Young's modulus.
 
     Parameters
     ----------
-    young_pa : (k,) Young's moduli, ascending
-    misfit : (k,) in standard deviations, NaN where it could not be simulated
+    young_pa : (k,)
+        Young's moduli, ascending.
+    misfit : (k,)
+        Misfit in standard deviations, NaN where the motion could not be simulated.
     best : int
-        Position of the start.
+        Index of the modulus at which the solve starts.
     """
     figure = framed_figure(COLUMN_MM, HEIGHT_MM, 14, 2, 9.5, 6)
     axes = figure.subplots()

@@ -1,4 +1,6 @@
-"""The body's shapes over time with the measured markers, in colours of its parts or of a field."""
+"""Pictures of the body's shapes over time with markers, coloured by parts of the body or by a
+field.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +25,27 @@ from .camera import ELEVATION_DEG, Camera
 from .scene import Drawn, View, draw_directions, draw_key, draw_scale, key, sheet, with_outlines
 
 SHOWN = 6
-HEAD_MM, FOOT_MM, CORNER_MM = 5.0, 5.0, 14.0
-TALLEST_MM, GAP_MM = 60.0, 4.0
-BAR_MM, BAR_ROOM_MM = 2.5, 20.0
+HEAD_MM = 5.0
+FOOT_MM = 5.0
+CORNER_MM = 14.0
+TALLEST_MM = 60.0
+GAP_MM = 4.0
+BAR_MM = 2.5
+BAR_ROOM_MM = 20.0
 # From pale to dark, on which markers and grasped nodes stand out; its darkest fifth is left out.
 COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).with_extremes(bad="0.85")
 
 
 @dataclass(frozen=True, eq=False)
 class Coloured:
-    """What colours a body.
+    """Field that colours the surface of a body.
 
     Attributes
     ----------
-    title : str, with its unit
+    title : str
+        Name with unit.
     at : callable
-        Its values (k, F) on the triangles of the surface at samples (k,).
+        Returns the values (k, F) on the boundary triangles at samples with indices (k,).
     """
 
     title: str
@@ -48,35 +55,53 @@ class Coloured:
 def shapes(
     seen: Replay, count: int = SHOWN, field: Coloured | None = None, camera: Camera | None = None
 ) -> Figure:
-    """Draw `count` of the body's shapes at evenly spaced samples, side by side in one scale.
+    """Draw the body at evenly spaced samples, side by side in one scale.
 
-    Heights are true; sideways the shapes are moved together. Samples of a simulation that went
-    astray, which are not finite, are left out. A field colours the body instead of its parts.
+    Heights are true; horizontally the shapes are moved together. Samples that are not finite, as in
+    a
+    simulation that diverged, are left out.
+
+    Parameters
+    ----------
+    seen : Replay
+        An experiment with at least one trajectory.
+    count : int
+        Number of samples.
+    field : Coloured, optional
+        Colours of the body; those of its parts by default.
+    camera : Camera, optional
+        Viewing direction; onto the plane of motion by default.
     """
-    t_s, positions_m, measured_m = seen.t_s, seen.shapes_m, seen.measured_m
+    t_s = seen.t_s
+    positions_m = seen.shapes_m
+    measured_m = seen.measured_m
     assert positions_m is not None  # it was chosen among those that have some
-    there = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
-    shown = there[np.unique(np.linspace(0, len(there) - 1, count).astype(int))]
-    outer = positions_m[:, np.unique(seen.surface)]
-    camera = camera or Camera.facing(outer[there], seen.up)
+    finite = np.flatnonzero(np.isfinite(positions_m).all(axis=(1, 2)))
+    shown = finite[np.unique(np.linspace(0, len(finite) - 1, count).astype(int))]
+    surface_m = positions_m[:, np.unique(seen.surface)]
+    camera = camera or Camera.facing(surface_m[finite], seen.up)
     outlines_m = None if seen.obstacles_m is None else seen.obstacles_m[shown]
-    beside = with_outlines(np.concatenate([outer[shown], measured_m[shown]], axis=1), outlines_m)
-    places = camera.project(beside)
-    left, right = np.nanmin(places[..., 0], axis=1), np.nanmax(places[..., 0], axis=1)
-    low, high = float(np.nanmin(places[..., 1])), float(np.nanmax(places[..., 1]))
+    extents_m = with_outlines(
+        np.concatenate([surface_m[shown], measured_m[shown]], axis=1), outlines_m
+    )
+    places = camera.project(extents_m)
+    lefts = np.nanmin(places[..., 0], axis=1)
+    rights = np.nanmax(places[..., 0], axis=1)
+    low = float(np.nanmin(places[..., 1]))
+    high = float(np.nanmax(places[..., 1]))
     width = PAGE_MM - CORNER_MM - (BAR_ROOM_MM if field else 0.0)
     room = width - len(shown) * GAP_MM
-    scale = min(room / float((right - left).sum()), TALLEST_MM / (high - low))
-    gap = GAP_MM + (room - scale * float((right - left).sum())) / len(shown)
+    scale = min(room / float((rights - lefts).sum()), TALLEST_MM / (high - low))
+    gap = GAP_MM + (room - scale * float((rights - lefts).sum())) / len(shown)
     total = HEAD_MM + scale * (high - low) + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
-    skins = [None] * len(shown) if field is None else _coloured(axes, field, shown)
+    colours = [None] * len(shown) if field is None else _coloured(axes, field, shown)
     start = CORNER_MM + (gap - GAP_MM) / 2
-    for t, first, last, skin in zip(shown, left, right, skins, strict=True):
+    for t, first, last, colour in zip(shown, lefts, rights, colours, strict=True):
         view = View(camera, scale, np.array([start - scale * first, FOOT_MM - scale * low]))
         body = Drawn(axes, view, seen.surface, seen.surface_parts, seen.surface_nodes)
-        around = None if seen.obstacles_m is None else seen.obstacles_m[t]
-        body.show(positions_m[t], seen.held[t], measured_m[t], skin, around)
+        obstacles_m = None if seen.obstacles_m is None else seen.obstacles_m[t]
+        body.show(positions_m[t], seen.held[t], measured_m[t], colour, obstacles_m)
         text = {"ha": "center", "va": "center", "fontsize": SMALL_PT}
         middle = start + scale * (last - first) / 2
         axes.text(middle, FOOT_MM / 2, f"{t_s[t] - t_s[0]:.3g} s", **text)
@@ -89,14 +114,17 @@ def shapes(
 
 
 def _coloured(axes: Axes, field: Coloured, samples: Index) -> Array:
-    """Colours (k, F, 3) of the triangles at samples (k,), with their bar on the sheet."""
+    """Draw the colour bar of a field, and return the colours (k, F, 3) at samples with indices
+    (k,).
+    """
     values = field.at(samples)
-    low, high = np.nanmin(values), np.nanmax(values)
+    low = np.nanmin(values)
+    high = np.nanmax(values)
     scale = ScalarMappable(Normalize(0.0 if 0 <= low < high / 5 else low, high), COLOURS)
     height = axes.get_ylim()[1]
     place = (PAGE_MM - BAR_ROOM_MM + 2, FOOT_MM, BAR_MM, height - HEAD_MM - FOOT_MM)
-    beside = axes.inset_axes(place, transform=axes.transData)
-    bar = axes.figure.colorbar(scale, cax=beside, ticks=MaxNLocator(4))
+    bar_axes = axes.inset_axes(place, transform=axes.transData)
+    bar = axes.figure.colorbar(scale, cax=bar_axes, ticks=MaxNLocator(4))
     bar.outline.set_linewidth(0.4)
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=1.5)
     end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}
@@ -105,8 +133,15 @@ def _coloured(axes: Axes, field: Coloured, samples: Index) -> Array:
 
 
 def contact_shapes(seen: Replay) -> dict[str, Figure]:
-    """The same coloured by pressure and by gap, from where most of the pressure is seen."""
-    positions_m, gaps_m, pressures_pa = seen.shapes_m, seen.gaps_m, seen.pressures_pa
+    """Return the pictures of `shapes` coloured by contact pressure and by gap, as "pressure" and
+    "gap".
+
+    The viewing direction is the one from which most of the pressure is visible. Empty without
+    obstacles.
+    """
+    positions_m = seen.shapes_m
+    gaps_m = seen.gaps_m
+    pressures_pa = seen.pressures_pa
     if positions_m is None or gaps_m is None or pressures_pa is None:
         return {}
     camera = _towards(seen, positions_m, pressures_pa)
@@ -118,7 +153,17 @@ def contact_shapes(seen: Replay) -> dict[str, Figure]:
 
 
 def _towards(seen: Replay, positions_m: Array, weights: Array) -> Camera:
-    """Of views from above and below, from the front and behind, that of most weights (T, F)."""
+    """Return the camera, of four directions around the body, from which most of the weights are
+    visible.
+
+    Parameters
+    ----------
+    seen : Replay
+    positions_m : (T, n, 3)
+        Positions of the nodes.
+    weights : (T, F)
+        Weights of the boundary triangles, such as the pressure.
+    """
     there = np.isfinite(positions_m).all(axis=(1, 2))
     front = Camera.facing(positions_m[there][:, np.unique(seen.surface)], seen.up)
     low = front.raised(-2 * ELEVATION_DEG)
@@ -141,14 +186,23 @@ MOST_SHAPES = 20
 def portrait(
     replay: Replay, body: Body, constants: Mapping[str, float], field: str | None, count: int
 ) -> Figure:
-    """Draw `count` of the replay's shapes, coloured by a field of its elements; see `FIELDS`.
+    """Draw `count` shapes of an experiment, coloured by a field of its elements.
 
-    Without a field the parts of the body have colours of their own.
+    Parameters
+    ----------
+    replay : Replay
+    body : Body
+    constants : mapping of name to value
+        Constants of the body, for stresses and energies.
+    field : str or None
+        One of `FIELDS`; None for the colours of the body's parts.
+    count : int
+        Number of shapes, at most `MOST_SHAPES`.
 
     Raises
     ------
     InputError
-        For an unknown field, or for no shapes or too many.
+        For an unknown field, or a number of shapes out of range.
     """
     if not 1 <= count <= MOST_SHAPES:
         raise InputError(f"count is {count}; expected 1 to {MOST_SHAPES} shapes")
@@ -160,7 +214,9 @@ def portrait(
 
 
 def _on_surface(seen: Replay, body: Body, constants: Mapping[str, float], field: str) -> Coloured:
-    elements, cells = ElementFields.of(body, body.theta(constants)), body.mesh.surface_cells
+    """Return a field of the elements, see `FIELDS`, as values on the boundary triangles."""
+    elements = ElementFields.of(body, body.theta(constants))
+    cells = body.mesh.surface_cells
 
     def at(samples: Index) -> Array:
         assert seen.shapes_m is not None

@@ -1,4 +1,4 @@
-"""How strongly the markers move at which frequency, beside the body's natural frequencies."""
+"""Frequency spectrum of the markers' motion with the body's natural frequencies."""
 
 from __future__ import annotations
 
@@ -21,24 +21,28 @@ from ..style import (
     log_axis,
 )
 
-# Zeros appended make the curve smooth; they resolve nothing.
+# Length of the zero-padded signal over its own: smoother curve, same resolution.
 PADDING = 4
-# Markers seen less than this are left out: gaps are bridged by straight lines.
+# Smallest share of samples with a marker: gaps are interpolated linearly.
 SEEN = 0.5
-# What lies this far below the largest density is rounding.
+# Decades below the largest density that are shown; smaller densities are rounding errors.
 DECADES = 8
 
 
 def spectrum(
     t_s: Array, measured_m: Array, fitted_m: Array | None, natural_hz: Array | None
 ) -> Figure:
-    """Draw the spectral density of the measured tracks, of the residual, and the modes.
+    """Draw the spectral density of the measured tracks and of the residual, with the natural
+    frequencies.
 
     Parameters
     ----------
-    t_s : (T,) evenly spaced
-    measured_m : (T, M, 3) NaN where missing
+    t_s : (T,)
+        Evenly spaced times.
+    measured_m : (T, M, 3)
+        Measured markers, NaN where missing.
     fitted_m : (T, M, 3) or None
+        Fitted markers.
     natural_hz : (k,) or None
         Natural frequencies; those above half the sampling rate are left out.
     """
@@ -61,35 +65,45 @@ def spectrum(
 
 
 def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
-    """Frequencies, and the power spectral density [mm²/Hz] of the motion of a mean marker.
+    """Return frequencies [Hz] and the power spectral density [mm²/Hz] of the markers' mean motion.
 
-    Straight trends are taken off, and Hann's window applied; the densities of x, y and z add up.
-    Gaps are bridged linearly, and markers seen less than half of the time left out.
+    Linear trends are removed and a Hann window is applied; the densities of x, y and z are added,
+    those of
+    markers averaged. Gaps are interpolated linearly, and markers present in less than the share
+    `SEEN` of
+    the samples are left out.
 
     Parameters
     ----------
-    tracks_m : (T, M, 3) NaN where missing
+    tracks_m : (T, M, 3)
+        Positions, NaN where missing.
     rate_hz : float
+        Sampling rate.
+
+    Returns
+    -------
+    hertz, density : (k,)
+        The density is NaN where it is zero, or if no marker is present often enough.
     """
     present = np.asarray(np.isfinite(tracks_m).all(axis=2))
-    kept = np.flatnonzero(present.mean(axis=0) >= SEEN)
+    markers = np.flatnonzero(present.mean(axis=0) >= SEEN)
     padded = PADDING * len(tracks_m)
-    if not len(kept):
+    if not len(markers):
         hertz = np.arange(padded // 2 + 1) * rate_hz / padded
         return hertz[1:], np.full(len(hertz) - 1, np.nan)
     t = np.arange(len(tracks_m))
-    filled = np.zeros((len(t), len(kept), 3))
-    for place, marker in enumerate(kept):
-        seen = present[:, marker]
+    filled = np.zeros((len(t), len(markers), 3))
+    for place, marker in enumerate(markers):
+        is_present = present[:, marker]
         for axis in range(3):
-            filled[:, place, axis] = np.interp(t, t[seen], tracks_m[seen, marker, axis])
+            filled[:, place, axis] = np.interp(t, t[is_present], tracks_m[is_present, marker, axis])
     hertz, density = periodogram(1e3 * filled, rate_hz, "hann", padded, detrend="linear", axis=0)
     mean = density.sum(axis=2).mean(axis=1)
     return hertz[1:], np.where(mean[1:] > 0, mean[1:], np.nan)
 
 
 def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
-    """Lines at the natural frequencies, numbered at their upper ends."""
+    """Draw lines at the natural frequencies below `limit_hz`, numbered from 1 at the top."""
     shown = natural_hz[natural_hz < limit_hz]
     for group in _together(shown, 0.05 * limit_hz):
         for hertz in shown[group]:
@@ -105,6 +119,8 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
 
 
 def _together(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
-    """Groups of neighbours nearer to each other than `gap`."""
+    """Return groups of indices of ascending values whose neighbours are nearer to each other than
+    `gap`.
+    """
     breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
     return [group for group in np.split(np.arange(len(ascending)), breaks) if len(group)]

@@ -1,6 +1,8 @@
-"""Look at a problem before solving it: what it holds, what it will cost, and what will go wrong.
+"""Check of a problem before it is solved: contents, cost, and likely mistakes.
 
-Every warning is one sentence that ends with the remedy.
+`check_problem` does everything, `glance` what takes no simulation. The modules contribute `body`
+(meshes and grasps), `measurements`, `motion` (natural modes and the time grid), `cost` and
+`derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
 from __future__ import annotations
@@ -52,11 +54,11 @@ __all__ = [
 ]
 
 
-# A simulation of the whole recordings that takes longer than this is left out unless asked for.
+# Longest computation, a simulation of the whole recordings for one, that needs no request [s].
 PATIENCE_S = 10.0
-# A fit of the first samples to the markers takes about as long as so many simulations of them.
+# Time of a fit of the first samples to the markers, in simulations of these samples.
 FIT_SIMULATIONS = 15.0
-# Agreement with fourth-order central differences that rounding allows.
+# Largest relative deviation from fourth-order central differences that rounding explains.
 AGREEMENT = 1e-6
 GUESSED = ", at the guess"
 CHOSEN = (
@@ -67,7 +69,7 @@ CHOSEN = (
 
 @dataclass(frozen=True, kw_only=True)
 class Glance:
-    """What `check` sees without a simulation.
+    """Findings of `check` without a simulation.
 
     Attributes
     ----------
@@ -83,34 +85,39 @@ class Glance:
 
 @dataclass(frozen=True, kw_only=True)
 class Findings(Glance):
-    """What `check` reports.
+    """All findings of `check`.
 
     Attributes
     ----------
+    experiments, timesteps : int
+        Numbers of experiments, and of time steps of all fitted experiments.
     samples, missing : int
-        Marker samples that are there and that are not, of all experiments.
+        Marker samples that are present and that are missing, of all experiments.
     largest_marker_distance_m : float
+        Largest distance of a marker from the body.
     rms_at_guess_m : float or None
-        Distance of the markers from their measurements in the simulation at the guess; None where
-        that is left out.
+        RMS distance of the markers in the simulation at the guess; None if only the first samples
+        were simulated.
     motions : tuple of Motion, one for each fitted experiment that moves
     variables, constraints : int
-        Of the program, without memory and wrenches.
+        Size of the program without lifted variables.
     overstresses, wrenches : int
-        As many of either are there beside them, of bodies with memory and of sensors, for interior
-        point and others that see the whole program.
+        Numbers of lifted variables: overstresses of bodies with memory, and wrenches of sensors,
+        for interior point and other methods that need the whole program.
     jacobian_nonzeros, hessian_nonzeros : int
-        With these.
+        With lifted variables.
     method : str
-        The chosen one; `memory_mb` is what it takes, if it is among the `costs`.
-    costs : tuple of Cost, one for each method of which they are known
+        The chosen method.
+    memory_mb : float or None
+        Its memory; None if it is not among the `costs`.
+    costs : tuple of Cost, one for each method with a known cost
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
     causes : tuple of Hypothesis
-        What is likely described wrongly; their sentences are the first warnings.
+        Likely errors in the description; their sentences are the first warnings.
     notes : tuple of str
     concerns : tuple of Concern
-        What will go wrong, with the remedy; `warnings` are their sentences.
+        Expected problems, with the remedy; `warnings` are their sentences.
     """
 
     TOLD: ClassVar = ("warnings",)
@@ -139,7 +146,7 @@ class Findings(Glance):
 
     @property
     def chosen_cost(self) -> Cost | None:
-        """That of the chosen method."""
+        """Cost of the chosen method; None if it is not known."""
         return next((cost for cost in self.costs if cost.method == self.method), None)
 
     @property
@@ -149,22 +156,32 @@ class Findings(Glance):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What will go wrong, a sentence each that ends with the remedy."""
+        """Sentences of the concerns; each ends with the remedy."""
         return tuple(concern.sentence for concern in self.concerns)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON and tables."""
+        """Return the findings as plain values for JSON and tables."""
         return content(replace(self, causes=())) | {"causes": [c.as_dict() for c in self.causes]}
 
 
 def glance(problem: Problem) -> Glance:
-    """What is seen at once: bodies, recordings and grasps; missing guesses are usual ones."""
+    """Return what needs no simulation: bodies, recordings and grasps.
+
+    Parameters without a guess get usual values.
+    """
     usual = usual_parameters(problem.parameters, SOFT_PA)
     return Glance(**_seen(replace(problem, parameters=usual), {}))
 
 
 def _seen(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
-    """Fields of `Glance`, with the motions (T, n, 3) of experiments at the guess where known."""
+    """Return the fields of `Glance`.
+
+    Parameters
+    ----------
+    problem : Problem
+    positions_m : mapping of experiment name to (T, n, 3)
+        Simulations at the guess, for those that have one.
+    """
     bodies = _bodies(problem)
     edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
     experiments = problem.experiments
@@ -178,7 +195,7 @@ def _seen(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
 def check_problem(
     problem: Problem, say: Callable[[str], None] | None = None, full: bool = False
 ) -> Findings:
-    """Validate a loaded problem further and measure it.
+    """Check a problem: simulate it at the guess, compare derivatives, and look for likely mistakes.
 
     Where parameters have no guess, a scan finds where a solve would start.
 
@@ -186,10 +203,10 @@ def check_problem(
     ----------
     problem : Problem
     say : callable, optional
-        Called with what is being done now, a text.
+        Called with progress messages.
     full : bool
         Whether the whole recordings are simulated at the guess however long that takes; by default
-        their first samples where it is more than some ten seconds.
+        only their first samples if it would take more than some ten seconds.
 
     Raises
     ------
@@ -197,24 +214,28 @@ def check_problem(
         Where no start is found.
     """
     say = say or (lambda _: None)
-    collocation, notes = problem.collocation(), []
+    collocation = problem.collocation()
+    notes = []
     if problem.parameters.unguessed:
         say("looking for a start, as there is no guess")
         collocation, scan = started(collocation)
         problem = replace(problem, parameters=collocation.parameters)
         notes = [scan.sentence] if scan else []
     say("simulating the first samples at the guess")
-    began, first = time.perf_counter(), shortened(problem).collocation()
+    started_s = time.perf_counter()
+    first = shortened(problem).collocation()
     first_z, start_notes = initial_variables(first)
-    whole_s = (time.perf_counter() - began) * _rows(collocation) / _rows(first)
+    whole_s = (time.perf_counter() - started_s) * _rows(collocation) / _rows(first)
     say("comparing derivatives with differences")
     jacobian_error, hessian_error = derivative_errors(first, first_z)
     say("estimating what methods take")
     program = _program(problem, collocation, first, first_z)
-    simulated, z = first, first_z
+    simulated = first
+    z = first_z
     if full or whole_s <= PATIENCE_S:
         say(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
-        simulated, (z, start_notes) = collocation, initial_variables(collocation)
+        simulated = collocation
+        (z, start_notes) = initial_variables(collocation)
     say("looking at modes and at the description")
     causes = description_causes(problem)
     fit_s = FIT_SIMULATIONS * whole_s * min(1.0, CHECKED_SAMPLES / _rows(collocation))
@@ -254,15 +275,18 @@ def check_problem(
 
 
 def _measured(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
-    """Bodies, recordings and grasps; the program may be of the first samples."""
+    """Return the fields of `Glance` and the totals of `Findings` for simulations at the guess.
+
+    The collocation may be that of the first samples.
+    """
     positions_m = {}
     for part in collocation.parts(z):
         at_samples = part.x[part.segment.markers.grid_rows]
         positions_m[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
-    seen = _seen(problem, positions_m)
-    recordings = seen["recordings"]
+    shared_fields = _seen(problem, positions_m)
+    recordings = shared_fields["recordings"]
     distances_m = [r.farthest.distance_m for r in recordings if r.markers]
-    return seen | {
+    return shared_fields | {
         "experiments": len(recordings),
         "samples": sum(recording.samples for recording in recordings),
         "missing": sum(recording.missing for recording in recordings),
@@ -271,15 +295,27 @@ def _measured(problem: Problem, collocation: Collocation, z: Array) -> dict[str,
 
 
 def _rows(collocation: Collocation) -> int:
+    """Return the number of time steps of all segments."""
     return sum(segment.grid_rows for segment in collocation.segments)
 
 
 def _program(
     problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
 ) -> dict[str, Any]:
-    """How large the program is, and what methods take for it: fields of `Findings`."""
-    whole = collocation.made_explicit()
-    jacobian, hessian = nonzeros(problem, whole)
+    """Return size of the program and cost of the methods, as fields of `Findings`.
+
+    Parameters
+    ----------
+    problem : Problem
+    collocation : Collocation
+        Of the whole recordings.
+    first : Collocation
+        Of their first samples.
+    first_z : (variables,) array
+        Variables of `first` at the guess.
+    """
+    lifted = collocation.made_explicit()
+    jacobian, hessian = nonzeros(problem, lifted)
     # Reduced space as the file has it, whichever method is chosen.
     named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
     reduced = next(each for each in named if isinstance(each, ReducedSpace))
@@ -289,8 +325,8 @@ def _program(
     return {
         "variables": collocation.variables,
         "constraints": collocation.constraints,
-        "overstresses": whole.added("memory"),
-        "wrenches": whole.added("wrench"),
+        "overstresses": lifted.added("memory"),
+        "wrenches": lifted.added("wrench"),
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,
@@ -300,7 +336,9 @@ def _program(
 
 
 def _motions(problem: Problem, collocation: Collocation) -> tuple[Motion, ...]:
-    scheme, guesses = as_scheme(collocation.scheme), problem.parameters.guesses
+    """Return the natural modes at the guess of all fitted experiments that move."""
+    scheme = as_scheme(collocation.scheme)
+    guesses = problem.parameters.guesses
     return tuple(
         motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
         for s in collocation.segments
@@ -311,9 +349,11 @@ def _motions(problem: Problem, collocation: Collocation) -> tuple[Motion, ...]:
 def _concerns(
     problem: Problem, findings: Findings, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
-    """What will go wrong, the likeliest mistakes first."""
-    experiments, parameters = problem.experiments, problem.parameters
-    bodies, chosen = findings.bodies, findings.chosen_cost
+    """Return the expected problems, the likeliest mistakes first."""
+    experiments = problem.experiments
+    parameters = problem.parameters
+    bodies = findings.bodies
+    chosen = findings.chosen_cost
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
         *(cause.concern() for cause in findings.causes),
@@ -330,13 +370,17 @@ def _concerns(
 
 
 def _contacts(simulated: Collocation, z: Array, whole: bool) -> list[Concern]:
-    """What is touched at the guess; of first samples only whether it is already."""
-    found = contact_concerns(touched(simulated.parts(z)), GUESSED)
-    return [each for each in found if whole or each.code == "contact/pressed"]
+    """Return concerns about contact at the guess.
+
+    `whole` is false if only the first samples were simulated: then only about penetration at the
+    start.
+    """
+    concerns = contact_concerns(touched(simulated.parts(z)), GUESSED)
+    return [each for each in concerns if whole or each.code == "contact/pressed"]
 
 
 def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
-    """Each body, with the names of the experiments that it is in."""
+    """Return the finding of each body, with the names of its experiments."""
     guesses = problem.parameters.guesses
     names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
     pairs = zip(problem.bodies, names, strict=True)
@@ -344,16 +388,18 @@ def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
 
 
 def _of_body(body: BodyFinding, alone: bool) -> tuple[Concern, ...]:
-    """Those of a body, with the names of its experiments where it is not alone."""
+    """Return the concerns of a body, with the names of its experiments unless it is the only
+    body.
+    """
     of = f"in the body of {', '.join(map(repr, body.experiments))}"
     named = (replace(each, data={"of": of, **each.data}) for each in body.concerns)
     return body.concerns if alone else tuple(named)
 
 
 def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:
-    """What is likely wrong with a problem's description; mostly nothing.
+    """Return likely errors in the description of a problem; mostly none.
 
-    Odd sizes and densities come first, as the rest may follow from them; then the likeliest.
+    Odd sizes and densities come first, as others may follow from them; then the likeliest.
 
     Raises
     ------

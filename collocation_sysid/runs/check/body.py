@@ -1,4 +1,4 @@
-"""A body as it will be simulated: size, mesh, what its elements do to the answer, its grasps."""
+"""Check of a body: size, mesh, suitability of its elements, and grasps."""
 
 from __future__ import annotations
 
@@ -24,25 +24,30 @@ FLAT = 0.1
 # Too stiff from this Poisson's ratio on: linear tetrahedra cannot keep their volume and bend;
 # with quadratic ones a beam's stiffness is found 6 % too low at 0.45, and 12 % at 0.49.
 LOCKING_POISSON = {"tet4": 0.4, "tet10": 0.45}
-# 0.45 by way of E, λ and μ may be a little less.
-ROUND_OFF = 1e-9
-# A body this many times as long as thick bends. Linear elements need this many across it, and where
-# the dilatation is averaged one across sags by half too much, two by 4 to 8 %.
-SLENDER, CELLS_ACROSS = 2.5, {"tet4": 4.0, "tet10-p0": 2.0}
+# Rounding of Poisson's ratio, which is converted to λ and μ and back, and of the elements across.
+ROUNDING = 1e-6
+# Ratio of length to thickness above which a body bends like a beam.
+SLENDER = 2.5
+# Elements needed across the thickness of a bending body: with averaged dilatation one element
+# sags by half too much, two by 4 to 8 %.
+CELLS_ACROSS = {"tet4": 4.0, "tet10-p0": 2.0}
+# Name of the linear element.
 LINEAR = "tet4"
-FOR_BENDING, FOR_VOLUME = 'set object.element = "tet10"', 'set object.element = "tet10-p0"'
+# Remedies in messages.
+FOR_BENDING = 'set object.element = "tet10"'
+FOR_VOLUME = 'set object.element = "tet10-p0"'
 
 _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
 @dataclass(frozen=True)
 class ElementShape:
-    """How far an element is from the regular tetrahedron.
+    """Shape of an element, compared with the regular tetrahedron.
 
     Attributes
     ----------
     element : int
-        Its number, counted from 0.
+        Its index.
     quality : float
         Mean ratio: 1 for the regular tetrahedron, towards 0 the flatter it is.
     aspect_ratio : float
@@ -58,7 +63,7 @@ class ElementShape:
 
 @dataclass(frozen=True)
 class Slenderness:
-    """How slender a body is, and how many elements share its thickness.
+    """Slenderness of a body, and number of elements across its thickness.
 
     Attributes
     ----------
@@ -73,7 +78,7 @@ class Slenderness:
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """The elements of lowest quality, worst first."""
+    """Return the `count` elements of lowest quality, worst first."""
     corners = mesh.points_m[mesh.tetrahedra]
     areas = [_areas(corners[:, face]) for face in _FACES]
     heights = 3 * mesh.volumes_m3 / np.max(areas, axis=0)
@@ -86,7 +91,7 @@ def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
 
 
 def slenderness(mesh: TetMesh) -> Slenderness:
-    """Length and thickness of a body, and elements across."""
+    """Return length and thickness of a body, and the number of elements across its thickness."""
     # Edges of the box with the same second moments, however it is turned.
     edges = np.sqrt(12 * np.linalg.eigvalsh(_covariance(mesh)))
     # A bent or hollow body is thinner than its extents: six times volume over surface is a cube's
@@ -100,8 +105,19 @@ def slenderness(mesh: TetMesh) -> Slenderness:
 def element_concerns(
     body: Body, theta: Array, shape: Slenderness, worst: ElementShape
 ) -> list[Concern]:
-    """What the elements will do to the answer."""
-    name, needed = body.element.name, CELLS_ACROSS.get(body.element.name, 0.0)
+    """Return concerns about flat elements, locking, and too few elements across the thickness.
+
+    Parameters
+    ----------
+    body : Body
+    theta : array
+        Constants θ at the guess.
+    shape : Slenderness
+    worst : ElementShape
+        Element of the lowest quality.
+    """
+    name = body.element.name
+    needed = CELLS_ACROSS.get(body.element.name, 0.0)
     poisson = max(engineering(*lame)[1] for lame in body.lame(theta).values())
     limit = LOCKING_POISSON.get(name, np.inf)
     slender = shape.length_m > SLENDER * shape.thickness_m
@@ -116,7 +132,7 @@ def element_concerns(
             aspect_ratio=worst.aspect_ratio,
         ),
         *concerned(
-            poisson >= limit - ROUND_OFF,
+            poisson >= limit - ROUNDING,
             False,
             "mesh/locks",
             poisson=poisson,
@@ -125,7 +141,7 @@ def element_concerns(
             remedy=FOR_VOLUME,
         ),
         *concerned(
-            slender and shape.cells_across < needed - ROUND_OFF,
+            slender and shape.cells_across < needed - ROUNDING,
             False,
             "mesh/few",
             cells=shape.cells_across,
@@ -151,7 +167,7 @@ def _covariance(mesh: TetMesh) -> Array:
 
 
 def _areas(triangles: Array) -> Array:
-    """Areas of triangles (k, 3, 3)."""
+    """Return the areas (k,) of triangles (k, 3, 3)."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.linalg.norm(normals, axis=1) / 2
 
@@ -162,21 +178,24 @@ FEW_SHAPES = 0.5
 
 @dataclass(frozen=True)
 class BodyFinding:
-    """One body.
+    """Size, mesh and guess of a body.
 
     Attributes
     ----------
-    experiments : tuple of the names of those that it is in
+    experiments : tuple of str
+        Names of its experiments.
     element : str
-    size_m : extents along the axes
+    size_m : (x, y, z) extents along the axes
     edges_m : shortest, mean and longest edge
     worst_elements : tuple of ElementShape, worst first
     cells_across : float
-        Elements that share the body's thickness.
-    guess : mapping of the constants, and of E and ν at small strain, to their values at the guess
+        Number of elements across the body's thickness.
+    guess : mapping of name to float
+        Values of the constants, and of E and ν at small strain, at the guess.
     concerns : tuple of Concern
-        What the elements will do to the answer; `warnings` are their sentences.
-    fields : by the name of its constant, what differs from place to place
+        Concerns about the elements; `warnings` are their sentences.
+    fields : mapping of the name of a constant to FieldShapes
+        Constants that vary in space.
     rest_shape : str or None
         "stress_free" or "under_gravity" where that is stated or follows from how the mesh was made.
     rest_shape_change_m : float
@@ -206,20 +225,31 @@ class BodyFinding:
 
     @property
     def diagonal_m(self) -> float:
-        """Length of the diagonal of its bounding box."""
+        """Length of the diagonal of the body's bounding box [m]."""
         return float(np.linalg.norm(self.size_m))
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence each."""
+        """Sentences of the concerns about this body."""
         return tuple(concern.sentence for concern in self.concerns)
 
 
 def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyFinding:
-    """Measure a body, with the constants θ at the guess."""
+    """Return size, mesh and guess of a body.
+
+    Parameters
+    ----------
+    body : Body
+    theta : array
+        Constants θ at the guess.
+    experiments : tuple of str
+        Names of its experiments.
+    """
     mesh = body.mesh
     fields = {part.field_name: part.field.told for part in body.parts if part.field}
-    quality, worst, shape = mesh.quality(), worst_elements(mesh), slenderness(mesh)
+    quality = mesh.quality()
+    worst = worst_elements(mesh)
+    shape = slenderness(mesh)
     x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
     return BodyFinding(
         experiments,
@@ -243,7 +273,7 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
 
 
 def _rest_shape(body: Body) -> str | None:
-    """Return the name of what is stated of the stress-free shape, None where nothing is."""
+    """Return the kind of the stated rest shape; None if none is stated."""
     if body.rest_shape is None:
         return None
     return "stress_free" if body.scan is None else "under_gravity"
@@ -260,13 +290,14 @@ def _rest_shape_change_m(body: Body, theta: Array) -> float:
 
 
 def _field_concerns(fields: Mapping[str, FieldShapes]) -> Iterator[Concern]:
-    """Too few shapes for how fast a field may change."""
+    """Yield a concern for each field with too few shapes for its correlation length."""
     for name, field in fields.items():
         if field.share < FEW_SHAPES:
             yield Concern("field/shapes", data={"name": name, **vars(field)})
 
 
 def _guess(body: Body, theta: Array) -> dict[str, float]:
+    """Return constants, and E and ν at small strain, by name."""
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering(*lame)
@@ -275,10 +306,12 @@ def _guess(body: Body, theta: Array) -> dict[str, float]:
     return moduli | {name: value for name, value in constants if not is_mode(name)}
 
 
-# Of the mean edge: nodes this near the held ones' box belong to it or not by chance.
+# Distance from the box of the held nodes, in mean edges, below which it is by chance whether a node
+# is held.
 NEAR = 0.1
+# Distance from that box, in mean edges, that is rounding.
 ROUND_OFF = 1e-6
-# Neighbours of the held nodes are no farther from their box than so many edges.
+# Largest distance from that box, in mean edges, of the neighbours of the held nodes.
 NEIGHBOURING = 1.5
 
 
@@ -290,16 +323,17 @@ class Hold:
     ----------
     experiment : str
     nodes : int
+        Number of nodes.
     low_m, high_m : (3,) corners of the box around them, on the undeformed body
     share : float
-        Of all nodes.
+        Share of all nodes.
     nearly_held : int
-        Free nodes beside it that are less than a tenth of an edge beyond one of its faces.
+        Number of free nodes beside the box, less than a tenth of an edge beyond one of its faces.
     nearly_free : int
-        Held nodes less than a tenth of an edge behind a face that the body goes on beyond, and
-        not in it.
+        Number of held nodes less than a tenth of an edge inside a face beyond which the body
+        continues, and not in that face.
     axes : str
-        Along which it holds.
+        Axes along which the grasp holds.
     """
 
     experiment: str
@@ -313,22 +347,26 @@ class Hold:
 
 
 def holds_of(experiment: Experiment, mean_edge_m: float) -> tuple[Hold, ...]:
-    """One for each grasp."""
+    """Return the held nodes of each grasp; `mean_edge_m` is the mean edge length of the mesh."""
     points_m = experiment.body.nodes.points_m
     return tuple(_hold(experiment.name, points_m, g, mean_edge_m) for g in experiment.gripping)
 
 
 def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:
+    """Return the held nodes of one grasp."""
     nodes = grasp.nodes
-    held, free = points_m[nodes], np.delete(points_m, nodes, axis=0)
-    low, high = held.min(axis=0), held.max(axis=0)
-    outside_m = np.concatenate([low - free, free - high], axis=1)
-    beside = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOURING * mean_edge_m
+    held_m = points_m[nodes]
+    free_m = np.delete(points_m, nodes, axis=0)
+    low = held_m.min(axis=0)
+    high = held_m.max(axis=0)
+    outside_m = np.concatenate([low - free_m, free_m - high], axis=1)
+    is_neighbour = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOURING * mean_edge_m
     # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
     inner = (outside_m > 0).any(axis=0)
-    depth_m = np.concatenate([held - low, high - held], axis=1)[:, inner]
-    least_m, reach_m = ROUND_OFF * mean_edge_m, NEAR * mean_edge_m
-    slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & beside[:, None]
+    depth_m = np.concatenate([held_m - low, high - held_m], axis=1)[:, inner]
+    least_m = ROUND_OFF * mean_edge_m
+    reach_m = NEAR * mean_edge_m
+    slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
     slightly_inside = (depth_m > least_m) & (depth_m < reach_m)
     return Hold(
         name,
@@ -343,17 +381,15 @@ def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:
 
 
 def hold_sentence(hold: Hold) -> str:
-    """What a grasp holds."""
+    """Return a description of the held nodes of a grasp."""
     size = " × ".join(f"{1e3 * (b - a):.4g}" for a, b in zip(hold.low_m, hold.high_m, strict=True))
     low = ", ".join(f"{1e3 * x:.4g}" for x in hold.low_m)
-    along = "" if hold.axes == "xyz" else f", held along {' and '.join(hold.axes)} only"
-    return (
-        f"{hold.nodes} nodes, {hold.share:.0%} of all, in a box of {size} mm at ({low}) mm{along}"
-    )
+    axes = "" if hold.axes == "xyz" else f", held along {' and '.join(hold.axes)} only"
+    return f"{hold.nodes} nodes, {hold.share:.0%} of all, in a box of {size} mm at ({low}) mm{axes}"
 
 
 def hold_concerns(hold: Hold) -> list[Concern]:
-    """Whether it is a matter of chance which nodes are held."""
+    """Return a concern if rounding decides which nodes are held."""
     by_chance = bool(hold.nearly_held or hold.nearly_free)
     counts = {"nodes": hold.nodes, "nearly_held": hold.nearly_held, "nearly_free": hold.nearly_free}
     return concerned(by_chance, False, "description/grasp", experiment=hold.experiment, **counts)

@@ -1,4 +1,4 @@
-"""What a solve will cost with each method, and whether this machine has the memory for it."""
+"""Cost of a solve with each method, and whether this machine has enough memory."""
 
 from __future__ import annotations
 
@@ -21,14 +21,17 @@ from ...program.sweep import Sweep
 from ...statistics.concern import Concern
 from .derivatives import few, first_samples, shortened
 
-# IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
+# Memory per nonzero [bytes]: IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
 BYTES = 280.0
-# Programs with less variables than this fit anywhere.
+# Number of variables below which programs fit into any memory.
 SMALL = 50_000
 
 
 def require_memory(problem: Problem, collocation: Collocation, method: object) -> None:
-    """Refuse a solve that this machine's memory cannot hold, before it begins.
+    """Raise an `InputError` if a solve needs more memory than this machine has.
+
+    Small programs, other methods than interior point and reduced space, and machines of unknown
+    memory pass.
 
     Raises
     ------
@@ -57,14 +60,18 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
 
 
 def interior_point_mb(entries: int) -> float:
-    """What IPOPT takes for so many nonzeros of Jacobian and Hessian."""
+    """Return the memory of IPOPT [MB] for so many nonzeros of Jacobian and Hessian."""
     return BYTES * entries / 1e6
 
 
 def nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:
-    """Nonzeros of Jacobian and Hessian, without laying them out: each sample adds as many.
+    """Return the numbers of nonzeros of Jacobian and Hessian, extrapolated from a few samples.
 
-    `whole` is the problem's program as interior point has it.
+    Parameters
+    ----------
+    problem : Problem
+    whole : Collocation
+        Program of the problem with lifted variables, as interior point needs it.
     """
     further = whole.carried_nonzeros
     short = shortened(problem)
@@ -79,31 +86,38 @@ def nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:
 
 
 def _counted(problem: Problem) -> NDArray[np.int64]:
+    """Return the nonzeros of Jacobian and Hessian as (2,) int array, by laying them out."""
     collocation = problem.collocation()
     structures = (collocation.jacobian_structure, collocation.hessian_structure)
     return np.array([len(indices) for _, indices in structures])
 
 
-# Rows timed, and sweeps that the reduced space mostly takes.
-ROWS, SWEEPS = 12, 10
-# IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps on one core: the work of an
-# iteration grows with the nonzeros and with the unknowns of a timestep to this power.
+# Time steps of the sweep that is timed: enough for a steady time per step.
+ROWS = 12
+# Sweeps that the reduced space mostly takes.
+SWEEPS = 10
+# Iterations that interior point mostly takes.
 ITERATIONS = 10
-SECONDS, POWER = 4.5e-10, 1.4
-# A method is recommended to those who would wait this long, if it takes this share of the time.
-LONG_S, MUCH_QUICKER = 60.0, 0.1
+# Time of an iteration [s] per nonzero and per unknown of a time step to the power POWER: IPOPT with
+# MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps on one core.
+SECONDS = 4.5e-10
+POWER = 1.4
+# Time of a method [s] above which a quicker one is recommended.
+LONG_S = 60.0
+# Largest time of the recommended method, as a share of the chosen one's.
+MUCH_QUICKER = 0.1
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a method takes, roughly.
+    """Approximate memory and time of a method.
 
     Attributes
     ----------
     method : str
     memory_mb : float
     time_s : float or None
-        None where it cannot be told: the equations at the guess cannot be solved.
+        None where it is unknown: the equations at the guess cannot be solved.
     """
 
     method: str
@@ -114,17 +128,19 @@ class Cost:
 def costs(
     collocation: Collocation, short: Collocation, z: Array, nonzeros: int, factorisation: Choice
 ) -> tuple[Cost, ...]:
-    """Costs by method.
+    """Return the costs of reduced space and of interior point.
 
     Parameters
     ----------
     collocation : Collocation
     short : Collocation
-        Of the first samples of the same experiments.
-    z : (variables,) the start of these
+        First samples of the same experiments.
+    z : (variables,) array
+        Start of `short`.
     nonzeros : int
-        Of the Jacobian and the Hessian that interior point gets, together.
+        Of the Jacobian and the Hessian of interior point, together.
     factorisation : {"auto", "band", "sparse", "supernodal"}
+        Option of reduced space.
     """
     width = max(unknowns_of_a_timestep(collocation))
     return (
@@ -140,7 +156,7 @@ def costs(
 
 
 def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
-    """What interior point has of each experiment, the overstress of its memory included."""
+    """Return the unknowns per time step of each experiment in interior point, with overstresses."""
     return [
         len(segment.free_dofs) + sum(b.own.stop - b.own.start for b in segment.body.memory.branches)
         for segment in collocation.segments
@@ -148,7 +164,7 @@ def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
 
 
 def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
-    """Whether another method is far quicker."""
+    """Return a note if another method is far quicker."""
     quickest = min(others, key=lambda cost: cost.time_s or np.inf)
     if chosen.time_s is None or quickest.time_s is None:
         return []
@@ -161,7 +177,7 @@ def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
 
 
 def cost_concerns(chosen: Cost, others: Sequence[Cost]) -> list[Concern]:
-    """Whether the chosen method will run out of memory."""
+    """Return a concern if the chosen method needs more memory than there is."""
     available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:
         return []
@@ -174,10 +190,14 @@ def cost_concerns(chosen: Cost, others: Sequence[Cost]) -> list[Concern]:
 def _sweeps_s(
     collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
 ) -> float | None:
-    """Seconds of all sweeps, from one over the first rows of each experiment."""
+    """Return the time of all sweeps [s], from one over the first rows of each experiment.
+
+    None if the equations cannot be solved.
+    """
     total = 0.0
     for segment, part in zip(collocation.segments, short.parts(z), strict=True):
-        rows, setting = min(ROWS, len(part.x)), part.setting
+        rows = min(ROWS, len(part.x))
+        setting = part.setting
         solver = Sweep(part.segment, rows, factorisation=factorisation)
         began = time.perf_counter()
         try:

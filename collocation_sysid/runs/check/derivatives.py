@@ -1,4 +1,6 @@
-"""Derivatives at the guess against differences, on the first samples of every experiment."""
+"""Check of the derivatives at the guess against differences, on the first samples of an
+experiment.
+"""
 
 from __future__ import annotations
 
@@ -16,34 +18,44 @@ from ...recording.experiment import Experiment
 from ...recording.tables import FEWEST
 from ...recording.wrench import Wrench
 
-# All kinds of rows are among these samples, those of equilibria among fewer; derivatives do not
-# depend on how many follow.
-SAMPLES, STATIC_SAMPLES = 12, 3
+# First samples of a motion that contain all kinds of equations; more would not change derivatives.
+SAMPLES = 12
+# The same of a static experiment.
+STATIC_SAMPLES = 3
+# Step of the differences, which balances truncation and rounding of fourth-order differences.
 STEP = 1e-5
-# Over the gap in which a pressure rises: steps that leave it say nothing of slopes within.
+# Largest step in contact, relative to the gap over which the pressure rises: it must stay within.
 OF_WIDTH = 1e-3
-# Of a thousand points some are where Huber's loss begins to be linear, and differences go across.
+# Huber threshold of the check [σ]: differences must not cross the kink of the second derivative.
 WITHOUT_KINK = 1e9
-# With more entries memory and wrenches are not laid out as variables: their slopes are checked.
+# Most nonzeros of lifted variables for which the whole program is laid out and checked.
 LAID_OUT = 5e6
 
 
 def few(experiment: Experiment) -> int:
-    """How many first samples have all kinds of rows."""
+    """Return the number of first samples that contain all kinds of equations."""
     return STATIC_SAMPLES if experiment.static else SAMPLES
 
 
 def shortened(problem: Problem) -> Problem:
-    """The same problem with a few first samples of every experiment only."""
+    """Return the problem with a few first samples of every experiment."""
     short = tuple(first_samples(e, few(e)) for e in problem.experiments)
     return replace(problem, experiments=short)
 
 
 def first_samples(experiment: Experiment, samples: int) -> Experiment:
-    """The same experiment with its first samples only, and more where cameras see later."""
+    """Return the experiment with its first samples, and more if cameras begin to see later.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    samples : int
+        Least number of samples.
+    """
     fewest = 1 if experiment.static else FEWEST
     samples, depths = begun(experiment.depths, experiment.t_s, samples, fewest)
-    markers, here = experiment.markers, slice(samples)
+    markers = experiment.markers
+    here = slice(samples)
     tracks = markers.positions_m[here]
     if not np.isfinite(tracks).any():
         tracks = np.nan_to_num(tracks)  # at least one sample has to be there
@@ -54,7 +66,7 @@ def first_samples(experiment: Experiment, samples: int) -> Experiment:
 
 
 def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
-    """The wrench up to the last of some times, if that leaves enough of it."""
+    """Return a wrench within the times (T,); None if it has fewer than `fewest` samples there."""
     if wrench is None:
         return None
     here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
@@ -64,22 +76,43 @@ def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
 
 
 def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]:
-    """Largest relative deviations of J and H along a random direction at a disturbed start."""
+    """Return the largest relative errors of the first and the second derivatives.
+
+    Exact derivatives along a random direction are compared with fourth-order central differences at
+    a disturbed start.
+
+    Parameters
+    ----------
+    collocation : Collocation
+    z : (variables,) array
+        Start.
+
+    Returns
+    -------
+    first : float
+        Error of the Jacobian and, if it exists, of the gradient of the eliminated form.
+    second : float
+        Error of the Hessian; 0 if the program with lifted variables is too large to be laid out.
+    """
     if any(segment.depths for segment in collocation.segments):
         collocation = replace(collocation, huber=WITHOUT_KINK)
-    rng, of_slopes, step = np.random.default_rng(0), 0.0, _step(collocation)
-    program, plain = collocation.made_explicit(), collocation
+    rng = np.random.default_rng(0)
+    of_slopes = 0.0
+    step = _step(collocation)
+    program = collocation.made_explicit()
+    plain = collocation
     if program.explicit:  # methods use these without memory and wrenches as variables
         of_slopes = _slope_error(plain.objective, plain.gradient, z, rng, step)
         if plain.remembers:
             forces = rng.normal(size=plain.constraints)
             through = partial(plain.pulled_back, multipliers=forces)
             pushed = lambda at: forces @ plain.constraint_values(at)  # noqa: E731
-            along = _slope_error(pushed, through, z, rng, step)
-            of_slopes = max(of_slopes, along)
+            slope = _slope_error(pushed, through, z, rng, step)
+            of_slopes = max(of_slopes, slope)
         if sum(program.carried_nonzeros) > LAID_OUT:
             return of_slopes, 0.0
-        collocation, z = program, carried_over(z, plain, program)
+        collocation = program
+        z = carried_over(z, plain, program)
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
     multipliers = rng.normal(size=collocation.constraints)
@@ -88,25 +121,31 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
         return collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
 
     hessian = collocation.hessian(point, 1.0, multipliers)
-    along = collocation.jacobian(point) @ direction
-    first = _deviation(collocation.constraint_values, along, point, direction, step)
+    slope = collocation.jacobian(point) @ direction
+    first = _deviation(collocation.constraint_values, slope, point, direction, step)
     second = _deviation(lagrangian_gradient, hessian @ direction, point, direction, step)
     return max(first, of_slopes), second
 
 
 def _step(collocation: Collocation) -> float:
-    """As long as differences may be."""
+    """Return the step of the differences, which is small against the gap in which contact
+    begins.
+    """
     touching = (t for s in collocation.segments for t in contacts(s.experiment))
     return min((STEP, *(OF_WIDTH * term.contact.width_m for term in touching)))
 
 
 def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:
-    """That of a gradient along a random direction."""
-    point, direction = z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=len(z))
+    """Return the relative error of a gradient along a random direction."""
+    point = z + 1e-3 * rng.normal(size=len(z))
+    direction = rng.normal(size=len(z))
     return _deviation(function, gradient(point) @ direction, point, direction, step)
 
 
 def _deviation(function, exact: Array, point: Array, direction: Array, step: float) -> float:
+    """Return the largest deviation of `exact` from differences along `direction`, relative to
+    `exact`.
+    """
     ahead, behind, far_ahead, far_behind = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)
     )

@@ -1,4 +1,4 @@
-"""What was recorded: how long, how often, and each marker's samples and place."""
+"""Check of recordings: duration, rate, and each marker's samples and place."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from ...recording.experiment import Experiment
 from ...statistics.concern import Concern, concerned
 from .body import BodyFinding
 
-# Of the mean edge length: beyond this, a marker's place is mostly extrapolation.
+# Distance of a marker from the body, in mean edges, above which its place is mostly extrapolated.
 FAR = 0.5
-# Of the body's diagonal: a marker that starts farther from where the guess puts it is in another
-# frame or unit, or on another place.
+# Distance of a marker's first sample from the simulation at the guess, in diagonals of the body,
+# above which its frame, unit or place is likely wrong.
 ASTRAY = 0.5
+# Share of missing samples of a marker above which there is a warning.
 MOSTLY_MISSING = 0.5
 
 
@@ -28,10 +29,12 @@ class MarkerFinding:
     ----------
     name : str
     distance_m : float
-        From the body, or from the node it was attached to.
+        Distance from the body, or from the node it was attached to.
     samples, missing : int
+        Numbers of samples that are present, and that are missing.
     start_miss_m : float or None
-        From its first sample to where the simulation at the guess has it then; None without one.
+        Distance from its first sample to its position in the simulation at the guess; None without
+        one.
     """
 
     name: str
@@ -43,12 +46,22 @@ class MarkerFinding:
 
 @dataclass(frozen=True)
 class Recording:
-    """One experiment's measurements.
+    """Measurements of one experiment.
 
     Attributes
     ----------
+    experiment : str
+    validation, static : bool
+    duration_s, rate_hz : float
+    frames : int
+        Number of sample times.
+    samples, missing : int
+        Numbers of marker samples that are present, and that are missing.
+    markers : tuple of MarkerFinding
+    instruments : tuple of str
+        Other instruments, in words.
     air_density_kg_m3 : float
-        Of the air around the body in the model; zero in a vacuum.
+        Density of the air around the body in the model; zero in a vacuum.
     """
 
     experiment: str
@@ -75,7 +88,7 @@ class Recording:
 
 
 def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording:
-    """What an experiment measured.
+    """Return a summary of the measurements of an experiment.
 
     Parameters
     ----------
@@ -86,18 +99,19 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     markers = experiment.markers
     miss = np.zeros((0, len(markers.names)))
     if positions_m is not None:
-        seen_m = markers.positions_m[: len(positions_m)]
-        miss = np.linalg.norm(markers.observe(positions_m) - seen_m, axis=2)
-    findings, missing = [], markers.missing
+        measured_m = markers.positions_m[: len(positions_m)]
+        miss = np.linalg.norm(markers.observe(positions_m) - measured_m, axis=2)
+    findings = []
+    missing = markers.missing
     for k, name in enumerate(markers.names):
-        seen = np.flatnonzero(markers.present[:, k])
+        present = np.flatnonzero(markers.present[:, k])
         findings.append(
             MarkerFinding(
                 name,
                 float(markers.placement.distance_m[k]),
-                len(seen),
+                len(present),
                 int(missing[k]),
-                float(miss[seen[0], k]) if len(seen) and seen[0] < len(miss) else None,
+                float(miss[present[0], k]) if len(present) and present[0] < len(miss) else None,
             )
         )
     return Recording(
@@ -120,24 +134,26 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
 
 
 def recording_concerns(recording: Recording, body: BodyFinding) -> list[Concern]:
-    """What is wrong with the measurements; the worst marker stands for all."""
+    """Return concerns about the markers of a recording; each names the worst marker only."""
     if not recording.markers:
         return []
 
     def of(marker: MarkerFinding, distance_m: float | None = 0.0) -> dict[str, Any]:
-        by_mm, frames = 1e3 * (distance_m or 0.0), recording.frames
+        by_mm = 1e3 * (distance_m or 0.0)
+        frames = recording.frames
         named = {"marker": marker.name, "experiment": recording.experiment}
         return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
 
-    far, lost = recording.farthest, recording.least_seen
+    farthest = recording.farthest
+    least_seen = recording.least_seen
     worst = max(recording.markers, key=lambda marker: marker.start_miss_m or 0.0)
-    unseen = lost.samples == 0
-    missing = not unseen and lost.missing > MOSTLY_MISSING * recording.frames
+    unseen = least_seen.samples == 0
+    missing = not unseen and least_seen.missing > MOSTLY_MISSING * recording.frames
     astray = (worst.start_miss_m or 0.0) > ASTRAY * body.diagonal_m
-    off = far.distance_m > FAR * body.edges_m[1]
+    off = farthest.distance_m > FAR * body.edges_m[1]
     return [
-        *concerned(off, False, "markers/off", **of(far, far.distance_m)),
-        *concerned(unseen, False, "markers/unseen", **of(lost)),
-        *concerned(missing, False, "markers/missing", **of(lost)),
+        *concerned(off, False, "markers/off", **of(farthest, farthest.distance_m)),
+        *concerned(unseen, False, "markers/unseen", **of(least_seen)),
+        *concerned(missing, False, "markers/missing", **of(least_seen)),
         *concerned(astray, False, "markers/astray", **of(worst, worst.start_miss_m)),
     ]

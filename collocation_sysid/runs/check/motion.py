@@ -1,4 +1,6 @@
-"""How the body oscillates in its grasp at the guess, and what the time grid makes of that."""
+"""Check of natural modes: oscillation of the body in its grasps, and its resolution by the time
+grid.
+"""
 
 from __future__ import annotations
 
@@ -19,31 +21,37 @@ from ...program.rest import rest_state
 from ...recording.experiment import Experiment
 from ...statistics.concern import Concern, concerned
 
+# Number of modes.
 COUNT = 6
-# A scheme may add this share of the physical damping ratio, or this ratio where there is little.
-DAMPING_SHARE, LITTLE_DAMPING = 0.1, 0.005
-# Fewer grid steps a period than this, and a mode's motion is badly computed; with fewer samples
-# than the second, it is badly seen.
-FEW_STEPS, FEW_SAMPLES = 8, 3
+# Largest numerical damping ratio, as a share of the material's.
+DAMPING_SHARE = 0.1
+# Largest numerical damping ratio of a mode with little damping.
+LITTLE_DAMPING = 0.005
+# Fewest grid steps per period with which the motion of a mode is computed well.
+FEW_STEPS = 8
+# Fewest samples per period with which the motion of a mode is measured well.
+FEW_SAMPLES = 3
+# Scheme without numerical damping.
 UNDAMPED = "midpoint"
+# Decimals of numerical damping ratios: further ones are rounding.
 ROUNDING = 12
 
 
 @dataclass(frozen=True)
 class ModeFinding:
-    """One natural mode at the guess.
+    """One natural mode.
 
     Attributes
     ----------
     frequency_hz : float
     samples_per_period, steps_per_period : float
-        Of the recording, and of the time grid.
+        Samples of the recording, and steps of the time grid.
     damping_ratio : float
-        Of the material, at the guess.
+        Of the material.
     numerical_damping_ratio : float
-        What the scheme adds at that damping; negative where it takes some away.
+        Damping ratio that the scheme adds; negative where it takes some away.
     period_error : float
-        By how much the scheme lengthens the undamped period, relatively.
+        Relative lengthening of the undamped period by the scheme.
     """
 
     frequency_hz: float
@@ -56,13 +64,13 @@ class ModeFinding:
 
 @dataclass(frozen=True)
 class Motion:
-    """How the body oscillates in one experiment at the guess.
+    """Natural modes of the body in one experiment, and errors of the time scheme.
 
     Attributes
     ----------
     experiment : str
     about : str
-        The state it oscillates about: "rest state" or "undeformed shape".
+        State about which the body oscillates: "rest state" or "undeformed shape".
     modes : tuple of ModeFinding, by frequency
     scheme : str
     timestep_s : float
@@ -71,7 +79,7 @@ class Motion:
     substeps_needed : int or None
         The fewest with which the scheme damps and slows the first mode little; None if too many.
     not_oscillating : int
-        Rigid modes left out.
+        Number of rigid modes that were left out.
     """
 
     experiment: str
@@ -85,21 +93,31 @@ class Motion:
 
     @property
     def first(self) -> ModeFinding | None:
-        """The slowest mode."""
+        """Mode of the lowest frequency; None if there is none."""
         return self.modes[0] if self.modes else None
 
 
 def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> Motion:
-    """Modes of one experiment at θ while it is held least, and what the scheme does to them.
+    """Return the natural modes of an experiment when fewest dofs are held, and errors of the
+    scheme.
 
-    Of those times the last counts, when all point masses have joined.
+    Of several such samples the last counts, when all point masses have joined.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    scheme : Scheme
+    step_s : float
+        Step of the time grid.
+    theta : array
+        Constants θ of the body.
     """
-    held = experiment.held(experiment.t_s)
-    count = held.sum(axis=(1, 2))
+    is_held = experiment.held(experiment.t_s)
+    count = is_held.sum(axis=(1, 2))
     least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])
-    x, about = _state(experiment, held[least], time_s, theta)
-    free = np.flatnonzero(~held[least])
+    x, about = _state(experiment, is_held[least], time_s, theta)
+    free = np.flatnonzero(~is_held[least])
     modes = natural_modes(Forces.of(experiment, time_s, theta), x, free, COUNT)
     findings = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
@@ -123,6 +141,10 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
 def _state(
     experiment: Experiment, held: NDArray[np.bool_], time_s: float, theta: Array
 ) -> tuple[Array, str]:
+    """Return node positions (n, 3) [m] about which the body oscillates, and the name of this state.
+
+    The equilibrium if it can be found, else the undeformed shape.
+    """
     if held.any():
         try:
             solver = Solver(experiment, held=held)
@@ -135,6 +157,7 @@ def _state(
 def _mode_findings(
     modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float
 ) -> tuple[ModeFinding, ...]:
+    """Return the findings of each mode."""
     findings = []
     for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
         omega = 2 * np.pi * frequency
@@ -154,32 +177,41 @@ def _mode_findings(
 
 
 def _oscillating(damping_ratio: float) -> float:
-    """The damping ratio, or none where nothing oscillates whose damping a scheme could change."""
+    """Return the damping ratio of an oscillating mode; 0 for an overdamped one.
+
+    The scheme's change of the damping of an overdamped mode does not matter.
+    """
     return damping_ratio if damping_ratio < 1 else 0.0
 
 
 def _damping_limit(mode: ModeFinding) -> float:
+    """Return the largest numerical damping ratio that is accepted for a mode."""
     return max(DAMPING_SHARE * mode.damping_ratio, LITTLE_DAMPING)
 
 
 def motion_concerns(motion: Motion) -> list[Concern]:
-    """What the time grid and the length of the recording will spoil."""
+    """Return concerns about too few steps, too few samples or a recording shorter than a period."""
     mode = motion.first
     if mode is None:
         return []
-    first, samples = _first_mode(motion, mode), mode.samples_per_period
-    seen = {"samples": samples, "needed_hz": FEW_STEPS * mode.frequency_hz}
-    cut, length = motion.duration_s * mode.frequency_hz < 1, {"duration_s": motion.duration_s}
+    first = _first_mode(motion, mode)
+    samples = mode.samples_per_period
+    rate_data = {"samples": samples, "needed_hz": FEW_STEPS * mode.frequency_hz}
+    is_short = motion.duration_s * mode.frequency_hz < 1
+    duration_data = {"duration_s": motion.duration_s}
     return [
         *_grid_concerns(motion, mode),
-        *concerned(samples < FEW_SAMPLES, False, "information/rate", **first, **seen),
-        *concerned(cut, False, "information/short", **first, **length),
+        *concerned(samples < FEW_SAMPLES, False, "information/rate", **first, **rate_data),
+        *concerned(is_short, False, "information/short", **first, **duration_data),
     ]
 
 
 def _grid_concerns(motion: Motion, mode: ModeFinding) -> list[Concern]:
-    """What the scheme and its step spoil."""
-    first, added = _first_mode(motion, mode), mode.numerical_damping_ratio
+    """Return a concern if the scheme changes the damping too much, or has too few steps per
+    period.
+    """
+    first = _first_mode(motion, mode)
+    added = mode.numerical_damping_ratio
     if abs(added) > _damping_limit(mode):
         remedy = _finer(motion)
         if motion.scheme != UNDAMPED:
@@ -194,13 +226,15 @@ def _grid_concerns(motion: Motion, mode: ModeFinding) -> list[Concern]:
 
 
 def _first_mode(motion: Motion, mode: ModeFinding) -> dict[str, Any]:
+    """Return experiment and frequency of the first mode, as data of a concern."""
     return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
 
 
 def motion_notes(motion: Motion) -> list[str]:
-    """What is worth knowing about the modes."""
+    """Return notes on rigid modes, overdamped modes and the lengthening of the first period."""
     notes = []
-    mode, name = motion.first, motion.experiment
+    mode = motion.first
+    name = motion.experiment
     if motion.not_oscillating:
         notes.append(
             f"{motion.not_oscillating} modes of '{name}' do not oscillate (rigid motions that no "
@@ -223,10 +257,12 @@ def motion_notes(motion: Motion) -> list[str]:
 
 
 def _finer(motion: Motion) -> str:
+    """Return the remedy for too few steps: a setting, or a higher rate."""
     if motion.substeps_needed is None:
         return "record at a higher rate"
     return f"set transcription.{_bare(motion)}"
 
 
 def _bare(motion: Motion) -> str:
+    """Return the setting of the substeps without its table."""
     return f"substeps = {motion.substeps_needed}"

@@ -1,0 +1,88 @@
+"""Rules of CONTRIBUTING.md for docstrings and names that a program can check."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import collocation_sysid
+
+PACKAGE = Path(collocation_sysid.__file__).parent
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+# A summary that begins with one of these words has no subject of its own.
+WITHOUT_SUBJECT = re.compile(
+    r"^(What|How|Where|Which|Those|That|The same|Of|They|Them|It|Its|One that|One's|All that|There|"
+    r"Who|Whose|By|From|Nothing|As|Beside|Then|So|Here)\b"
+)
+# "G at a point" may be the gap g or the matrix G: a lint rule that capitalises summaries hides it.
+CAPITAL_SYMBOL = re.compile(r"^([B-HJ-ZΑ-Ω])(?:[ ,.]|\()")
+
+Documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def identifier(path: Path, node: ast.AST) -> str:
+    return f"{path.relative_to(PACKAGE)}:{getattr(node, 'lineno', 1)}"
+
+
+def trees() -> Iterator[tuple[Path, ast.Module]]:
+    for path in FILES:
+        yield path, ast.parse(path.read_text())
+
+
+def summaries() -> Iterator[tuple[str, str]]:
+    """Place and first docstring line of everything that the package documents."""
+    for path, tree in trees():
+        for node in ast.walk(tree):
+            if isinstance(node, Documented) and (docstring := ast.get_docstring(node)):
+                yield identifier(path, node), docstring.split("\n")[0]
+
+
+def packed_names(function: ast.FunctionDef | ast.AsyncFunctionDef) -> set[str]:
+    """Names to which a function assigns a tuple that it writes out."""
+    return {
+        target.id
+        for node in ast.walk(function)
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+
+
+@pytest.mark.parametrize("pattern", [WITHOUT_SUBJECT, CAPITAL_SYMBOL])
+def test_every_docstring_begins_with_a_subject(pattern):
+    assert [f"{place} {text}" for place, text in summaries() if pattern.match(text)] == []
+
+
+def test_a_module_assigns_each_of_its_names_once():
+    repeated = []
+    for path, tree in trees():
+        names: Counter[str] = Counter()
+        for node in tree.body:
+            if isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                stored = (each for target in targets for each in ast.walk(target))
+                names.update(each.id for each in stored if isinstance(each, ast.Name))
+        repeated += [f"{identifier(path, tree)} {name}" for name, n in names.items() if n > 1]
+    assert repeated == []
+
+
+def test_no_function_packs_arguments_into_a_tuple():
+    packs = []
+    for path, tree in trees():
+        for function in ast.walk(tree):
+            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+                packed = packed_names(function)
+                packs += [
+                    f"{identifier(path, node)} *{node.value.id}"
+                    for node in ast.walk(function)
+                    if isinstance(node, ast.Starred)
+                    and isinstance(node.value, ast.Name)
+                    and node.value.id in packed
+                ]
+    assert packs == []
