@@ -59,6 +59,7 @@ from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.formats import topics  # noqa: F401
 from collocation_sysid.result import record
 from collocation_sysid.result.export import TARGETS
+from collocation_sysid.result.pictures import album  # noqa: F401
 from collocation_sysid.runs import check  # noqa: F401
 
 Rng = np.random.Generator
@@ -253,7 +254,7 @@ def _place(rng: Rng, content: bytes) -> int:
 
 
 def _cut(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
-    return content[: rng.integers(len(content) + 1)]
+    return content[: int(rng.integers(len(content) + 1))]
 
 
 def _replaced(rng: Rng, content: bytes, words: Sequence[bytes]) -> bytes:
@@ -966,7 +967,7 @@ KINDS: dict[str, FileKind | OtherKind] = {each.name: each for each in (*FILES, *
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("--count", type=int, default=100, help="cases of a kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", choices=list(KINDS), default=list(KINDS))

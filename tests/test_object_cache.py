@@ -95,6 +95,18 @@ def test_folder_of_another_user_is_refused(folder, monkeypatch):
         assert jit.load("key") is None
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
+@pytest.mark.parametrize("given", ["file", "folder", "parent"])
+def test_what_is_really_another_users_is_not_loaded(folder, given):
+    file = entry(folder)
+    os.chown({"file": file, "folder": folder, "parent": folder.parent}[given], 65534, 65534)
+    if given == "file":
+        assert jit.load("key") is None
+    else:
+        with pytest.warns(RuntimeWarning, match="belongs to another user"):
+            assert jit.load("key") is None
+
+
 APART = """
 import ctypes, mmap, sys
 
