@@ -43,6 +43,7 @@ from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.result import progress as progress_shown
 from collocation_sysid.result.progress import Heartbeat
 from collocation_sysid.runs import forward_simulation, solving
+from collocation_sysid.written_files import list_files
 
 RESULT_KEYS = {
     "schema": set(),
@@ -212,6 +213,7 @@ def test_a_run_that_does_not_converge_is_marked_and_takes_the_place_of_an_earlie
     earlier.mkdir()
     (earlier / "result.json").write_text("{}")
     (earlier / "old.png").write_text("old")
+    list_files(earlier)
     short = settings(
         "solver.interior-point.max_iterations=2", "solver.interior-point.initial=simulation"
     )
