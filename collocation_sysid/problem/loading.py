@@ -110,12 +110,13 @@ def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
     """Return the numbers of nodes and elements of a mesh to be generated; None for meshes
     from files.
     """
+    length_m = section.edge_length_m
+    if length_m is None:
+        return None
     if section.box_m is not None:
-        return counts_of_box(section.box_m, section.edge_length_m)
+        return counts_of_box(section.box_m, length_m)
     if (shape := section.cylinder) is not None:
-        return counts_of_cylinder(
-            shape.diameter_m, shape.height_m, section.edge_length_m, quarter=shape.quarter
-        )
+        return counts_of_cylinder(shape.diameter_m, shape.height_m, length_m, quarter=shape.quarter)
     return None
 
 

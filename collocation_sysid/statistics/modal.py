@@ -37,10 +37,11 @@ LAGS_S = np.concatenate([-np.arange(15, 0, -1), np.arange(1, 16)]) * 0.01
 LONGEST_LAG = 0.3
 # Alternations between the best stiffness and the best rigid motion.
 REFITS = 3
-# Many variants are tried of one mistake: each must fit so many times better than others.
+# Additional factor for each of many variants of one mistake.
 ONE_OF_MANY = 1.05
-# Of the body's diagonal: equilibria may deform it so far, and no grasped body is so far off.
+# Deformation of an equilibrium over the body's diagonal that needs no explanation.
 DEFORMED = 0.1
+# Distance of the tracks over the body's diagonal from which on no stiffness explains them.
 FAR_OFF = 0.3
 
 
@@ -72,7 +73,9 @@ def doubts(
 
 
 def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield other axes of the tracks that bring them far nearer to the undeformed body."""
+    """Yield hypotheses of other axes of the tracks that bring them far nearer to the
+    undeformed body.
+    """
     markers = experiment.markers
     body = experiment.body
     places_m = markers.observe(experiment.rigid_positions(experiment.t_s))
@@ -88,7 +91,9 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
-    """Yield tracks (T, M, 3) with their axes in every other order and of either sign."""
+    """Yield the tracks (T, M, 3) with their axes in every other order and of either sign,
+    as hypotheses.
+    """
     for axes, (order, signs) in OTHER_AXES.items():
         turned = np.array(signs) * tracks_m[..., list(order)]
         yield Hypothesis("markers-axes", name, {"axes": axes}, turned, ONE_OF_MANY)
@@ -150,7 +155,9 @@ class ModalComparison:
         yield from self._other_axes()
 
     def unlike(self) -> Iterator[Hypothesis]:
-        """Yield that the tracks are far from where any stiffness has them, if they are."""
+        """Yield the hypothesis that no stiffness explains the tracks, if they are far from
+        all predictions.
+        """
         misfit_m = self.misfit_m(self.given)
         size_m = self.sway.size_m
         strength = misfit_m / (FAR_OFF * size_m)
@@ -159,6 +166,7 @@ class ModalComparison:
             yield Hypothesis("unlike", self.given.name, data, strength=strength)
 
     def _other_axes(self) -> Iterator[Hypothesis]:
+        """Yield hypotheses of other axes of the tracks, tested by the modes."""
         predicted = self.sway.predicted(self.given)
 
         def left(tracks_m: Array) -> float:

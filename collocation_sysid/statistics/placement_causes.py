@@ -17,9 +17,9 @@ from ..recording.obstacle import Obstacle
 from ..recording.solids import Plane
 from .hypothesis import Hypothesis
 
-# Nodes deeper in a solid than this share of the body's diagonal are inside it; that share of all
-# nodes cannot be.
+# Depth in a solid from which on a node is inside, over the body's diagonal.
 DEEP = 0.01
+# Largest share of the nodes that may be inside.
 MOST_INSIDE = 0.5
 
 

@@ -144,7 +144,9 @@ def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
-    """Return the world axis along which an obstacle moves most; "" if its force has other axes."""
+    """Return the world axis along which an obstacle moves most; "" if it does not move, or
+    its force is not in world axes.
+    """
     moved_m = np.ptp(shifts_m, axis=0)
     pushes = isinstance(grasp, Obstacle) and grasp.wrench is not None
     if not pushes or not moved_m.any() or grasp.wrench.frame != "world":
@@ -172,7 +174,7 @@ def steps(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesis]:
-    """Yield a step of all markers together that the poses do not have."""
+    """Yield the hypothesis of a step of all markers together that the poses do not have."""
     tracks_m = experiment.markers.positions_m
     sigma_m = experiment.markers.sigma_m
     complete = np.isfinite(tracks_m).all(axis=(1, 2))
@@ -187,38 +189,45 @@ def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesi
     yield from _sudden("markers-jump", experiment, int(rows[k]), float(sizes[k]), usual_m)
 
 
-# Of the body's diagonal and of the noise: markers that move less may be still.
+# Motion of markers that may be none, over the size of the body.
 STILL_OF_SIZE = 0.01
+# Additional motion that may be noise, over sigma_m.
 STILL_SIGMAS = 6.0
 
 
 def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield that markers move on a body that starts at rest and that nothing moves."""
+    """Yield the hypothesis that poses are wrong, if markers move on a body that starts at
+    rest and that nothing moves.
+    """
     t_s = experiment.t_s
     grasps = experiment.grasps
     if experiment.start != "equilibrium" or experiment.actuators or experiment.obstacles:
         return
-    held = (grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps)
+    is_held_throughout = (grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps)
     motions = [part for grasp in grasps for part in grasp.poses.at(t_s)]
     loads = [experiment.node_forces_n(t_s), experiment.tied_mass_kg(t_s)]
-    if not grasps or not all(held) or any(_changes(each) for each in (*motions, *loads)):
+    if (
+        not grasps
+        or not all(is_held_throughout)
+        or any(_changes(each) for each in (*motions, *loads))
+    ):
         return
     markers = experiment.markers
     size_m = float(np.ptp(experiment.body.nodes_m, axis=0).max())
-    there = markers.present.sum(axis=0) >= FEWEST_SAMPLES
-    if not there.any():
+    is_measured = markers.present.sum(axis=0) >= FEWEST_SAMPLES
+    if not is_measured.any():
         return
-    tracks_m = markers.positions_m[:, there]
-    moved_m = np.sqrt(np.nanmean(np.nanvar(tracks_m, axis=0).sum(axis=1)))
+    tracks_m = markers.positions_m[:, is_measured]
+    motion_m = np.sqrt(np.nanmean(np.nanvar(tracks_m, axis=0).sum(axis=1)))
     still_m = STILL_OF_SIZE * size_m + STILL_SIGMAS * float(np.median(markers.sigma_m))
-    if moved_m > still_m:
-        data = {"by_mm": 1e3 * moved_m}
+    if motion_m > still_m:
+        data = {"by_mm": 1e3 * motion_m}
         of = f"'{experiment.name}'"
-        yield Hypothesis("poses-constant", of, data, strength=float(moved_m / still_m))
+        yield Hypothesis("poses-constant", of, data, strength=float(motion_m / still_m))
 
 
 def _changes(values: Array) -> bool:
-    """Return whether any row of values (T, …) differs from the first."""
+    """Whether any row of values (T, …) differs from the first."""
     return bool(np.ptp(values, axis=0).max(initial=0.0) > 1e-9)
 
 

@@ -26,23 +26,32 @@ from ..recording.wrench import Frame, Wrench
 from .axes import OTHER_AXES
 from .hypothesis import Hypothesis, Trial
 
-# Residuals up to so many standard deviations need no cause; what is right leaves so much less.
+# RMS residual in standard deviations that needs an explanation; a correct description must leave
+# less.
 MISFIT = 1.3
+# Factor by which the misfit must decrease.
 BETTER = 1.5
-# The prediction is of no use where the markers themselves are fitted worse than this, in sigmas.
+# RMS residual of the markers in standard deviations above which the prediction is useless.
 MARKERS_MISFIT = 3.0
+# Largest number of sweeps of the fit to the markers, after a solve.
 MOST_SWEEPS = 40
-# Of the fit before a solve: the samples, its sweeps and its tolerance.
+# Samples of the fit before a solve.
 CHECKED_SAMPLES = 100
+# Its largest number of sweeps.
 CHECKED_SWEEPS = 15
+# Length of its last step of a parameter's logarithm.
 CHECKED_TOLERANCE = 1e-2
-# Clocks may be off by this share of a recording.
+# Largest clock shift that is tried, over the length of the recording.
 LATEST = 0.25
+# Number of intervals of the clock shifts that are tried.
 SHIFTS = 60
+# Columns of the forces.
 FORCES = slice(0, 3)
+# Columns of the torques.
 TORQUES = slice(3, 6)
+# Columns of forces and torques.
 BOTH = slice(0, 6)
-# What forces, and torques, are written in by mistake.
+# Wrong units of forces and of torques that are tried, with their factors.
 UNITS = (
     (
         "forces",
@@ -56,13 +65,15 @@ UNITS = (
     ),
     ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
 )
-# Offsets of so many standard deviations of the tare's prior are no tare of a zeroed sensor.
+# Offset over the standard deviation of the tare's prior from which on the sensor was not zeroed.
 FAR_TARE = 3.0
-# A calibration is good to this share, and a point to this distance; less gives no concern.
+# Error of a calibration that gives no concern.
 SAME_GAIN = 0.05
+# Error of the reference point that gives no concern [m].
 SAME_POINT_M = 0.005
-# Mistakes with numbers to fit, or with many variants, must fit so many times better than others.
+# Additional factor for hypotheses with fitted numbers.
 FITTED = 1.5
+# Additional factor for each of many variants of one mistake.
 ONE_OF_MANY = 1.05
 
 
