@@ -75,6 +75,7 @@ def command(group: typer.Typer, *shown: str) -> Callable[[Callable[[Any], None]]
     """
 
     def registered(function: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Register the function in `group`, and return it unchanged."""
         (kind,) = (each for name, each in get_type_hints(function).items() if name != "return")
         parameters = [*_parameters(kind)]
 

@@ -45,6 +45,7 @@ def refine(options: Refine) -> None:
     from ..result.run_sections import refinement_table, verdict_of
 
     def say(what: str) -> None:
+        """Print what is being done on stderr unless the command is quiet."""
         if not options.quiet:
             errors.print(Text(what, style="dim"), soft_wrap=True)
 

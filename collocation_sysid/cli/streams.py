@@ -82,6 +82,7 @@ def live(options: Live) -> None:
     estimator = options.estimator(options.problem)
 
     def opened(port: int) -> None:
+        """Print on stderr that the port is open."""
         errors.print(f"listening on UDP port {port} of this machine")
 
     if options.udp is None:

@@ -144,7 +144,7 @@ def _said(result: Result) -> Iterator[str]:
             changes = (
                 f"{p.name}: {listed(_goes(p, result, n) for n in p.told)}" for p in disagreeing
             )
-            yield f"{kind}s disagree, beyond chance ({'; '.join(changes)})"
+            yield f"{kind}s disagree significantly ({'; '.join(changes)})"
     if relaxed:
         first = relaxed[0]
         names = _shown(result)
@@ -157,10 +157,10 @@ def _said(result: Result) -> Iterator[str]:
             "estimate it"
         )
         if others := [f"{worded(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
-            yield f"instead of it also {listed(others)}: one cause may look like another"
+            yield f"alternatively {listed(others)}: these assumptions have similar effects"
     elif not significant:
         tested = " or ".join(_first_order(p) for p in result.probes)
-        nothing = "no part of the data, and no relaxed assumption, fits better than by chance"
+        nothing = "no subset of the data and no relaxed assumption changes the fit significantly"
         yield f"no significant {tested}" if is_routine(result) else nothing
     if not is_routine(result):
         yield from _matters(result)
@@ -187,7 +187,7 @@ def _matters(result: Result) -> Iterator[str]:
         if source is not None:
             share = result.budget[name][source]
             yield (
-                f"of those that the data do not tell {worded(source)} would matter most: "
+                f"of the assumptions not determined by the data, {worded(source)} matters most: "
                 f"{share:.0%} of {symbol_of(name)}'s variance"
             )
             return

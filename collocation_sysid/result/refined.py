@@ -83,6 +83,7 @@ def refine_run(
         answer = Earlier.of_result(before, run)
 
     def keep(refinement: Refinement) -> Result:
+        """Write a refinement and the updated result into the folder, and return the latter."""
         after = refined(before, refinement, problem.parameters)
         with whole_file(levels_file) as levels, whole_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
@@ -108,6 +109,7 @@ def refined(before: Result, refinement: Refinement, parameters: Parameters) -> R
     optimum = _at_optimum(before, parameters)
 
     def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
+        """Return estimates by name, corrected where the refinement measured their error."""
         return {
             name: _corrected(name, each, optimum[name], refinement.errors[name], parameters)
             if name in optimum and name in refinement.errors

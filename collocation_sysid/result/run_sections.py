@@ -63,17 +63,17 @@ LITTLE = 0.01
 MOSTLY_SYSTEMATIC = 1.5
 
 CAPTIONS = {
-    "depth": "What a depth camera saw under outlines of the fitted surface, of up to four samples, "
-    "and how far behind the surface points are; grey ones do not count.",
+    "depth": "Points of a depth camera with outlines of the fitted surface, at up to four samples, "
+    "and distances of the points behind the surface; grey points do not count.",
     "shapes": "The body at times of the recording; orange: measured markers.",
-    "field": "What differs from place to place, between the ends of its 95 % interval; below, cut "
-    "open. Pale is what the data do not tell: it is as the prior has it.",
-    "mesh": "The mesh, its grasped nodes and the markers' places as found.",
-    "pressure": "Pressure that obstacles give the body.",
-    "gap": "How far the body's surface is from obstacles.",
+    "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
+    "through the body. Pale where the data add little to the prior.",
+    "mesh": "The mesh, its grasped nodes and the estimated places of the markers.",
+    "pressure": "Contact pressure of obstacles on the body.",
+    "gap": "Gap between the body's surface and obstacles.",
     "tracks": "Measured, fitted and simulated markers, the residual below.",
     "wrench": "Wrench of a grasp: measured, fitted and simulated.",
-    "reading": "A reading of your own: measured, fitted and simulated.",
+    "reading": "Custom sensor: measured, fitted and simulated.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % confidence ellipses of pairs of parameters, for the noise.",
@@ -652,6 +652,7 @@ def _pictures(run: Path) -> list[Picture]:
     pictures: list[Picture] = []
 
     def kind(file: Path) -> str:
+        """Return the key of `CAPTIONS` with which the name of a picture begins; "" if none."""
         return next(k for k in order if file.stem.startswith(k))
 
     for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):

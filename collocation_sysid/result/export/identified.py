@@ -98,14 +98,14 @@ def alone(experiment: Experiment) -> Experiment:
         name: None if (positions_m := getattr(experiment, name)) is None else positions_m[:own]
         for name in ("start_positions_m", "start_velocities_m_s")
     }
-    # Nothing here looks at measurements, of which there may be none but of what was touched.
+    # Exports need no measurements, and all of them may be of the obstacles.
     some = Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, ["corner"], body.nodes_m[:1])
     unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
     try:
         return replace(experiment, grasps=experiment.gripping, **started, **unmeasured)
     except InputError as error:
         raise InputError(
-            "exports have no equilibrium of a body that obstacles alone carry; expected a "
+            "exports leave obstacles out, and the body has no equilibrium without them; expected a "
             f"recording in which it is grasped, or that starts undeformed: {error}"
         ) from error
 

@@ -198,7 +198,7 @@ def _never_held(body: Identified) -> Iterator[str]:
     if e.air_density_kg_m3:
         yield "buoyancy, added mass and drag of the air are not exported"
     if e.body.forces:
-        yield f"{', '.join(f.name for f in e.body.forces)} of your own is not exported"
+        yield f"custom forces are not exported: {', '.join(f.name for f in e.body.forces)}"
     if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
         yield "forces and point masses stay as they are at the first sample"
     if any(not grasp.holds(times).all() for grasp in e.grasps):

@@ -51,7 +51,7 @@ REGIONS = (
 )
 TIED = "point masses on nodes are left out"
 TILT = (
-    "gravity points {degrees:.3g}° away from −z of the stage, as was found of the recording; a "
+    "gravity points {degrees:.3g}° away from −z of the stage, as estimated from the recording; a "
     "simulator that takes its magnitude alone, and lets it point along −z, leaves that out"
 )
 UNMOVED = "the points of the body are those of the first sample: the run has no forward simulation"

@@ -219,8 +219,8 @@ def correlation_matrix(known: Confidence) -> Figure:
     return figure
 
 
-# Sources below this share of every variance are drawn together, and so are all but the largest, of
-# which there are as many as colours that can be told apart.
+# Smallest share of a variance with a colour of its own; smaller ones are drawn together, and so are
+# all but the largest sources, because there are only as many distinguishable colours.
 LITTLE = 0.03
 OTHERS = "others"
 GREY = "#B4B4B4"

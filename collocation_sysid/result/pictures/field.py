@@ -65,7 +65,7 @@ def field_picture(seen: Replay, name: str, values: Array) -> Figure:
     total = HEAD_MM + 2 * height + GAP_MM + FOOT_MM
     figure, axes = sheet(PAGE_MM, total)
     known = values[np.isfinite(values[:, 0])]
-    # The ends of where nothing is told would leave no colours to what is.
+    # Wide intervals where the data add nothing would take up the colour scale.
     low = np.quantile(known[:, 1], 0.05)
     high = np.quantile(known[:, 2], 0.95)
     scale = ScalarMappable((LogNorm if low > 0 else Normalize)(low, high), COLOURS)

@@ -219,6 +219,7 @@ def _on_surface(seen: Replay, body: Body, constants: Mapping[str, float], field:
     cells = body.mesh.surface_cells
 
     def at(samples: Index) -> Array:
+        """Return the values (k, F) on the boundary triangles at samples with indices (k,)."""
         assert seen.shapes_m is not None
         return elements.at(seen.shapes_m[samples])[field][:, cells]
 
