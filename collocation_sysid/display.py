@@ -1,7 +1,7 @@
 """Plain description of output (sentences, tables, pictures, sections) and its rendering.
 
 The same description is rendered for terminals, HTML and Markdown, and written as JSON by
-`tree.as_json`. Styles are words: good, check, doubtful, strong, quiet, code.
+`tree.update_as_json`. Styles are words: good, check, doubtful, strong, quiet, code.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ class SimulationError(RuntimeError):
     Attributes
     ----------
     lost_stability : LostStability or None
-        Mode in which the body lost its stability, see `program.lost_stability`; None for other
+        Mode in which the body lost its stability, see `program.find_lost_stability`; None for other
         causes and for errors that were passed to another process.
     """
 

@@ -17,31 +17,31 @@ from .display import plain_text
 from .errors import InputError, SimulationError
 from .fem.two_phase import TwoPhaseModes
 from .methods.solution import Method, Solution, Status, Watch
-from .methods.start import marched
-from .methods.workers import workers_of
+from .methods.start import simulate_trajectories
+from .methods.workers import connect_executor
 from .model.schemes import as_scheme
 from .problem import Problem
-from .runs.answer import Answer
+from .runs.answer import SolvedProblem
 from .runs.check.cost import require_memory
-from .runs.forward_simulation import roll_outs, step_error
+from .runs.forward_simulation import simulate_experiments, step_error
 from .runs.refine import refine
 from .runs.result import Elapsed, Result
-from .runs.solving import read_where_found, shared, solve
-from .runs.told import result_of
-from .runs.warm_start import Earlier
-from .statistics.budget import Sources
-from .statistics.causes import likely_causes
-from .statistics.considered import Changes, assumed
-from .statistics.diagnostics import diagnose
-from .statistics.linearised import LinearisedFit, linearised_fit
+from .runs.solving import solve, solve_with_renewed_correspondences, with_workers
+from .runs.told import build_result
+from .runs.warm_start import WarmStart
+from .statistics.budget import VarianceSources
+from .statistics.causes import find_misspecifications
+from .statistics.considered import ResidualChanges, changes_of_assumptions
+from .statistics.diagnostics import diagnose_markers
+from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.numerical import MOST_SUBSTEPS
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes import probes, probes_of_every_solve
-from .statistics.profile import Profile, profile_of
-from .statistics.relaxation import Answered, Probe, probed_changes
+from .statistics.probes import deep_probes, routine_probes_with_steps
+from .statistics.profile import Profile, profile_of_solution
+from .statistics.relaxation import Probe, SolvedFit, probed_changes
 from .statistics.routine_probes import probed_deviations
-from .statistics.trust import turn_concerns
-from .statistics.uncertainty import Uncertainty, uncertainty_of
+from .statistics.trust import rotation_step_concerns
+from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes a while to import
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 Log = Callable[[str], None]
 
 
-class Run(Answer):
+class Run(SolvedProblem):
     """Solved problem with its verification and uncertainties, for display and storage; see
-    `Answer`.
+    `SolvedProblem`.
     """
 
     def __str__(self) -> str:
@@ -62,7 +62,7 @@ class Run(Answer):
     @cached_property
     def result(self) -> Result:
         """Content of ``result.json`` as dataclasses."""
-        return result_of(self)
+        return build_result(self)
 
     def table(self) -> str:
         """Return parameters, combined intervals, their sources and the verdict, as printed in the
@@ -135,7 +135,7 @@ def run(
     method: str | Method | None = None,
     watch: Watch | None = None,
     log: Log | None = None,
-    start: str | Path | Earlier | None = None,
+    start: str | Path | WarmStart | None = None,
     seek_causes: bool = True,
     scheduler: str | None = None,
     probe: bool = False,
@@ -153,9 +153,9 @@ def run(
     log : callable, optional
         Called with a text at the beginning of each step.
     seek_causes : bool
-        Whether to test hypotheses about the cause of a misfit, see `likely_causes`.
+        Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`.
     probe : bool
-        Whether to refit subsets of the data and to relax each assumption, see `probes`.
+        Whether to refit subsets of the data and to relax each assumption, see `deep_probes`.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def run(
         checks_s = time.perf_counter() - searched_s - finer_s
         return replace(answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s))
 
-    bodies = (segment.body for segment in solution.collocation.segments)
+    bodies = (segment.body for segment in solution.collocation.transcriptions)
     fields = {part.field_name: part.field for b in bodies for part in b.parts if part.field}
     problem = problem.with_lengths({name: field.length_m for name, field in fields.items()})
     phases = {n: f for n, f in fields.items() if isinstance(f, TwoPhaseModes)}
@@ -191,25 +191,27 @@ def run(
         if problem.substeps == "auto":
             answer, fit = _fine_enough(answer, fit, problem.solver(method), watch, say, scheduler)
         substeps = answer.solution.collocation.substeps
-        turns = (c.sentence for e in problem.experiments for c in turn_concerns(e, substeps))
+        turns = (
+            c.message for e in problem.experiments for c in rotation_step_concerns(e, substeps)
+        )
         answer = replace(answer, notes=(*turns, *answer.notes))
         if answer.uncertainty is not None and fit is not None:
             profiles = _profiles(answer, fit, say)
             changes = _changes(answer, say)
             sources = _sources(answer, fit, answer.uncertainty, changes)
-            answer = replace(answer, profiles=profiles, sources=sources)
+            answer = replace(answer, profiles=profiles, systematic_effects=sources)
             answer = replace(answer, probes=_probes(answer, fit, changes, say, deep=probe))
         if not seek_causes or answer.solution.status is Status.INTERRUPTED:
             return timed(answer)
         say("looking for causes of the misfit")
-        answer = replace(answer, causes=likely_causes(answer.solution))
+        answer = replace(answer, causes=find_misspecifications(answer.solution))
         if problem.uncertainty.numerical and answer.uncertainty is not None:
-            answer = refine(answer, say=say)
+            answer = refine(answer, report_progress=say)
         return timed(answer)
     except KeyboardInterrupt:
         unsimulated = dict.fromkeys((e.name for e in problem.experiments), "interrupted")
         rollouts = unsimulated | dict(answer.rollouts)
-        return timed(replace(answer, rollouts=rollouts, missing=missing))
+        return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
 
 def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
@@ -219,49 +221,51 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     The fit is None if the solution did not converge or cannot be linearised.
     """
     say("checking the answer by a forward simulation")
-    rollouts = roll_outs(problem, solution)
+    rollouts = simulate_experiments(problem, solution)
     if not solution.status.converged:
         return Run(problem, solution, rollouts, None), None
     say("finding the error bars")
     try:
-        fit = linearised_fit(solution.collocation, solution.z)
+        fit = linearise_fit(solution.collocation, solution.z)
         say("finding what noise of the poses does")
         fit, noises = with_pose_noise(fit, solution.collocation, solution.z)
     except SimulationError as error:
         return Run(problem, solution, rollouts, None, notes=(f"no error bars: {error}",)), None
-    answer = Run(problem, solution, rollouts, None, diagnose(fit))
+    answer = Run(problem, solution, rollouts, None, diagnose_markers(fit))
     if not solution.collocation.nq:
         return answer, fit
     parameters = solution.collocation.parameters
     try:
-        uncertainty = uncertainty_of(fit, parameters, solution.q, problem.uncertainty)
+        uncertainty = uncertainty_from_fit(fit, parameters, solution.q, problem.uncertainty)
     except InputError as error:
         raise error.located(problem.path) from error
-    answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.sentence for n in noises))
+    answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.message for n in noises))
     error = step_error(problem, solution, fit, rollouts, answer.optimum)
     return replace(answer, refinement=error), fit
 
 
-def _changes(answer: Run, say: Log) -> Changes:
+def _changes(answer: Run, say: Log) -> ResidualChanges:
     """Return the changes of the residuals by the systematic effects and by the routine probes."""
     say("finding what is assumed is worth")
     solution = answer.solution
     deviations = probed_deviations(answer.problem.uncertainty.considered)
-    return assumed(solution.collocation, solution.z, deviations)
+    return changes_of_assumptions(solution.collocation, solution.z, deviations)
 
 
-def _sources(answer: Run, fit: LinearisedFit, known: Uncertainty, changes: Changes) -> Sources:
+def _sources(
+    answer: Run, fit: LinearisedFit, known: Uncertainty, changes: ResidualChanges
+) -> VarianceSources:
     """Return the systematic contributions to the uncertainty, without effects stated as exact."""
     solution = answer.solution
     stated = answer.problem.uncertainty.assumptions.deviations
     parameters = solution.collocation.parameters
     budgeted = changes.without(name for name, deviation in stated.items() if deviation is None)
     means = answer.problem.uncertainty.assumptions.means
-    return Sources.of(fit, budgeted, parameters, solution.q, known, means)
+    return VarianceSources.from_fit(fit, budgeted, parameters, solution.q, known, means)
 
 
 def _probes(
-    answer: Run, fit: LinearisedFit, changes: Changes, say: Log, deep: bool
+    answer: Run, fit: LinearisedFit, changes: ResidualChanges, say: Log, deep: bool
 ) -> tuple[Probe, ...]:
     """Return the routine probes, or for a `deep` check those of subsets and of every assumption."""
     solution = answer.solution
@@ -269,20 +273,20 @@ def _probes(
     deviations = probed_deviations(options.considered)
     collocation = solution.collocation
     z = solution.z
-    answered = Answered(
+    answered = SolvedFit(
         collocation=collocation,
         z=z,
         fit=fit,
-        errors=options,
+        error_model=options,
         statistical=answer.optimum,
         budget=answer.budget,
         deviations=deviations,
         changes=probed_changes(collocation, z, deviations, changes),
     )
     if not deep:
-        return probes_of_every_solve(answered)
+        return routine_probes_with_steps(answered)
     say("refitting parts of the data, and with assumptions relaxed")
-    return probes(answered)
+    return deep_probes(answered)
 
 
 def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
@@ -292,7 +296,7 @@ def _profiles(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
     for name in answer.problem.uncertainty.profile:
         say(f"profile likelihood of {name}")
         try:
-            profiles.append(profile_of(answer.solution, fit, answer.uncertainty, name))
+            profiles.append(profile_of_solution(answer.solution, fit, answer.uncertainty, name))
         except InputError as error:
             raise error.located(answer.problem.path) from error
     return tuple(profiles)
@@ -326,12 +330,12 @@ def _fine_enough(
     first = coarse.solution
     problem = coarse.problem
     before = first.collocation.substeps
-    factor = coarse.refinement.substeps(coarse.optimum, as_scheme(problem.scheme).order)
+    factor = coarse.refinement.suggested_substeps(coarse.optimum, as_scheme(problem.scheme).order)
     substeps = min(before * factor, MOST_SUBSTEPS)
     steps = "one step" if before == 1 else f"{before} steps"
-    worst, many = coarse.refinement.worst(coarse.optimum)
+    worst, many = coarse.refinement.largest_correction(coarse.optimum)
     why = f"with {steps} a sample, the step moves {worst} by {many:.2g} standard errors"
-    if fit.at_bound[: fit.shared].all():
+    if fit.is_at_bound[: fit.shared_count].all():
         substeps = MOST_SUBSTEPS
         why = f"with {steps} a sample, every parameter ends at a bound"
     if substeps <= before:
@@ -339,15 +343,15 @@ def _fine_enough(
     say(f"solving again with {substeps} steps a sample")
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
-    p = np.where(fit.at_bound, again.guess_p, p)
+    p = np.where(fit.is_at_bound, again.guess_p, p)
     try:
         require_memory(problem, again, solver)
-        positions, failure = marched(again, p)
+        positions, failure = simulate_trajectories(again, p)
         if failure is not None:
             raise failure
-        with workers_of(scheduler) as workers:
-            finer = read_where_found(
-                shared(solver, workers), again, watch, again.pack(p, positions)
+        with connect_executor(scheduler) as workers:
+            finer = solve_with_renewed_correspondences(
+                with_workers(solver, workers), again, watch, again.pack(p, positions)
             )
         message = finer.message
     except (InputError, SimulationError) as error:

@@ -1,7 +1,8 @@
 """Serialisation of results: dataclasses to JSON and back.
 
 A dataclass becomes an object of its fields and of the properties listed in its class attribute
-``TOLD``; arrays become lists. JSON has neither NaN nor infinity: null is written in their place,
+``SERIALISED_PROPERTIES``; arrays become lists. JSON has neither NaN nor infinity: null is written
+in their place,
 and is read as NaN where a number is expected.
 """
 
@@ -32,7 +33,7 @@ def content(value: Any) -> Any:
     """Return a value as plain objects that `json` can write; NaN and infinity become None."""
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
-        own |= {name: getattr(value, name) for name in getattr(value, "TOLD", ())}
+        own |= {name: getattr(value, name) for name in getattr(value, "SERIALISED_PROPERTIES", ())}
         left_out = {f.name for f in fields(value) if _is_optional(f) and own[f.name] is None}
         return {name: content(each) for name, each in own.items() if name not in left_out}
     if isinstance(value, Mapping):
@@ -75,7 +76,7 @@ def read(kind: Any, found: Any) -> Any:
     kind : type
         A dataclass, or the annotation of a field: numbers, texts, tuples, mappings, arrays.
     found : object
-        Output of `json.load`; None is NaN where a number is expected.
+        Output of `json.load_object`; None is NaN where a number is expected.
 
     Raises
     ------

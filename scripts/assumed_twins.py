@@ -28,7 +28,7 @@ from collocation_sysid import (
 )
 from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
 from collocation_sysid.fem.constants import GAMMA_R
-from collocation_sysid.fem.materials import DAMPINGS, Damping, rayleigh
+from collocation_sysid.fem.materials import DAMPINGS, DampingLaw, rayleigh
 from collocation_sysid.statistics.assumptions import OBJECTIVE_DAMPINGS
 
 Array = NDArray[np.float64]
@@ -138,10 +138,10 @@ def _stiffer_along(shares: Sequence[float]) -> Material:
         isotropic += 0.5 * lambda_pa * ca.log(j) ** 2
         return isotropic + 0.5 * young_pa * sum(s * green[k, k] ** 2 for k, s in enumerate(shares))
 
-    return Material.of(energy)
+    return Material.from_energy(energy)
 
 
-def _damping(stated: Damping, off: Mapping[str, float]) -> Damping:
+def _damping(stated: DampingLaw, off: Mapping[str, float]) -> DampingLaw:
     """The stated law, which is a stress, with a share of the differences of others from it."""
     shares = {
         law: off.get(key, 0.0)
@@ -167,7 +167,7 @@ def _damping(stated: Damping, off: Mapping[str, float]) -> Damping:
     def potential(psi, f, rate, gamma_r_s):
         return shares["rayleigh"] * rayleigh(psi, f, rate, gamma_r_s)
 
-    return Damping("between", (GAMMA_R,), potential, stress)
+    return DampingLaw("between", (GAMMA_R,), potential, stress)
 
 
 def _drag(density_kg_m3: float) -> NodeForce:
@@ -177,7 +177,7 @@ def _drag(density_kg_m3: float) -> NodeForce:
     def drag(x, v, at):
         return -per_area * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-8) * v
 
-    return NodeForce.of(drag)
+    return NodeForce.from_law(drag)
 
 
 def _lift(experiment: Experiment, body: Body, off: Mapping[str, float]) -> tuple[Force, ...]:

@@ -15,9 +15,9 @@ from collections.abc import Callable
 import numpy as np
 
 import collocation_sysid as cs
-from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
 EDGE_M, STEP_S, SCHEME = 0.1, 0.01, "bdf2"
@@ -41,7 +41,9 @@ def pressed(divisions: int, steps: int, friction: float | None) -> cs.Experiment
         grasps.append(cs.Obstacle(poses=down, shape=cs.Cuboid(corners), friction=friction))
     top = np.flatnonzero(body.nodes_m[:, 2] > EDGE_M - 1e-9)
     nowhere = np.zeros((len(t_s), len(top), 3))
-    markers = cs.Markers(t_s, nowhere, 1e-3, [f"m{k}" for k in top], body.nodes_m[top]).on(body)
+    markers = cs.Markers(t_s, nowhere, 1e-3, [f"m{k}" for k in top], body.nodes_m[top]).on_body(
+        body
+    )
     return cs.Experiment(body, t_s, grasps, markers, nuisance=cs.Nuisance.none())
 
 
@@ -49,18 +51,23 @@ def prepared(divisions: int, steps: int, friction: float | None) -> dict[str, Ca
     """A forward simulation, and a sweep along it; what touches is printed."""
     experiment = pressed(divisions, steps, friction)
     collocation = cs.Collocation([experiment], UNKNOWN, SCHEME)
-    (segment,) = collocation.segments
-    dynamics = Dynamics.of(experiment, SCHEME).with_theta(experiment.body.theta(TRUTH))
-    x = march(experiment, dynamics)
-    (part,) = collocation.parts_at(collocation.guess_p, [x])
-    for term in contacts(experiment):
-        area_m2, nothing = term.contact.surface.area_m2, np.zeros((0, len(x), term.points.count))
-        gap_m = term.contact.distance.value(term.points.vectors(x), nothing)[0]
-        touched = (gap_m < term.contact.width_m) @ area_m2 / area_m2.sum()
+    (segment,) = collocation.transcriptions
+    dynamics = Dynamics.from_experiment(experiment, SCHEME).with_theta(
+        experiment.body.theta_from_values(TRUTH)
+    )
+    x = simulate_scheme(experiment, dynamics)
+    (part,) = collocation.iterates_at(collocation.guess_p, [x])
+    for term in contact_terms(experiment):
+        area_m2, nothing = (
+            term.law_of_contact.surface.area_m2,
+            np.zeros((0, len(x), term.points.count)),
+        )
+        gap_m = term.law_of_contact.gap_function.evaluate(term.points.vectors(x), nothing)[0]
+        touched = (gap_m < term.law_of_contact.largest_width_m) @ area_m2 / area_m2.sum()
         print(f"{100 * touched.mean():.0f} % of the surface is in contact, at friction {friction}")
     return {
-        "forward simulation": lambda: march(experiment, dynamics),
-        "sweep": lambda: Sweep(segment).forward(part.x, part.setting),
+        "forward simulation": lambda: simulate_scheme(experiment, dynamics),
+        "sweep": lambda: Sweep(segment).forward(part.x, part.equations),
     }
 
 

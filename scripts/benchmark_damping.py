@@ -21,7 +21,7 @@ from benchmark_methods import PAPER_SIZE, PARAMETERS, TRUTH, experiment_of
 from collocation_sysid import Body, Collocation
 from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.model.dynamics import Dynamics
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
 
@@ -74,15 +74,18 @@ def sweep_of(
     body = Body(shape, density_kg_m3=20.0, element=element, damping=law, threads=threads)
     held = body.nodes_m[:, 2] < 1e-9
     grasp = replace(made.grasps[0], nodes=np.flatnonzero(held))
-    experiment = replace(made, body=body, grasps=(grasp,), markers=made.markers.on(body))
+    experiment = replace(made, body=body, grasps=(grasp,), markers=made.markers.on_body(body))
     collocation = Collocation([experiment], PARAMETERS)
-    (segment,) = collocation.segments
-    x = march(experiment, Dynamics.of(experiment, "midpoint").with_theta(body.theta(TRUTH)))
-    (part,) = collocation.parts_at(collocation.guess_p, [x])
+    (segment,) = collocation.transcriptions
+    x = simulate_scheme(
+        experiment,
+        Dynamics.from_experiment(experiment, "midpoint").with_theta(body.theta_from_values(TRUTH)),
+    )
+    (part,) = collocation.iterates_at(collocation.guess_p, [x])
 
     def sweep() -> tuple[float, ...]:
         watch, began = Stopwatch(), time.perf_counter()
-        Sweep(segment, stopwatch=watch).forward(part.x, part.setting)
+        Sweep(segment, stopwatch=watch).forward(part.x, part.equations)
         return time.perf_counter() - began, watch.evaluations, watch.linear_algebra
 
     sweep()

@@ -108,7 +108,7 @@ def _extra(collocation: Collocation, z: np.ndarray, values: np.ndarray) -> float
 
     Counts the arrays kept between calls as well.
     """
-    kept = sum(segment.linearisation_rows.nbytes for segment in collocation.segments)
+    kept = sum(segment.linearisation_buffer.nbytes for segment in collocation.transcriptions)
     tracemalloc.start()
     collocation.constraints_and_jacobian(z, values)
     _, peak = tracemalloc.get_traced_memory()

@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 from twins import SOFT, twin
 
-from collocation_sysid.live import Estimator, Frame, LiveOptions
-from collocation_sysid.live.sources import collected_before, recorded
+from collocation_sysid.live import Frame, LiveEstimator, LiveOptions
+from collocation_sysid.live.sources import frames_of_recording, without_garbage_of_startup
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 PROBLEMS = Path(__file__).parent.parent / "problems"
 # Standard deviation of the noise that is added, and of the truth.
@@ -53,8 +53,8 @@ def main() -> None:
     options = LiveOptions(budget_s=budget_s, rows=arguments.rows)
     for name in arguments.problem or NOISE_M:
         problem = _noisy(name)
-        live = Estimator(problem, options, time.thread_time)
-        frames = list(recorded(problem.experiments[0], live.model))
+        live = LiveEstimator(problem, options, time.thread_time)
+        frames = list(frames_of_recording(problem.experiments[0], live.model))
         if arguments.frames:
             _endless(name, live, frames, arguments.frames)
         else:
@@ -73,16 +73,16 @@ def _noisy(name: str) -> Problem:
     return Problem([seen], problem.parameters, scheme=problem.scheme, substeps=problem.substeps)
 
 
-def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame]) -> None:
+def _compared(name: str, problem: Problem, live: LiveEstimator, frames: list[Frame]) -> None:
     took, again = [], []
-    with collected_before():
+    with without_garbage_of_startup():
         for frame in frames:
-            update = live.take(frame)
+            update = live.process_frame(frame)
             took.append(update.latency_s)
             again.append(update.relinearised)
             if abs(frame.t_s - EARLY_S) < 1e-6:
                 early = update
-    settled, row_s = live.settle() or update, _row_s(problem)
+    settled, row_s = live.finish() or update, _row_s(problem)
     median, late = 1e3 * np.percentile(took, [50, 99])
     print(f"{name}: {len(frames)} frames of {live.model.substeps} rows, {np.mean(again):.1f} again")
     print(f"    median {median:.2f} ms, 99 % below {late:.2f} ms, first {1e3 * took[0]:.2f} ms")
@@ -90,7 +90,7 @@ def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame])
         f"    a row of the batch's sweep {1e3 * row_s:.2f} ms: {1e-3 * median / row_s:.1f} of these"
     )
     solution = solve(problem, ReducedSpace())
-    batch = covariance(solution.collocation, solution.z).estimates
+    batch = uncertainty_at(solution.collocation, solution.z).estimates
     for key, true in TRUTH[name].items():
         found, known = update.estimates[key], batch[key]
         apart, at_last = (
@@ -111,9 +111,9 @@ def _compared(name: str, problem: Problem, live: Estimator, frames: list[Frame])
 def _row_s(problem: Problem) -> float:
     """Processor time of a row in a sweep of the whole recording, the least of some."""
     collocation = problem.collocation()
-    rows = collocation.segments[0].grid_rows
+    rows = collocation.transcriptions[0].grid_times
     horizon, found = Horizon(collocation, [rows]), []
-    x, _ = horizon.extend(collocation.guess_p)
+    x, _ = horizon.simulate(collocation.guess_p)
     for _ in range(SWEEPS):
         began = time.thread_time()
         horizon.evaluate(collocation.guess_p, x)
@@ -128,10 +128,10 @@ def _to_and_fro(frames: list[Frame]) -> Iterator[Frame]:
         yield replace(there_and_back[k % len(there_and_back)], t_s=k * interval_s)
 
 
-def _endless(name: str, live: Estimator, frames: list[Frame], wanted: int) -> None:
+def _endless(name: str, live: LiveEstimator, frames: list[Frame], wanted: int) -> None:
     """The poses there and back again, with markers that stay behind: memory is what counts."""
     for k, frame in zip(range(wanted), _to_and_fro(frames), strict=False):
-        live.take(frame)
+        live.process_frame(frame)
         if k in (999, wanted - 1) or (k + 1) % max(1, wanted // 10) == 0:
             used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             print(f"{name}: {k + 1} frames, {len(live.log)} rows kept, {used_mb:.0f} MB at most")

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from collocation_sysid import Body, Collocation, Experiment, Parameters, Problem, Unknown
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.sweep import Sweep
 
 FILE = Path(__file__).parents[1] / "problems/table1/problem.toml"
@@ -58,13 +58,13 @@ def sweep(
     memory = {n: v for n, v in MEMORY.items() if n.partition(".")[0] in names}
     given: dict[str, Unknown | float] = {name: Unknown(guess=v) for name, v in TRUTH.items()}
     given |= {name: Unknown(guess=v) if estimated else v for name, v in memory.items()}
-    collocation = Collocation([replace(experiment, body=body)], Parameters.of(given))
-    (segment,) = collocation.segments
-    setting = segment.setting(collocation.guess_p, np.zeros(segment.nuisance.size))
-    x = march(experiment=segment.experiment, dynamics=setting.dynamics)
+    collocation = Collocation([replace(experiment, body=body)], Parameters.from_mapping(given))
+    (segment,) = collocation.transcriptions
+    setting = segment.equations_at(collocation.guess_p, np.zeros(segment.nuisance.size))
+    x = simulate_scheme(experiment=segment.experiment, dynamics=setting.dynamics)
     solver = Sweep(segment)
     solver.forward(x, setting)
-    return lambda: solver.forward(x, setting), 1 + len(segment.moving)
+    return lambda: solver.forward(x, setting), 1 + len(segment.dynamic_parameters)
 
 
 def timed(run: Callable[[], object]) -> float:

@@ -43,7 +43,7 @@ from collocation_sysid.fem.structured import cylinder_mesh
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.workers import OnCluster
+from collocation_sysid.methods.workers import DaskExecutor
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
@@ -137,14 +137,14 @@ def measure(mesh: str, steps: int, method: str) -> Row:
     began = time.perf_counter()
     collocation = Collocation([experiment], PARAMETERS)
     build_s = time.perf_counter() - began
-    body, truth = experiment.body, experiment.body.theta(TRUTH)
+    body, truth = experiment.body, experiment.body.theta_from_values(TRUTH)
     body.linearise(body.nodes_m, 0 * body.nodes_m, truth)
     began = time.perf_counter()
     solution = METHODS[method]()(collocation)
     total_s = time.perf_counter() - began
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     # The full Jacobian of a large problem would take more memory than its solution did.
-    small = collocation.variables < 500_000
+    small = collocation.variable_count < 500_000
     return Row(
         method=method,
         nodes=len(experiment.body.nodes_m),
@@ -239,7 +239,7 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
 
     collocation = Collocation(recordings, PARAMETERS)
 
-    def solve(workers: OnCluster | None, threads: int) -> tuple[float, float, float]:
+    def solve(workers: DaskExecutor | None, threads: int) -> tuple[float, float, float]:
         first.body.threads = threads
         busy_s = workers.client.run(time.process_time) if workers else {}
         here_s, began = time.process_time(), time.perf_counter()
@@ -253,11 +253,11 @@ def shared_out(mesh: str, steps: int, experiments: int = 4, repeats: int = 3) ->
         return wall_s, busiest_s, here_s
 
     with ExitStack() as stack:
-        clusters: list[OnCluster] = []
+        clusters: list[DaskExecutor] = []
         for count in (1, 2):
             cluster = LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=":0")
             client = stack.enter_context(Client(stack.enter_context(cluster)))
-            clusters.append(OnCluster(client))
+            clusters.append(DaskExecutor(client))
         cases = {
             "one worker": (clusters[0], 1),
             "two workers": (clusters[1], 1),

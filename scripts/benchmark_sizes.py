@@ -24,7 +24,7 @@ from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung
 
 from collocation_sysid import Body, Collocation
 from collocation_sysid.program.factorisation import Choice
-from collocation_sysid.program.marching import march_on
+from collocation_sysid.program.marching import continue_simulation
 from collocation_sysid.program.newton import NewtonOptions
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
@@ -80,12 +80,12 @@ def measured(size: str, steps: int | None, threads: int, choice: Choice, damping
         cylinder(mesh), density_kg_m3=20.0, damping=damping, element=element, threads=threads
     )
     collocation = Collocation([swung(body, steps + 1)], PARAMETERS)
-    (segment,) = collocation.segments
-    setting = segment.setting(np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0))
+    (segment,) = collocation.transcriptions
+    setting = segment.equations_at(np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0))
     before_mb = peak_mb()
     clock = time.perf_counter if threads > 1 else time.process_time
     began, spent = clock(), Stopwatch(clock)
-    x, failure = march_on(
+    x, failure = continue_simulation(
         segment.experiment,
         setting.dynamics,
         options=NewtonOptions(tolerance=1e-6),
@@ -104,7 +104,7 @@ def measured(size: str, steps: int | None, threads: int, choice: Choice, damping
     return (
         f"{len(body.nodes_m):6d} nodes {element:5s} {steps:4d} steps {threads} threads "
         f"{kind(solver):10s} march {march.told(steps)}  sweep {sweep.told(steps)}  "
-        f"at a time {solver.chunk} steps, {numbers / 1e6:.0f} MB; "
+        f"at a time {solver.chunk_rows} steps, {numbers / 1e6:.0f} MB; "
         f"peak {peak_mb():.0f} MB, before {before_mb:.0f} MB"
     )
 
@@ -114,7 +114,7 @@ def kind(solver: Sweep) -> str:
     chosen = solver.factoriser
     if chosen.skyline:
         return "skyline"
-    return "band" if chosen.banded else "supernodal" if chosen.supernodal else "sparse"
+    return "band" if chosen.is_banded else "supernodal" if chosen.is_supernodal else "sparse"
 
 
 def peak_mb() -> float:

@@ -55,7 +55,7 @@ def main() -> None:
 def as_glued(experiment: Experiment) -> Experiment:
     """The experiment with the misplaced marker where it is."""
     body, markers = experiment.body, experiment.markers
-    places = markers.observe(body.nodes_m)
+    places = markers.predict_positions(body.nodes_m)
     places[markers.names.index(MISPLACED)] = GLUED_M
     placement = place_markers(places, body.nodes_m, body)
     return replace(experiment, markers=replace(markers, placement=placement))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.mesh_checks import orient
+from collocation_sysid.fem.mesh_checks import orient_elements
 
 FILE = Path(__file__).parents[1] / "problems" / "phantom_compression" / "eighth.vtu"
 SECTORS = 2
@@ -60,7 +60,7 @@ def turned(radii_mm: tuple[float, ...], heights_mm: tuple[float, ...]) -> TetMes
     kept = np.array([four for four in tetrahedra if len(set(four)) == 4])
     used, tetrahedra = np.unique(kept, return_inverse=True)
     points_m = np.concatenate(points)[used]
-    return TetMesh(points_m, orient(points_m, tetrahedra.reshape(-1, 4))[0])
+    return TetMesh(points_m, orient_elements(points_m, tetrahedra.reshape(-1, 4))[0])
 
 
 def main() -> None:

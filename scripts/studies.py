@@ -16,7 +16,7 @@ from collocation_sysid.plan import (
     plan_comparison,
     run_all,
 )
-from collocation_sysid.plan.table import Row, Yardstick, run_row
+from collocation_sysid.plan.table import Row, SuccessCriterion, run_row
 from collocation_sysid.problem import Problem
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -98,11 +98,11 @@ def run_variants(
         run
         for runs in planned.values()
         for run in runs
-        if store.finished(run.key, limits.time_limit_s) is None
+        if store.load_finished(run.key, limits.time_limit_s) is None
     ]
     names = {run.key: name for name, runs in planned.items() for run in runs}
     run_all(remaining, store, limits, lambda record, _: _tell(names[record["key"]], record))
-    yardstick = Yardstick(TRUTH)
+    yardstick = SuccessCriterion(TRUTH)
     return {
         name: [run_row(run, store.load(run.key), yardstick) for run in runs]
         for name, runs in planned.items()

@@ -23,9 +23,9 @@ from scipy.stats import t as student
 
 import collocation_sysid as cs
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.recording.solids import Solid
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 YOUNG_PA, POISSON = 1e4, 0.3
 LAW = {
@@ -93,14 +93,16 @@ def pressed(
         nuisance=cs.Nuisance.none(),
     )
     seen = cs.simulate(experiment, LAW)
-    (term,) = contacts(experiment)
+    (term,) = contact_terms(experiment)
     x = seen.positions_m.reshape(1, -1)
     place = term.points.vectors(x)[:, 0]
-    gap_m = term.contact.distance.value(place[:, None], np.zeros((0, 1, place.shape[1])))[0, 0]
-    law = term.contact
+    gap_m = term.law_of_contact.gap_function.evaluate(
+        place[:, None], np.zeros((0, 1, place.shape[1]))
+    )[0, 0]
+    law = term.law_of_contact
     near, within = np.maximum(law.widths_m - gap_m, 0), np.maximum(-gap_m, 0)
     push = law.surface.area_m2 * law.data[3] * (near**2 - within**2) / law.widths_m
-    x_m, y_m, _ = place[:3] + term.contact.body.frame_m[0][:, None]
+    x_m, y_m, _ = place[:3] + term.law_of_contact.body.frame_nodes_m[0][:, None]
     r2_m2 = x_m**2 + (y_m**2 if isinstance(shape, cs.Sphere) else 0.0)
     return -float(seen.wrenches[0][0, 2]), float((push * r2_m2).sum() / push.sum())
 
@@ -184,8 +186,8 @@ def twins(count: int) -> Iterator[Twin]:
             measured.append(replace(experiment, grasps=[*held, read]))
         twin = replace(problem, experiments=measured).collocation()
         solution = ReducedSpace()(twin, start=z)
-        z, told = solution.z, covariance(solution.collocation, solution.z)
-        places = [part.phi[0] for part in solution.collocation.parts(solution.z)]
+        z, told = solution.z, uncertainty_at(solution.collocation, solution.z)
+        places = [part.phi[0] for part in solution.collocation.iterates(solution.z)]
         off = np.abs(np.array(places) - onset_m / gel.ONSET_M) / list(told.nuisance.values())
         simple = np.array([hertz_pa(gel.DEPTHS_M, own_n) for own_n in force_n])
         half = spread * sem(simple) * np.array([0, -1, 1])

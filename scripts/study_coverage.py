@@ -30,16 +30,16 @@ from scipy.stats import binom, norm
 from study_starts import TRUTH, hanging_cylinder, parameters
 from synthetic import swing
 
-from collocation_sysid.fem.moduli import engineering
+from collocation_sysid.fem.moduli import engineering_constants
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance
-from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import (
     ErrorModel,
     Uncertainty,
-    uncertainty_of,
+    uncertainty_from_fit,
 )
 
 Array = NDArray[np.float64]
@@ -129,9 +129,9 @@ def run(case: Case, sigma_m: float, seed: Sequence[int]) -> Outcome:
     solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation)
     collocation = solution.collocation
     q = solution.z[: collocation.nq]
-    fit = linearised_fit(collocation, solution.z)
-    found = [uncertainty_of(fit, collocation.parameters, q, kind) for kind in KINDS]
-    wrong = collocation.parameters_of(solution.z)[collocation.nq :] - phi
+    fit = linearise_fit(collocation, solution.z)
+    found = [uncertainty_from_fit(fit, collocation.parameters, q, kind) for kind in KINDS]
+    wrong = collocation.parameters_from(solution.z)[collocation.nq :] - phi
     return Outcome(
         solution.status.converged,
         np.array([[*held(each), held_own(each, wrong)] for each in found]),
@@ -172,9 +172,9 @@ def twin(
     experiment = replace(experiment, nuisance=case.nuisance)
     collocation = collocation_of(experiment)
     drawn = rng.standard_normal(collocation.nphi)
-    followed, p = collocation.following(np.append(collocation.parameters.guess_q, drawn))
-    (segment,), phi = followed.segments, p[collocation.nq :]
-    tracks = segment.markers.of_positions(x, phi)
+    followed, p = collocation.follow_estimates(np.append(collocation.parameters.guess_q, drawn))
+    (segment,), phi = followed.transcriptions, p[collocation.nq :]
+    tracks = segment.markers.predict_positions(x, phi)
     noise = sigma_m * noise_of(rng, tracks.shape, case.phi)
     return collocation_of(with_markers(experiment, tracks + noise)), phi
 
@@ -191,7 +191,7 @@ def noise_of(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Ar
 
 
 def truth() -> dict[str, float]:
-    young_pa, poisson = engineering(TRUTH["lambda_pa"], TRUTH["mu_pa"])
+    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
     return {**TRUTH, "young_pa": young_pa, "poisson": poisson}
 
 

@@ -25,9 +25,9 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
-from collocation_sysid.program.skin import Skin
+from collocation_sysid.program.skin import VisibleSurface
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
@@ -64,9 +64,12 @@ def image_m(seen_by: cs.DepthCamera) -> np.ndarray:
     """Without noise."""
     depth = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
     experiment = bar(depth)
-    x, skin = cs.simulate(experiment, TRUTH).positions_m[0], Skin.of(experiment.body, depth)
-    rotations, translations = seen_by.motion([0.0])
-    triangles = (skin.triangles(x[skin.nodes]) - translations[0]) @ rotations[0]
+    x, skin = (
+        cs.simulate(experiment, TRUTH).positions_m[0],
+        VisibleSurface.from_body(experiment.body, depth),
+    )
+    rotations, translations = seen_by.pose_at([0.0])
+    triangles = (skin.subdivided_triangles(x[skin.nodes]) - translations[0]) @ rotations[0]
     return cs.depth_image(seen_by, SHAPE, triangles)
 
 
@@ -97,12 +100,14 @@ def fitted(
     sigma_m = ALONG_NORMALS * noise_m
     depth = cs.Depth.of_images("front", image, said, sigma_m, spacing_m=0.004)
     unknown = {**TRUTH, "young_pa": cs.Unknown()}
-    solution = cs.solve(cs.Problem([bar(depth)], cs.Parameters.of(unknown)))
-    bars = covariance(solution.collocation, solution.z).estimates["young_pa"]
+    solution = cs.solve(cs.Problem([bar(depth)], cs.Parameters.from_mapping(unknown)))
+    bars = uncertainty_at(solution.collocation, solution.z).estimates["young_pa"]
     low, high = bars.statistical95 or (0.0, np.inf)
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     (reading,) = part.segment.depths
-    rms_mm = 1e3 * np.sqrt(np.nanmean(reading.apart_m(part.looked[-1], part.phi) ** 2))
+    rms_mm = 1e3 * np.sqrt(
+        np.nanmean(reading.signed_distances_m(part.observables[-1], part.phi) ** 2)
+    )
     return np.append(np.array([bars.value, low, high]) / TRUTH["young_pa"], rms_mm)
 
 
@@ -184,9 +189,12 @@ def soft_image_m() -> np.ndarray:
     nothing = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
     experiment = soft_experiment(nothing)
     x = cs.simulate(experiment, SOFT_TRUTH).positions_m[0]
-    skin, camera = Skin.of(experiment.body, nothing), soft_camera(np.zeros(3), np.zeros(3))
-    rotations, translations = camera.motion([0.0])
-    triangles = (skin.triangles(x[skin.nodes]) - translations[0]) @ rotations[0]
+    skin, camera = (
+        VisibleSurface.from_body(experiment.body, nothing),
+        soft_camera(np.zeros(3), np.zeros(3)),
+    )
+    rotations, translations = camera.pose_at([0.0])
+    triangles = (skin.subdivided_triangles(x[skin.nodes]) - translations[0]) @ rotations[0]
     return cs.depth_image(camera, SOFT_SHAPE, triangles)
 
 
@@ -200,7 +208,7 @@ def soft_problem(seed: int, guess_pa: float | None = None) -> cs.Problem:
     )
     depth = cs.Depth.of_images("front", image_m, camera, SOFT_NOISE_M, spacing_m=0.004)
     unknown = cs.Unknown() if guess_pa is None else cs.Unknown(guess_pa)
-    parameters = cs.Parameters.of({**SOFT_TRUTH, "young_pa": unknown})
+    parameters = cs.Parameters.from_mapping({**SOFT_TRUTH, "young_pa": unknown})
     return cs.Problem([soft_experiment(depth)], parameters)
 
 

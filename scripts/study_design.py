@@ -19,12 +19,18 @@ from make_foam_cylinder import FOLDER, SWING, TRUTH
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.plan.design import Criterion, Design, DesignOptions, Limits, design
+from collocation_sysid.plan.design import (
+    Design,
+    DesignCriterion,
+    DesignOptions,
+    Limits,
+    design_motion,
+)
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Nuisance
-from collocation_sysid.statistics.linearised import Derived
+from collocation_sysid.statistics.linearised import DerivedModuli
 
 FINE_S = 1e-4
 
@@ -45,7 +51,9 @@ def main() -> None:
     limits = Limits.read(given.limits) if given.limits else own_limits()
     names = tuple(given.names.split(",")) if given.names else ()
     options = DesignOptions(given.evaluations, pairs=0, waves=given.waves, seed=given.seed)
-    found = design(problem, limits, given.duration, Criterion("worst", names), options, say=print)
+    found = design_motion(
+        problem, limits, given.duration, DesignCriterion("worst", names), options, say=print
+    )
     print(table(found), features(found), sep="\n\n", flush=True)
     if given.twins:
         print("", spread(found, given.twins, given.seed), sep="\n")
@@ -116,7 +124,7 @@ def features(found: Design) -> str:
 
     Turns and pushes are told in the body's own axes at the start: along the cylinder, and across.
     """
-    motion, (rotation, _) = found.motion, found.recording.start
+    motion, (rotation, _) = found.motion, found.recording.start_pose
     place, rate, growth = motion.derivatives(motion.grid_s)
     lines = ["|  | RMS | RMS acceleration | frequency Hz |", "|---|---|---|---|"]
     for kind, columns, unit in (("shift", slice(3), "m"), ("turn", slice(3, 6), "rad")):
@@ -157,18 +165,20 @@ def twin(found: Design, rng: np.random.Generator) -> dict[str, float] | None:
     """The answer for one recording of the designed motion; None where there is none."""
     problem, experiment = found.recording.problem, found.experiment
     options = problem.parameters, problem.scheme, problem.first_substeps
-    (segment,) = Collocation([experiment], *options).segments
+    (segment,) = Collocation([experiment], *options).transcriptions
     phi = segment.guess_phi + rng.normal(size=segment.nuisance.size)
     values = problem.parameters.guesses
     _, scheme, substeps = options
-    actual = simulate(segment.corrected(phi), values, scheme, substeps=substeps)
-    tracks = segment.markers.of_samples(actual.positions_m, phi)
+    actual = simulate(segment.corrected_experiment(phi), values, scheme, substeps=substeps)
+    tracks = segment.markers.predict_samples(actual.positions_m, phi)
     noise = experiment.markers.sigma_m[:, None] * rng.normal(size=tracks.shape)
     seen = with_markers(experiment, tracks + noise)
     solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(Collocation([seen], *options))
     if not solution.status.converged:
         return None
-    derived = Derived.of((s.constants for s in solution.collocation.segments), solution.q).values
+    derived = DerivedModuli.from_bodies(
+        (s.constants for s in solution.collocation.transcriptions), solution.q
+    ).values
     return solution.parameters | dict(derived)
 
 

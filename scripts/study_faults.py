@@ -35,10 +35,10 @@ from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
 from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumption
-from collocation_sysid.statistics.budget import BudgetLine, Sources, budget
+from collocation_sysid.statistics.budget import BudgetLine, VarianceSources, budget
 from collocation_sysid.statistics.considered import changed_residuals
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import Uncertainty, covariance
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
@@ -130,7 +130,7 @@ def run(fault: str, seed: Sequence[int]) -> Outcome:
 def measured() -> Experiment:
     """The experiment with its tracks, without noise, and with the default nuisance parameters."""
     experiment = replace(reference(SIGMA_M)[0], nuisance=Nuisance())
-    return with_markers(experiment, experiment.markers.observe(positions_m()))
+    return with_markers(experiment, experiment.markers.predict_positions(positions_m()))
 
 
 def positions_m() -> Array:
@@ -157,11 +157,11 @@ def fitted(experiment: Experiment, assumed: Sequence[Assumption]) -> Fit:
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
     collocation, z = solution.collocation, solution.z
-    found = covariance(collocation, z)
+    found = uncertainty_at(collocation, z)
     deviations = [(row, row.sigma) for row in assumed if row.sigma is not None]
     changes = changed_residuals(collocation, z, deviations)
-    fit = linearised_fit(collocation, z)
-    sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
+    fit = linearise_fit(collocation, z)
+    sources = VarianceSources.from_fit(fit, changes, collocation.parameters, solution.q, found)
     lines = budget(sources, found, {}, problem.parameters)
     return Fit(found, lines, solution.status.converged)
 
@@ -252,9 +252,9 @@ def loose(experiment: Experiment, rng: Generator) -> Pair:
 
 def misplaced(experiment: Experiment, rng: Generator) -> Pair:
     """Every marker sits 1 mm an axis off its place."""
-    places_m = experiment.markers.observe(experiment.body.nodes_m)
+    places_m = experiment.markers.predict_positions(experiment.body.nodes_m)
     moved = at_places(experiment, places_m + 1e-3 * rng.standard_normal(places_m.shape))
-    return with_markers(experiment, moved.markers.observe(positions_m())), experiment
+    return with_markers(experiment, moved.markers.predict_positions(positions_m())), experiment
 
 
 def unplaced(experiment: Experiment, rng: Generator) -> Pair:

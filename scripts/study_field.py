@@ -26,8 +26,8 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.field import Prior
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.statistics.fields import FieldEstimate, fields_of
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.fields import FieldEstimate, field_estimates
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 Array = NDArray[np.float64]
 SIZE_M, EDGE_M, STEP_S, SIGMA_M = (0.04, 0.04, 0.12), 0.01, 1 / 60, 1e-4
@@ -72,7 +72,7 @@ def hung(body: Body, count: int, steps: int) -> cs.Experiment:
     chosen = np.random.default_rng(0).permutation(surface)[:count]
     names = [f"m{k}" for k in range(len(chosen))]
     nowhere = np.zeros((steps, len(chosen), 3))
-    markers = cs.Markers(t_s, nowhere, SIGMA_M, names, x[chosen]).on(body)
+    markers = cs.Markers(t_s, nowhere, SIGMA_M, names, x[chosen]).on_body(body)
     grasp = cs.Grasp(np.flatnonzero(x[:, 2] > high[2] - 1e-9), poses)
     return cs.Experiment(body, t_s, [grasp], markers, nuisance=cs.Nuisance.none())
 
@@ -131,9 +131,9 @@ def found_of(twin: Twin, seed: int) -> Found:
     solution = cs.solve(problem)
     assert solution.status.converged, solution.message
     collocation, took_s = solution.collocation, time.process_time() - began
-    known = covariance(collocation, solution.z)
-    body = collocation.segments[0].body
-    (field,) = fields_of(body, collocation.parameters, solution.q, known)
+    known = uncertainty_at(collocation, solution.z)
+    body = collocation.transcriptions[0].body
+    (field,) = field_estimates(body, collocation.parameters, solution.q, known)
     estimate = known.estimates.get("contrast")
     return Found(field, truth, body.mesh, took_s, estimate and estimate.statistical95)
 
@@ -144,17 +144,17 @@ def told(twin: Twin, seeds: range) -> str:
     for seed in seeds:
         found = found_of(twin, seed)
         field, truth, mesh, took_s = found.field, found.truth, found.mesh, found.took_s
-        low, high = np.log(field.ci95)
+        low, high = np.log(field.statistical95)
         held = (low < truth) & (truth < high)
         stiff, log = stiff_cells(twin.kind, mesh), np.log(field.value)
         ratio = np.exp(log[stiff].mean() - log[~stiff].mean()) if stiff.any() else np.nan
         z_m = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2]
         step_mm = 1e3 * step_of(z_m, log) if twin.kind == "half" else np.nan
-        share, width = field.told.mean(), np.median(field.deviation)
+        share, width = field.is_informed.mean(), np.median(field.deviation)
         error = np.sqrt(np.mean((log - truth) ** 2))
-        inside = held[field.told].mean() if field.told.any() else np.nan
+        inside = held[field.is_informed].mean() if field.is_informed.any() else np.nan
         within = held[stiff].mean() if stiff.any() else np.nan
-        counts = field.identified, took_s, within
+        counts = field.identified_modes, took_s, within
         rows.append((share, inside, held.mean(), error, width, ratio, step_mm, *counts))
         if found.contrast95 is not None:
             lower, upper = found.contrast95
@@ -188,7 +188,7 @@ def cost() -> None:
         twin = Twin("", "half", 2.0, 0.04, max(1, modes))
         problem, _ = problem_of(twin, 1)
         if not modes:
-            fixed = {name: 0.0 for name in problem.bodies[0].mode_names}
+            fixed = {name: 0.0 for name in problem.bodies[0].field_coefficient_names}
             problem = cs.Problem(
                 problem.experiments, problem.parameters.with_fixed(fixed), substeps=1
             )

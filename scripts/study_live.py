@@ -18,12 +18,12 @@ from collections import Counter
 import numpy as np
 from twins import SOFT, twin
 
-from collocation_sysid.live import Estimator, LiveOptions, Update
-from collocation_sysid.live.sources import recorded
+from collocation_sysid.live import LiveEstimator, LiveOptions, LiveUpdate
+from collocation_sysid.live.sources import frames_of_recording
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 SAMPLES = 101
 # Frames come from 0 s on; the motion rises from there.
@@ -45,9 +45,9 @@ class Tally:
 
     def stream(self, problem: Problem, rows: int, batch: bool) -> None:
         """Stream a twin."""
-        live = Estimator(problem, LiveOptions(rows=rows), time.thread_time)
-        for frame in recorded(problem.experiments[0], live.model):
-            update = live.take(frame)
+        live = LiveEstimator(problem, LiveOptions(rows=rows), time.thread_time)
+        for frame in frames_of_recording(problem.experiments[0], live.model):
+            update = live.process_frame(frame)
             self.latency_s.append(update.latency_s)
             for at_s in LOOKED_AT_S:
                 if abs(frame.t_s - at_s) < 1e-6:
@@ -57,14 +57,14 @@ class Tally:
                 self.errors.append([abs(found[n].value / SOFT[n] - 1) for n in SOFT])
         if batch:
             solution = solve(problem, ReducedSpace())
-            known = covariance(solution.collocation, solution.z).estimates
+            known = uncertainty_at(solution.collocation, solution.z).estimates
             self.apart += [
                 abs(update.estimates[n].value - known[n].value)
                 / (known[n].statistical_std_error or np.inf)
                 for n in SOFT
             ]
 
-    def _count(self, at_s: float, update: Update) -> None:
+    def _count(self, at_s: float, update: LiveUpdate) -> None:
         self.verdicts[at_s, update.trust.verdict] += 1
         for name, estimate in update.estimates.items():
             if estimate.statistical95 is not None:

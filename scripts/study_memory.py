@@ -32,8 +32,8 @@ from collocation_sysid import (
     with_markers,
 )
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import uncertainty_of
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 SIZE_M, DIVISIONS = (0.1, 0.03, 0.03), (4, 1, 1)
 NOISE_M, STEPS, STEP_S, MOVED_S = 2e-4, 120, 0.01, 0.4
@@ -71,8 +71,8 @@ def report(branches: int, twins: int, seed: int) -> None:
         noisy = with_markers(exact, tracks + rng.normal(scale=NOISE_M, size=tracks.shape))
         collocation = Collocation([noisy], parameters)
         found = ReducedSpace()(collocation)
-        fit = linearised_fit(collocation, found.z)
-        uncertainty = uncertainty_of(fit, parameters, found.q)
+        fit = linearise_fit(collocation, found.z)
+        uncertainty = uncertainty_from_fit(fit, parameters, found.q)
         for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
             if name in true and estimate.statistical95 is not None:
                 held[name] += estimate.statistical95[0] <= true[name] <= estimate.statistical95[1]
@@ -91,7 +91,7 @@ def truth(branches: int) -> dict[str, float]:
 
 def unknowns(branches: int) -> Parameters:
     """All to be estimated, from guesses near the truth."""
-    return Parameters.of({n: Unknown(guess=1.1 * v) for n, v in truth(branches).items()})
+    return Parameters.from_mapping({n: Unknown(guess=1.1 * v) for n, v in truth(branches).items()})
 
 
 @cache

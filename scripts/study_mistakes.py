@@ -21,8 +21,8 @@ from wrong_twins import FAULTS, OBSTACLE_FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fa
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
-from collocation_sysid.runs.check import description_causes
-from collocation_sysid.statistics.hypothesis import ranked
+from collocation_sysid.runs.check import misspecification_hypotheses
+from collocation_sysid.statistics.hypothesis import rank
 from collocation_sysid.statistics.wrench_causes import wrench_mistakes
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
@@ -84,8 +84,8 @@ def cases(body: str, samples: int, seeds: int) -> Iterator[tuple[str, Fault, Pro
 
 def checked_causes(problem: Problem) -> tuple:
     """Return the causes that `check` lists."""
-    causes = description_causes(problem)
-    return causes or ranked(wrench_mistakes(problem.collocation()))
+    causes = misspecification_hypotheses(problem)
+    return causes or rank(wrench_mistakes(problem.collocation()))
 
 
 def solved_report(problem: Problem) -> str:

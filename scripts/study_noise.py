@@ -31,7 +31,7 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.statistics.uncertainty import ErrorModel, covariance
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 Array = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def run(case: Case, sigma_m: float, seed: int) -> Outcome:
 def noisy(sigma_m: float, seed: int | None, guess: Sequence[float]) -> Collocation:
     """The twin with noise of its seed; without noise where there is none."""
     experiment, x = reference(sigma_m)
-    tracks = experiment.markers.observe(x.reshape(len(x), -1, 3))
+    tracks = experiment.markers.predict_positions(x.reshape(len(x), -1, 3))
     if seed is not None:
         tracks = tracks + sigma_m * np.random.default_rng(seed).standard_normal(tracks.shape)
     parameters = Parameters(
@@ -125,7 +125,9 @@ def predicted(sigma_m: float) -> tuple[float, ...]:
     collocation = noisy(sigma_m, None, truth)
     _, x = reference(sigma_m)
     z = collocation.pack(np.log(truth), [x])
-    variances = covariance(collocation, z, ErrorModel(errors="independent")).covariance.diagonal()
+    variances = uncertainty_at(
+        collocation, z, ErrorModel(errors="independent")
+    ).covariance.diagonal()
     return tuple(np.sqrt(variances).tolist())
 
 

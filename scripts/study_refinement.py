@@ -23,9 +23,9 @@ from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
-from collocation_sysid.runs.refine import finer_mesh, refinement_of
-from collocation_sysid.runs.warm_start import Earlier
-from collocation_sysid.statistics.uncertainty import ErrorModel, covariance
+from collocation_sysid.runs.refine import finer_mesh, solve_refined
+from collocation_sysid.runs.warm_start import WarmStart
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 NOISE_M = 5e-5
 SAMPLES, STEP_S = 20, 0.01
@@ -80,8 +80,10 @@ def main(twins: int = 20, first: int = 0) -> None:
         for name in BODIES:
             problem, truth = twin(name, seed)
             solution = solve(problem)
-            found = covariance(solution.collocation, solution.z, ErrorModel(errors="independent"))
-            refined = refinement_of(problem, Earlier.of(solution), found.estimates)
+            found = uncertainty_at(
+                solution.collocation, solution.z, ErrorModel(errors="independent")
+            )
+            refined = solve_refined(problem, WarmStart.of(solution), found.estimates)
             for key in held:
                 estimate, error = found.estimates[key], refined.errors.get(key)
                 if estimate.statistical95 is None or error is None or error.interval95 is None:

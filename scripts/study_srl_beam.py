@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from collocation_sysid import Problem, Solution, solve
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.program.collocation import Part
-from collocation_sysid.statistics.diagnostics import diagnose
+from collocation_sysid.program.collocation import ExperimentIterate
+from collocation_sysid.statistics.diagnostics import diagnose_markers
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.identifiability import verdicts
-from collocation_sysid.statistics.linearised import LinearisedFit, linearised_fit
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.identifiability import identifiability_sentences
+from collocation_sysid.statistics.linearised import LinearisedFit, linearise_fit
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 TRIALS = ("gravity", "load52", "load101")
 # Element and bricks along x, y and z.
@@ -94,8 +94,10 @@ def fit(problem: Problem, solution: Solution | None = None) -> Fit:
     solution = solution or solve(problem)
     if not solution.status.converged:
         print(f"NOT CONVERGED: {solution.message}")
-    linearised = linearised_fit(solution.collocation, solution.z)
-    return Fit(solution, linearised, uncertainty_of(linearised, problem.parameters, solution.q))
+    linearised = linearise_fit(solution.collocation, solution.z)
+    return Fit(
+        solution, linearised, uncertainty_from_fit(linearised, problem.parameters, solution.q)
+    )
 
 
 # Parts ----------------------------------------------------------------------------------------
@@ -111,14 +113,16 @@ def joint(beam: Beam) -> None:
         print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
     print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
     print("\nnuisance parameters, and their standard deviations")
-    for part in solution.collocation.parts(solution.z):
+    for part in solution.collocation.iterates(solution.z):
         nuisance = part.segment.nuisance
         for name, value, scale in zip(nuisance.names, part.phi, nuisance.scales, strict=True):
             deviation = uncertainty.nuisance[name] * scale
             print(f"  {name:45}{1e3 * value * scale:8.2f} ±{1e3 * deviation:6.2f} 1e-3")
     print(f"\nRMS distance [mm]: {rms_line(solution)}")
-    said = dict.fromkeys((*solution.notes, *uncertainty.notes, *verdicts(uncertainty)))
-    sentences = [diagnosis.sentence for diagnosis in diagnose(found.linearised)]
+    said = dict.fromkeys(
+        (*solution.notes, *uncertainty.notes, *identifiability_sentences(uncertainty))
+    )
+    sentences = [diagnosis.sentence for diagnosis in diagnose_markers(found.linearised)]
     print("\n" + "\n".join(f"- {sentence}" for sentence in (*said, *sentences)))
 
 
@@ -164,7 +168,7 @@ def poisson(beam: Beam) -> None:
     report("estimated", found)
     ratio = found.uncertainty.estimates["poisson"]
     print(f"ν = {ratio.value:.3f}, {interval(ratio)}")
-    said = dict.fromkeys((*found.uncertainty.notes, *verdicts(found.uncertainty)))
+    said = dict.fromkeys((*found.uncertainty.notes, *identifiability_sentences(found.uncertainty)))
     print("\n".join(f"- {sentence}" for sentence in said))
     for value in (0.3, 0.4, 0.45, 0.48, 0.49):
         here = started(beam.load(f"parameters.poisson={{ fixed = {value} }}"), near)
@@ -175,7 +179,7 @@ def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[
     """RMS distance of a trial at a solution's material: its nuisance fitted, and all zero."""
     experiment = next(e for e in problem.experiments if e.name == trial)
     fixed = tuple(
-        replace(item, guess=solution.parameters[item.name], fixed=True)
+        replace(item, guess=solution.parameters[item.name], is_fixed=True)
         for item in problem.parameters.items
     )
     collocation = replace(
@@ -183,7 +187,7 @@ def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[
         experiments=[replace(experiment, validation=False)],
         parameters=replace(problem.parameters, items=fixed),
     )
-    (part,) = collocation.parts(ReducedSpace()(collocation).z)
+    (part,) = collocation.iterates(ReducedSpace()(collocation).z)
     return rms_of(part), rms_of(replace(part, phi=np.zeros_like(part.phi)))
 
 
@@ -222,17 +226,17 @@ def started(problem: Problem, solution: Solution) -> Problem:
     """The problem with an answer's values as guesses of what both estimate."""
     found = solution.parameters
     items = tuple(
-        item if item.fixed or item.name not in found else replace(item, guess=found[item.name])
+        item if item.is_fixed or item.name not in found else replace(item, guess=found[item.name])
         for item in problem.parameters.items
     )
     return replace(problem, parameters=replace(problem.parameters, items=items))
 
 
 def rms_mm(solution: Solution) -> list[float]:
-    return [rms_of(part) for part in solution.collocation.parts(solution.z)]
+    return [rms_of(part) for part in solution.collocation.iterates(solution.z)]
 
 
-def rms_of(part: Part) -> float:
+def rms_of(part: ExperimentIterate) -> float:
     squares = part.segment.markers.squared_distances_m2(part.x, part.phi)
     return 1e3 * float(np.sqrt(squares.mean()))
 

@@ -36,8 +36,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.factorisation import Factor, Factoriser
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_of
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 BOUNDS = {
@@ -260,8 +260,8 @@ def study(
     best = solve(problem_of(case, truth), method)
     if not best.status.converged:
         raise SystemExit(f"from the truth: {best.message}")
-    fit = linearised_fit(best.collocation, best.z)
-    found = uncertainty_of(
+    fit = linearise_fit(best.collocation, best.z)
+    found = uncertainty_from_fit(
         fit, best.collocation.parameters, best.q, ErrorModel("given", "independent")
     )
     std_errors = [found.estimates[name].statistical_std_error or np.nan for name in case.truth]

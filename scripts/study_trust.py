@@ -28,15 +28,15 @@ from collocation_sysid import Run, run
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.structured import box_mesh, cylinder_mesh
-from collocation_sysid.methods.scan import usual_constants
+from collocation_sysid.methods.scan import typical_constants
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
-from collocation_sysid.problem.recording import refuse_other_scale
+from collocation_sysid.problem.recording import require_plausible_markers
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers
 from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.causes import likely_causes
-from collocation_sysid.statistics.plausible import oddities
+from collocation_sysid.statistics.causes import find_misspecifications
+from collocation_sysid.statistics.plausible import size_and_density_hypotheses
 
 # With fewer steps the scheme, not a mistake, would be what is recognised.
 SAMPLES, STEP_S, SUBSTEPS, SIGMA_M = 60, 0.01, 3, 1e-3
@@ -117,12 +117,12 @@ def judged(fault: str, seed: int) -> Outcome:
         if fault != "none":
             problem = FAULTS[fault](problem, np.random.default_rng((seed, *fault.encode())))
         for body in problem.bodies:
-            oddities(body)
+            size_and_density_hypotheses(body)
         for experiment in problem.experiments:
-            refuse_other_scale(experiment, usual_constants(problem.parameters))
+            require_plausible_markers(experiment, typical_constants(problem.parameters))
         found = run(problem, seek_causes=False)
         if found.trust.verdict == "good":
-            found = replace(found, causes=likely_causes(found.solution))
+            found = replace(found, causes=find_misspecifications(found.solution))
     except (InputError, SimulationError) as error:
         return Outcome(fault, seed, "refused", (str(error),), None, None)
     errors = errors_of(found, truth)

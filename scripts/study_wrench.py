@@ -31,8 +31,8 @@ from collocation_sysid import (
 )
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.program.simulation import with_wrenches
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import uncertainty_of
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 SIZE_M, DIVISIONS = (0.2, 0.06, 0.06), (4, 1, 1)
 NOISE_M, NOISE_N, NOISE_NM = 1e-3, 0.05, 0.005
@@ -82,8 +82,8 @@ def fitted(experiment: Experiment):
     unknown = {name: Unknown(guess=1.1 * value) for name, value in TRUTH.items()}
     problem = Problem([experiment], unknown)
     solution = ReducedSpace()(problem.collocation())
-    fit = linearised_fit(solution.collocation, solution.z)
-    return uncertainty_of(fit, problem.parameters, solution.q)
+    fit = linearise_fit(solution.collocation, solution.z)
+    return uncertainty_from_fit(fit, problem.parameters, solution.q)
 
 
 def noisy(exact: Experiment, rng: np.random.Generator) -> Experiment:

@@ -300,7 +300,7 @@ def torn(experiment: Experiment, rng: Rng) -> Experiment:
         element=body.element.name,
         damping=body.parts[0].damping,
     )
-    places_m = experiment.markers.observe(body.nodes_m)
+    places_m = experiment.markers.predict_positions(body.nodes_m)
     markers = replace(
         experiment.markers, placement=None, located=None, places_m=places_m, attach="embedded"
     )
@@ -382,7 +382,7 @@ def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
 def reversed_normal(obstacle: Obstacle) -> Obstacle:
     """A plane on the other side of which the body is."""
     assert isinstance(obstacle.shape, Plane)
-    return replace(obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal))
+    return replace(obstacle, shape=replace(obstacle.shape, offset_direction=-obstacle.shape.normal))
 
 
 OBSTACLE_FAULTS = {

@@ -8,8 +8,8 @@ from scipy.sparse.linalg import spsolve
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.mesh_checks import orient
-from collocation_sysid.fem.shape import Volume
+from collocation_sysid.fem.mesh_checks import orient_elements
+from collocation_sysid.fem.shape import EnclosedVolume
 from collocation_sysid.fem.structured import box_mesh
 
 
@@ -54,11 +54,11 @@ def hollow_octant(inner_m: float, outer_m: float, divisions: int, layers: int) -
             np.stack([a + low, a + high, b + high, c + high], axis=1),
         ]
     wall = np.isclose(np.linalg.norm(points, axis=1), inner_m)
-    return TetMesh(points, orient(points, np.concatenate(cells))[0], {"wall": wall})
+    return TetMesh(points, orient_elements(points, np.concatenate(cells))[0], {"wall": wall})
 
 
 def inflated(
-    body: Body, volume: Volume, pressure_pa: float, constants: dict[str, float], steps: int
+    body: Body, volume: EnclosedVolume, pressure_pa: float, constants: dict[str, float], steps: int
 ) -> np.ndarray:
     """(n, 3) equilibrium of an octant under a pressure, its nodes in their planes of symmetry."""
     free = np.flatnonzero(np.abs(body.nodes_m).ravel() > 1e-9)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from collocation_sysid.model.parameters import Parameter, Parameters
-from collocation_sysid.statistics.linearised import FitBlock, LinearisedFit
+from collocation_sysid.statistics.linearised import LinearisedFit, ResidualBlock
 
 SAMPLE_S = 0.01
 PARAMETERS = Parameters(
@@ -46,13 +46,13 @@ class Problem:
         right = np.concatenate([*(e.ravel() for e in errors), -self.prior_slope * truth])
         wrong = np.linalg.lstsq(matrix, right)[0]
         blocks = tuple(
-            FitBlock(
+            ResidualBlock(
                 name=f"swing {k}",
                 t_s=SAMPLE_S * np.arange(len(row)),
                 marker_names=tuple(f"m{m}" for m in range(row.shape[1])),
-                present=seen,
+                is_present=seen,
                 residual=row @ wrong - error,
-                slope=row,
+                jacobian=row,
                 sigma_m=np.full(row.shape[1], 1e-3),
             )
             for k, (row, seen, error) in enumerate(zip(rows, self.present, errors, strict=True))
@@ -60,10 +60,10 @@ class Problem:
         fit = LinearisedFit(
             blocks=blocks,
             names=self.names,
-            shared=4,
+            shared_count=4,
             prior_residual=self.prior_slope * (wrong + truth),
-            prior_slope=self.prior_slope,
-            at_bound=np.zeros(width, dtype=bool),
+            prior_jacobian=self.prior_slope,
+            is_at_bound=np.zeros(width, dtype=bool),
         )
         return fit, wrong
 

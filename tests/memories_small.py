@@ -36,7 +36,9 @@ def truth(branches: int) -> dict[str, float]:
 
 def guesses(values: Mapping[str, float], factor: float = 1.5) -> Parameters:
     """All of them to be estimated, from guesses that are off by a factor."""
-    return Parameters.of({name: Unknown(guess=factor * value) for name, value in values.items()})
+    return Parameters.from_mapping(
+        {name: Unknown(guess=factor * value) for name, value in values.items()}
+    )
 
 
 def recorded(name: str, steps: int, branches: int = 1, scheme: str = "midpoint", **changes):
@@ -46,4 +48,4 @@ def recorded(name: str, steps: int, branches: int = 1, scheme: str = "midpoint",
 
 def theta(values: Mapping[str, float], body: Body) -> np.ndarray:
     """Constants in the order of the body."""
-    return body.theta(values)
+    return body.theta_from_values(values)

@@ -27,7 +27,7 @@ def released_in_a_mode(theta: np.ndarray, mode: int, timestep_s: float = 0.01, s
     cube = hung_cube()
     body, t_s = cube.body, timestep_s * np.arange(steps + 1)
     held = nodes_where(body, 2, EDGE_M)
-    modes = natural_modes(Forces.on(body, theta), body.nodes_m, cube.free_dofs)
+    modes = natural_modes(Forces.of_body_alone(body, theta), body.nodes_m, cube.free_dofs)
     shape = modes.shapes[mode] / np.abs(modes.shapes[mode]).max()
     released = replace(
         cube,

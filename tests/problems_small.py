@@ -106,7 +106,7 @@ def point_markers(body: Body, points_m: np.ndarray, t_s: np.ndarray) -> Markers:
     """Markers at points of the undeformed body, not measured yet."""
     names = [f"m{k}" for k in range(len(points_m))]
     nowhere = np.zeros((len(t_s), len(points_m), 3))
-    return Markers(t_s, nowhere, 1e-3, names, points_m).on(body)
+    return Markers(t_s, nowhere, 1e-3, names, points_m).on_body(body)
 
 
 def times(steps: int, timestep_s: float = 0.01) -> np.ndarray:
@@ -286,7 +286,7 @@ def measured_with(
 ) -> Experiment:
     """The same with the tracks of any parameters."""
     tracks = simulate(experiment, truth, scheme, substeps=substeps).markers_m
-    present = experiment.markers.present[:, :, None]
+    present = experiment.markers.is_present[:, :, None]
     return with_markers(experiment, np.where(present, tracks, np.nan))
 
 
@@ -308,17 +308,19 @@ def relative_errors(solution: Solution) -> np.ndarray:
 def some_point(made: Collocation, rng: np.random.Generator | None = None) -> np.ndarray:
     """Variables that satisfy nothing, what is carried neither: rigid, then shaken."""
     rng, positions = rng or np.random.default_rng(1), []
-    for segment in made.segments:
-        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
+    for segment in made.transcriptions:
+        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(
+            -1, segment.dof_count
+        )
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
     p, nq = made.guess_p, made.nq
     p[:nq] += 0.1 * rng.normal(size=nq)
     p[nq:] += 0.5 * rng.normal(size=made.nphi)
-    lags = np.array(["lag of" in name for name in made.names], dtype=bool)
+    lags = np.array(["lag of" in name for name in made.parameter_names], dtype=bool)
     p[lags] = np.abs(p[lags]) + 0.1
     z = made.pack(p, positions)
-    for carried in made.carried:
-        z[carried.variables] += 0.01 * rng.normal(size=carried.count)
+    for carried in made.lifted:
+        z[carried.columns] += 0.01 * rng.normal(size=carried.count)
     return z
 
 

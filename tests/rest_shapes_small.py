@@ -14,7 +14,7 @@ from collocation_sysid.fem.rest_shape import UnderGravity
 from collocation_sysid.fem.selection import Indices
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.problem.problem import Problem
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 
@@ -61,7 +61,7 @@ def recorded(
     seen = np.arange(len(mesh.points_m))[-9:]
     nowhere = np.zeros((len(t_s), len(seen), 3))
     names = [f"m{k}" for k in range(len(seen))]
-    markers = Markers(t_s, nowhere, NOISE_M, names, mesh.points_m[seen]).on(body)
+    markers = Markers(t_s, nowhere, NOISE_M, names, mesh.points_m[seen]).on_body(body)
     grasp = Grasp(Indices(clamped_nodes(mesh).tolist()), poses)
     return Experiment(
         body,
@@ -79,8 +79,8 @@ def recorded(
 def hung_mesh(young_pa: float = TRUTH["young_pa"], element: str = "tet4") -> TetMesh:
     """The mesh that a scan of the hanging bar gives: the deformed one."""
     body = straight_bar(element)
-    theta = body.theta(TRUTH | {"young_pa": young_pa})
-    shape = rest_state(recorded(body), theta).reshape(-1, 3)
+    theta = body.theta_from_values(TRUTH | {"young_pa": young_pa})
+    shape = equilibrium(recorded(body), theta).reshape(-1, 3)
     return TetMesh(shape[: len(body.mesh.points_m)], body.mesh.tetrahedra)
 
 
@@ -107,7 +107,7 @@ def problem_of(experiment: Experiment, **changes) -> Problem:
     """Identify E, and of a motion γ_r."""
     from collocation_sysid.model.parameters import Unknown
 
-    static = experiment.static
+    static = experiment.is_static
     parameters = {
         "young_pa": Unknown(4e5),
         "poisson": TRUTH["poisson"],

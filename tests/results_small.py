@@ -11,20 +11,20 @@ import numpy as np
 from collocation_sysid.files import SCHEMA
 from collocation_sysid.methods.solution import Timing
 from collocation_sysid.runs.result import (
+    DynamicsResult,
     Elapsed,
-    FoundDynamics,
-    FoundFit,
-    FoundRollout,
-    FoundUncertainty,
+    FitResult,
+    ForwardResult,
     ProgramSize,
     Provenance,
     ReportedEstimate,
     Result,
+    UncertaintyResult,
 )
-from collocation_sysid.statistics.trust import Trust
+from collocation_sysid.statistics.trust import Assessment
 
-FIT = FoundFit(1e-3, 1e-3, {})
-ROLLOUT = FoundRollout(0.8e-3, 2e-3, {})
+FIT = FitResult(1e-3, 1e-3, {})
+ROLLOUT = ForwardResult(0.8e-3, 2e-3, {})
 
 
 def value(number: float = 100.0, std_error: float | None = 1.0) -> ReportedEstimate:
@@ -40,11 +40,11 @@ def value(number: float = 100.0, std_error: float | None = 1.0) -> ReportedEstim
     )
 
 
-def uncertainty(names: Sequence[str], covariance: np.ndarray) -> FoundUncertainty:
+def uncertainty(names: Sequence[str], covariance: np.ndarray) -> UncertaintyResult:
     scale = np.sqrt(np.diag(covariance))
     quantiles = np.full(len(names), 1.96)
     correlation = covariance / np.outer(scale, scale)
-    return FoundUncertainty(
+    return UncertaintyResult(
         noise="given",
         errors="independent",
         reduced_chi_squared=1.0,
@@ -68,7 +68,7 @@ def a_result(parameters: Mapping[str, ReportedEstimate] | None = None, **changes
         converged=True,
         message="Converged.",
         missing="",
-        trust=Trust(()),
+        trust=Assessment(()),
         method="reduced-space",
         title="small",
         parameters={"lambda_pa": value()} if parameters is None else parameters,
@@ -83,7 +83,7 @@ def a_result(parameters: Mapping[str, ReportedEstimate] | None = None, **changes
         scan=None,
         fit=FIT,
         residuals=(),
-        dynamics=FoundDynamics(1e-9, 1e-8, ()),
+        dynamics=DynamicsResult(1e-9, 1e-8, ()),
         rollout=ROLLOUT,
         iterations=5,
         evaluations=5,

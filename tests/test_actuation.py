@@ -14,8 +14,8 @@ from collocation_sysid.fem.selection import Box, Named
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.newton import Solver
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.newton import NewtonSolver
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.recording import (
     Experiment,
     Grasp,
@@ -83,7 +83,9 @@ def test_a_tendon_bends_a_thin_beam_as_the_elastica(tension_n):
     points = [(x, THICK_M / 2 + arm, THICK_M / 2) for x in np.linspace(0, LENGTH_M, 41)]
     grasps = [Grasp(plane(body, 0), STILL)]
     experiment = driven(body, grasps, tendons=[Tendon(points, tension_n)])
-    x = rest_state(experiment, body.theta({"young_pa": YOUNG_PA, "poisson": 0.0} | REST))
+    x = equilibrium(
+        experiment, body.theta_from_values({"young_pa": YOUNG_PA, "poisson": 0.0} | REST)
+    )
     middle = plane(body, 0, LENGTH_M)
     tip = x.reshape(-1, 3)[middle].mean(axis=0)
     expected = tip_of_the_elastica(tension_n, arm) + np.array([0.0, THICK_M / 2])
@@ -112,8 +114,8 @@ def test_a_thick_sphere_that_keeps_its_volume_inflates_as_rivlin_says():
         grasps = [Grasp(plane(body, k), STILL, axes="xyz"[k]) for k in range(3)]
         wall = Pressure(Named("wall"), 0.4 * mu)
         experiment = driven(body, grasps, pressures=[wall])
-        theta = body.theta({"mu_pa": mu, "poisson": 0.4999} | REST)
-        x = rest_state(experiment, theta).reshape(-1, 3)
+        theta = body.theta_from_values({"mu_pa": mu, "poisson": 0.4999} | REST)
+        x = equilibrium(experiment, theta).reshape(-1, 3)
         radii = np.linalg.norm(x[np.flatnonzero(mesh.point_arrays["wall"])], axis=1)
         errors.append(radii.mean() - stretch * inner)
     assert np.log(errors[0] / errors[1]) / np.log(1.5) > 1.4
@@ -127,7 +129,7 @@ def test_a_pressed_patch_with_a_held_rim_has_the_force_of_the_pressure():
     top = Pressure(Box((-1, -1, 0.0099), (1, 1, 1)), 100.0)
     experiment = driven(body, [Grasp(held, STILL)], pressures=[top])
     here = States(body.nodes_m.reshape(1, -1), np.zeros((1, 0)), np.zeros(0))
-    (pressure,) = Forces.of(experiment, [0.0]).further
+    (pressure,) = Forces.from_experiment(experiment, [0.0]).external_terms
     force = -pressure.force(here)
     up = force.reshape(-1, 3)[inside & (body.nodes_m[:, 2] > 0.009)]
     np.testing.assert_allclose(up[:, :2], 0, atol=1e-15)
@@ -141,8 +143,8 @@ def test_tensions_are_applied_in_parts_where_newton_fails_at_once():
     body = Body(mesh, density_kg_m3=1e3, element="tet10")
     points = [(x, 0.008, 0.005) for x in np.linspace(0, 0.1, 17)]
     experiment = driven(body, [Grasp(plane(body, 0), STILL)], tendons=[Tendon(points, 0.6)])
-    theta = body.theta({"young_pa": YOUNG_PA, "poisson": 0.3} | REST)
-    x = rest_state(experiment, theta)
-    forces = Forces.of(experiment, [0.0], theta).total(x[None], np.zeros((1, x.size)))
-    assert np.abs(forces[0, Solver(experiment).free]).max() < 1e-8
+    theta = body.theta_from_values({"young_pa": YOUNG_PA, "poisson": 0.3} | REST)
+    x = equilibrium(experiment, theta)
+    forces = Forces.from_experiment(experiment, [0.0], theta).total(x[None], np.zeros((1, x.size)))
+    assert np.abs(forces[0, NewtonSolver(experiment).free]).max() < 1e-8
     assert np.linalg.norm(x.reshape(-1, 3)[-1] - body.nodes_m[-1]) > 0.05

@@ -13,7 +13,7 @@ from scipy.integrate import solve_bvp
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.selection import Ball, Box, Named
-from collocation_sysid.fem.shape import Length, Volume
+from collocation_sysid.fem.shape import EnclosedVolume, PolylineLength
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording.pressure import Pressure
 from collocation_sysid.recording.tendon import Tendon
@@ -21,14 +21,14 @@ from collocation_sysid.recording.tendon import Tendon
 NODES = 14
 
 
-def scalars(rng) -> dict[str, Length | Volume]:
+def scalars(rng) -> dict[str, PolylineLength | EnclosedVolume]:
     """A thread of four points, and five faces of each kind, on nodes in disorder."""
     points = np.array([rng.permutation(NODES)[:4] for _ in range(4)])
     flat, curved = (np.array([rng.permutation(NODES)[:k] for _ in range(5)]) for k in (3, 6))
     return {
-        "length": Length(points, rng.random((4, 4)), NODES),
-        "flat faces": Volume(flat, NODES, rng.random(3)),
-        "curved faces": Volume(curved, NODES),
+        "length": PolylineLength(points, rng.random((4, 4)), NODES),
+        "flat faces": EnclosedVolume(flat, NODES, rng.random(3)),
+        "curved faces": EnclosedVolume(curved, NODES),
     }
 
 
@@ -54,7 +54,7 @@ def test_derivatives_are_those_of_the_value(scalar, states):
     turned = np.stack([m @ each for m, each in zip(matrices, w, strict=True)])
     np.testing.assert_allclose((scalar.gradient(x) * w).sum(axis=1), slope(scalar.value), rtol=1e-7)
     np.testing.assert_allclose(turned, slope(scalar.gradient), atol=1e-7)
-    np.testing.assert_allclose(scalar.hessian_along(x, w), slope(scalar.hessian), atol=1e-7)
+    np.testing.assert_allclose(scalar.hessian_derivative(x, w), slope(scalar.hessian), atol=1e-7)
 
 
 def test_second_derivatives_equal_those_of_a_computer_algebra(rng, states):
@@ -64,7 +64,10 @@ def test_second_derivatives_equal_those_of_a_computer_algebra(rng, states):
     ends = [ca.mtimes(x[:, p.tolist()], w) for p, w in zip(points, weights, strict=True)]
     length = sum(ca.norm_2(b - a) for a, b in pairwise(ends))
     volume = sum(ca.det(x[:, face.tolist()]) / 6 for face in faces)
-    for energy, mine in ((length, Length(points, weights, NODES)), (volume, Volume(faces, NODES))):
+    for energy, mine in (
+        (length, PolylineLength(points, weights, NODES)),
+        (volume, EnclosedVolume(faces, NODES)),
+    ):
         hessian = ca.Function("h", [x], [ca.hessian(energy, ca.vec(x))[0]])
         expected = hessian(states[0][0].reshape(-1, 3).T).full()
         found = mine.couplings.matrix(mine.hessian(states[0][:1])[0]).toarray()
@@ -74,10 +77,10 @@ def test_second_derivatives_equal_those_of_a_computer_algebra(rng, states):
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_a_cavity_encloses_its_volume_and_its_forces_balance(element, rng):
     body = Body(box_with_cavity(), density_kg_m3=1e3, element=element)
-    volume = Pressure(Named("wall"), 1e3).on(body).measure
+    volume = Pressure(Named("wall"), 1e3).on_body(body).measure
     assert volume is not None
     assert not volume.rim.size
-    assert volume.value(body.nodes_m.reshape(1, -1))[0] == pytest.approx(1e-6, rel=1e-12)
+    assert volume.evaluate(body.nodes_m.reshape(1, -1))[0] == pytest.approx(1e-6, rel=1e-12)
     bent = body.nodes_m + 1e-3 * rng.standard_normal(body.nodes_m.shape)
     force = volume.gradient(bent.reshape(1, -1)).reshape(-1, 3)
     np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-17)
@@ -86,7 +89,7 @@ def test_a_cavity_encloses_its_volume_and_its_forces_balance(element, rng):
 
 def test_curved_faces_enclose_what_a_finer_flat_surface_does():
     body = Body(box_with_cavity(), density_kg_m3=1e3, element="tet10")
-    volume = Pressure(Named("wall"), 1e3).on(body).measure
+    volume = Pressure(Named("wall"), 1e3).on_body(body).measure
     assert volume is not None
     centre = np.full(3, 0.015)
     away = body.nodes_m - centre
@@ -111,15 +114,15 @@ def test_curved_faces_enclose_what_a_finer_flat_surface_does():
         sums[cuts] = np.linalg.det(corners).sum() / 6
     coarse, fine = ((4 * sums[2 * n] - sums[n]) / 3 for n in (4, 8))
     limit = (16 * fine - coarse) / 15
-    assert volume.value(bulged.reshape(1, -1))[0] == pytest.approx(limit, rel=1e-9)
+    assert volume.evaluate(bulged.reshape(1, -1))[0] == pytest.approx(limit, rel=1e-9)
 
 
 def test_a_tendon_shortens_as_its_body_does():
     body = Body(box_mesh((0.1, 0.01, 0.01), (8, 1, 1)), density_kg_m3=1e3, element="tet10")
     points = [(x, 0.004, 0.003) for x in np.linspace(0, 0.1, 12)]
-    length = Tendon(points, 1.0).on(body).measure
+    length = Tendon(points, 1.0).on_body(body).measure
     assert length is not None
-    assert length.value(0.9 * body.nodes_m.reshape(1, -1))[0] == pytest.approx(0.09, rel=1e-12)
+    assert length.evaluate(0.9 * body.nodes_m.reshape(1, -1))[0] == pytest.approx(0.09, rel=1e-12)
     force = -length.gradient(body.nodes_m.reshape(1, -1)).reshape(-1, 3)
     assert force[body.nodes_m[:, 0] < 0.01, 0].sum() == pytest.approx(1.0)
     np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-14)
@@ -165,7 +168,7 @@ def test_an_inflated_sphere_converges_to_its_radial_solution():
     for divisions in (2, 4):
         mesh = hollow_octant(INNER, OUTER, divisions, divisions)
         body = Body(mesh, density_kg_m3=1e3, element="tet10")
-        volume = Pressure(Named("wall"), 1.0).on(body).measure
+        volume = Pressure(Named("wall"), 1.0).on_body(body).measure
         assert volume is not None
         x = inflated(body, volume, pressure_pa, LAMES, steps=2)
         wall = np.flatnonzero(mesh.point_arrays["wall"])
@@ -177,7 +180,7 @@ def test_an_inflated_sphere_converges_to_its_radial_solution():
 def test_faces_of_a_box_and_a_ball_are_those_with_all_their_corners_in_it():
     body = Body(box_with_cavity(), density_kg_m3=1e3)
     for selection in (Ball((0.015,) * 3, 0.009), Box((0.009,) * 3, (0.021,) * 3)):
-        volume = Pressure(selection, 1e3).on(body).measure
+        volume = Pressure(selection, 1e3).on_body(body).measure
         assert volume is not None
         assert len(volume.faces) == 12
 

@@ -14,7 +14,7 @@ from problems_small import smooth_poses, times
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.fem.shape import Volume
+from collocation_sysid.fem.shape import EnclosedVolume
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv
 from collocation_sysid.result.synthesis import Recipe, write_data
@@ -82,7 +82,7 @@ def driven(made, tmp_path) -> Path:
 def test_a_driven_box_is_read_solved_and_shown(driven):
     (experiment,) = Problem.read(driven / "problem.toml").experiments
     assert [actuator.name for actuator in experiment.actuators] == ["tendon_1", "air"]
-    np.testing.assert_allclose(experiment.tendons[0].amplitude([0.025]), 0.0025)
+    np.testing.assert_allclose(experiment.tendons[0].energy_amplitude_at([0.025]), 0.0025)
     with pictures_drawn():
         done = run_command("solve", driven / "problem.toml", "--out", driven / "run")
     assert done.code == 0, done.err
@@ -102,7 +102,7 @@ def test_a_driven_box_is_read_solved_and_shown(driven):
 def test_a_group_of_triangles_is_the_wall(driven):
     body = Problem.read(driven / "problem.toml").experiments[0].body
     volume = body and Problem.read(driven / "problem.toml").experiments[0].pressures[0].measure
-    assert isinstance(volume, Volume)
+    assert isinstance(volume, EnclosedVolume)
     cells = [("tetra", body.mesh.tetrahedra), ("triangle", volume.faces)]
     on_wall = [np.zeros(len(body.cells), int), np.ones(12, int)]
     mesh = meshio.Mesh(body.mesh.points_m, cells, cell_data={"cavity": on_wall})
@@ -113,7 +113,7 @@ def test_a_group_of_triangles_is_the_wall(driven):
     (driven / "problem.toml").write_text(text)
     again = Problem.read(driven / "problem.toml").experiments[0].pressures[0].measure
     at = body.nodes_m.reshape(1, -1)
-    assert again.value(at)[0] == pytest.approx(volume.value(at)[0], rel=1e-12)
+    assert again.evaluate(at)[0] == pytest.approx(volume.evaluate(at)[0], rel=1e-12)
 
 
 TENDON = PROBLEM[PROBLEM.index("[[experiment.tendon]]") : PROBLEM.index("[[experiment.pressure]]")]

@@ -36,10 +36,10 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment
 from collocation_sysid.statistics.assumptions import ASSUMPTIONS
-from collocation_sysid.statistics.budget import BudgetLine, Sources, budget
+from collocation_sysid.statistics.budget import BudgetLine, VarianceSources, budget
 from collocation_sysid.statistics.considered import changed_residuals
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 VOLUME_M3, DENSITY_KG_M3 = EDGE_M**3, 30.0
 STIFF = {"lambda_pa": 1e5, "mu_pa": 1e5, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.0}
@@ -101,17 +101,21 @@ def test_in_equilibrium_a_body_in_air_is_as_one_that_is_lighter_by_the_air():
 def test_point_masses_displace_no_air_and_no_air_is_damped_as_the_body_is():
     cube = hung_cube(3)
     tip = cs.PointMass([0], 0.01)
-    mass = Forces.of(replace(cube, masses=[tip], air_density_kg_m3=AIR_KG_M3), [0.0]).mass
+    mass = Forces.from_experiment(
+        replace(cube, masses=[tip], air_density_kg_m3=AIR_KG_M3), [0.0]
+    ).mass
     air_kg = AIR_KG_M3 * VOLUME_M3
     assert mass.displaced_kg.sum() == pytest.approx(3 * air_kg)
     body_kg = 3 * (DENSITY_KG_M3 * VOLUME_M3 + 0.01)
     assert mass.damped_kg.sum() == pytest.approx(body_kg)
-    assert mass.weighed_kg.sum() == pytest.approx(body_kg - 3 * air_kg)
-    assert mass.kg.sum() == pytest.approx(body_kg + 1.5 * air_kg)
+    assert mass.weight_kg.sum() == pytest.approx(body_kg - 3 * air_kg)
+    assert mass.inertia_kg.sum() == pytest.approx(body_kg + 1.5 * air_kg)
 
 
 def test_drag_is_the_slope_of_what_it_dissipates_and_acts_at_the_surface_alone(rng):
-    forces = Forces.of(hung_cube(3, (3, 3, 3), air_density_kg_m3=AIR_KG_M3), [0.0, 0.1])
+    forces = Forces.from_experiment(
+        hung_cube(3, (3, 3, 3), air_density_kg_m3=AIR_KG_M3), [0.0, 0.1]
+    )
     drag = forces.air_drag
     assert drag is not None
     size = forces.body.pattern.size
@@ -136,10 +140,10 @@ def test_drag_is_the_slope_of_what_it_dissipates_and_acts_at_the_surface_alone(r
 
 def test_nothing_drags_in_equilibrium_and_in_a_vacuum():
     static = hung_cube(3, air_density_kg_m3=AIR_KG_M3, kind="static")
-    assert Forces.of(static, [0.0]).air_drag is None
+    assert Forces.from_experiment(static, [0.0]).air_drag is None
     vacuum = hung_cube(3, air_density_kg_m3="none")
     assert vacuum.air_density_kg_m3 == 0.0
-    assert Forces.of(vacuum, [0.0]).air_drag is None
+    assert Forces.from_experiment(vacuum, [0.0]).air_drag is None
 
 
 # What the air does to an estimate -----------------------------------------------------------------
@@ -156,7 +160,7 @@ def recorded(drag: float, stated: float | str) -> Problem:
         speed = ca.sqrt(ca.sumsqr(v) + 1e-8)
         return -(drag - 1) * 0.125 * AIR_KG_M3 * at.area_m2 * speed * v
 
-    force = cs.NodeForce.of(more_drag)
+    force = cs.NodeForce.from_law(more_drag)
     body = cs.Body(hung.body.mesh, density_kg_m3=DENSITY_KG_M3, forces=[force])
     tracks = simulate(replace(hung, body=body), TRUTH, "midpoint", substeps=1).markers_m
     noise = NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
@@ -179,9 +183,9 @@ def estimated(described: Problem, deviations: Mapping[str, float] | None = None)
     collocation, z = solution.collocation, solution.z
     rows = [row for row in ASSUMPTIONS if row.name in OF_AIR]
     sizes = [(row, (deviations or {}).get(row.name, row.sigma)) for row in rows]
-    changes, found = changed_residuals(collocation, z, sizes), covariance(collocation, z)
-    fit = linearised_fit(collocation, z)
-    sources = Sources.of(fit, changes, collocation.parameters, solution.q, found)
+    changes, found = changed_residuals(collocation, z, sizes), uncertainty_at(collocation, z)
+    fit = linearise_fit(collocation, z)
+    sources = VarianceSources.from_fit(fit, changes, collocation.parameters, solution.q, found)
     line = budget(sources, found, {}, collocation.parameters)[GAMMA_M]
     interval = found.estimates[GAMMA_M].statistical95
     assert interval is not None

@@ -35,7 +35,7 @@ from collocation_sysid.result.replay import headline, read_run
 from collocation_sysid.result.style import GREEN
 from collocation_sysid.result.view import frame_files, view
 from collocation_sysid.statistics.concern import Concern
-from collocation_sysid.statistics.trust import Trust
+from collocation_sysid.statistics.trust import Assessment
 
 NODES = 36
 
@@ -256,7 +256,9 @@ def test_page_and_film_say_what_was_found(run, tmp_path):
     result, (swing, _) = read_run(run)
     assert headline(result).startswith("E = ")
     assert headline(result).endswith(f"verdict: {result.trust.verdict}")
-    one = a_result({"core.young_pa": value(1543.21, 123.4)}, trust=Trust((Concern("solve/moves"),)))
+    one = a_result(
+        {"core.young_pa": value(1543.21, 123.4)}, trust=Assessment((Concern("solve/moves"),))
+    )
     assert headline(one) == "E core = 1543.2 ± 120 Pa; verdict: check"
     run_command("view", run, "--html", tmp_path / "page.html")
     assert headline(result) in (tmp_path / "page.html").read_text(encoding="utf-8")

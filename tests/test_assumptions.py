@@ -26,11 +26,11 @@ from collocation_sysid import (
 )
 from collocation_sysid.fem.air import AIR_KG_M3
 from collocation_sysid.fem.constants import GAMMA_R
-from collocation_sysid.fem.materials import DAMPINGS, Damping
+from collocation_sysid.fem.materials import DAMPINGS, DampingLaw
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.assumptions import (
     ASSUMPTIONS,
-    Fitted,
+    FittedExperiment,
 )
 from collocation_sysid.statistics.considered import changed_residuals
 
@@ -70,7 +70,9 @@ def swung(air_density_kg_m3: float = 0.0) -> Experiment:
 
 
 def parameters(**stated: float | Unknown | Tied) -> Parameters:
-    return Parameters.of(VALUES | {"young_pa": Unknown(VALUES["young_pa"], 10.0, 1e6)} | stated)
+    return Parameters.from_mapping(
+        VALUES | {"young_pa": Unknown(VALUES["young_pa"], 10.0, 1e6)} | stated
+    )
 
 
 def changed(experiment: Experiment, name: str, scheme: str = "midpoint") -> np.ndarray:
@@ -104,7 +106,7 @@ def test_a_grip_that_gives_way_is_a_body_on_springs():
         way = x - at.rest_m - sway_m * (1 - ca.cos(20.0 * at.t_s))
         return -VALUES["young_pa"] * at.volume_m3 ** (2 / 3) / layer_m * way
 
-    loose = Body(mesh, density_kg_m3=60.0, forces=[NodeForce.of(spring, nodes=nodes)])
+    loose = Body(mesh, density_kg_m3=60.0, forces=[NodeForce.from_law(spring, nodes=nodes)])
     gripped = replace(hung, body=body, grasps=(Grasp(nodes, poses),))
     on_springs = replace(hung, body=loose, grasps=())
     # Under the midpoint rule springs as stiff as these would ring.
@@ -119,7 +121,7 @@ def test_a_grip_that_gives_way_is_a_body_on_springs():
 def platen_forces_n(experiment: Experiment, platen: int) -> np.ndarray:
     """(T, k, 3) what a platen gives each node that it holds, which is what the body gives it."""
     x = simulate(experiment, VALUES).positions_m.reshape(len(experiment.t_s), -1)
-    inside = experiment.body.force(x, np.zeros_like(x), experiment.body.theta(VALUES))
+    inside = experiment.body.force(x, np.zeros_like(x), experiment.body.theta_from_values(VALUES))
     return -inside.reshape(len(x), -1, 3)[:, experiment.grasps[platen].nodes]
 
 
@@ -148,7 +150,7 @@ def test_friction_holds_back_what_slides_on_platens():
             forces += [Force([n], f) for n, f in zip(nodes, pull, strict=True) if f.any()]
         held_back = block(t_s=TIMES[:2], z_m=PRESSED_M[[k, k]], forces=forces)
         tracks.append(simulate(held_back, VALUES).markers_m[-1])
-    simulated = (tracks - sliding.markers.observe(x)[1:]) / friction
+    simulated = (tracks - sliding.markers.predict_positions(x)[1:]) / friction
     expected = changed(sliding, "platen_friction")[1:]
     np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
 
@@ -163,8 +165,8 @@ def test_planes_of_symmetry_have_no_friction_and_are_no_grip():
 def test_in_a_vacuum_nothing_is_assumed_of_the_air(name):
     collocation = Collocation([swung()], parameters(), "midpoint")
     x = np.tile(collocation.experiments[0].body.nodes_m.ravel(), (25, 1))
-    (part,) = collocation.parts(collocation.pack(collocation.guess_p, [x]))
-    assert BY_NAME[name].effect(Fitted(part, collocation.parameters), 0) is None
+    (part,) = collocation.iterates(collocation.pack(collocation.guess_p, [x]))
+    assert BY_NAME[name].effect(FittedExperiment(part, collocation.parameters), 0) is None
 
 
 def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
@@ -172,7 +174,7 @@ def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = experiment.body.nodes_m.ravel()
     z = collocation.pack(collocation.guess_p, [np.tile(x, (len(experiment.t_s), 1))])
-    at = Fitted(collocation.parts(z)[0], collocation.parameters)
+    at = FittedExperiment(collocation.iterates(z)[0], collocation.parameters)
     count = len(experiment.t_s)
     sideways = np.tile([0.0, 2.0, 0.0], len(x) // 3)
     vars(at)["states"] = (np.tile(x, (count, 1)), np.tile(sideways, (count, 1)))
@@ -185,9 +187,9 @@ def test_a_ratio_tied_to_one_that_is_estimated_is_not_stated():
     experiment = swung()
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = np.tile(experiment.body.nodes_m.ravel(), (len(experiment.t_s), 1))
-    (part,) = collocation.parts(collocation.pack(collocation.guess_p, [x]))
-    assert BY_NAME["poisson"].effect(Fitted(part, estimated), 0) is None
-    assert BY_NAME["poisson"].effect(Fitted(part, parameters()), 0) is not None
+    (part,) = collocation.iterates(collocation.pack(collocation.guess_p, [x]))
+    assert BY_NAME["poisson"].effect(FittedExperiment(part, estimated), 0) is None
+    assert BY_NAME["poisson"].effect(FittedExperiment(part, parameters()), 0) is not None
 
 
 @pytest.mark.parametrize("law", ["material", "kelvin-voigt"])
@@ -208,11 +210,11 @@ def test_without_damping_its_law_is_no_matter(changes):
         experiment = replace(experiment, kind="static", nuisance=Nuisance.none())
     else:
         values = VALUES | changes
-    collocation = Collocation([experiment], Parameters.of(values), "midpoint")
+    collocation = Collocation([experiment], Parameters.from_mapping(values), "midpoint")
     rows = len(experiment.t_s)
     rest = np.tile(experiment.body.nodes_m.ravel(), (rows, 1))
     z = collocation.pack(collocation.guess_p, [rest])
-    at = Fitted(next(iter(collocation.parts(z))), collocation.parameters)
+    at = FittedExperiment(next(iter(collocation.iterates(z))), collocation.parameters)
     for name in ("damping_law", "rayleigh_damping"):
         row = BY_NAME[name]
         assert all(row.effect(at, axis) is None for axis in range(len(row.components)))
@@ -223,6 +225,6 @@ def test_a_law_of_a_users_own_stays_as_it_is():
         return DAMPINGS["material"].stress(psi, F, rate, gamma_r_s)
 
     experiment = swung()
-    own = Damping("own", (GAMMA_R,), stress=stress)
+    own = DampingLaw("own", (GAMMA_R,), stress=stress)
     body = Body(experiment.body.mesh, density_kg_m3=60.0, damping=own)
     assert not changed(replace(experiment, body=body), "damping_law kelvin-voigt").any()

@@ -42,7 +42,7 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(name: str):
 
 def test_explicit_grasps_have_multipliers_too():
     made = noisy(hung_cube(6))
-    collocation = Collocation([made], GUESS, explicit_grasps=True)
+    collocation = Collocation([made], GUESS, has_grasp_constraints=True)
     solution = AugmentedLagrangian()(collocation)
     assert solution.status is Status.CONVERGED
     assert solution.kkt_residual < 2e-6

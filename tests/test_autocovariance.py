@@ -10,7 +10,7 @@ from fits_small import Problem, autoregressive, problem
 from scipy.linalg import block_diag, toeplitz
 
 from collocation_sysid.statistics.autocorrelation import error_processes, lagged_products
-from collocation_sysid.statistics.linearised import LinearisedFit, information
+from collocation_sysid.statistics.linearised import LinearisedFit, factorise_information
 
 LAG = 2
 PROBLEMS = {
@@ -39,15 +39,17 @@ def dense(of: Problem, by_experiment: list[np.ndarray]) -> np.ndarray:
 def test_lags_explain_the_expected_products_of_residuals(name):
     of = PROBLEMS[name]
     fit = some_fit(of)
-    factored = information(fit)
+    factored = factorise_information(fit)
     lengths = [len(present) for present in of.present]
     found = lagged_products(fit, factored, [LAG] * len(lengths))
     true = [0.7**k * 0.9 ** np.arange(length) for k, length in enumerate(lengths)]
     tails = [np.where(np.arange(len(gamma)) > LAG, gamma, 0.0) for gamma in true]
     explained = found.expected @ np.concatenate([gamma[: LAG + 1] for gamma in true])
-    explained += found.beyond(fit, factored, tails)
+    explained += found.long_lag_products(fit, factored, tails)
 
-    slopes = np.concatenate([slope.reshape(-1, slope.shape[2]) for slope in factored.slopes])
+    slopes = np.concatenate(
+        [slope.reshape(-1, slope.shape[2]) for slope in factored.scaled_jacobians]
+    )
     maker = np.eye(len(slopes)) - slopes @ slopes.T
     of_residuals = maker @ dense(of, [toeplitz(gamma) for gamma in true]) @ maker
     expected = []
@@ -69,14 +71,14 @@ def test_products_are_those_of_residuals_so_many_samples_apart(name):
         for lag in range(LAG + 1):
             apart = toeplitz(distance == lag).astype(float)
             expected.append(np.einsum("tc,ts,sc->", residual, apart, residual))
-    found = lagged_products(fit, information(fit), [LAG] * len(lengths))
+    found = lagged_products(fit, factorise_information(fit), [LAG] * len(lengths))
     np.testing.assert_allclose(found.products, expected, rtol=1e-9)
 
 
 def test_experiments_have_lags_of_their_own():
     of, lags = PROBLEMS["two"], (1, 3)
     fit = some_fit(of)
-    found = lagged_products(fit, information(fit), lags)
+    found = lagged_products(fit, factorise_information(fit), lags)
     first, second = found.autocovariances()
     assert (len(first), len(second)) == (2, 4)
     np.testing.assert_allclose(found.expected @ [*first, *second], found.products, atol=1e-9)
@@ -92,9 +94,9 @@ def test_the_size_of_errors_is_found_where_offsets_hide_their_mean():
     of, variances, lag1 = problem((60,), markers=4), [], []
     for seed in range(60):
         fit = some_fit(of, 0.85, seed)
-        (process,) = error_processes(fit, information(fit))
-        variances.append(np.diag(process.among_channels).mean())
-        lag1.append(process.along_time[1])
+        (process,) = error_processes(fit, factorise_information(fit))
+        variances.append(np.diag(process.channel_covariance).mean())
+        lag1.append(process.autocorrelation[1])
     assert np.mean(variances) == pytest.approx(1.0, abs=4 * np.std(variances) / np.sqrt(60))
     assert np.mean(lag1) == pytest.approx(0.85, abs=4 * np.std(lag1) / np.sqrt(60))
     assert np.std(variances) < 0.2
@@ -104,13 +106,13 @@ def test_error_bars_stay_sane_where_errors_hardly_forget():
     of = problem((60,), markers=4)
     for seed in range(20):
         fit = some_fit(of, 0.98, seed)
-        (process,) = error_processes(fit, information(fit))
+        (process,) = error_processes(fit, factorise_information(fit))
         assert process.degrees_of_freedom > 5
 
 
 def test_rounding_is_no_process():
     fit = some_fit(PROBLEMS["one"])
     silent = tuple(replace(block, residual=0 * block.residual) for block in fit.blocks)
-    (process,) = error_processes(replace(fit, blocks=silent), information(fit))
+    (process,) = error_processes(replace(fit, blocks=silent), factorise_information(fit))
     assert process.order == 0
-    np.testing.assert_array_equal(process.among_channels, 0.0)
+    np.testing.assert_array_equal(process.channel_covariance, 0.0)

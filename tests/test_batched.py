@@ -17,18 +17,18 @@ from materials_small import ELASTIC
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem import kernels as batched
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.expressions import PointKernel
+from collocation_sysid.fem.expressions import ElementKernel
 from collocation_sysid.fem.kernels import (
-    Batch,
+    KernelBatch,
     choose_evaluator,
     instructions,
     jit,
     make_combiner,
     make_evaluator,
-    make_instances,
+    make_instance_evaluator,
     simd,
 )
-from collocation_sysid.fem.kernels.combine import combine_natively, combine_with_numpy
+from collocation_sysid.fem.kernels.combine import combine_with_numpy, compile_combiner
 from collocation_sysid.fem.materials import MATERIALS, neo_hookean
 
 VARIABLE = "COLLOCATION_SYSID_EVALUATOR"
@@ -56,7 +56,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 def new_body(mesh, material: str | Callable = "neo-hookean", evaluator: str = "auto") -> Body:
     """As in a process of its own."""
-    jit.compiled.cache_clear()
+    jit.compile_function.cache_clear()
     return Body(mesh, material, 30.0, damping="rayleigh", evaluator=evaluator)
 
 
@@ -115,7 +115,7 @@ def test_forcing_vector_code_without_llvmlite_names_the_remedy(small_mesh, witho
 )
 def test_vectors_of_any_width_give_the_same(small_mesh, make_body, lanes, quickly, monkeypatch):
     monkeypatch.setattr(simd, "vector_lanes", lambda: lanes)
-    monkeypatch.setattr(simd, "REPAID", 10_000 if quickly else 0)
+    monkeypatch.setattr(simd, "OPTIMISED_FROM_POINTS", 10_000 if quickly else 0)
     x = squeezed(small_mesh)
     body, reference = new_body(small_mesh, evaluator="simd"), make_body("neo-hookean", "casadi")
     found, expected = (each.elastic_force(x, **ELASTIC) for each in (body, reference))
@@ -128,7 +128,7 @@ def test_code_that_was_compiled_quickly_is_not_taken_for_optimised_code(small_me
     new_body(small_mesh, evaluator="simd").elastic_force(squeezed(small_mesh), **ELASTIC)
     quickly = set(cache.iterdir())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simd, "REPAID", 0)
+        patch.setattr(simd, "OPTIMISED_FROM_POINTS", 0)
         new_body(small_mesh, evaluator="simd").elastic_force(squeezed(small_mesh), **ELASTIC)
     assert len(set(cache.iterdir()) - quickly) == len(quickly) > 0
 
@@ -143,8 +143,8 @@ def distance_and_slopes() -> ca.Function:
 def test_any_number_of_instances_gives_the_same_compiled(count):
     rng = np.random.default_rng(0)
     inputs = [rng.normal(size=(3, count)), rng.normal(size=(1, count))]
-    compiled = make_instances(distance_and_slopes(), compiled=True)(inputs)
-    expected = make_instances(distance_and_slopes(), compiled=False)(inputs)
+    compiled = make_instance_evaluator(distance_and_slopes(), compiled=True)(inputs)
+    expected = make_instance_evaluator(distance_and_slopes(), compiled=False)(inputs)
     assert [each.shape for each in compiled] == [(1, count), (3, count)]
     for each, other in zip(compiled, expected, strict=True):
         np.testing.assert_allclose(each, other, rtol=1e-14)
@@ -152,7 +152,7 @@ def test_any_number_of_instances_gives_the_same_compiled(count):
 
 def test_instances_are_evaluated_by_casadi_where_they_cannot_be_compiled(broken_compiler, cache):
     inputs = [np.ones((3, 4)), np.ones((1, 4))]
-    distance, _ = make_instances(distance_and_slopes(), compiled=True)(inputs)
+    distance, _ = make_instance_evaluator(distance_and_slopes(), compiled=True)(inputs)
     np.testing.assert_array_equal(distance, np.full((1, 4), 2.0))
 
 
@@ -209,22 +209,22 @@ NUMBERS = [0.0, 1e-9, 0.25, 0.5, 1.0, 1.5, 2.0, 3.7, 40.0, np.inf]
 NUMBERS = [np.nan, *NUMBERS, *(-number for number in NUMBERS)]
 
 
-def kernel_of(function: Callable) -> PointKernel:
+def kernel_of(function: Callable) -> ElementKernel:
     """A function of two numbers, which are coordinates of one node, as a kernel."""
     x, geometry, theta = ca.SX.sym("x", 3), ca.SX.sym("geometry", 4), ca.SX.sym("theta", 3)
     value = geometry[3] * function(x[0], x[1])
     names = ["x", "geometry", "theta"]
     pieces = ca.Function("value", [x, geometry, theta], [value], names, ["value"])
-    return PointKernel(pieces, ("x",), {"value": "none"})
+    return ElementKernel(pieces, ("x",), {"value": "none"})
 
 
-def values(kernel: PointKernel, evaluator: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def values(kernel: ElementKernel, evaluator: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     count = len(x)
     cells = np.arange(count)[:, None]
     geometry = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (count, 1, 4))
     fields = np.stack([x, y, np.zeros(count)], axis=1).reshape(1, -1)
     found = np.empty((1, count))
-    batch = Batch(kernel, cells, geometry, cells, count)
+    batch = KernelBatch(kernel, cells, geometry, cells, count)
     make_evaluator(batch, evaluator)([fields], np.zeros(3), found, 1)
     return found[0]
 
@@ -249,7 +249,7 @@ def test_derivatives_need_no_other_operations(name):
     value = ca.exp(function(z[0], z[1]))
     for _ in range(3):  # as many as a curvature kernel takes
         value = ca.sum1(ca.gradient(value, z))
-        instructions.check_operations(ca.Function("derivative", [z], [value]))
+        instructions.require_supported_operations(ca.Function("derivative", [z], [value]))
 
 
 def test_every_operation_of_vector_code_is_tested():
@@ -412,11 +412,11 @@ def test_changed_sources_are_compiled_anew(small_mesh, cache, tmp_path, monkeypa
     with (sources / "erfinv.py").open("a") as file:
         file.write("# changed\n")
     monkeypatch.setattr(jit, "__file__", str(sources / "jit.py"))
-    jit._generation.cache_clear()
+    jit._source_digest.cache_clear()
     try:
         evaluate(small_mesh)
     finally:
-        jit._generation.cache_clear()
+        jit._source_digest.cache_clear()
     assert len(list(cache.iterdir())) == 2
 
 
@@ -504,7 +504,7 @@ def test_compiled_and_numpy_combinations_are_equal(seed, start, stop):
     a, b = shared[:, :ENTRIES], shared[:, ENTRIES : 2 * ENTRIES]
     before = rng.standard_normal(COLUMN_BLOCKS * BLOCK_ENTRIES)
     native, reference = before.copy(), before.copy()
-    combine_natively(plan)(start, stop, a, b, native)
+    compile_combiner(plan)(start, stop, a, b, native)
     combine_with_numpy(plan)(start, stop, a, b, reference)
     np.testing.assert_allclose(native, reference, rtol=1e-13, atol=1e-14)
     assert (native == before).all() == (start == stop)

@@ -14,7 +14,7 @@ from problem_files import run_command
 from collocation_sysid import run
 from collocation_sysid.display import as_markdown, plain_text
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.mesh import Nodes
+from collocation_sysid.fem.mesh import ElementNodes
 from collocation_sysid.fem.selection import Face
 from collocation_sysid.fem.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
@@ -25,7 +25,7 @@ from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.tables import read_pressure
 from collocation_sysid.result.run_sections import run_report, summary
 from collocation_sysid.result.synthesis import write_data
-from collocation_sysid.statistics.modal import doubts
+from collocation_sysid.statistics.modal import find_misspecifications_by_modes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -283,7 +283,11 @@ def test_loads_of_a_part_are_reported_for_the_whole_specimen(tmp_path):
 def test_a_sign_that_only_displacement_or_load_has_is_named(tmp_path):
     def said(text: str) -> list[str]:
         problem = Problem.read(block_problem(tmp_path, text))
-        return [cause.sentence for each in problem.experiments for cause in doubts(each, {})]
+        return [
+            cause.message
+            for each in problem.experiments
+            for cause in find_misspecifications_by_modes(each, {})
+        ]
 
     assert said(SHARED) == []
     assert said(SHARED.replace("sign = -1", "sign = 1")) == []  # pulled, not pressed
@@ -473,7 +477,7 @@ def test_one_table_of_two_recordings_is_not_simulated(tmp_path):
 
 def test_faces_are_found_without_any_length():
     mesh = box_mesh((0.02, 0.03, 0.04), (2, 2, 2), origin_m=(0.01, 0.0, -0.5))
-    nodes = Nodes.corners(mesh)
+    nodes = ElementNodes.corners(mesh)
     faces = (Face("top"), 2, -0.46, 9), (Face("bottom"), 2, -0.5, 9), (Face("side_x"), 0, 0.01, 3)
     for face, axis, place, count in faces:
         chosen = mesh.points_m[face.resolve(nodes)]

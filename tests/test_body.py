@@ -11,7 +11,7 @@ from materials_small import elastic, theta_for
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.body import Body, Curvature
+from collocation_sysid.fem.body import Body, SecondDerivatives
 from collocation_sysid.fem.elements import ELEMENTS
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
@@ -255,7 +255,9 @@ def weighted_slopes(body: Body, w: np.ndarray) -> dict[str, Callable[..., np.nda
     }
 
 
-def second_derivative(body: Body, at: Curvature, of: str, by: str, d: np.ndarray) -> np.ndarray:
+def second_derivative(
+    body: Body, at: SecondDerivatives, of: str, by: str, d: np.ndarray
+) -> np.ndarray:
     """∂²φ/∂of ∂by times a direction."""
     matrix = getattr(at, f"{of}_{by}")
     return matrix @ d if by == "theta" else times(body, matrix, d)
@@ -393,7 +395,7 @@ def assert_same(a: Body, b: Body, rng: np.random.Generator, tolerance: float = 1
     first, second = (
         [
             *vars(body.linearise(x, v, theta)).items(),
-            *vars(body.curvature(x, v, w, theta)).items(),
+            *vars(body.second_derivatives(x, v, w, theta)).items(),
         ]
         for body in (a, b)
     )

@@ -34,11 +34,11 @@ def let_go(seed: int) -> Experiment:
 @pytest.mark.parametrize("seed", [1, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
     free = (
-        Parameter("lambda_pa", TRUTH["lambda_pa"], fixed=True),
+        Parameter("lambda_pa", TRUTH["lambda_pa"], is_fixed=True),
         Parameter("mu_pa", 9e3, 10.0, 1e6),
         Parameter("gamma_r_s", 0.004, 1e-5, 1.0),
     )
-    known = Parameter("gamma_m_1_s", 0.01, fixed=True)
+    known = Parameter("gamma_m_1_s", 0.01, is_fixed=True)
     bounded = Parameter("gamma_m_1_s", 0.01, 0.01, 100.0)
     experiment = let_go(seed)
     made = RolloutOptions("scheme")  # by which the tracks are made
@@ -46,7 +46,7 @@ def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
         run(Problem([experiment], Parameters((*free, last)), rollout=made)).estimates
         for last in (known, bounded)
     )
-    assert found["gamma_m_1_s"].at_bound
+    assert found["gamma_m_1_s"].is_at_bound
     truth = TRUTH["gamma_r_s"]
     low, high = wrong["gamma_r_s"].statistical95 or (0, 0)
     assert high < 1.2 * low

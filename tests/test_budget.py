@@ -29,18 +29,18 @@ from collocation_sysid import (
 )
 from collocation_sysid.display import plain_text
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.recording.nuisance import ROWS
+from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.result import Result
 from collocation_sysid.statistics.assumptions import ASSUMPTIONS, Assumptions
-from collocation_sysid.statistics.budget import Sources, worded
+from collocation_sysid.statistics.budget import VarianceSources, source_label
 from collocation_sysid.statistics.combined import combine
-from collocation_sysid.statistics.considered import assumed, considered
+from collocation_sysid.statistics.considered import changes_of_assumptions, changes_of_nuisances
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.numerical import shifts
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.numerical import estimate_changes
 from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 NOTHING = {name: "none" for name in Assumptions().deviations}
 
@@ -104,9 +104,9 @@ def test_a_parameter_with_an_interval_wider_than_its_value_is_not_determined():
     assert airy.trust.verdict == "check"
     found = [c for c in airy.trust.concerns if c.code == "information/combined"]
     (concern,) = [c for c in found if c.data["name"] == "gamma_m_1_s"]
-    assert "gamma_m_1_s is not determined" in concern.sentence
-    assert "air drag" in concern.sentence
-    assert REMEDIES["air_drag"] in concern.sentence
+    assert "gamma_m_1_s is not determined" in concern.message
+    assert "air drag" in concern.message
+    assert REMEDIES["air_drag"] in concern.message
     assert "not determined" in airy.table()
 
 
@@ -133,9 +133,9 @@ def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(
     described = Problem([experiment], GUESS, substeps=1, huber=huber)
     first = solve(described, ReducedSpace(tolerance=1e-9))
     collocation, off = first.collocation, 2e-4
-    changes = considered(collocation, first.z, {"calibration_scale": off})
+    changes = changes_of_nuisances(collocation, first.z, {"calibration_scale": off})
     assert changes.names == ("calibration_scale", "calibration_distortion_1_m2", "clock_rate")
-    told = -shifts(linearised_fit(collocation, first.z), changes.blocks)[: len(first.q), 0]
+    told = -estimate_changes(linearise_fit(collocation, first.z), changes.blocks)[: len(first.q), 0]
     pivot = experiment.rigid_positions(experiment.t_s[:1])[0].mean(axis=0)
     tracks = pivot + (1 + off) * (experiment.markers.positions_m - pivot)
     moved = replace(described, experiments=[with_markers(experiment, tracks)])
@@ -148,7 +148,7 @@ def test_what_is_estimated_is_not_considered():
     experiment = measured(cube_with_nuisance(8))
     wide = replace(experiment, nuisance=replace(experiment.nuisance, calibration_scale=0.01))
     solution = solve(Problem([wide], GUESS))
-    names = considered(solution.collocation, solution.z, Assumptions().deviations).names
+    names = changes_of_nuisances(solution.collocation, solution.z, Assumptions().deviations).names
     assert "calibration_scale" not in names
     assert "clock_rate" in names
 
@@ -156,25 +156,25 @@ def test_what_is_estimated_is_not_considered():
 def test_a_nuisance_that_moves_the_body_may_be_considered():
     solution = solve(Problem([measured(hung_cube(12))], GUESS))
     stated = Assumptions(gravity_rad=0.02).deviations
-    changes = assumed(solution.collocation, solution.z, stated)
+    changes = changes_of_assumptions(solution.collocation, solution.z, stated)
     here = [k for k, name in enumerate(changes.names) if name == "gravity_rad"]
     assert len(here) == 2
     assert all(np.abs(changes.blocks[0][..., k]).max() > 0.1 for k in here)
 
 
 def test_every_assumption_has_a_key_a_default_and_words():
-    assert set(Assumptions().deviations) == {row.name for row in (*ASSUMPTIONS, *ROWS)}
-    assert all(row.said and worded(row.name) for row in ASSUMPTIONS)
-    assert worded("grip_layer_m") == "grip layer"
+    assert set(Assumptions().deviations) == {row.name for row in (*ASSUMPTIONS, *KINDS)}
+    assert all(row.description and source_label(row.name) for row in ASSUMPTIONS)
+    assert source_label("grip_layer_m") == "grip layer"
 
 
 def test_sources_need_no_nuisance_parameters():
     solution = solve(Problem([measured(hung_cube(12))], GUESS))
-    fit = linearised_fit(solution.collocation, solution.z)
-    changes = assumed(solution.collocation, solution.z, Assumptions().deviations)
-    known = covariance(solution.collocation, solution.z)
-    sources = Sources.of(fit, changes, GUESS, solution.q, known)
-    assert sources.of_noise(np.eye(len(solution.q))[0]) == (1.0, 1.0)
+    fit = linearise_fit(solution.collocation, solution.z)
+    changes = changes_of_assumptions(solution.collocation, solution.z, Assumptions().deviations)
+    known = uncertainty_at(solution.collocation, solution.z)
+    sources = VarianceSources.from_fit(fit, changes, GUESS, solution.q, known)
+    assert sources.noise_shares(np.eye(len(solution.q))[0]) == (1.0, 1.0)
 
 
 def swings(*gamma_r_s: float) -> Problem:

@@ -11,11 +11,11 @@ import pytest
 from checks import assert_derivative, relative_error
 from problems_small import GUESS, hung_cube
 
-from collocation_sysid.model.recursion import Evolution, Recursion
-from collocation_sysid.program.carried import Carried, Places
+from collocation_sysid.model.recursion import Recursion, RecursionTrajectory
+from collocation_sysid.program.carried import LiftedOffsets, LiftedVariables
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.part import Part
-from collocation_sysid.program.pattern_rows import Numbers, Pattern
+from collocation_sysid.program.part import ExperimentIterate
+from collocation_sysid.program.pattern_rows import AssemblyIndices, ExpressionPattern
 
 CORNERS = np.array([[0, 3], [1, 5], [2, 4]])
 MODULUS_PA = 1e3
@@ -36,57 +36,60 @@ STRETCH = Recursion(slow_stretch, 1, 6, 1, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class Stretches(Carried):
+class Stretches(LiftedVariables):
     """That of three pairs of nodes, at all grid times."""
 
     called = "stretch"
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        return 1, self.segment.grid_rows, 3
+        return 1, self.segment.grid_times, 3
 
     @property
     def began(self) -> np.ndarray:
-        return (np.arange(self.segment.grid_rows) == 0)[None, :, None]
+        return (np.arange(self.segment.grid_times) == 0)[None, :, None]
 
-    def evolution(self, part: Part) -> Evolution:
+    def evolution(self, part: ExperimentIterate) -> RecursionTrajectory:
         modulus_pa = np.exp(part.q[:1])
-        return Evolution.of(STRETCH, modulus_pa, self.began, self.looked(part.x))
+        return RecursionTrajectory.from_signal(STRETCH, modulus_pa, self.began, self.looked(part.x))
 
     def looked(self, x: np.ndarray) -> np.ndarray:
         """(6, N, 3, …) positions of each pair."""
         at = x.reshape(len(x), -1, 3, *x.shape[2:])[:, CORNERS]
         return np.moveaxis(at.reshape(len(x), 3, 6, *x.shape[2:]), 2, 0)
 
-    def following(self, part: Part) -> np.ndarray:
+    def following(self, part: ExperimentIterate) -> np.ndarray:
         return self.evolution(part).states.ravel()
 
     @cached_property
-    def patterns(self) -> tuple[Pattern, ...]:
+    def patterns(self) -> tuple[ExpressionPattern, ...]:
         rows = np.arange(self.count).reshape(self.shape)
         columns = np.arange(self.segment.columns.start, self.segment.columns.stop)
-        at = self.looked(columns.reshape(self.segment.grid_rows, -1))
+        at = self.looked(columns.reshape(self.segment.grid_times, -1))
         recursion = Recursion(
             lambda before, now, last, q, data: slow_stretch(before, now, last, ca.exp(q), data),
             *(1, 6, 1, 1),
         )
-        looked = Numbers(at, np.full((1, 1, 1), self.segment.length_m))
-        states, of_q = Numbers(self.places.variable + rows), Numbers(np.zeros((1, 1, 1), int))
-        numbers = self.began, states, looked, of_q, Numbers(rows)
-        return (Pattern.of_recursion(recursion, *numbers),)
+        looked = AssemblyIndices(at, np.full((1, 1, 1), self.segment.length_m))
+        states, of_q = (
+            AssemblyIndices(self.offsets.variable + rows),
+            AssemblyIndices(np.zeros((1, 1, 1), int)),
+        )
+        numbers = self.began, states, looked, of_q, AssemblyIndices(rows)
+        return (ExpressionPattern.from_recursion(recursion, *numbers),)
 
 
 @pytest.fixture(scope="module")
 def program() -> Collocation:
     made = Collocation([hung_cube(5)], GUESS)
-    last = Places(made.variables, made.constraints)
-    vars(made)["carried"] = (Stretches(made.segments[0], 0, made.of_phi.start, last),)
+    last = LiftedOffsets(made.variable_count, made.constraint_count)
+    vars(made)["carried"] = (Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),)
     return made
 
 
 def some_positions(program: Collocation, rng: np.random.Generator) -> np.ndarray:
-    (segment,) = program.segments
-    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
+    (segment,) = program.transcriptions
+    rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dof_count)
     return rigid + 1e-3 * rng.normal(size=rigid.shape)
 
 
@@ -125,7 +128,7 @@ def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
         program.carried,
     )
     rows = program.jacobian(z)[carried.rows].toarray()
-    (part,) = program.parts_at(program.guess_p, [x])
+    (part,) = program.iterates_at(program.guess_p, [x])
     evolution, moved, by_q = (
         carried.evolution(part),
         rng.normal(size=(*x.shape, 2)),
@@ -149,5 +152,7 @@ def test_coefficients_of_a_linear_one_are_those_of_all_its_instances(rng):
         return c[0] * before + data[0] * now - c[1] ** 2 * last
 
     c, data = ca.SX.sym("c", 2), ca.SX.sym("data", 1)
-    found = ca.Function("found", [c, data], [Recursion(blend, 1, 1, 2, 1).coefficients(c, data)])
+    found = ca.Function(
+        "found", [c, data], [Recursion(blend, 1, 1, 2, 1).linear_coefficients(c, data)]
+    )
     np.testing.assert_allclose(found([0.5, 3.0], 2.0).full().ravel(), [0.5, 2.0, -9.0])

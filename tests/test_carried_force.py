@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Nuisance
 
@@ -41,14 +41,14 @@ def tied(steps: int = 12, **changes) -> Experiment:
     """A hung cube, one corner of which such an element holds."""
     old = hung_cube(steps, (1, 1, 1), nuisance=Nuisance.none(), **changes)
     corner = np.flatnonzero(np.abs(old.body.nodes_m).sum(axis=1) < 1e-9)
-    force = cs.NodeForce.of(maxwell, nodes=corner, carries=6)
+    force = cs.NodeForce.from_law(maxwell, nodes=corner, carries=6)
     return replace(old, body=cs.Body(old.body.mesh, density_kg_m3=30.0, forces=[force]))
 
 
 def integrated(experiment: Experiment) -> np.ndarray:
     """Positions (T, 3n) by another hand: one ODE of positions, velocities and the joint."""
     body, grasp, t_s = experiment.body, experiment.grasps[0], experiment.t_s
-    theta, mass = body.theta(STATED), np.repeat(body.node_mass, 3)
+    theta, mass = body.theta_from_values(STATED), np.repeat(body.node_mass, 3)
     held = np.isin(np.repeat(np.arange(len(body.nodes_m)), 3), grasp.nodes)
     free, count = ~held, int((~held).sum())
     corner = 3 * int(np.abs(body.nodes_m).sum(axis=1).argmin()) + np.arange(3)
@@ -56,7 +56,7 @@ def integrated(experiment: Experiment) -> np.ndarray:
 
     def whole(t: float, of_free: np.ndarray) -> np.ndarray:
         x = np.empty(len(held))
-        x[held], x[free] = grasp.carry(body.nodes_m, [t]).ravel(), of_free
+        x[held], x[free] = grasp.positions_at(body.nodes_m, [t]).ravel(), of_free
         return x
 
     def rates(t: float, y: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def integrated(experiment: Experiment) -> np.ndarray:
         force[corner] -= SPRING_N_M * (x[corner] - joint)
         return np.concatenate([v[free], (force / mass)[free], (x[corner] - joint) / CREEP_S])
 
-    x = rest_state(experiment, theta)
+    x = equilibrium(experiment, theta)
     start = np.concatenate([x[free], np.zeros(count), x[corner]])
     found = solve_ivp(rates, t_s[[0, -1]], start, "DOP853", t_s, rtol=1e-9, atol=1e-11)
     return np.array([whole(t, y) for t, y in zip(t_s, found.y[:count].T, strict=True)])
@@ -96,7 +96,7 @@ def test_every_method_finds_its_constants(method: str):
     made = tied(20)
     made = with_markers(made, simulate(made, STATED, "midpoint", substeps=1).markers_m)
     own = {"spring_n_m": cs.Unknown(2.0), "creep_s": cs.Unknown(0.04)}
-    problem = cs.Problem([made], cs.Parameters.of(STATED | own), method=METHODS[method]())
+    problem = cs.Problem([made], cs.Parameters.from_mapping(STATED | own), method=METHODS[method]())
     found = cs.solve(problem).parameters
     assert found["spring_n_m"] == pytest.approx(SPRING_N_M, rel=5e-3)
     assert found["creep_s"] == pytest.approx(CREEP_S, rel=5e-3)
@@ -107,9 +107,9 @@ def test_a_law_that_leaves_something_else_is_refused_in_words():
         return -pull_n * x, before[:2]
 
     with pytest.raises(InputError, match="'pull' returns 2 numbers to carry; expected 3"):
-        cs.NodeForce.of(pull, carries=3)
+        cs.NodeForce.from_law(pull, carries=3)
     with pytest.raises(InputError, match="returns three forces and what is carried"):
-        cs.NodeForce.of(lambda x, v, before, at, pull_n: -pull_n * x, carries=2, name="pull")
+        cs.NodeForce.from_law(lambda x, v, before, at, pull_n: -pull_n * x, carries=2, name="pull")
 
 
 # In a file ----------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def strutted(tiny: Path) -> Path:
 def test_a_strut_from_a_file_is_the_one_from_python(strutted):
     read = cs.Problem.read(strutted / "problem.toml", allow_code=True)
     (experiment,) = read.experiments
-    force = cs.NodeForce.of(maxwell, nodes=[0], carries=6)
+    force = cs.NodeForce.from_law(maxwell, nodes=[0], carries=6)
     body = cs.Body(experiment.body.mesh, density_kg_m3=30.0, forces=[force])
     made = replace(experiment, body=body)
     found, same = (

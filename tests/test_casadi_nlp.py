@@ -16,7 +16,12 @@ from collocation_sysid import solve as solve_problem
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.callbacks import NlpFunctions
-from collocation_sysid.methods.comparison.casadi_nlp import PLUGINS, REFUSED, SqpMethod, why_not
+from collocation_sysid.methods.comparison.casadi_nlp import (
+    PLUGINS,
+    REFUSED,
+    SqpMethod,
+    refusal_reason,
+)
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status, Watch
 from collocation_sysid.problem import Problem
@@ -53,7 +58,7 @@ def point() -> tuple[np.ndarray, np.ndarray]:
     """Some variables and multipliers."""
     rng = np.random.default_rng(1)
     z = cube().pack(GUESS.guess_q, [ReducedSpace()(cube()).positions_m[0].reshape(5, -1)])
-    return z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=cube().constraints)
+    return z + 1e-3 * rng.normal(size=len(z)), rng.normal(size=cube().constraint_count)
 
 
 # The answer
@@ -87,7 +92,9 @@ def test_with_noise_it_is_the_optimum_of_the_reduced_space(plugin: str):
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_explicit_grasps_lead_to_the_same_answer(plugin: str):
-    collocation = Collocation([measured(hung_cube(4, (1, 1, 2)))], GUESS, explicit_grasps=True)
+    collocation = Collocation(
+        [measured(hung_cube(4, (1, 1, 2)))], GUESS, has_grasp_constraints=True
+    )
     solution = PLUGINS[plugin]()(collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
@@ -217,11 +224,11 @@ def test_every_plugin_of_casadi_is_offered_or_refused_with_a_reason():
     ],
 )
 def test_other_names_are_refused_with_a_reason(name: str, message: str):
-    assert message in (why_not(name) or "")
+    assert message in (refusal_reason(name) or "")
 
 
 def test_offered_names_are_not_refused():
-    assert [name for name in METHODS if why_not(name)] == []
+    assert [name for name in METHODS if refusal_reason(name)] == []
 
 
 def test_an_unknown_hessian_is_refused():

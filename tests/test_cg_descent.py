@@ -14,7 +14,7 @@ from collocation_sysid.methods.comparison.cg_descent import (
     CgDescentOptions,
     CgResult,
     CgState,
-    minimise,
+    minimise_cg_descent,
 )
 
 OPTIONS = CgDescentOptions(tolerance=1e-6, max_iterations=20_000)
@@ -90,7 +90,7 @@ FUNCTIONS = {
 def followed(name: str, options: CgDescentOptions = OPTIONS) -> tuple[CgResult, list[CgState]]:
     function, start = FUNCTIONS[name]
     states: list[CgState] = []
-    return minimise(function, start, options, states.append), states
+    return minimise_cg_descent(function, start, options, states.append), states
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -107,7 +107,7 @@ def test_it_finds_the_minimum_that_scipy_finds(name: str):
     result, _ = followed(name)
     settings = {"gtol": 1e-6, "maxiter": 20_000}
     reference = scipy_minimise(function, start, jac=True, method="CG", options=settings)
-    assert result.converged
+    assert result.is_converged
     assert np.abs(result.gradient).max() <= 1e-6
     assert result.value == pytest.approx(reference.fun, abs=1e-6)
     assert result.evaluations < 5 * reference.nfev + 50
@@ -141,8 +141,8 @@ def test_a_point_out_of_the_domain_is_stepped_back_from():
         return value, 1 / (1 - x) - 5 if inside else np.full_like(x, np.nan)
 
     states: list[CgState] = []
-    result = minimise(barrier, np.array([-50.0, 0.5]), OPTIONS, states.append)
-    assert result.converged
+    result = minimise_cg_descent(barrier, np.array([-50.0, 0.5]), OPTIONS, states.append)
+    assert result.is_converged
     np.testing.assert_allclose(result.x, 0.8, atol=1e-6)
     assert all((state.x < 1).all() for state in states)
 
@@ -155,18 +155,18 @@ def test_the_value_alone_is_asked_where_that_is_enough():
         return rosen(x)
 
     _, start = FUNCTIONS["rosenbrock in 2"]
-    alone = minimise(rosenbrock, start, OPTIONS, value=value)
+    alone = minimise_cg_descent(rosenbrock, start, OPTIONS, value=value)
     assert asked
-    assert alone.evaluations < minimise(rosenbrock, start, OPTIONS).evaluations
+    assert alone.evaluations < minimise_cg_descent(rosenbrock, start, OPTIONS).evaluations
 
 
 def test_it_says_why_it_ended():
     _, start = FUNCTIONS["rosenbrock in 2"]
     few = replace(OPTIONS, max_iterations=3)
-    assert minimise(rosenbrock, start, few).ending == "iteration-limit"
-    assert minimise(rosenbrock, start, OPTIONS, lambda state: True).ending == "stopped"
-    assert minimise(rosenbrock, np.ones(2), OPTIONS).ending == "converged"
-    nowhere = minimise(lambda x: (np.inf, x), np.ones(2), OPTIONS)
+    assert minimise_cg_descent(rosenbrock, start, few).ending == "iteration-limit"
+    assert minimise_cg_descent(rosenbrock, start, OPTIONS, lambda state: True).ending == "stopped"
+    assert minimise_cg_descent(rosenbrock, np.ones(2), OPTIONS).ending == "converged"
+    nowhere = minimise_cg_descent(lambda x: (np.inf, x), np.ones(2), OPTIONS)
     assert nowhere.ending == "not-finite"
-    wrong = minimise(lambda x: (float(x @ x), -2 * x), np.ones(2), OPTIONS)
+    wrong = minimise_cg_descent(lambda x: (float(x @ x), -2 * x), np.ones(2), OPTIONS)
     assert wrong.ending == "line-search"

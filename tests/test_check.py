@@ -25,11 +25,11 @@ from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
 from collocation_sysid.result.check_sections import closer_table, glance_table
-from collocation_sysid.runs.check import Findings, check_problem, glance
+from collocation_sysid.runs.check import CheckResult, check_problem, quick_check
 from collocation_sysid.runs.check.body import element_concerns, slenderness, worst_elements
-from collocation_sysid.runs.check.cost import Cost, cost_concerns, cost_notes
-from collocation_sysid.runs.check.derivatives import shortened
-from collocation_sysid.runs.check.motion import ModeFinding, Motion, motion_concerns, motion_of
+from collocation_sysid.runs.check.cost import MethodCost, cost_concerns, cost_notes
+from collocation_sysid.runs.check.derivatives import shortened_problem
+from collocation_sysid.runs.check.motion import ModeCheck, ModesCheck, check_modes, mode_concerns
 from collocation_sysid.statistics.concern import Concern
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
@@ -44,18 +44,21 @@ REGULAR = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 10
 COMPRESSIBLE = np.array([100.0, 100.0, 0.0, 0.0])
 
 
-def checked(folder: Path, *overrides: str) -> Findings:
+def checked(folder: Path, *overrides: str) -> CheckResult:
     return check_problem(Problem.read(folder / "problem.toml", overrides))
 
 
-def checked_motion(folder: Path, *overrides: str) -> Motion:
+def checked_motion(folder: Path, *overrides: str) -> ModesCheck:
     """How the body of the only experiment oscillates at the guess."""
-    (segment,) = Problem.read(folder / "problem.toml", overrides).collocation().segments
-    theta, step_s = segment.body.theta(segment.parameters.guesses), segment.dynamics.step_s
-    return motion_of(segment.experiment, as_scheme(segment.scheme), step_s, theta)
+    (segment,) = Problem.read(folder / "problem.toml", overrides).collocation().transcriptions
+    theta, step_s = (
+        segment.body.theta_from_values(segment.parameters.guesses),
+        segment.dynamics.step_s,
+    )
+    return check_modes(segment.experiment, as_scheme(segment.scheme), step_s, theta)
 
 
-def about(findings: Findings, *words: str) -> str:
+def about(findings: CheckResult, *words: str) -> str:
     """The one warning that has all these words."""
     found = [warning for warning in findings.warnings if all(word in warning for word in words)]
     assert len(found) == 1, findings.warnings
@@ -63,7 +66,7 @@ def about(findings: Findings, *words: str) -> str:
 
 
 def sentences(concerns: Iterable[Concern]) -> list[str]:
-    return [concern.sentence for concern in concerns]
+    return [concern.message for concern in concerns]
 
 
 # The motion and the time grid -------------------------------------------------------------------
@@ -89,9 +92,9 @@ def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_
     assert needed == findings.motions[0].substeps_needed
     cured, nearly = (
         [
-            concern.sentence
-            for concern in motion_concerns(checked_motion(tiny, *euler, f"{SUBSTEPS}={count}"))
-            if "backward-euler" in concern.sentence
+            concern.message
+            for concern in mode_concerns(checked_motion(tiny, *euler, f"{SUBSTEPS}={count}"))
+            if "backward-euler" in concern.message
         ]
         for count in (needed, needed - 1)
     )
@@ -118,10 +121,10 @@ def test_damping_at_the_guess_is_rayleighs(tiny: Path):
 
 
 def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
-    def first(*overrides: str) -> ModeFinding:
+    def first(*overrides: str) -> ModeCheck:
         return checked_motion(tiny, *SILICONE, *overrides).modes[0]
 
-    def added(mode: ModeFinding, scheme: str, damping_ratio: float) -> float:
+    def added(mode: ModeCheck, scheme: str, damping_ratio: float) -> float:
         omega = 2 * np.pi * mode.frequency_hz
         return numerical_mode(SCHEMES[scheme], omega, 0.01, damping_ratio).damping_ratio
 
@@ -141,7 +144,7 @@ def test_what_the_scheme_adds_is_at_the_damping_of_the_guess(tiny: Path):
 def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
     motion = checked_motion(tiny, *SILICONE, "parameters.gamma_r_s.guess=0.02")
     first = replace(motion.modes[0], damping_ratio=0.3, numerical_damping_ratio=-0.05)
-    said = motion_concerns(replace(motion, modes=(first,), duration_s=10.0))[0].sentence
+    said = mode_concerns(replace(motion, modes=(first,), duration_s=10.0))[0].message
     assert "takes a damping ratio of 0.05 from the first mode" in said
     assert "found will be too high" in said
     assert f"set transcription.substeps = {motion.substeps_needed}" in said
@@ -150,9 +153,9 @@ def test_a_scheme_that_takes_damping_away_is_warned_of(tiny: Path):
 def test_too_few_steps_or_samples_a_period_are_warned_of(tiny: Path):
     motion = checked(tiny, *SILICONE).motions[0]
     first = replace(motion.modes[0], steps_per_period=5.0, samples_per_period=2.5)
-    found = motion_concerns(replace(motion, modes=(first,), duration_s=10.0))
+    found = mode_concerns(replace(motion, modes=(first,), duration_s=10.0))
     assert [each.topic for each in found] == ["scheme", "information"]
-    steps, samples = (each.sentence for each in found)
+    steps, samples = (each.message for each in found)
     assert "only 5.0 steps a period" in steps
     assert f"substeps = {motion.substeps_needed}" in steps
     assert "only 2.5 samples a period" in samples
@@ -206,7 +209,7 @@ def test_the_worst_element_is_named():
     body = Body(mesh, density_kg_m3=30.0)
     concern, *_ = element_concerns(body, COMPRESSIBLE, slenderness(mesh), worst)
     assert concern.code == "mesh/flat"
-    assert "element 1 is nearly flat" in concern.sentence
+    assert "element 1 is nearly flat" in concern.message
 
 
 @pytest.mark.parametrize(
@@ -253,7 +256,7 @@ def test_a_marker_far_from_the_body_is_named(tiny: Path):
     AWAY(tiny)
     findings = checked(tiny)
     assert about(findings, "marker 'side' of 'swing' lies 25 mm", "reference_m")
-    assert findings.recordings[0].farthest.name == "side"
+    assert findings.recordings[0].farthest_marker.name == "side"
     assert findings.largest_marker_distance_m == pytest.approx(0.025)
 
 
@@ -313,7 +316,10 @@ def test_every_method_has_a_cost_and_the_chosen_one_counts(tiny: Path):
 
 def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
     monkeypatch.setattr("collocation_sysid.runs.check.cost.machine_memory_mb", lambda: 8000.0)
-    small, large = Cost("reduced-space", 500.0, 10.0), Cost("interior-point", 40000.0, 1000.0)
+    small, large = (
+        MethodCost("reduced-space", 500.0, 10.0),
+        MethodCost("interior-point", 40000.0, 1000.0),
+    )
     (warning,) = sentences(cost_concerns(large, (small, large)))
     assert "about 40 GB" in warning
     assert 'set solver.method = "reduced-space"' in warning
@@ -333,7 +339,7 @@ def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
     for name in ("initial_variables", "started"):
         monkeypatch.setattr(f"collocation_sysid.runs.check.{name}", no_simulation)
     unguessed = ["parameters.mu_pa={}", "parameters.lambda_pa={}"]
-    seen = glance(Problem.read(tiny / "problem.toml", unguessed))
+    seen = quick_check(Problem.read(tiny / "problem.toml", unguessed))
     assert seen.bodies[0].elements > 0
     assert seen.recordings[0].samples == 27
     assert seen.holds[0].nodes == 9
@@ -353,7 +359,7 @@ def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypat
 
 
 def test_every_grasp_of_an_experiment_is_shown():
-    shown = plain_text(glance_table(glance(Problem([bar_in_two_hands()], TRUTH))))
+    shown = plain_text(glance_table(quick_check(Problem([bar_in_two_hands()], TRUTH))))
     (first,) = re.findall(r"grasp 1 of 'bar in two hands' .* at \((.*?)\) mm", shown)
     (second,) = re.findall(r"grasp 2 of 'bar in two hands' .* at \((.*?)\) mm", shown)
     assert (first, second) == ("0, 0, 0", "150, 0, 0")
@@ -377,9 +383,9 @@ def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, mon
 
 
 def test_of_equilibria_three_samples_have_all_kinds_of_rows():
-    static = shortened(Problem([block(t_s=np.arange(6.0), z_m=np.zeros(6))], TRUTH))
+    static = shortened_problem(Problem([block(t_s=np.arange(6.0), z_m=np.zeros(6))], TRUTH))
     assert len(static.experiments[0].t_s) == 3
-    moving = shortened(Problem([hung_cube(30)], TRUTH))
+    moving = shortened_problem(Problem([hung_cube(30)], TRUTH))
     assert len(moving.experiments[0].t_s) == 12
 
 

@@ -263,7 +263,7 @@ def test_pictures_may_be_left_out(tiny):
 
 def test_the_time_of_checks_is_none_of_the_search(tiny, monkeypatch):
     wait_s = 1.5
-    monkeypatch.setattr(pipeline, "likely_causes", lambda _: time.sleep(wait_s) or ())
+    monkeypatch.setattr(pipeline, "find_misspecifications", lambda _: time.sleep(wait_s) or ())
     began_s = time.perf_counter()
     assert run_command("solve", "problem.toml", "--out", "run").code == 0
     took_s = time.perf_counter() - began_s
@@ -317,7 +317,9 @@ def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
             time.sleep(0.5)  # until it is heard, on the main thread
 
     monkeypatch.setattr(progress_shown.Progress, "iteration", interrupt)
-    monkeypatch.setattr(pipeline, "likely_causes", lambda _: pytest.fail("nobody waits for this"))
+    monkeypatch.setattr(
+        pipeline, "find_misspecifications", lambda _: pytest.fail("nobody waits for this")
+    )
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Interrupted" in outcome.out
@@ -375,8 +377,10 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch
         found.append(replace(solution, status=status))
         return found[-1]
 
-    monkeypatch.setattr(solving, "read_where_found", solved)
-    monkeypatch.setattr(solving, "second_start", lambda first: first.collocation.parameters)
+    monkeypatch.setattr(solving, "solve_with_renewed_correspondences", solved)
+    monkeypatch.setattr(
+        solving, "second_start_parameters", lambda first: first.collocation.parameters
+    )
     method = settings("solver.method=reduced-space")
     outcome = run_command("solve", "problem.toml", *method, "--out", "run")
     assert (outcome.code, len(found)) == (130, 2)
@@ -583,7 +587,7 @@ def test_a_new_problem_file_is_valid(tmp_path, monkeypatch, name):
     assert outcome.code == 0
     file, _ = read_problem_file(outcome.out.strip())
     assert file.title == Path(name).name
-    assert file.experiment[0].grasps[0].poses == "poses.csv"
+    assert file.experiment[0].grasp_list[0].poses == "poses.csv"
 
 
 def test_a_new_problem_leaves_the_data_that_are_there(tmp_path, monkeypatch):

@@ -32,8 +32,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods import workers
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
-from collocation_sysid.methods.start import marched
-from collocation_sysid.methods.workers import OnCluster, workers_of
+from collocation_sysid.methods.start import simulate_trajectories
+from collocation_sysid.methods.workers import DaskExecutor, connect_executor
 from collocation_sysid.program.collocation import Collocation
 
 distributed = pytest.importorskip("distributed")
@@ -93,27 +93,27 @@ def test_markers_without_places_are_read_in_the_same_elements(there):
     experiment = noisy(bar_with_nuisance())
     markers = replace(experiment.markers, located=np.zeros(len(experiment.markers.names), bool))
     collocation = Collocation([replace(experiment, markers=markers)], GUESS)
-    with workers_of(there.scheduler_address) as found:
+    with connect_executor(there.scheduler_address) as found:
         assert_alike(ReducedSpace()(collocation, workers=found), ReducedSpace()(collocation))
 
 
 def test_what_comes_back_does_not_grow_with_the_recording(there, monkeypatch):
     sizes: list[int] = []
 
-    def weighed(self: OnCluster, kept: Any) -> list[Any]:
+    def weighed(self: DaskExecutor, kept: Any) -> list[Any]:
         found = fetch(self, kept)
         sizes.append(len(pickle.dumps(found)))
         return found
 
-    fetch = OnCluster.fetch
-    monkeypatch.setattr(OnCluster, "fetch", weighed)
+    fetch = DaskExecutor.fetch
+    monkeypatch.setattr(DaskExecutor, "fetch", weighed)
     most = []
     for steps in (12, 36):
         collocation = Collocation([noisy(hung_cube(steps))], GUESS)
-        with workers_of(there.scheduler_address) as found:
+        with connect_executor(there.scheduler_address) as found:
             ReducedSpace()(collocation, workers=found)
         *on_the_way, trajectories = sizes
-        assert trajectories > collocation.variables * 8
+        assert trajectories > collocation.variable_count * 8
         most.append(max(on_the_way))
         sizes.clear()
     assert most[1] < 1.02 * most[0] < 2000
@@ -126,7 +126,7 @@ def test_what_a_lost_worker_had_is_done_again(there):
         if line.number == 3:
             lose(there, 0)
 
-    with workers_of(there.scheduler_address) as found:
+    with connect_executor(there.scheduler_address) as found:
         solution = ReducedSpace()(collocation, watch, workers=found)
     assert len(there.scheduler.workers) == 1
     *notes, said = solution.notes
@@ -140,9 +140,9 @@ def assert_best_is_kept(solution: cs.Solution, why: str) -> None:
     assert solution.message == f"{Status.CLUSTER_LOST.sentence} {why}"
     assert solution.parameters == solution.history[-1].parameters
     collocation, z = solution.collocation, solution.z
-    alike, failure = marched(collocation, collocation.unpack(z)[0])
+    alike, failure = simulate_trajectories(collocation, collocation.unpack(z)[0])
     assert failure is None
-    for part, x in zip(collocation.parts(z), alike, strict=True):
+    for part, x in zip(collocation.iterates(z), alike, strict=True):
         np.testing.assert_allclose(part.x, x, atol=1e-9)
 
 
@@ -154,7 +154,7 @@ def test_without_workers_left_the_best_is_kept(there, monkeypatch):
             for number in (0, 1):
                 lose(there, number)
 
-    with workers_of(there.scheduler_address) as found:
+    with connect_executor(there.scheduler_address) as found:
         solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
     assert_best_is_kept(solution, "No worker is left.")
 
@@ -166,7 +166,7 @@ def test_without_a_scheduler_left_the_best_is_kept(there, monkeypatch):
         if line.number == 3:
             there.sync(there.scheduler.close)
 
-    with workers_of(there.scheduler_address) as found:
+    with connect_executor(there.scheduler_address) as found:
         solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
     with dask.config.set({"distributed.comm.timeouts.connect": "0.5s"}):
         there.close()  # which looks for the scheduler
@@ -211,7 +211,7 @@ def test_an_interrupted_solve_keeps_its_best(there):
         if len(lines) == 3:
             raise KeyboardInterrupt
 
-    with workers_of(there.scheduler_address) as found:
+    with connect_executor(there.scheduler_address) as found:
         solution = ReducedSpace()(Collocation(several(), GUESS), watch, workers=found)
     assert solution.status is Status.INTERRUPTED
     assert solution.parameters == lines[-1].parameters
@@ -274,10 +274,10 @@ def test_workers_of_another_version_are_refused():
     answers = {"tcp://a:1": workers.version("collocation-sysid"), "tcp://b:1": "0.0.1"}
     client = SimpleNamespace(run=lambda *_, **__: answers)
     with pytest.raises(InputError, match=r"found '0\.0\.1' on the worker tcp://b:1; expected"):
-        OnCluster(client)
+        DaskExecutor(client)
     answers.clear()
     with pytest.raises(InputError, match="the scheduler has no workers"):
-        OnCluster(client)
+        DaskExecutor(client)
 
 
 @pytest.mark.parametrize("error", [OSError, distributed.client.CancelledError])
@@ -288,14 +288,14 @@ def test_a_scheduler_lost_while_versions_are_asked_for_is_reported(monkeypatch, 
     client = SimpleNamespace(run=lost, close=lost)
     monkeypatch.setattr(distributed, "Client", lambda *_, **__: client)
     with pytest.raises(InputError, match="--scheduler: the scheduler stopped answering"):  # noqa: SIM117
-        with workers_of("tcp://a:1"):
+        with connect_executor("tcp://a:1"):
             pytest.fail("the work was started")
 
 
 def test_costly_experiments_are_shared_out_first():
     threads = {"a": 1, "b": 1}
-    assert workers._shared_out([1, 5, 2, 3], threads) == ["a", "a", "b", "b"]
-    assert workers._shared_out([1, 1, 1], {"a": 2, "b": 1}) == ["a", "b", "a"]
+    assert workers._assign_workers([1, 5, 2, 3], threads) == ["a", "a", "b", "b"]
+    assert workers._assign_workers([1, 1, 1], {"a": 2, "b": 1}) == ["a", "b", "a"]
 
 
 # The command line

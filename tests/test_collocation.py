@@ -19,13 +19,13 @@ from problems_small import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.kernels.combine import combine_with_numpy
-from collocation_sysid.fem.moduli import engineering as engineering_moduli
+from collocation_sysid.fem.moduli import engineering_constants as engineering_moduli
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program import block_band
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 
@@ -42,12 +42,12 @@ ENGINEERING = Parameters(
 POISSON_FIXED = Parameters(
     (
         Parameter("young_pa", 700.0, 10.0, 1e5),
-        Parameter("poisson", 0.2, fixed=True),
-        Parameter("gamma_r_s", 0.0, fixed=True),
+        Parameter("poisson", 0.2, is_fixed=True),
+        Parameter("gamma_r_s", 0.0, is_fixed=True),
         DAMPING[1],
     )
 )
-ALL_FIXED = Parameters(tuple(Parameter(i.name, i.guess, fixed=True) for i in GUESS.items))
+ALL_FIXED = Parameters(tuple(Parameter(i.name, i.guess, is_fixed=True) for i in GUESS.items))
 
 
 def swung(start: str = "equilibrium", steps: int = 5, **changes) -> Experiment:
@@ -59,7 +59,7 @@ def swung(start: str = "equilibrium", steps: int = 5, **changes) -> Experiment:
         changes["start_positions_m"] = experiment.body.nodes_m + 1e-3 * rng.normal(size=shape)
         changes["start_velocities_m_s"] = 0.1 * rng.normal(size=shape)
     rng = np.random.default_rng(7)
-    tracks = experiment.markers.observe(experiment.rigid_positions(experiment.t_s))
+    tracks = experiment.markers.predict_positions(experiment.rigid_positions(experiment.t_s))
     tracks += 5e-3 * rng.normal(size=tracks.shape)
     tracks[rng.random(tracks.shape[:2]) < 0.3] = np.nan
     return replace(with_markers(experiment, tracks), start=start, **changes)
@@ -68,8 +68,8 @@ def swung(start: str = "equilibrium", steps: int = 5, **changes) -> Experiment:
 def marched(collocation: Collocation, q: np.ndarray | None = None) -> np.ndarray:
     q = collocation.parameters.guess_q if q is None else q
     motions = [
-        march(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
-        for s in collocation.segments
+        simulate_scheme(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
+        for s in collocation.transcriptions
     ]
     return collocation.pack(q, motions)
 
@@ -102,7 +102,7 @@ def test_a_marched_trajectory_satisfies_the_constraints(
     assert np.abs(collocation.constraint_values(z)).max() < 1e-12
     lower, upper = collocation.bounds()
     assert ((z >= lower) & (z <= upper)).all()
-    newtons = np.abs(collocation.violations_n(z)[0]).max()
+    newtons = np.abs(collocation.residuals_n(z)[0]).max()
     assert newtons < 3e-12 * collocation.largest_force_n(z)
 
 
@@ -115,7 +115,7 @@ def test_the_loss_is_zero_where_the_tracks_came_from():
     collocation = Collocation([measured(hung_cube())], GUESS)
     z = marched(collocation, np.log(THETA))
     assert collocation.objective(z) < 1e-20
-    assert collocation.rms_m(z) < 1e-13
+    assert collocation.rms_marker_distance_m(z) < 1e-13
 
 
 # Layout
@@ -123,7 +123,7 @@ def test_the_loss_is_zero_where_the_tracks_came_from():
 
 def test_pack_and_unpack_are_inverse():
     collocation = Collocation([swung(), swung(steps=7)], GUESS, substeps=2)
-    z = np.random.default_rng(0).normal(size=collocation.variables)
+    z = np.random.default_rng(0).normal(size=collocation.variable_count)
     q, positions = collocation.unpack(z)
     assert q.shape == (4,)
     assert [x.shape for x in positions] == [(11, 36), (15, 36)]
@@ -135,18 +135,18 @@ def test_variables_and_rows_are_in_the_documented_order():
     z = some_point(collocation)
     q, positions = collocation.unpack(z)
     expected_z, expected_g = [q], []
-    for segment, x in zip(collocation.segments, positions, strict=True):
+    for segment, x in zip(collocation.transcriptions, positions, strict=True):
         residual = segment.dynamics.with_theta(segment.constants.theta(q)).residual(x)
         expected_z.append(x.ravel() / segment.length_m)
         rows = residual[segment.dynamics.first_row :, segment.free_dofs]
         expected_g.append(rows.ravel() / segment.force_n)
     np.testing.assert_allclose(z, np.concatenate(expected_z))
     np.testing.assert_allclose(collocation.constraint_values(z), np.concatenate(expected_g))
-    assert [s.dynamics.first_row for s in collocation.segments] == [1, 0]
+    assert [s.dynamics.first_row for s in collocation.transcriptions] == [1, 0]
 
 
 def test_lengths_are_scaled_by_the_mean_edge():
-    segment = Collocation([swung()], GUESS).segments[0]
+    segment = Collocation([swung()], GUESS).transcriptions[0]
     ends = segment.body.nodes_m[segment.body.mesh.edges]
     assert segment.length_m == pytest.approx(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 
@@ -156,7 +156,7 @@ def test_gauss_newtons_model_of_wild_samples_is_nowhere_below_their_loss(rng):
     z = some_point(collocation)
     value, slope = collocation.objective(z), collocation.gradient(z)
     hessian = collocation.hessian(z, 1.0, None)
-    x = collocation.segments[0].columns
+    x = collocation.transcriptions[0].columns
     for length in (1e-4, -1e-2, 1.0):
         step = np.zeros(len(z))
         step[x] = length * rng.normal(size=len(step[x]))
@@ -167,7 +167,7 @@ def test_gauss_newtons_model_of_wild_samples_is_nowhere_below_their_loss(rng):
 def test_gauss_newtons_hessian_is_the_exact_one_where_readings_are_met():
     truth = Parameters(tuple(replace(item, guess=TRUTH[item.name]) for item in GUESS.items))
     collocation = Collocation([measured(cube_with_nuisance(4))], truth)
-    (start, _), none = initial_variables(collocation), np.zeros(collocation.constraints)
+    (start, _), none = initial_variables(collocation), np.zeros(collocation.constraint_count)
     exact = collocation.hessian(start, 1.0, none).toarray()
     found = collocation.hessian(start, 1.0, None).toarray()
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
@@ -176,7 +176,7 @@ def test_gauss_newtons_hessian_is_the_exact_one_where_readings_are_met():
 def test_values_are_written_where_they_are_wanted():
     collocation = Collocation([swung(), swung(steps=3)], GUESS)
     z = some_point(collocation)
-    y = np.ones(collocation.constraints)
+    y = np.ones(collocation.constraint_count)
     jacobian = np.full(len(collocation.jacobian_structure[1]), np.nan)
     second = np.full(len(collocation.hessian_structure[1]), np.nan)
     assert collocation.jacobian_values(z, jacobian) is jacobian
@@ -188,22 +188,24 @@ def test_values_are_written_where_they_are_wanted():
 @pytest.mark.parametrize("make", [swung, bar_in_two_hands])
 def test_held_nodes_are_bound_to_the_grasp(make):
     collocation = Collocation([make()], GUESS, substeps=2)
-    segment = collocation.segments[0]
+    segment = collocation.transcriptions[0]
     (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
-    held = segment.experiment.held_positions(segment.dynamics.t_s)
-    np.testing.assert_allclose(lower[:, segment.held_dofs], held, rtol=1e-14, atol=1e-17)
-    np.testing.assert_array_equal(lower[:, segment.held_dofs], upper[:, segment.held_dofs])
+    held = segment.experiment.prescribed_positions(segment.dynamics.t_s)
+    np.testing.assert_allclose(lower[:, segment.prescribed_dofs], held, rtol=1e-14, atol=1e-17)
+    np.testing.assert_array_equal(
+        lower[:, segment.prescribed_dofs], upper[:, segment.prescribed_dofs]
+    )
     assert (lower[:, segment.free_dofs] == -np.inf).all()
     assert (upper[:, segment.free_dofs] == np.inf).all()
 
 
 @pytest.mark.parametrize("start", ["undeformed", "given"])
 def test_a_known_start_is_bound_too(start: str):
-    collocation = Collocation([swung(start)], GUESS, explicit_grasps=True)
+    collocation = Collocation([swung(start)], GUESS, has_grasp_constraints=True)
     (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
-    expected = collocation.segments[0].experiment.start_positions_m
+    expected = collocation.transcriptions[0].experiment.start_positions_m
     if expected is None:
-        expected = collocation.segments[0].body.nodes_m
+        expected = collocation.transcriptions[0].body.nodes_m
     np.testing.assert_allclose(lower[0], np.ravel(expected), rtol=1e-14, atol=1e-17)
     np.testing.assert_array_equal(lower[0], upper[0])
     assert np.isinf(lower[1:]).all()
@@ -242,15 +244,15 @@ def test_losses_of_experiments_add_up():
     total = 0.0
     for experiment, x in zip(experiments, positions, strict=True):
         alone = Collocation([experiment], GUESS)
-        total += alone.objective(alone.pack(q, [x])) * alone.measurements
-    assert both.objective(z) * both.measurements == pytest.approx(total)
+        total += alone.objective(alone.pack(q, [x])) * alone.measurement_count
+    assert both.objective(z) * both.measurement_count == pytest.approx(total)
 
 
 def test_validation_experiments_are_left_out():
     fitted, held_out = swung(), replace(swung(steps=7), name="held out", validation=True)
     collocation = Collocation([held_out, fitted], GUESS)
-    assert [segment.experiment for segment in collocation.segments] == [fitted]
-    assert collocation.variables == Collocation([fitted], GUESS).variables
+    assert [segment.experiment for segment in collocation.transcriptions] == [fitted]
+    assert collocation.variable_count == Collocation([fitted], GUESS).variable_count
 
 
 def test_nothing_to_fit_is_refused():
@@ -266,19 +268,19 @@ def test_nothing_to_fit_is_refused():
 def test_the_loss_counts_present_samples_only():
     collocation = Collocation([swung()], GUESS)
     z = some_point(collocation)
-    segment, (_, (x,)) = collocation.segments[0], collocation.unpack(z)
+    segment, (_, (x,)) = collocation.transcriptions[0], collocation.unpack(z)
     markers = segment.experiment.markers
-    predicted = markers.observe(x.reshape(len(x), -1, 3))
+    predicted = markers.predict_positions(x.reshape(len(x), -1, 3))
     squares = np.sum((predicted - markers.positions_m) ** 2, axis=2)
     present = np.isfinite(squares)
     assert 0 < present.sum() < present.size
-    assert collocation.measurements == 3 * present.sum()
-    expected = (squares / markers.sigma_m**2)[present].sum() / collocation.measurements
+    assert collocation.measurement_count == 3 * present.sum()
+    expected = (squares / markers.sigma_m**2)[present].sum() / collocation.measurement_count
     assert collocation.objective(z) == pytest.approx(expected)
     np.testing.assert_allclose(
         segment.markers.squared_distances_m2(x, np.zeros(0)), squares[present]
     )
-    assert collocation.rms_m(z) == pytest.approx(np.sqrt(squares[present].mean()))
+    assert collocation.rms_marker_distance_m(z) == pytest.approx(np.sqrt(squares[present].mean()))
 
 
 def test_a_frame_without_samples_pulls_on_nothing():
@@ -302,7 +304,7 @@ def test_with_substeps_only_the_rows_at_samples_are_measured():
 def test_a_prior_adds_its_squared_residual():
     with_prior, without = (Collocation([swung()], p) for p in (WITH_PRIOR, GUESS))
     z = some_point(without)
-    difference = (with_prior.objective(z) - without.objective(z)) * without.measurements
+    difference = (with_prior.objective(z) - without.objective(z)) * without.measurement_count
     assert difference == pytest.approx(((z[0] - np.log(300.0)) / 0.2) ** 2)
 
 
@@ -310,12 +312,12 @@ def test_a_prior_adds_its_squared_residual():
 
 
 def test_fixing_parameters_drops_their_columns():
-    fixed = Parameters((*GUESS.items[:3], Parameter("gamma_m_1_s", 0.5, fixed=True)))
+    fixed = Parameters((*GUESS.items[:3], Parameter("gamma_m_1_s", 0.5, is_fixed=True)))
     all_free, reduced = Collocation([swung()], GUESS), Collocation([swung()], fixed)
     z = some_point(all_free)
     z[3] = np.log(0.5)
     shorter = np.delete(z, 3)
-    assert reduced.variables == all_free.variables - 1
+    assert reduced.variable_count == all_free.variable_count - 1
     np.testing.assert_allclose(
         reduced.constraint_values(shorter), all_free.constraint_values(z), atol=1e-14
     )
@@ -326,12 +328,12 @@ def test_fixing_parameters_drops_their_columns():
 def test_both_elastic_pairs_describe_the_same_constraints():
     lame, engineering = Collocation([swung()], GUESS), Collocation([swung()], ENGINEERING)
     z = some_point(lame)
-    lambda_pa, mu_pa, *damping = lame.values(z).values()
+    lambda_pa, mu_pa, *damping = lame.parameter_values(z).values()
     q = np.log([*engineering_moduli(lambda_pa, mu_pa), *damping])
     other = engineering.pack(q, lame.unpack(z)[1])
-    newtons = lame.violations_n(z)[0]
+    newtons = lame.residuals_n(z)[0]
     np.testing.assert_allclose(
-        engineering.violations_n(other)[0], newtons, atol=1e-12 * np.abs(newtons).max()
+        engineering.residuals_n(other)[0], newtons, atol=1e-12 * np.abs(newtons).max()
     )
 
 
@@ -342,7 +344,7 @@ def test_the_largest_violation_is_named():
     collocation = Collocation([swung(), replace(swung(steps=7), name="second")], GUESS)
     z = marched(collocation)
     q, positions = collocation.unpack(z)
-    node = int(collocation.segments[1].experiment.free_dofs[6]) // 3
+    node = int(collocation.transcriptions[1].experiment.free_dofs[6]) // 3
     positions[1][-1, 3 * node + 1] += 1e-3
     worst = collocation.largest_violations(collocation.pack(q, positions), count=3)
     assert len(worst) == 3
@@ -350,7 +352,7 @@ def test_the_largest_violation_is_named():
     assert worst[0].time_s == pytest.approx(0.07)
     assert str(worst[0]).startswith(f"second: t = 0.07 s, node {node}, y: -")
     assert str(worst[0]).endswith(" N")
-    sizes = [abs(violation.newtons) for violation in worst]
+    sizes = [abs(violation.residual_n) for violation in worst]
     assert sizes == sorted(sizes, reverse=True)
 
 
@@ -361,7 +363,7 @@ def test_the_numpy_combiner_fills_the_same_values(monkeypatch):
     def values(experiment: Experiment) -> tuple[np.ndarray, np.ndarray]:
         collocation = Collocation([experiment], GUESS, "bdf2")
         z = some_point(collocation)
-        y = np.random.default_rng(0).normal(size=collocation.constraints)
+        y = np.random.default_rng(0).normal(size=collocation.constraint_count)
         return collocation.jacobian_values(z), collocation.hessian_values(z, 1.0, y)
 
     natively = values(swung())

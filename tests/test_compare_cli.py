@@ -172,13 +172,13 @@ def test_a_late_run_is_a_row(tiny, stand_in):
 
 
 def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
-    done = display.StudyProgress.done
+    done = display.StudyProgress.count_run
 
     def interrupt(self, record, slots):
         done(self, record, slots)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(display.StudyProgress, "done", interrupt)
+    monkeypatch.setattr(display.StudyProgress, "count_run", interrupt)
     outcome = compare("--starts", 2, "--workers", 2)
     assert outcome.code == 130
     assert outcome.out == ""

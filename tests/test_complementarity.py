@@ -14,9 +14,9 @@ import collocation_sysid as cs
 from collocation_sysid.methods.complementarity import RELAXED
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.recording import Experiment
-from collocation_sysid.runs.forward_simulation import Rollout, roll_out
+from collocation_sysid.runs.forward_simulation import ForwardSimulation, simulate_experiment
 
 TRUTH = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.3}
 STIFFER = np.array([1.0, 10.0])
@@ -64,7 +64,7 @@ MADE = {
 
 def stiffer(experiment: Experiment, factor: float) -> Experiment:
     """With κ so much larger, and δ smaller: at the same pressure the gap is zero."""
-    edges = [each.surface(experiment.body).edge_m for each in experiment.obstacles]
+    edges = [each.contact_surface(experiment.body).edge_m for each in experiment.obstacles]
     return experiment.with_obstacles(
         [
             replace(
@@ -88,7 +88,7 @@ def seen(experiment: Experiment) -> Experiment:
 
 
 def solved(experiment: Experiment, parameters: cs.Parameters | None = None) -> Solution:
-    known = parameters or cs.Parameters.of(TRUTH)
+    known = parameters or cs.Parameters.from_mapping(TRUTH)
     problem = cs.Problem([seen(experiment)], known, scheme="bdf2")
     return InteriorPoint(contact="complementarity")(problem.collocation())
 
@@ -118,20 +118,20 @@ def test_nothing_is_entered_and_pressure_times_gap_is_small(name: str):
     experiment, answer = answered(name)
     (hard,) = answer.positions_m
     hard = hard.reshape(len(hard), -1)
-    (term,) = contacts(experiment)
-    gaps = term.contact.gaps(term.points.vectors(hard))
+    (term,) = contact_terms(experiment)
+    gaps = term.law_of_contact.gaps(term.points.vectors(hard))
     assert gaps.min() >= -1e-9
     relaxed = experiment.with_obstacles(
         [replace(each, relaxed=RELAXED[-1]) for each in experiment.obstacles]
     )
-    (term,) = contacts(relaxed)
-    product_m2 = term.pressing(hard)[0] * gaps
-    assert product_m2.max() <= 1.000001 * RELAXED[-1] * term.contact.width_m**2
-    assert np.any(term.pressing(hard) > 0.01 * term.contact.width_m)
+    (term,) = contact_terms(relaxed)
+    product_m2 = term.scaled_pressures(hard)[0] * gaps
+    assert product_m2.max() <= 1.000001 * RELAXED[-1] * term.law_of_contact.largest_width_m**2
+    assert np.any(term.scaled_pressures(hard) > 0.01 * term.law_of_contact.largest_width_m)
 
 
 def test_a_stiffness_is_that_of_an_ever_stiffer_energy():
-    unknown = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(7e3)})
+    unknown = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(7e3)})
     poked = stiffer(pressed(cs.Sphere(0.03, (0.03, 0.03, 0.06))), 10.0)
     answer = solved(poked, unknown)
     assert answer.status.converged
@@ -150,6 +150,6 @@ def test_friction_of_a_recording_for_validation_is_simulated_by_the_contacts_ene
     predicted = replace(rough, name="rubbed", validation=True)
     hard = InteriorPoint(contact="complementarity")
     problem = cs.Problem([seen(smooth), predicted], TRUTH, scheme="bdf2", method=hard)
-    simulated = roll_out(problem, predicted, answer)
-    assert isinstance(simulated, Rollout), simulated
+    simulated = simulate_experiment(problem, predicted, answer)
+    assert isinstance(simulated, ForwardSimulation), simulated
     assert simulated.rms_m < 1e-4

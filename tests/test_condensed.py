@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from test_static import HANGING, block
 from wrenches_small import sensing, wristed_cube
 
-from collocation_sysid.methods.condensed import Condensed, condensed
+from collocation_sysid.methods.condensed import CondensedCollocation, condense
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameters
@@ -57,19 +57,21 @@ CASES: dict[str, Callable[[Nuisance], tuple[list[Experiment], Parameters]]] = {
 }
 
 
-def made(name: str, nuisance: Nuisance) -> tuple[Collocation, Collocation, Condensed]:
+def made(name: str, nuisance: Nuisance) -> tuple[Collocation, Collocation, CondensedCollocation]:
     """A collocation, all that follows as variables, and without held dofs."""
     collocation = Collocation(*CASES[name](nuisance))
-    whole = collocation.made_explicit()
-    program = condensed(whole)
-    assert isinstance(program, Condensed)
+    whole = collocation.with_lifted_variables()
+    program = condense(whole)
+    assert isinstance(program, CondensedCollocation)
     return collocation, whole, program
 
 
 def some_point(collocation: Collocation, program: Collocation, rng: np.random.Generator):
     positions = []
-    for segment in collocation.segments:
-        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(-1, segment.dofs)
+    for segment in collocation.transcriptions:
+        rigid = segment.experiment.rigid_positions(segment.dynamics.t_s).reshape(
+            -1, segment.dof_count
+        )
         positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
     p = collocation.guess_p
     p += 0.1 * rng.normal(size=len(p))
@@ -79,8 +81,14 @@ def some_point(collocation: Collocation, program: Collocation, rng: np.random.Ge
 @pytest.mark.parametrize("name", CASES)
 def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
     collocation, whole, program = made(name, ON_TIME)
-    rows = sum(s.grasp_rows.sum() for s in whole.segments if s.nuisance.moves_grasps)
-    assert whole.variables - program.variables == whole.constraints - program.constraints == rows
+    rows = sum(
+        s.is_grasp_constraint.sum() for s in whole.transcriptions if s.nuisance.affects_grasps
+    )
+    assert (
+        whole.variable_count - program.variables
+        == whole.constraint_count - program.constraints
+        == rows
+    )
     z, y = some_point(collocation, program, rng), rng.normal(size=program.constraints)
 
     def slope(at: np.ndarray) -> np.ndarray:
@@ -92,7 +100,7 @@ def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
         program.hessian(z, 1.3, y),
     )
     of_phi = np.zeros(len(z))
-    of_phi[program.of_phi] = 0.1
+    of_phi[program.phi_slice] = 0.1
     for scale in (0.1, of_phi):
         options = {"scale": scale, "directions": 1}
         assert_derivative(program.objective, lambda d: gradient @ d, z, rng, **options)
@@ -104,9 +112,9 @@ def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
 def test_held_dofs_are_where_the_grasps_are_and_multipliers_balance_them(name: str, rng):
     collocation, whole, program = made(name, ON_TIME)
     z, y = some_point(collocation, program, rng), rng.normal(size=program.constraints)
-    at, of_rows = program.whole_variables(z), program.whole_multipliers(z, 1.0, y)
-    rows = np.concatenate([each.rows for each in program.left_out])
-    held = np.concatenate([each.variables for each in program.left_out])
+    at, of_rows = program.complete_variables(z), program.complete_multipliers(z, 1.0, y)
+    rows = np.concatenate([each.rows for each in program.eliminated])
+    held = np.concatenate([each.variables for each in program.eliminated])
     np.testing.assert_allclose(whole.constraint_values(at)[rows], 0.0, atol=1e-12)
     np.testing.assert_array_equal(np.delete(at, held), z)
     slope = whole.gradient(at) + whole.jacobian(at).T @ of_rows
@@ -118,26 +126,28 @@ def test_held_dofs_are_where_the_grasps_are_and_multipliers_balance_them(name: s
 @pytest.mark.parametrize("substeps", [1, 2])
 def test_a_clock_adds_no_entry_between_timesteps_that_motion_does_not_join(substeps: int):
     whole = Collocation([late_cube(DEFAULT)], GUESS, substeps=substeps)
-    program = condensed(whole)
-    (segment,) = whole.segments
+    program = condense(whole)
+    (segment,) = whole.transcriptions
     apart = []
-    for each, dofs in ((whole, segment.dofs), (program, len(segment.free_dofs))):
+    for each, dofs in ((whole, segment.dof_count), (program, len(segment.free_dofs))):
         indptr, rows = each.hessian_structure
-        columns = np.repeat(np.arange(each.variables), np.diff(indptr))
-        of_x = (rows >= each.nq) & (columns < each.of_phi.start)
+        columns = np.repeat(np.arange(each.variable_count), np.diff(indptr))
+        of_x = (rows >= each.nq) & (columns < each.phi_columns.start)
         first, second = ((index[of_x] - each.nq) // dofs for index in (rows, columns))
         apart.append((second - first).max())
     assert apart[0] == 4 * substeps
-    assert apart[1] <= segment.dynamics.reach
+    assert apart[1] <= segment.dynamics.largest_lag
 
 
 def test_steps_take_slopes_as_they_are_at_the_nearest_sample(rng):
     whole = Collocation([late_cube(DEFAULT)], GUESS)
-    program = condensed(whole)
-    (segment,) = whole.segments
+    program = condense(whole)
+    (segment,) = whole.transcriptions
     z = some_point(whole, program, rng)
-    (clock,) = program.of_phi.start + segment.nuisance.of_clock
-    sample = segment.experiment.timestep_s / segment.nuisance.scales[segment.nuisance.of_clock[0]]
+    (clock,) = program.phi_columns.start + segment.nuisance.clock_indices
+    sample = (
+        segment.experiment.timestep_s / segment.nuisance.scales[segment.nuisance.clock_indices[0]]
+    )
     found = []
     for samples in (0.4, 0.0, 0.6, 1.0):
         z[clock] = samples * sample

@@ -15,13 +15,13 @@ from scipy.optimize import brentq, minimize
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.near_contact import NearContact
+from collocation_sysid.program.near_contact import StepContact
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.touches import rubbings
+from collocation_sysid.program.touches import friction_summaries
 from collocation_sysid.recording import (
     Capsule,
     Cuboid,
@@ -122,8 +122,8 @@ def energy_j(term, x) -> float:
     law, body = term.contact, term.contact.body
     from_origin = term.points.vectors(x[None])[:3, 0].T
     origin, *ends = x.reshape(-1, 3)[law.obstacle.nodes]
-    axes = (np.array(ends) - origin) / (body.frame_m[1, 0] - body.frame_m[0, 0])
-    gap, _ = gaps(law.obstacle.shape, from_origin @ axes.T + body.frame_m[0])
+    axes = (np.array(ends) - origin) / (body.frame_nodes_m[1, 0] - body.frame_nodes_m[0, 0])
+    gap, _ = gaps(law.obstacle.shape, from_origin @ axes.T + body.frame_nodes_m[0])
     kappa = law.obstacle.stiffness_pa_m
     if kappa is None:
         young_pa = TRUTH["mu_pa"] * (3 * 200 + 2 * 300) / (200 + 300)
@@ -139,7 +139,7 @@ def cubed_m2(gap, width_m):
 @pytest.mark.parametrize("which", [0, 1])
 def test_a_contact_force_is_the_slope_of_its_energy(which):
     experiment, states = pushed()
-    term = contacts(experiment)[which]
+    term = contact_terms(experiment)[which]
     force, x = term.force(states)[0], states.xi[0]
     assert energy_j(term, x) > 0
     ways = np.random.default_rng(1).normal(size=(6, len(x)))
@@ -154,7 +154,7 @@ def test_a_contact_force_is_the_slope_of_its_energy(which):
 def test_what_a_body_is_given_its_obstacle_loses(friction):
     experiment, states = pushed(friction)
     places = states.xi.reshape(-1, 3)
-    for term in contacts(experiment):
+    for term in contact_terms(experiment):
         force = term.force(states).reshape(-1, 3)
         assert np.abs(force).max() > 1e-4
         np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12)
@@ -164,7 +164,7 @@ def test_what_a_body_is_given_its_obstacle_loses(friction):
 def test_friction_dissipates_and_stays_within_its_cone():
     experiment, states = pushed(0.4)
     smooth, _ = pushed()
-    rubbing, pressing = contacts(experiment)[0], contacts(smooth)[0]
+    rubbing, pressing = contact_terms(experiment)[0], contact_terms(smooth)[0]
     along = (rubbing.force(states) - pressing.force(states))[0]
     assert along @ states.nu[0] < 0
     own = slice(3 * len(experiment.body.nodes.points_m))
@@ -175,10 +175,10 @@ def test_friction_dissipates_and_stays_within_its_cone():
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_a_step_sees_of_contact_what_all_points_of_the_surface_do(friction):
     experiment, states = pushed(friction)
-    forces = Forces.of(experiment, experiment.t_s[-1:], states.theta)
+    forces = Forces.from_experiment(experiment, experiment.t_s[-1:], states.theta)
     rest, touching = forces.without_contact()
     assert len(touching) == 2
-    near, rates = NearContact(touching, states.theta, forces.pattern), (0.7, 30.0)
+    near, rates = StepContact(touching, states.theta, forces.pattern), (0.7, 30.0)
     force, *parts = near.linearise(states.xi, states.nu, rates)
     whole, other = (each.linearise(states.xi, states.nu) for each in (forces, rest))
     own = np.arange(states.xi.size) < 3 * len(experiment.body.nodes.points_m)
@@ -203,7 +203,7 @@ def test_a_sensor_of_an_obstacle_reads_the_sum_of_its_contact_forces():
     seen = simulate(experiment, TRUTH, "backward-euler", substeps=1)
     x = seen.positions_m.reshape(len(seen.t_s), -1)
     nu = np.diff(x, axis=0, prepend=x[:1]) / experiment.timestep_s
-    terms = contacts(experiment)
+    terms = contact_terms(experiment)
     own = slice(len(experiment.body.nodes.points_m))
     for term, read in zip(terms, seen.wrenches[1:], strict=True):
         force = term.force(States(x, nu, as_theta(TRUTH))).reshape(len(x), -1, 3)[:, own]
@@ -324,9 +324,9 @@ def test_stiffer_contact_tends_to_what_may_not_enter_at_all():
         still = {"kind": "static", "gravity_m_s2": (0.0, 0.0, 0.0), "nuisance": IDEAL}
         return Experiment(body, t_s, [held, obstacle], **still)
 
-    points = contacts(pressed(1.0, 1e-4))[0].points
+    points = contact_terms(pressed(1.0, 1e-4))[0].points
     own = len(body.nodes_m)
-    free = np.setdiff1d(np.arange(3 * own), held.dofs)
+    free = np.setdiff1d(np.arange(3 * own), held.prescribed_dofs)
     elastic = {name: TRUTH[name] for name in ("lambda_pa", "mu_pa")}
     start = np.append(body.nodes_m, np.zeros((4, 3)), axis=0).ravel()
 
@@ -388,14 +388,14 @@ def laid(
 
 def energies_j(experiment: Experiment, positions_m: np.ndarray, scheme: str) -> np.ndarray:
     """All of it at each step: of motion, of height, of the body and of the contact."""
-    body, law = experiment.body, contacts(experiment)[0]
+    body, law = experiment.body, contact_terms(experiment)[0]
     own, mass, step_s = len(body.nodes.points_m), body.node_mass, experiment.timestep_s
     elastic = {name: SPONGE[name] for name in ("lambda_pa", "mu_pa")}
     young_pa = 3e3 * (3 * 2e3 + 2 * 3e3) / (2e3 + 3e3)
-    kappa, delta = 100 * young_pa / law.contact.edges_m, law.contact.widths_m
+    kappa, delta = 100 * young_pa / law.law_of_contact.edges_m, law.law_of_contact.widths_m
     above_m = law.points.vectors(positions_m.reshape(len(positions_m), -1))[2]
-    gap = above_m + body.frame_m[0, 2] + 0.005
-    still = (law.contact.surface.area_m2 * kappa * cubed_m2(gap, delta)).sum(axis=1)
+    gap = above_m + body.frame_nodes_m[0, 2] + 0.005
+    still = (law.law_of_contact.surface.area_m2 * kappa * cubed_m2(gap, delta)).sum(axis=1)
     still += G_M_S2 * (mass * positions_m[..., 2]).sum(axis=1)
     still += [box().energy(x[:own], **elastic) for x in positions_m]
     x = positions_m
@@ -471,7 +471,7 @@ def test_a_pressure_averaged_over_a_step_does_the_work_of_its_energy():
     stiff = replace(plate, stiffness_pa_m=None, width_m=None)
     experiment = pressed_cube().with_obstacles([stiff])
     step_s, theta = 0.01, as_theta(TRUTH)
-    (term,), (still,) = contacts(experiment, step_s), contacts(experiment)
+    (term,), (still,) = contact_terms(experiment, step_s), contact_terms(experiment)
     rng = np.random.default_rng(0)
     x = experiment.rigid_positions(experiment.t_s[-1:])
     own = len(experiment.body.nodes.points_m)
@@ -499,7 +499,7 @@ def test_a_block_on_a_tilted_plane_slides_beyond_its_angle_of_friction(degrees, 
     gained = (speed[-1] - speed[-41]) / (40 * experiment.timestep_s)
     if np.tan(tilt) < friction:
         share = np.tan(tilt) / friction
-        slip = contacts(experiment)[0].contact.slip
+        slip = contact_terms(experiment)[0].law_of_contact.slip
         assert gained == pytest.approx(0.0, abs=1e-6)
         assert speed[-1] == pytest.approx(slip * share / np.sqrt(1 - share**2), rel=1e-4)
     else:
@@ -508,9 +508,11 @@ def test_a_block_on_a_tilted_plane_slides_beyond_its_angle_of_friction(degrees, 
     across, normal = np.linalg.norm(seen.wrenches[0][:, :2], axis=1), seen.wrenches[0][:, 2]
     known = np.isfinite(normal)
     assert (across[known] <= friction * normal[known] + 1e-9).all()
-    dynamics = Dynamics.of(experiment, scheme).with_theta(experiment.body.theta(RUBBER))
+    dynamics = Dynamics.from_experiment(experiment, scheme).with_theta(
+        experiment.body.theta_from_values(RUBBER)
+    )
     x = seen.positions_m.reshape(len(seen.t_s), -1)
-    (rubbed,) = rubbings(experiment, dynamics, x).values()
+    (rubbed,) = friction_summaries(experiment, dynamics, x).values()
     path_m = speed.sum() * experiment.timestep_s
     braked_j = friction * mass.sum() * G_M_S2 * np.cos(tilt) * path_m
     assert rubbed.used <= 1

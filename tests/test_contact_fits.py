@@ -11,7 +11,7 @@ from problems_small import GUESS, measured, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.display import plain_text
-from collocation_sysid.program.touches import Touch, touches
+from collocation_sysid.program.touches import ContactSummary, contact_summaries
 from collocation_sysid.recording import Experiment
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
@@ -64,7 +64,7 @@ def measured_once(experiment: Experiment, seed: int = 0, **unknown) -> cs.Proble
     """To find E and the place of the ball."""
     held, ball = experiment.grasps
     read = replace(ball, wrench=replace(ball.wrench, values=forces_n(seed)))
-    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4), **unknown})
+    known = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(1e4), **unknown})
     return cs.Problem([replace(experiment, grasps=[held, read])], known)
 
 
@@ -73,10 +73,10 @@ def answer(experiment: Experiment, seed: int = 0, **unknown) -> cs.Run:
     return cs.run(measured_once(experiment, seed, **unknown), seek_causes=False)
 
 
-def touch_of(experiment: Experiment) -> Touch:
+def touch_of(experiment: Experiment) -> ContactSummary:
     """How the ball touches the block."""
     x = cs.simulate(experiment, TRUTH).positions_m.reshape(len(experiment.t_s), -1)
-    (touch,) = touches(experiment, x, experiment.t_s)
+    (touch,) = contact_summaries(experiment, x, experiment.t_s)
     return touch
 
 
@@ -99,7 +99,7 @@ def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(off_m: 
     low, high = finished.result.parameters["young_pa"].statistical95
     assert low < TRUTH["young_pa"] < high
     assert high - low < 0.1 * TRUTH["young_pa"]
-    part = finished.solution.collocation.parts(finished.solution.z)[0]
+    part = finished.solution.collocation.iterates(finished.solution.z)[0]
     place_m = float((part.phi * part.segment.nuisance.scales)[0])
     assert place_m == pytest.approx(-off_m, abs=1e-4)
 
@@ -132,7 +132,9 @@ def test_a_compressed_block_is_found_from_thirty_times_its_stiffness_and_a_thirt
     held, plate = pressed.grasps
     exact_n = cs.simulate(pressed, TRUTH).wrenches[0][:, :3]
     measured = replace(plate, wrench=replace(plate.wrench, values=exact_n))
-    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(factor * TRUTH["young_pa"])})
+    known = cs.Parameters.from_mapping(
+        {**TRUTH, "young_pa": cs.Unknown(factor * TRUTH["young_pa"])}
+    )
     solution = cs.solve(cs.Problem([replace(pressed, grasps=[held, measured])], known))
     assert solution.status.converged
     assert solution.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=1e-4)
@@ -158,7 +160,7 @@ def test_wrong_friction_and_a_forgotten_obstacle_are_told(fault: str):
     read_n = exact_n + SIGMA_N * np.random.default_rng(0).normal(size=exact_n.shape)
     held, ball = stated.grasps
     measured = replace(ball, wrench=replace(ball.wrench, values=read_n))
-    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(1e4)})
+    known = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(1e4)})
     problem = cs.Problem([replace(stated, grasps=[held, measured])], known)
     run = cs.run(problem, seek_causes=False)
     low, high = run.result.parameters["young_pa"].combined95
@@ -175,8 +177,8 @@ def test_an_obstacle_that_is_never_touched_is_told():
 def test_a_contact_of_few_faces_is_told():
     fine = poked(shape=SMALL)
     touch, wide = (touch_of(each) for each in (fine, poked()))
-    assert 0 < touch.faces < 4
-    assert wide.faces > touch.faces
+    assert 0 < touch.face_count < 4
+    assert wide.face_count > touch.face_count
     assert wide.gap_m < 1e-4
     assert touch.face_mm == pytest.approx(1e3 * np.sqrt(2 / np.sqrt(3)) * 0.015)
 
@@ -202,8 +204,8 @@ def test_check_says_what_contact_will_spoil_at_the_guess(changes: dict, codes: s
     concerns = check_problem(measured_once(poked(**changes)), full=True).concerns
     of_contact = [each for each in concerns if each.topic == "contact"]
     assert {each.code for each in of_contact} == {f"contact/{code}" for code in codes}
-    assert all("ball" in each.sentence for each in of_contact)
-    assert all("at the guess" in each.sentence for each in of_contact)
+    assert all("ball" in each.message for each in of_contact)
+    assert all("at the guess" in each.message for each in of_contact)
 
 
 def test_check_says_nothing_of_contact_that_it_has_not_simulated(monkeypatch):
@@ -216,7 +218,7 @@ def test_check_says_nothing_of_contact_that_it_has_not_simulated(monkeypatch):
 def test_what_several_recordings_share_is_said_once():
     often = [touch_of(replace(poked(shape=SMALL), name=name)) for name in ("a", "b", "c")]
     (one,) = contact_concerns(often)
-    assert "'a' and 2 more" in one.sentence
+    assert "'a' and 2 more" in one.message
 
 
 def test_what_friction_did_is_told_in_a_line_and_kept_in_the_result(tmp_path):
@@ -236,8 +238,8 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     seen = measured(pressed_cube(6))
     run = cs.run(cs.Problem([seen], GUESS), seek_causes=False)
     assert run.refinement is None
-    assert run.result.covers == ()
-    free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).gripping))
+    assert run.result.discretisation_kinds == ()
+    free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).body_grasps))
     assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None
 
 
@@ -246,11 +248,11 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
 def test_what_is_found_of_an_obstacle_moves_it_in_a_forward_simulation_as_in_the_fit(unknown, zero):
     pressed = pressed_cube(8, nuisance=cs.Nuisance.none(**{unknown: 1e-4}))
     displaced = [replace(obstacle, zero=zero) for obstacle in pressed.obstacles]
-    (segment,) = cs.Problem([pressed.with_obstacles(displaced)], GUESS).collocation().segments
-    as_stated = segment.grasping.at(np.zeros(segment.nuisance.size))
+    (segment,) = cs.Problem([pressed.with_obstacles(displaced)], GUESS).collocation().transcriptions
+    as_stated = segment.prescribed_motion.evaluate_at(np.zeros(segment.nuisance.size))
     for phi in np.eye(segment.nuisance.size):
-        change_m = segment.grasping.at(phi).positions_m - as_stated.positions_m
-        simulated_m = segment.corrected(phi).held_positions(segment.dynamics.t_s)
+        change_m = segment.prescribed_motion.evaluate_at(phi).positions_m - as_stated.positions_m
+        simulated_m = segment.corrected_experiment(phi).prescribed_positions(segment.dynamics.t_s)
         assert np.abs(change_m).max() > 1e-6
         np.testing.assert_allclose(
             simulated_m - as_stated.positions_m, change_m, atol=0.01 * np.abs(change_m).max()
@@ -259,5 +261,5 @@ def test_what_is_found_of_an_obstacle_moves_it_in_a_forward_simulation_as_in_the
 
 def test_a_place_is_off_along_the_displacement_or_else_along_the_normal():
     ball, plate = pressed_cube().obstacles
-    assert replace(ball, zero="y").direction.tolist() == [0.0, 1.0, 0.0]
-    np.testing.assert_array_equal(plate.direction, plate.shape.normal)
+    assert replace(ball, zero="y").offset_direction.tolist() == [0.0, 1.0, 0.0]
+    np.testing.assert_array_equal(plate.offset_direction, plate.shape.offset_direction)

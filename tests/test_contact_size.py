@@ -13,8 +13,8 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.recording import Experiment
 from collocation_sysid.statistics.assumptions import ASSUMPTIONS
 from collocation_sysid.statistics.considered import changed_residuals
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.numerical import shifts
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.numerical import estimate_changes
 
 LARGER = 0.01
 (BODY_SCALE,) = (row for row in ASSUMPTIONS if row.name == "body_scale")
@@ -38,7 +38,7 @@ def solution(experiment: Experiment, forces_n: np.ndarray) -> cs.Solution:
     held, obstacle = experiment.grasps
     assert obstacle.wrench is not None
     read = replace(obstacle, wrench=replace(obstacle.wrench, values=forces_n))
-    known = cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown(TRUTH["young_pa"])})
+    known = cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown(TRUTH["young_pa"])})
     return cs.solve(cs.Problem([replace(experiment, grasps=[held, read])], known))
 
 
@@ -50,9 +50,9 @@ def test_a_larger_body_changes_the_stiffness_as_a_refit_with_a_larger_mesh_does(
         stated = stated.with_obstacles([replace(stated.obstacles[0], shape=FLAT)])
     forces_n = cs.simulate(stated, TRUTH).wrenches[0][:, :3]
     answer = solution(stated, forces_n)
-    fit = linearised_fit(answer.collocation, answer.z)
+    fit = linearise_fit(answer.collocation, answer.z)
     effect = changed_residuals(answer.collocation, answer.z, [(BODY_SCALE, LARGER)])
-    first_order = float(shifts(fit, effect.blocks)[0, 0])  # of the logarithm of E
+    first_order = float(estimate_changes(fit, effect.blocks)[0, 0])  # of the logarithm of E
     young_pa = [
         solution(larger(stated, way * LARGER), forces_n).parameters["young_pa"] for way in (1, -1)
     ]

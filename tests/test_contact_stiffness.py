@@ -12,7 +12,7 @@ from test_contact_fits import TRUTH as POKED
 from test_contact_fits import poked
 
 import collocation_sysid as cs
-from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import Experiment, Obstacle, Plane
 from collocation_sysid.statistics.assumptions import ASSUMPTIONS
@@ -55,7 +55,7 @@ def between_platens(stretch: float, factor: float = 1.0) -> Experiment:
 
 def first_order_n(experiment: Experiment, values: dict[str, float]) -> np.ndarray:
     """Return the change (T,) of the last sensor's force along z if contact were rigid [N]."""
-    known = Parameters.of({**values, "young_pa": cs.Unknown(values["young_pa"])})
+    known = Parameters.from_mapping({**values, "young_pa": cs.Unknown(values["young_pa"])})
     collocation = cs.Collocation([experiment], known, "midpoint")
     positions = cs.simulate(experiment, values).positions_m
     z = collocation.pack(collocation.guess_p, [positions.reshape(len(positions), -1)])
@@ -80,9 +80,9 @@ def test_the_force_between_platens_is_within_the_allowance_for_softness():
 def test_the_effect_on_an_indentation_is_that_of_a_contact_with_twice_the_stiffness():
     experiment = poked(place_sigma_m=None, depths_m=np.linspace(0.001, 0.004, 4))
     (ball,) = experiment.obstacles
-    (term,) = contacts(experiment)
-    edge_m = float(term.contact.edges_m[0])
-    assert np.ptp(term.contact.edges_m) < 1e-12
+    (term,) = contact_terms(experiment)
+    edge_m = float(term.law_of_contact.edges_m[0])
+    assert np.ptp(term.law_of_contact.edges_m) < 1e-12
     law = {"stiffness_pa_m": 100 * POKED["young_pa"] / edge_m, "width_m": 2e-4 * edge_m}
     soft, stiffer = (
         experiment.with_obstacles(
@@ -108,14 +108,14 @@ def test_stiffness_and_width_follow_the_faces_at_each_point():
     t_s = np.zeros(1)
     ball = Obstacle(shape=cs.Sphere(0.02, (0.0, 0.0, 0.12)), wrench=sensor(t_s))
     experiment = Experiment(graded, t_s, [ball], kind="static", nuisance=cs.Nuisance.none())
-    law = contacts(experiment)[0].contact
+    law = contact_terms(experiment)[0].law_of_contact
     corners = graded.mesh.points_m[graded.mesh.surface]
     top = np.flatnonzero(
         (corners[..., 2] > 0.0999).all(axis=1) & (corners[..., :2] < 0.011).all((1, 2))
     )
     edges_m = law.edges_m.reshape(len(corners), -1)[top]
     assert edges_m == pytest.approx(0.01 * (2 + np.sqrt(2)) / 3)
-    theta = graded.theta(LAW)
+    theta = graded.theta_from_values(LAW)
     kappa = law.stiffness_at(theta).reshape(len(corners), -1)[top]
     assert kappa == pytest.approx(100 * YOUNG_PA / edges_m)
     assert law.widths_m.max() > 3 * law.widths_m.reshape(len(corners), -1)[top].max()

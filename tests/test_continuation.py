@@ -22,7 +22,7 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.continuation import Continuation, first_part, first_samples
+from collocation_sysid.methods.continuation import Continuation, first_samples, first_share
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
@@ -75,13 +75,13 @@ def test_a_part_has_the_layout_of_the_whole():
         GUESS,
         "bdf2",
         substeps=2,
-        explicit_grasps=True,
+        has_grasp_constraints=True,
         huber=3.0,
     )
-    part = first_part(whole, 0.5)
-    assert [segment.grid_rows for segment in part.segments] == [19, 31]
+    part = first_share(whole, 0.5)
+    assert [segment.grid_times for segment in part.transcriptions] == [19, 31]
     assert (part.scheme, part.substeps, part.huber) == ("bdf2", 2, 3.0)
-    assert all(segment.explicit_grasps for segment in part.segments)
+    assert all(segment.has_grasp_constraints for segment in part.transcriptions)
 
 
 # The answer

@@ -14,8 +14,8 @@ from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
-from collocation_sysid.program.reading import as_squares
+from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.reading import huber_as_least_squares
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 
@@ -25,11 +25,11 @@ def with_noise(noise_m: float, experiment: Experiment | None = None, **changes) 
 
 
 def point_at(collocation: Collocation, p: np.ndarray) -> Iterate:
-    (segment,) = collocation.segments
+    (segment,) = collocation.transcriptions
     q, phi = np.split(p, [collocation.nq])
-    setting = segment.setting(q, phi)
-    x = march(segment.experiment, setting.dynamics)
-    return Horizon(collocation, [segment.grid_rows]).evaluate(p, [x])
+    setting = segment.equations_at(q, phi)
+    x = simulate_scheme(segment.experiment, setting.dynamics)
+    return Horizon(collocation, [segment.grid_times]).evaluate(p, [x])
 
 
 @pytest.mark.parametrize("huber", [None, 4.0])
@@ -67,7 +67,7 @@ def test_both_methods_find_the_same_optimum_of_all_parameters(experiment, huber)
     assert reduced.status.converged
     assert interior.status.converged
     assert reduced.kkt_residual < 1e-7
-    found, expected = (collocation.parameters_of(s.z) for s in (reduced, interior))
+    found, expected = (collocation.parameters_from(s.z) for s in (reduced, interior))
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
@@ -88,7 +88,7 @@ def test_huberised_residuals_square_to_hubers_loss_with_its_gradient(rng):
         length = np.linalg.norm(residual + slope @ step, axis=1)
         return np.array([np.where(length > 2, 4 * length - 4, length**2).sum()])
 
-    shrunk, weighted = as_squares(residual, slope, 2.0)
+    shrunk, weighted = huber_as_least_squares(residual, slope, 2.0)
     assert np.sum(shrunk**2) == pytest.approx(loss(np.zeros(2))[0])
     expected = directional_derivative(loss, np.zeros(2), direction, 1e-4)[0]
     assert 2 * np.sum(shrunk * (weighted @ direction)) == pytest.approx(expected, rel=1e-6)
@@ -96,7 +96,7 @@ def test_huberised_residuals_square_to_hubers_loss_with_its_gradient(rng):
 
 def test_hubers_loss_is_not_led_astray_by_swapped_markers():
     collocation = with_noise(5e-4)
-    experiment = collocation.segments[0].experiment
+    experiment = collocation.transcriptions[0].experiment
     tracks = experiment.markers.positions_m.copy()
     tracks[4:7, [0, 1]] = tracks[4:7, [1, 0]]
     mistaken = with_markers(experiment, tracks)

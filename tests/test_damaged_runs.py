@@ -16,7 +16,7 @@ from problem_files import run_command, settings, write_problem
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.result.view import frame_files
-from collocation_sysid.runs.warm_start import Earlier
+from collocation_sysid.runs.warm_start import WarmStart
 
 Damage = Callable[[Path], object]
 links = pytest.mark.skipif(os.name != "posix", reason="links need rights here")
@@ -150,7 +150,7 @@ def test_every_reader_of_arrays_refuses_damaged_ones(run: Path, tmp_path: Path, 
 def test_a_damaged_run_is_no_start(run: Path, damage: Damage):
     damage(run)
     with pytest.raises(InputError, match="damaged"):
-        Earlier.read(run)
+        WarmStart.read(run)
     assert "damaged" in refused("solve", run / "problem.toml", "--start", run)
 
 

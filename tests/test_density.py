@@ -61,7 +61,9 @@ def weighted(experiment: Experiment) -> Experiment:
 
 
 def parameters(truth=TRUTH, guess=GUESS) -> Parameters:
-    return Parameters.of({n: Unknown(guess[n]) if n in guess else v for n, v in truth.items()})
+    return Parameters.from_mapping(
+        {n: Unknown(guess[n]) if n in guess else v for n, v in truth.items()}
+    )
 
 
 MADE = {
@@ -76,7 +78,7 @@ MADE = {
 
 def test_derivatives_of_the_forces_of_a_body_by_its_densities(rng):
     body = with_core(hung_cube()).body
-    theta = body.theta(TRUTH)
+    theta = body.theta_from_values(TRUTH)
     x = body.nodes_m.ravel() + 1e-3 * rng.standard_normal(body.pattern.size)
     v, w = 0.1 * rng.standard_normal((2, body.pattern.size))
     tied = np.abs(rng.standard_normal(body.pattern.size)) * 1e-3
@@ -86,7 +88,7 @@ def test_derivatives_of_the_forces_of_a_body_by_its_densities(rng):
         return body.force(x, v, values, tied)[0]
 
     assert_derivative(force, lambda d: at.by_theta[0] @ d, theta, rng, scale=0.1 * theta)
-    found = body.curvature(x, v, w, theta, tied_kg=tied)
+    found = body.second_derivatives(x, v, w, theta, tied_kg=tied)
 
     def slope(values):
         return body.linearise(x, v, values, tied_kg=tied).by_theta[0].T @ w

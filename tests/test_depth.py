@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance import NuisanceMap
-from collocation_sysid.program.sighting import Sighting
-from collocation_sysid.program.skin import Skin
-from collocation_sysid.program.view import View
-from collocation_sysid.recording.depth import points_of
+from collocation_sysid.program.sighting import SurfaceCorrespondences
+from collocation_sysid.program.skin import VisibleSurface
+from collocation_sysid.program.view import DepthCameraModel
+from collocation_sysid.recording.depth import points_from_image
 from collocation_sysid.recording.formats.depth_files import read_depth
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 MATRIX, SHAPE = [[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]], (120, 160)
@@ -67,14 +67,14 @@ NOTHING = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
 def hanging_m() -> np.ndarray:
     """The surface of the bar, sagging."""
     x = cs.simulate(hanging((NOTHING,)), TRUTH).positions_m[0]
-    return x[Skin.of(bar(), NOTHING).nodes]
+    return x[VisibleSurface.from_body(bar(), NOTHING).nodes]
 
 
 @cache
 def image_m() -> np.ndarray:
     """What a camera at POSE sees of the bar, without noise."""
-    skin, camera = Skin.of(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE)
-    seen = (skin.triangles(hanging_m()) - POSE[:3, 3]) @ POSE[:3, :3]
+    skin, camera = VisibleSurface.from_body(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE)
+    seen = (skin.subdivided_triangles(hanging_m()) - POSE[:3, 3]) @ POSE[:3, :3]
     return cs.depth_image(camera, SHAPE, seen)
 
 
@@ -96,7 +96,7 @@ def fitted(image: np.ndarray, pose: np.ndarray, guess: float = 2e5, **options) -
     camera = cs.DepthCamera(MATRIX, pose=pose)
     depth = cs.Depth.of_images("front", image, camera, NOISE_M, spacing_m=0.004, **options)
     unknown = {**TRUTH, "young_pa": cs.Unknown(guess)}
-    return cs.solve(cs.Problem([hanging((depth,))], cs.Parameters.of(unknown)))
+    return cs.solve(cs.Problem([hanging((depth,))], cs.Parameters.from_mapping(unknown)))
 
 
 def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
@@ -104,11 +104,11 @@ def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     pose = moved(np.radians(10) * axis / np.linalg.norm(axis), 0.02 * way / np.linalg.norm(way))
     solution = fitted(noisy(rng), pose)
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     (reading,) = part.segment.depths
-    apart = reading.apart_m(part.looked[-1], part.phi)
+    apart = reading.signed_distances_m(part.observables[-1], part.phi)
     assert np.sqrt(np.nanmean(apart**2)) < 2e-4
-    bars = covariance(solution.collocation, solution.z).estimates["young_pa"]
+    bars = uncertainty_at(solution.collocation, solution.z).estimates["young_pa"]
     low, high = bars.statistical95
     assert low < TRUTH["young_pa"] < high < 1.2 * low
 
@@ -124,19 +124,22 @@ def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(axis
     )
     depth = cs.Depth.of_images("front", noisy(rng), camera, NOISE_M, spacing_m=0.004)
     experiment = hanging((depth,))
-    nuisance = NuisanceMap.of(experiment)
-    view, nothing = View.of(experiment, 0, nuisance), np.zeros(nuisance.size)
-    sighting = Sighting.aligned(view, bar(), hanging_m()[None], nothing)
+    nuisance = NuisanceMap.from_experiment(experiment)
+    view, nothing = (
+        DepthCameraModel.from_experiment(experiment, 0, nuisance),
+        np.zeros(nuisance.size),
+    )
+    sighting = SurfaceCorrespondences.from_alignment(view, bar(), hanging_m()[None], nothing)
     assert sighting.gate_m == depth.gate_m
-    assert sighting.used.sum() > 0.95 * len(depth.points_m[0])
+    assert sighting.is_compared.sum() > 0.95 * len(depth.points_m[0])
 
 
 def test_what_is_beside_the_body_is_left_out_and_counted(rng):
     image = noisy(rng)
     image[:20] = 0.34  # a wall above the bar, nearer than it
     solution = fitted(image, POSE)
-    (sighting,) = solution.collocation.segments[0].chart.sightings
-    assert sighting.left_out["far"] > 20
+    (sighting,) = solution.collocation.transcriptions[0].association.correspondences
+    assert sighting.excluded_counts["far"] > 20
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.05
 
 
@@ -144,19 +147,21 @@ def test_a_point_whose_normal_is_turned_from_that_of_the_surface_is_left_out():
     camera = cs.DepthCamera(MATRIX, pose=POSE)
     depth = cs.Depth.of_images("front", image_m(), camera, NOISE_M, spacing_m=0.004)
 
-    def sighting(depth: cs.Depth) -> Sighting:
+    def sighting(depth: cs.Depth) -> SurfaceCorrespondences:
         experiment = hanging((depth,))
-        nuisance = NuisanceMap.of(experiment)
-        view = View.of(experiment, 0, nuisance)
-        return Sighting.of(view, bar(), hanging_m()[None], np.zeros(nuisance.size), depth.gate_m)
+        nuisance = NuisanceMap.from_experiment(experiment)
+        view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
+        return SurfaceCorrespondences.from_shapes(
+            view, bar(), hanging_m()[None], np.zeros(nuisance.size), depth.gate_m
+        )
 
     plain = sighting(depth)
-    used, normals = plain.used[0], plain.normals[0] @ POSE[:3, :3]
+    used, normals = plain.is_compared[0], plain.normals[0] @ POSE[:3, :3]
     cloud = np.hstack([plain.points[0], normals])[used]
     cloud[:20, 3:] *= -1  # of another body, as close
     turned = sighting(replace(depth, clouds=[cloud]))
-    assert turned.left_out["turned away"] == 20
-    assert turned.used.sum() == len(cloud) - 20 > 100
+    assert turned.excluded_counts["turned away"] == 20
+    assert turned.is_compared.sum() == len(cloud) - 20 > 100
 
 
 @pytest.mark.long
@@ -165,7 +170,7 @@ def test_an_interior_point_method_finds_the_same(rng):
     reduced = fitted(image, POSE)
     unknown = {**TRUTH, "young_pa": cs.Unknown(1.05 * reduced.parameters["young_pa"])}
     seen = reduced.collocation.experiments
-    other = cs.solve(cs.Problem(seen, cs.Parameters.of(unknown), method="interior-point"))
+    other = cs.solve(cs.Problem(seen, cs.Parameters.from_mapping(unknown), method="interior-point"))
     assert other.status.converged
     assert abs(other.parameters["young_pa"] / reduced.parameters["young_pa"] - 1) < 5e-3
 
@@ -174,7 +179,7 @@ def test_pixels_at_edges_and_without_depth_are_left_out():
     image = np.full((8, 10), 0.5)
     image[:, 5:] = 0.6
     image[3, 2] = 0.0
-    points = points_of(image, cs.DepthCamera([[100, 0, 5], [0, 100, 4], [0, 0, 1]]))
+    points = points_from_image(image, cs.DepthCamera([[100, 0, 5], [0, 100, 4], [0, 0, 1]]))
     # Rows 1 to 6, columns 1 to 8, without both beside the jump, nor the hole and its neighbours.
     assert len(points) == 6 * 6 - 5
     assert set(points[:, 2]) == {0.5, 0.6}
@@ -182,7 +187,7 @@ def test_pixels_at_edges_and_without_depth_are_left_out():
 
 def test_a_lens_bends_the_rays_as_its_distortion_says():
     camera = cs.DepthCamera(MATRIX, distortion=[0.1, -0.02, 1e-3, 2e-3])
-    x, y, _ = camera.rays(np.array([[20.0, 100.0]]))[0]
+    x, y, _ = camera.points_at_unit_depth(np.array([[20.0, 100.0]]))[0]
     r2 = x * x + y * y
     radial = 1 + 0.1 * r2 - 0.02 * r2 * r2
     u = x * radial + 2 * 1e-3 * x * y + 2e-3 * (r2 + 2 * x * x)
@@ -322,8 +327,10 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
         kept = hanging((NOTHING,)).nuisance
         experiment = cs.Experiment(bar(), t_s, [held], kind="static", depths=[depth], nuisance=kept)
         unknown = {**TRUTH, "young_pa": cs.Unknown(1.6e5)}
-        solution = cs.solve(cs.Problem([experiment], cs.Parameters.of(unknown)))
-        low, high = covariance(solution.collocation, solution.z).estimates["young_pa"].statistical95
+        solution = cs.solve(cs.Problem([experiment], cs.Parameters.from_mapping(unknown)))
+        low, high = (
+            uncertainty_at(solution.collocation, solution.z).estimates["young_pa"].statistical95
+        )
         widths.append(np.log(high / low))
     assert 2 < widths[1] / widths[0] < 4.4
 
@@ -338,7 +345,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 
 
 def test_a_dropout_is_a_cloud_without_points():
-    seen = points_of(image_m(), cs.DepthCamera(MATRIX))
+    seen = points_from_image(image_m(), cs.DepthCamera(MATRIX))
     depth = cs.Depth("front", [0.0, 1.0], [seen, seen[:0]], 1e-3)
     assert [len(points) > 0 for points in depth.points_m] == [True, False]
     with pytest.raises(InputError, match="no point"):

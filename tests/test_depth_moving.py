@@ -11,8 +11,8 @@ from test_depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
 
 import collocation_sysid as cs
 from collocation_sysid.methods.continuation import first_samples
-from collocation_sysid.plan.choice import without
-from collocation_sysid.program.skin import Skin
+from collocation_sysid.plan.choice import hold_out
+from collocation_sysid.program.skin import VisibleSurface
 from collocation_sysid.result.record import replays
 from collocation_sysid.runs.check import check_problem
 
@@ -31,12 +31,12 @@ def swung(depth: cs.Depth) -> cs.Experiment:
 def problem() -> cs.Problem:
     camera, at_s = cs.DepthCamera(MATRIX, pose=POSE), times(SAMPLES)[SEEN]
     blind = cs.Depth("none", at_s, [np.zeros((1, 3))] * len(at_s), 1e-3)
-    x, skin = cs.simulate(swung(blind), MADE).positions_m, Skin.of(bar(), blind)
+    x, skin = cs.simulate(swung(blind), MADE).positions_m, VisibleSurface.from_body(bar(), blind)
     images_m = [
         cs.depth_image(
             camera,
             SHAPE,
-            (skin.triangles(x[k][skin.nodes], 2) - POSE[:3, 3]) @ POSE[:3, :3],
+            (skin.subdivided_triangles(x[k][skin.nodes], 2) - POSE[:3, 3]) @ POSE[:3, :3],
         )
         for k in SEEN
     ]
@@ -84,11 +84,11 @@ def test_first_samples_have_the_images_of_their_time():
     (whole,) = problem().experiments
     for count, samples, images in ((3, 9, 3), (12, 12, 4), (15, 15, 5)):
         part = first_samples(whole, count)
-        assert (len(part.t_s), len(part.depths[0].times)) == (samples, images)
+        assert (len(part.t_s), len(part.depths[0].sample_times_s)) == (samples, images)
 
 
 def test_images_that_are_held_out_are_not_fitted():
-    known, start_s = without(problem(), "swing")
+    known, start_s = hold_out(problem(), "swing")
     (whole,), (left,) = problem().experiments, known.experiments
-    np.testing.assert_array_equal(left.depths[0].times, times(SAMPLES)[[2, 5, 8]])
-    assert left.depths[0].times[-1] <= start_s < whole.depths[0].times[3]
+    np.testing.assert_array_equal(left.depths[0].sample_times_s, times(SAMPLES)[[2, 5, 8]])
+    assert left.depths[0].sample_times_s[-1] <= start_s < whole.depths[0].sample_times_s[3]

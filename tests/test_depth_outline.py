@@ -20,10 +20,10 @@ from collocation_sysid.methods.scan import _other_starts
 from collocation_sysid.model.nuisance import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.outline import no_depth_is_empty
-from collocation_sysid.program.sighting import Sighting
-from collocation_sysid.program.skin import Skin
-from collocation_sysid.program.view import View
-from collocation_sysid.recording.depth import MOST_OUTLINED, outlined_samples
+from collocation_sysid.program.sighting import SurfaceCorrespondences
+from collocation_sysid.program.skin import VisibleSurface
+from collocation_sysid.program.view import DepthCameraModel
+from collocation_sysid.recording.depth import MOST_OUTLINE_IMAGES, samples_with_outlines
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 from collocation_sysid.statistics.trust import camera_pose_concerns, outline_concerns
 
@@ -41,26 +41,30 @@ def surface_m(young_pa: float) -> np.ndarray:
     """Positions of the surface's nodes of the hanging bar."""
     nothing = cs.Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
     x = cs.simulate(hanging((nothing,)), {**TRUTH, "young_pa": young_pa}).positions_m[0]
-    return x[Skin.of(bar(), nothing).nodes]
+    return x[VisibleSurface.from_body(bar(), nothing).nodes]
 
 
-def sighting(image: np.ndarray, young_pa: float = TRUTH["young_pa"], **options) -> Sighting:
+def sighting(
+    image: np.ndarray, young_pa: float = TRUTH["young_pa"], **options
+) -> SurfaceCorrespondences:
     """What belongs together where the bar has a stiffness and the camera is as stated."""
     experiment = seen_by(image, **options)
-    nuisance = NuisanceMap.of(experiment)
-    view = View.of(experiment, 0, nuisance)
+    nuisance = NuisanceMap.from_experiment(experiment)
+    view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
     shapes_m = surface_m(young_pa)[None]
-    return Sighting.of(view, bar(), shapes_m, np.zeros(nuisance.size), 0.01)
+    return SurfaceCorrespondences.from_shapes(view, bar(), shapes_m, np.zeros(nuisance.size), 0.01)
 
 
-def outside_px(found: Sighting) -> np.ndarray:
+def outside_px(found: SurfaceCorrespondences) -> np.ndarray:
     """How many pixels outline points are outside of their edges."""
     outline = found.outline
     shape_m = found.shapes_m[0]
     points_m = np.einsum("ea,eai->ei", outline.weights[0], shape_m[outline.nodes[0]])
     edges_m = outline.points[0] @ POSE[:3, :3].T + POSE[:3, 3]
     way_m = np.sum(outline.normals[0] * (points_m - edges_m), axis=1)
-    return (way_m / np.where(outline.used[0], outline.pixel_m[0], np.inf))[outline.used[0]]
+    return (way_m / np.where(outline.is_compared[0], outline.pixel_m[0], np.inf))[
+        outline.is_compared[0]
+    ]
 
 
 def test_the_outline_of_the_true_shape_is_at_the_edges_in_the_image():
@@ -93,12 +97,12 @@ def test_pixels_that_show_something_far_behind_the_body_are_evidence():
 )
 def test_pixels_that_may_hide_the_body_are_no_evidence(image):
     found = sighting(image, 0.5 * TRUTH["young_pa"], background="unknown")
-    assert not found.outline.used.any()
+    assert not found.outline.is_compared.any()
 
 
 def test_missing_depths_are_evidence_where_no_background_is_seen():
     found = sighting(image_m())
-    view, image = found.view, found.view.depth.images_m[0]
+    view, image = found.camera, found.camera.depth.images_m[0]
     assert no_depth_is_empty(view, image, sample=0, size_m=view.size_m)
     wall = image.copy()
     wall[:30] = 1.5
@@ -110,10 +114,10 @@ def test_outlines_beyond_the_margin_of_the_image_are_no_evidence():
     camera = replace(CAMERA, matrix=MATRIX)
     depth = cs.Depth.of_images("front", cut, camera, NOISE_M, spacing_m=0.004)
     experiment = hanging((depth,), nuisance=UNKNOWN)
-    nuisance = NuisanceMap.of(experiment)
-    view = View.of(experiment, 0, nuisance)
+    nuisance = NuisanceMap.from_experiment(experiment)
+    view = DepthCameraModel.from_experiment(experiment, 0, nuisance)
     shapes_m = surface_m(TRUTH["young_pa"])[None]
-    found = Sighting.of(view, bar(), shapes_m, np.zeros(nuisance.size), 0.01)
+    found = SurfaceCorrespondences.from_shapes(view, bar(), shapes_m, np.zeros(nuisance.size), 0.01)
     apart_px = outside_px(found)
     assert 20 < len(apart_px) < len(outside_px(sighting(image_m())))
     assert np.abs(apart_px).max() < 1.0
@@ -122,13 +126,15 @@ def test_outlines_beyond_the_margin_of_the_image_are_no_evidence():
 def test_slopes_of_outline_residuals_agree_with_differences():
     experiment = seen_by(image_m())
     unknown = {**TRUTH, "young_pa": cs.Unknown(TRUTH["young_pa"])}
-    collocation: Collocation = cs.Problem([experiment], cs.Parameters.of(unknown)).collocation()
-    (segment,) = collocation.segments
+    collocation: Collocation = cs.Problem(
+        [experiment], cs.Parameters.from_mapping(unknown)
+    ).collocation()
+    (segment,) = collocation.transcriptions
     (reading,) = segment.outlines
     rng = np.random.default_rng(0)
-    values = segment.body.nodes_m[reading.sighting.skin.nodes][None]
+    values = segment.body.nodes_m[reading.correspondences.surface.nodes][None]
     phi = 0.1 * rng.normal(size=segment.nuisance.size)
-    by_values, by_phi = reading.loss_slopes(values, phi)
+    by_values, by_phi = reading.loss_gradient(values, phi)
     way, turn = rng.normal(size=values.shape), rng.normal(size=len(phi))
     step = 1e-7
     for by, here, there in (
@@ -146,7 +152,7 @@ def test_silhouettes_that_are_smaller_all_around_do_not_make_the_body_stiffer(rn
     image = image_m() + NOISE_M * rng.normal(size=SHAPE)
     image[~binary_erosion(np.isfinite(image_m()), iterations=2)] = np.nan
     unknown = {**TRUTH, "young_pa": cs.Unknown(1.2 * TRUTH["young_pa"])}
-    solution = cs.solve(cs.Problem([seen_by(image)], cs.Parameters.of(unknown)))
+    solution = cs.solve(cs.Problem([seen_by(image)], cs.Parameters.from_mapping(unknown)))
     (part,) = solution.parts
     (edge_px,) = part.phi[[e.row.name == "depth_edge_px" for e in part.segment.nuisance.entries]]
     assert 1.0 < edge_px < 2.5
@@ -160,11 +166,11 @@ def test_missing_depths_at_the_free_end_that_count_as_evidence_ask_for_a_check(r
     columns = np.flatnonzero(np.isfinite(image).any(axis=0))
     image[:, columns[-20] :] = np.nan
     unknown = {**TRUTH, "young_pa": cs.Unknown(1.2 * TRUTH["young_pa"])}
-    problem = cs.Problem([seen_by(image, background="empty")], cs.Parameters.of(unknown))
+    problem = cs.Problem([seen_by(image, background="empty")], cs.Parameters.from_mapping(unknown))
     answer = cs.run(problem, seek_causes=False)
     assert answer.trust.verdict != "good"
     assert any("outline of the body" in reason for reason in answer.trust.reasons)
-    known = cs.Problem([seen_by(image, background="unknown")], cs.Parameters.of(unknown))
+    known = cs.Problem([seen_by(image, background="unknown")], cs.Parameters.from_mapping(unknown))
     found = cs.solve(known).parameters["young_pa"]
     assert found == pytest.approx(TRUTH["young_pa"], rel=0.2)
 
@@ -174,7 +180,7 @@ def test_an_outline_off_the_edges_at_many_points_gives_concern():
     assert not outline_concerns("camera", np.zeros(0))
     (found,) = outline_concerns("camera", np.r_[np.zeros(40), np.full(10, 4.0)])
     assert (found.code, found.grade) == ("residuals/outline", "check")
-    assert "20 %" in found.sentence
+    assert "20 %" in found.message
 
 
 def test_starts_are_the_best_stiffness_its_neighbours_and_other_minima():
@@ -205,21 +211,21 @@ def test_a_camera_more_than_two_deviations_off_asks_for_a_check():
     assert not camera_pose_concerns([], [])
     (found,) = camera_pose_concerns(["turn", "shift"], [1.0, -2.5])
     assert (found.code, found.grade) == ("nuisance/camera", "check")
-    assert "shift is 2.5 deviations" in found.sentence
+    assert "shift is 2.5 deviations" in found.message
 
 
 def test_the_lens_projects_points_to_the_pixels_of_their_rays():
     camera = cs.DepthCamera(MATRIX, distortion=[0.1, -0.02, 1e-3, 2e-3, 0.01])
     pixels = np.array([[20.0, 100.0], [80.0, 60.0], [150.0, 5.0]])
     np.testing.assert_allclose(
-        camera.distorted_pixels(0.4 * camera.rays(pixels)), pixels, atol=1e-5
+        camera.distorted_pixels(0.4 * camera.points_at_unit_depth(pixels)), pixels, atol=1e-5
     )
 
 
 def test_only_some_images_of_a_long_recording_are_kept():
-    assert outlined_samples(3) == {0, 1, 2}
-    kept = outlined_samples(1000)
-    assert len(kept) == MOST_OUTLINED
+    assert samples_with_outlines(3) == {0, 1, 2}
+    kept = samples_with_outlines(1000)
+    assert len(kept) == MOST_OUTLINE_IMAGES
     assert {0, 999} <= kept
 
 
@@ -227,7 +233,9 @@ def test_only_some_images_of_a_long_recording_are_kept():
 def test_depth_in_a_wrong_unit_is_refused_with_the_power_of_ten(factor):
     camera = cs.DepthCamera(MATRIX, pose=POSE)
     depth = cs.Depth.of_images("front", factor * image_m(), camera, NOISE_M, spacing_m=0.004)
-    problem = cs.Problem([hanging((depth,))], cs.Parameters.of({**TRUTH, "young_pa": cs.Unknown()}))
+    problem = cs.Problem(
+        [hanging((depth,))], cs.Parameters.from_mapping({**TRUTH, "young_pa": cs.Unknown()})
+    )
     with pytest.raises(InputError, match=f"multiply count_m by {1 / factor:g}"):
         cs.solve(problem)
 

@@ -28,14 +28,14 @@ import collocation_sysid as cs
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.depth_comparison import SurfaceComparison
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.program.skin import Skin
-from collocation_sysid.recording.depth import points_of
+from collocation_sysid.program.skin import VisibleSurface
+from collocation_sysid.recording.depth import points_from_image
 from collocation_sysid.result.animation import Film
 from collocation_sysid.result.pictures.album import album
 from collocation_sysid.result.pictures.depth import depth_picture
 from collocation_sysid.result.replay import Replay
 from collocation_sysid.result.seen import compared_rows, save_overlays, seen_before
-from collocation_sysid.statistics.cameras import camera_mistakes
+from collocation_sysid.statistics.cameras import camera_hypotheses
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)
 AWAY = np.eye(4) + 5 * np.outer(np.eye(4)[2], np.eye(4)[3])  # 5 m above, and looks up
@@ -60,7 +60,7 @@ def seeing(pose: np.ndarray, factor: float = 1.0) -> cs.Experiment:
     ],
 )
 def test_a_camera_that_sees_nothing_of_the_body_is_told_why(pose, factor, said):
-    (mistake,) = camera_mistakes(seeing(pose, factor))
+    (mistake,) = camera_hypotheses(seeing(pose, factor))
     assert mistake.cause == "camera"
     # Of those that do as well each has as many as are wrong.
     either = mistake.data["mistakes"].split("; or if ")
@@ -69,8 +69,8 @@ def test_a_camera_that_sees_nothing_of_the_body_is_told_why(pose, factor, said):
 
 
 def test_an_inverted_pose_is_told_with_what_to_state():
-    (mistake,) = camera_mistakes(seeing(INVERTED))
-    assert mistake.sentence.endswith(
+    (mistake,) = camera_hypotheses(seeing(INVERTED))
+    assert mistake.message.endswith(
         "hardly any points are near the body; they would be if camera.pose were inverted (state "
         "the motion from the camera's frame to the world)"
     )
@@ -78,7 +78,7 @@ def test_an_inverted_pose_is_told_with_what_to_state():
 
 @pytest.mark.parametrize("sides", [(1, -1, -1, 1), (-1, 1, -1, 1)])
 def test_frames_that_a_symmetric_body_cannot_tell_apart_are_both_named(sides):
-    (mistake,) = camera_mistakes(seeing(POSE @ np.diag([*map(float, sides)])))
+    (mistake,) = camera_hypotheses(seeing(POSE @ np.diag([*map(float, sides)])))
     one, other = mistake.data["mistakes"].split("; or if ")
     assert "x to the right, y up, z backwards" in one + other
     assert "x to the left, y down, z backwards" in one + other
@@ -86,20 +86,20 @@ def test_frames_that_a_symmetric_body_cannot_tell_apart_are_both_named(sides):
 
 def test_a_frame_of_no_convention_is_not_told_as_two_at_once():
     forward = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-    (mistake,) = camera_mistakes(seeing(POSE @ forward.T @ np.diag([-1.0, -1, 1, 1])))
+    (mistake,) = camera_hypotheses(seeing(POSE @ forward.T @ np.diag([-1.0, -1, 1, 1])))
     assert "mistakes" not in mistake.data
-    assert "check camera.pose" in mistake.sentence
+    assert "check camera.pose" in mistake.message
 
 
 def test_a_camera_that_is_somewhere_else_is_told_to_see_nothing():
     elsewhere = moved(np.zeros(3), np.array([0.0, 0.0, 0.7]))
-    (mistake,) = camera_mistakes(seeing(elsewhere))
-    assert "only 0 % of the surface" in mistake.sentence
+    (mistake,) = camera_hypotheses(seeing(elsewhere))
+    assert "only 0 % of the surface" in mistake.message
 
 
 def test_a_camera_that_is_20_mm_and_10_degrees_off_is_none_that_sees_nothing():
     off = moved(np.radians(10) * np.array([0, 0.6, 0.8]), np.array([0.02, 0, 0]))
-    assert not [*camera_mistakes(seeing(off))]
+    assert not [*camera_hypotheses(seeing(off))]
 
 
 def test_outlines_before_a_fit_are_where_the_stated_camera_sees_the_body():
@@ -107,8 +107,8 @@ def test_outlines_before_a_fit_are_where_the_stated_camera_sees_the_body():
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     assert np.isnan(points[:, 4]).all()
     # The undeformed bar is drawn by hand.
-    skin = Skin.of(bar(), seeing(POSE).depths[0])
-    own = (skin.triangles(bar().nodes_m[skin.nodes], 1) - POSE[:3, 3]) @ POSE[:3, :3]
+    skin = VisibleSurface.from_body(bar(), seeing(POSE).depths[0])
+    own = (skin.subdivided_triangles(bar().nodes_m[skin.nodes], 1) - POSE[:3, 3]) @ POSE[:3, :3]
     silhouette = np.argwhere(np.isfinite(cs.depth_image(cs.DepthCamera(MATRIX), SHAPE, own)))
     low, high = np.nanmin(lines[:, 1:3], axis=0), np.nanmax(lines[:, 1:3], axis=0)
     np.testing.assert_allclose(low[::-1], silhouette.min(axis=0), atol=1.5)
@@ -123,7 +123,7 @@ def test_what_is_not_in_view_is_said_in_the_picture():
 
 
 def test_a_cloud_is_drawn_with_the_body_from_its_broad_side():
-    cloud = points_of(image_m(), cs.DepthCamera(MATRIX)) @ POSE[:3, :3].T + POSE[:3, 3]
+    cloud = points_from_image(image_m(), cs.DepthCamera(MATRIX)) @ POSE[:3, :3].T + POSE[:3, 3]
     (rows,) = seen_before(hanging((cs.Depth("scan", [0.0], [cloud], 1e-3),))).values()
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     wide, high = np.nanmax(lines[:, 1:3], axis=0) - np.nanmin(lines[:, 1:3], axis=0)
@@ -166,7 +166,7 @@ def test_a_solve_in_which_no_point_of_a_camera_counts_is_saved_with_its_pictures
     marked = replace(seeing(AWAY), markers=still, nuisance=cs.Nuisance.none())
     marked = with_markers(marked, cs.simulate(marked, TRUTH).markers_m)
     unknown = TRUTH | {"young_pa": cs.Unknown(2e5)}
-    solved = run(cs.Problem([marked], cs.Parameters.of(unknown)), seek_causes=False)
+    solved = run(cs.Problem([marked], cs.Parameters.from_mapping(unknown)), seek_causes=False)
     assert solved.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=1e-3)
     assert any("0 points of 'front' count" in note for note in solved.solution.notes)
     with pictures_drawn():
@@ -206,7 +206,7 @@ def found():
 
 def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(found):
     (part,) = found.collocation.parts(found.z)
-    ((reading, looked),) = part.sights
+    ((reading, looked),) = part.depth_residuals
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
     rows = compared_rows(surface, part.segment.experiment.up)
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
@@ -230,7 +230,7 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(f
 
 def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found):
     (part,) = found.collocation.parts(found.z)
-    ((reading, looked),) = part.sights
+    ((reading, looked),) = part.depth_residuals
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
     rows = compared_rows(surface, part.segment.experiment.up)
     experiment = part.segment.experiment

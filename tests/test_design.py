@@ -15,27 +15,33 @@ from wrenches_small import wristed_cube
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
-from collocation_sysid.plan.design import Criterion, DesignOptions, HandMotion, Limits, designing
-from collocation_sysid.plan.design.designing import Judge, design
+from collocation_sysid.plan.design import (
+    DesignCriterion,
+    DesignOptions,
+    HandMotion,
+    Limits,
+    designing,
+)
+from collocation_sysid.plan.design.designing import MotionObjective, design_motion
 from collocation_sysid.plan.design.folder import PROBLEM_FILE, write_design
 from collocation_sysid.plan.design.information import (
-    Errors,
     FutureRecording,
     LinearRecording,
-    both_sides,
-    draws_about,
+    PredictedErrors,
+    prior_draws,
     shared_information,
+    symmetric_draws,
 )
 from collocation_sysid.plan.design.motion import angular_motion
-from collocation_sysid.plan.design.search import search
+from collocation_sysid.plan.design.search import minimise
 from collocation_sysid.plan.progress import DesignProgress
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Grasp, PoseSequence
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import ErrorModel, covariance
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 AT = GUESS.with_guess(TRUTH)
 LIMITS = Limits.model_validate(
@@ -60,10 +66,13 @@ angular_acceleration_deg_s2 = 3000.0
 
 def drawn_motions(count: int = 12, waves: int = 1) -> list[HandMotion]:
     """Motions of coefficients up to far beyond the usual, within the limits."""
-    bounds, rng = LIMITS.about(np.array([0.05, 0.05, 0.1])), np.random.default_rng(0)
-    size = HandMotion.size(waves)
+    bounds, rng = LIMITS.bounds_from(np.array([0.05, 0.05, 0.1])), np.random.default_rng(0)
+    size = HandMotion.coefficient_count(waves)
     drawn = [rng.normal(size=size) * rng.choice([1.0, 5.0]) for _ in range(count)]
-    return [bounds.within(HandMotion.of(u, 0.3, 10.0, bounds.reach)) for u in drawn]
+    return [
+        bounds.scale_to_limits(HandMotion.from_coefficients(u, 0.3, 10.0, bounds.reach))
+        for u in drawn
+    ]
 
 
 def problem(**changes) -> Problem:
@@ -93,7 +102,7 @@ def test_derivatives_of_a_motion_are_those_of_its_course():
 
 
 def test_angular_velocity_and_acceleration_are_those_of_the_rotation():
-    motion = drawn_motions(1)[0].scaled(turn=4.0)  # up to 100°, where the formula matters
+    motion = drawn_motions(1)[0].scaled(rotation=4.0)  # up to 100°, where the formula matters
     t, h = np.linspace(0.02, 0.28, 41), 1e-4
 
     def velocity(t):
@@ -146,9 +155,9 @@ def test_no_motion_exceeds_a_limit_and_some_reach_it(waves):
 
 
 def test_a_motion_within_the_limits_is_left_as_it_is():
-    bounds = LIMITS.about(np.array([0.05, 0.05, 0.1]))
+    bounds = LIMITS.bounds_from(np.array([0.05, 0.05, 0.1]))
     motion = drawn_motions(1)[0].scaled(0.5, 0.5)
-    assert np.array_equal(bounds.within(motion).amplitude, motion.amplitude)
+    assert np.array_equal(bounds.scale_to_limits(motion).amplitude, motion.amplitude)
     assert bounds.shares(motion) == pytest.approx(peaks(motion), rel=2e-3)
 
 
@@ -222,38 +231,38 @@ def at_answer(experiments) -> tuple[Collocation, np.ndarray]:
     ]
     found = Collocation(exact, AT)
     rows = [
-        march(s.experiment, s.dynamics.with_theta(s.constants.theta(AT.guess_q)))
-        for s in found.segments
+        simulate_scheme(s.experiment, s.dynamics.with_theta(s.constants.theta(AT.guess_q)))
+        for s in found.transcriptions
     ]
-    phi = [s.guess_phi for s in found.segments]
+    phi = [s.guess_phi for s in found.transcriptions]
     return found, found.pack(np.concatenate([AT.guess_q, *phi]), rows)
 
 
 def test_the_information_is_that_of_all_parameters_with_nuisances_eliminated():
-    fit = linearised_fit(*at_answer([cube_with_nuisance(6)]))
-    slopes = np.vstack([b.slope.reshape(-1, len(fit.names)) for b in fit.blocks])
-    whole = np.linalg.inv(slopes.T @ slopes + np.diag(fit.prior_slope**2))
-    assert fit.shared < len(fit.names)
+    fit = linearise_fit(*at_answer([cube_with_nuisance(6)]))
+    slopes = np.vstack([b.jacobian.reshape(-1, len(fit.names)) for b in fit.blocks])
+    whole = np.linalg.inv(slopes.T @ slopes + np.diag(fit.prior_jacobian**2))
+    assert fit.shared_count < len(fit.names)
     found = np.linalg.inv(shared_information(fit))
-    assert np.allclose(found, whole[: fit.shared, : fit.shared], rtol=1e-6)
+    assert np.allclose(found, whole[: fit.shared_count, : fit.shared_count], rtol=1e-6)
 
 
 def test_information_of_recordings_adds_up_to_that_of_the_joint_fit():
     first, second = cube_with_nuisance(6), replace(hung_cube(9), name="other")
-    alone = [shared_information(linearised_fit(*at_answer([e]))) for e in (first, second)]
-    joint = shared_information(linearised_fit(*at_answer([first, second])))
+    alone = [shared_information(linearise_fit(*at_answer([e]))) for e in (first, second)]
+    joint = shared_information(linearise_fit(*at_answer([first, second])))
     assert np.allclose(sum(alone), joint, rtol=1e-8, atol=1e-8 * np.abs(joint).max())
 
 
-def errors_at(collocation, z) -> Errors:
-    information = shared_information(linearised_fit(collocation, z))
+def errors_at(collocation, z) -> PredictedErrors:
+    information = shared_information(linearise_fit(collocation, z))
     body = collocation.experiments[0].body
-    return Errors.of(information, AT, ThetaMap(AT, body), AT.guess_q)
+    return PredictedErrors.from_information(information, AT, ThetaMap(AT, body), AT.guess_q)
 
 
 def test_error_bars_are_those_that_a_run_reports():
     collocation, z = at_answer([hung_cube(8)])
-    run = covariance(collocation, z, ErrorModel("given", "independent"))
+    run = uncertainty_at(collocation, z, ErrorModel("given", "independent"))
     found = errors_at(collocation, z)
     known = {
         n: e
@@ -271,18 +280,20 @@ def test_error_bars_are_those_that_a_run_reports():
 def test_criteria_are_what_they_say_of_the_covariance():
     found = errors_at(*at_answer([hung_cube(8)]))
     variances = np.diag(found.covariance)
-    size = {kind: np.exp(Criterion(kind).log_size(found)) for kind in ("worst", "A", "D")}
+    size = {kind: np.exp(DesignCriterion(kind).log_size(found)) for kind in ("worst", "A", "D")}
     assert size["worst"] == pytest.approx(np.sqrt(variances.max()))
     assert size["A"] == pytest.approx(np.sqrt(variances.mean()))
     assert size["D"] == pytest.approx(np.linalg.det(found.covariance) ** (1 / 8))
-    alone = Criterion("D", ("poisson",)).log_size(found)
+    alone = DesignCriterion("D", ("poisson",)).log_size(found)
     assert np.exp(alone) == pytest.approx(found.relative["poisson"])
-    assert Criterion(over="mean").over_draws([1.0, 4.0]) == 2.5
-    assert Criterion(over="worst").over_draws([1.0, 4.0]) == 4.0
+    assert DesignCriterion(over="mean").combine_draws([1.0, 4.0]) == 2.5
+    assert DesignCriterion(over="worst").combine_draws([1.0, 4.0]) == 4.0
 
 
 def test_what_is_not_told_at_all_has_a_size_that_compares():
-    found = Errors.of(np.zeros((4, 4)), AT, ThetaMap(AT, hung_cube(3).body), AT.guess_q)
+    found = PredictedErrors.from_information(
+        np.zeros((4, 4)), AT, ThetaMap(AT, hung_cube(3).body), AT.guess_q
+    )
     assert list(found.relative.values())[:4] == pytest.approx([100.0] * 4)
 
 
@@ -297,17 +308,17 @@ def test_what_is_not_told_at_all_has_a_size_that_compares():
 )
 def test_a_criterion_that_cannot_be_is_refused(criterion, message):
     with pytest.raises(InputError, match=message):
-        design(problem(), LIMITS, 0.1, Criterion(*criterion))
+        design_motion(problem(), LIMITS, 0.1, DesignCriterion(*criterion))
 
 
 def test_draws_follow_priors_and_lie_on_both_sides_within_bounds():
     items = [replace(AT.items[0], prior=(500.0, 0.1)), *AT.items[1:]]
     tight = Parameters((items[0], replace(items[1], upper=310.0), *items[2:]))
-    middle, above, below = draws_about(tight, 1.5, 1, seed=3)
+    middle, above, below = prior_draws(tight, 1.5, 1, seed=3)
     assert np.exp(middle[0]) == pytest.approx(500.0)
     assert np.allclose(above[[0, 2, 3]] + below[[0, 2, 3]], 2 * middle[[0, 2, 3]])
     assert max(above[1], below[1]) < np.log(310.0)
-    many = both_sides(AT, AT.guess_q, 0.2 * np.eye(4), 400, seed=0)
+    many = symmetric_draws(AT, AT.guess_q, 0.2 * np.eye(4), 400, seed=0)
     assert np.std(many, axis=0) == pytest.approx(0.2, rel=0.1)
 
 
@@ -325,29 +336,35 @@ def test_what_is_not_to_be_designed_is_refused():
             FutureRecording(Problem([experiment], AT), experiment, 0.1)
     static = replace(hung_cube(4), kind="static")
     with pytest.raises(InputError, match="every experiment is static"):
-        design(Problem([static], AT), LIMITS, 0.1)
+        design_motion(Problem([static], AT), LIMITS, 0.1)
     with pytest.raises(InputError, match="--duration"):
-        design(problem(), LIMITS, 0.001)
+        design_motion(problem(), LIMITS, 0.001)
     unguessed = Parameters((Parameter("lambda_pa", None, 10.0, 1e5), *AT.items[1:]))
     with pytest.raises(InputError, match="lambda_pa: has no guess"):
-        design(Problem([hung_cube(4)], unguessed), LIMITS, 0.1)
+        design_motion(Problem([hung_cube(4)], unguessed), LIMITS, 0.1)
 
 
 def test_the_poses_turn_the_body_about_its_hand():
     recording = FutureRecording(problem(), hung_cube(8), 0.2)
     coordinates = np.zeros((len(recording.pose_times_s), 6))
     coordinates[:, 4] = np.linspace(0, 1, len(coordinates))
-    poses = recording.carried(coordinates)
-    assert np.allclose(poses.carry(recording.hand_m[None], poses.t_s)[:, 0], recording.hand_m)
+    poses = recording.poses_from_coordinates(coordinates)
+    assert np.allclose(
+        poses.carried_positions(recording.hand_m[None], poses.t_s)[:, 0], recording.hand_m
+    )
 
 
 def test_a_small_motion_tells_what_it_does_to_first_order():
     recording = FutureRecording(problem(), hung_cube(8), 0.25)
     motion = replace(drawn_motions(1)[0], duration_s=0.25, active_s=0.22, rise_s=0.08)
     small = motion.scaled(0.1, 0.1)
-    linear = LinearRecording.of(recording, AT.guess_q).information(small)
-    exact = recording.told(recording.experiment(recording.poses(small)), AT.guess_q).information
-    still = recording.told(recording.experiment(recording.poses(motion.scaled(0, 0))), AT.guess_q)
+    linear = LinearRecording.from_simulations(recording, AT.guess_q).information(small)
+    exact = recording.simulate_motion(
+        recording.experiment(recording.poses(small)), AT.guess_q
+    ).information
+    still = recording.simulate_motion(
+        recording.experiment(recording.poses(motion.scaled(0, 0))), AT.guess_q
+    )
     gained = np.sqrt(np.diag(exact)) - np.sqrt(np.diag(still.information))
     assert (gained[2:] > 0.5 * np.sqrt(np.diag(exact))[2:]).all()  # it is not the rest that tells
     assert np.allclose(np.sqrt(np.diag(linear)), np.sqrt(np.diag(exact)), rtol=0.05)
@@ -361,11 +378,11 @@ def test_a_sensor_measures_at_its_own_rate_over_the_new_time():
     assert grasp.wrench is not None
     assert np.ptp(grasp.wrench.t_s) == pytest.approx(0.2, abs=0.02)
     assert np.diff(grasp.wrench.t_s) == pytest.approx(np.diff(before.wrench.t_s).mean())
-    assert grasp.wrench.names == before.wrench.names
+    assert grasp.wrench.component_names == before.wrench.component_names
 
 
 def still_poses(recording: FutureRecording) -> PoseSequence:
-    return recording.carried(np.zeros((len(recording.pose_times_s), 6)))
+    return recording.poses_from_coordinates(np.zeros((len(recording.pose_times_s), 6)))
 
 
 # Designs ------------------------------------------------------------------------------------------
@@ -380,10 +397,10 @@ def test_a_designed_motion_tells_more_than_a_poor_one():
         np.tile([0, 0, 0, 1.0], (9, 1)),
     )
     poor = replace(hung_cube(8), grasps=[Grasp(hung_cube(8).grasps[0].nodes, slow)])
-    found = design(Problem([poor], AT), LIMITS, 0.08, options=FEW)
+    found = design_motion(Problem([poor], AT), LIMITS, 0.08, options=FEW)
     assert found.before is not None
-    assert max(found.before.relative[n] for n in TRUTH) > 3 * found.size
-    assert found.size == pytest.approx(max(found.after.relative[n] for n in TRUTH))
+    assert max(found.before.relative[n] for n in TRUTH) > 3 * found.minimised_error
+    assert found.minimised_error == pytest.approx(max(found.after.relative[n] for n in TRUTH))
     assert max(found.shares.values()) <= 1
 
 
@@ -394,29 +411,31 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
     q, told = AT.guess_q, []
     for experiment in (sensing, blind):
         recording = FutureRecording(Problem([experiment], AT), experiment, 0.08)
-        told.append(recording.told(recording.experiment(still_poses(recording)), q).information)
+        told.append(
+            recording.simulate_motion(recording.experiment(still_poses(recording)), q).information
+        )
     assert np.linalg.eigvalsh(told[0] - told[1]).min() > -1e-6 * np.trace(told[0])
     assert told[0][0, 0] > 1.01 * told[1][0, 0]
-    found = design(Problem([sensing], AT), LIMITS, 0.08, options=DesignOptions(1, pairs=0))
-    assert np.isfinite(found.size)
+    found = design_motion(Problem([sensing], AT), LIMITS, 0.08, options=DesignOptions(1, pairs=0))
+    assert np.isfinite(found.minimised_error)
 
 
 def test_answers_that_need_too_much_memory_are_not_sought(monkeypatch):
     recording = FutureRecording(problem(), hung_cube(8), 0.08)
-    judge = Judge(recording, LIMITS, Criterion(), [AT.guess_q], np.zeros((4, 4)))
+    judge = MotionObjective(recording, LIMITS, DesignCriterion(), [AT.guess_q], np.zeros((4, 4)))
     monkeypatch.setattr(designing, "MOST_GIGABYTES", 0.5 * LinearRecording.gigabytes(recording))
-    assert judge.first_guess(FEW, print).at is None
+    assert judge.first_guess(FEW, print).coefficients is None
 
 
 def test_a_motion_is_judged_over_all_draws():
-    judge = Judge(
+    judge = MotionObjective(
         FutureRecording(problem(), hung_cube(8), 0.08),
         LIMITS,
-        Criterion(over="worst"),
-        draws_about(AT, 1.5, 1, 0),
+        DesignCriterion(over="worst"),
+        prior_draws(AT, 1.5, 1, 0),
         np.zeros((4, 4)),
     )
-    at = np.random.default_rng(0).normal(size=HandMotion.size(1))
+    at = np.random.default_rng(0).normal(size=HandMotion.coefficient_count(1))
     alone = [replace(judge, draws=[q]).value(at, np.inf) for q in judge.draws]
     assert judge.value(at, np.inf) == pytest.approx(max(alone))
     assert judge.value(at, alone[0] - 1) == pytest.approx(alone[0])  # beyond the bar at the first
@@ -426,9 +445,11 @@ def test_recordings_there_are_count_where_they_are_to_be_completed():
     experiment = hung_cube(8)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
     recorded = Problem([with_markers(experiment, tracks)], AT)
-    found = design(recorded, LIMITS, 0.08, options=FEW, add=True)
-    alone = shared_information(linearised_fit(*at_answer([experiment])))
-    before = Errors.of(alone, AT, ThetaMap(AT, experiment.body), AT.guess_q).relative
+    found = design_motion(recorded, LIMITS, 0.08, options=FEW, add=True)
+    alone = shared_information(linearise_fit(*at_answer([experiment])))
+    before = PredictedErrors.from_information(
+        alone, AT, ThetaMap(AT, experiment.body), AT.guess_q
+    ).relative
     assert found.before is not None
     for name in TRUTH:
         assert found.before.relative[name] == pytest.approx(before[name], rel=1e-3)
@@ -443,8 +464,8 @@ def test_ctrl_c_keeps_the_best_motion():
         if number == 4:
             raise KeyboardInterrupt
 
-    found = design(problem(), LIMITS, 0.08, options=FEW, watch=interrupt)
-    assert found.best.interrupted
+    found = design_motion(problem(), LIMITS, 0.08, options=FEW, watch=interrupt)
+    assert found.best.is_interrupted
     assert len(found.best.history) == 4
     assert found.best.value == min(tried)
 
@@ -454,12 +475,12 @@ def test_no_motion_in_view_and_none_that_can_be_simulated_are_told():
         LIMITS.model_dump() | {"markers_box_m": ((1.0, 1.0, 1.0), (2.0, 2.0, 2.0))}
     )
     with pytest.raises(InputError, match="keeps the markers in view"):
-        design(problem(), nowhere, 0.05, options=DesignOptions(evaluations=2, pairs=0))
+        design_motion(problem(), nowhere, 0.05, options=DesignOptions(evaluations=2, pairs=0))
 
 
 def test_motions_that_break_a_rule_come_after_all_others():
     recording = FutureRecording(problem(), hung_cube(8), 0.05)
-    at = np.random.default_rng(0).normal(size=HandMotion.size(1))
+    at = np.random.default_rng(0).normal(size=HandMotion.coefficient_count(1))
     near, far = (
         Limits.model_validate(
             LIMITS.model_dump() | {"markers_box_m": ((-1.0, -1, 0.02), (1.0, 1, top))}
@@ -467,7 +488,9 @@ def test_motions_that_break_a_rule_come_after_all_others():
         for top in (1.0, 0.03)
     )
     values = [
-        Judge(recording, limits, Criterion(), [AT.guess_q], np.zeros((4, 4))).value(at, np.inf)
+        MotionObjective(recording, limits, DesignCriterion(), [AT.guess_q], np.zeros((4, 4))).value(
+            at, np.inf
+        )
         for limits in (LIMITS, near, far)
     ]
     assert values[0] < 100 < designing.FORBIDDEN < values[1] < values[2]
@@ -475,14 +498,14 @@ def test_motions_that_break_a_rule_come_after_all_others():
 
 def test_the_search_finds_a_minimum_in_a_few_hundred_evaluations():
     scales = np.geomspace(0.3, 3, 12)
-    found = search(lambda u, _: float(np.sum((scales * (u - 0.5)) ** 2)), 12, 600, seed=1)
+    found = minimise(lambda u, _: float(np.sum((scales * (u - 0.5)) ** 2)), 12, 600, seed=1)
     assert found.value < 0.02
     assert found.history == sorted(found.history, reverse=True)
     assert len(found.history) == 600
 
 
 def test_the_search_has_one_dimension_too():
-    found = search(lambda u, _: float((u[0] - 0.5) ** 2), 1, 100, seed=1)
+    found = minimise(lambda u, _: float((u[0] - 0.5) ** 2), 1, 100, seed=1)
     assert found.value < 1e-3
 
 
@@ -529,7 +552,7 @@ def test_poses_are_written_as_the_robot_has_them(tiny, tmp_path):
     file.write_text(file.read_text().replace('poses = "swing', f'{held}, poses = "swing'))
     loaded = Problem.read(file)
     wide = Limits.model_validate(LIMITS.model_dump() | {"workspace_m": ((-1.0,) * 3, (1.0,) * 3)})
-    found = design(loaded, wide, 0.05, options=DesignOptions(1, pairs=0))
+    found = design_motion(loaded, wide, 0.05, options=DesignOptions(1, pairs=0))
     write_design(found, tmp_path / "out", with_film=False)
     read = Problem.read(tmp_path / "out" / PROBLEM_FILE).experiments[0].grasps[0].poses
     for mine, theirs in zip(read.at(read.t_s), found.poses.at(read.t_s), strict=True):
@@ -545,7 +568,7 @@ def test_a_design_knows_where_the_files_of_the_problem_are(tiny, tmp_path):
     force = 'density_kg_m3 = 30.0\n[[object.force]]\nfile = "drag.py"\nfunction = "drag"\n'
     file.write_text(file.read_text().replace("density_kg_m3 = 30.0\n", force))
     loaded = Problem.read(file, allow_code=True)
-    designed = design(loaded, LIMITS, 0.05, options=DesignOptions(1, pairs=0))
+    designed = design_motion(loaded, LIMITS, 0.05, options=DesignOptions(1, pairs=0))
     write_design(designed, tmp_path / "out", with_film=False)
     again = Problem.read(tmp_path / "out" / PROBLEM_FILE, allow_code=True)
     assert [force.name for force in again.bodies[0].forces] == ["drag"]
@@ -555,7 +578,7 @@ def test_an_interrupted_design_is_written_and_told(tiny, tmp_path, monkeypatch):
     def interrupt(self, number, size):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(DesignProgress, "tried", interrupt)
+    monkeypatch.setattr(DesignProgress, "show_best", interrupt)
     done = run_command(*words(tiny, tmp_path, "--no-film"))
     assert done.code == 130
     assert "interrupted: the best of 1 motions" in done.out

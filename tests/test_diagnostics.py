@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from collocation_sysid.statistics.diagnostics import MarkerDiagnosis, diagnose
-from collocation_sysid.statistics.linearised import FitBlock, LinearisedFit
+from collocation_sysid.statistics.diagnostics import MarkerDiagnosis, diagnose_markers
+from collocation_sysid.statistics.linearised import LinearisedFit, ResidualBlock
 
 T_S = 0.01 * np.arange(160)
 SIGMA_M = 2e-4
@@ -24,10 +24,10 @@ def diagnosis(residual: np.ndarray, missing: float = 0.0) -> MarkerDiagnosis:
     slope = np.zeros((len(T_S), 2, 3, 2))
     slope[:, 1, 2, 0] = np.where(seen[:, 1], 50 * MOTION, 0.0)  # of a shared parameter
     slope[:, 1, 0, 1] = seen[:, 1]  # of an offset
-    block = FitBlock("gravity", T_S, ("Base", "Tip2"), seen, both, slope, np.full(2, SIGMA_M))
+    block = ResidualBlock("gravity", T_S, ("Base", "Tip2"), seen, both, slope, np.full(2, SIGMA_M))
     names = ("mu_pa", "gravity: offset of Tip2, x [m]")
     fit = LinearisedFit((block,), names, 1, np.zeros(2), np.zeros(2), np.zeros(2, dtype=bool))
-    (found,) = diagnose(fit)
+    (found,) = diagnose_markers(fit)
     assert (found.experiment, found.marker) == ("gravity", "Tip2")
     assert found.sentence.startswith("gravity/Tip2: ")
     return found

@@ -21,7 +21,7 @@ from problems_small import (
 from collocation_sysid.fem.body import Body
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 
 THETA = as_theta(TRUTH)
@@ -108,12 +108,13 @@ def test_residual_depends_on_nothing_older_than_two_steps_or_newer(backward_eule
 def test_constant_forces_add_to_gravity():
     push, nodes = np.array([1.0, -2.0, 0.5]), np.array([3, 7])
     plain, pushed = (
-        Dynamics.of(hung_cube(forces=forces), "midpoint") for forces in ((), (Force(nodes, push),))
+        Dynamics.from_experiment(hung_cube(forces=forces), "midpoint")
+        for forces in ((), (Force(nodes, push),))
     )
     expected = np.zeros((27, 3))
     expected[nodes] = push / 2
     difference = pushed.forces.weight.external_n - plain.forces.weight.external_n
-    np.testing.assert_allclose(difference, [expected.ravel()] * pushed.rows, atol=1e-15)
+    np.testing.assert_allclose(difference, [expected.ravel()] * pushed.row_count, atol=1e-15)
 
 
 # Conservation
@@ -141,8 +142,8 @@ def thrown_box(steps: int = 40, gravity_m_s2: Sequence[float] = GRAVITY_M_S2) ->
 @pytest.mark.parametrize("scheme", ["backward-euler", "midpoint", "bdf2"])
 def test_only_gravity_changes_the_momentum_of_a_body_in_flight(scheme: str):
     experiment = thrown_box()
-    dynamics = Dynamics.of(experiment, scheme).with_theta([200.0, 300.0, 0.009, 0.0])
-    x = march(experiment, dynamics)
+    dynamics = Dynamics.from_experiment(experiment, scheme).with_theta([200.0, 300.0, 0.009, 0.0])
+    x = simulate_scheme(experiment, dynamics)
     mass = experiment.body.node_mass
     centre = np.einsum("i,tij->tj", mass, x.reshape(len(x), -1, 3)) / mass.sum()
     acceleration = np.diff(centre, 2, axis=0) / dynamics.step_s**2
@@ -152,8 +153,8 @@ def test_only_gravity_changes_the_momentum_of_a_body_in_flight(scheme: str):
 
 def test_midpoint_keeps_the_angular_momentum_of_a_body_in_flight():
     experiment = thrown_box(gravity_m_s2=(0.0, 0.0, 0.0))
-    dynamics = Dynamics.of(experiment, "midpoint").with_theta(FREE)
-    x = march(experiment, dynamics)
+    dynamics = Dynamics.from_experiment(experiment, "midpoint").with_theta(FREE)
+    x = simulate_scheme(experiment, dynamics)
     momentum = node_momenta(dynamics, x, FREE)
     angular = np.cross(x[1:].reshape(len(momentum), -1, 3), momentum).sum(axis=1)
     spread = np.ptp(angular, axis=0).max()
@@ -191,8 +192,8 @@ def plucked_bar(steps: int = 60) -> Experiment:
 def energies(scheme: str, theta: np.ndarray) -> np.ndarray:
     """Kinetic plus elastic energy of the plucked bar at every grid time [J]."""
     experiment = plucked_bar()
-    dynamics = Dynamics.of(experiment, scheme).with_theta(theta)
-    x = march(experiment, dynamics)
+    dynamics = Dynamics.from_experiment(experiment, scheme).with_theta(theta)
+    x = simulate_scheme(experiment, dynamics)
     step, v0 = dynamics.step_s, dynamics.start_velocity_m_s
     if scheme == "midpoint":
         momenta = node_momenta(dynamics, x, theta).reshape(len(x) - 1, -1)

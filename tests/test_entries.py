@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from collocation_sysid.program.entries import OffBand
+from collocation_sysid.program.entries import SparseAssembly
 
 SHAPE = (5, 7)
 
@@ -24,11 +24,11 @@ def test_values_of_all_groups_add_up_where_their_entries_are(rng, columns):
     smaller = sp.csc_array(sp.random_array((5, 4), density=0.5, rng=rng))
     smaller.sort_indices()
     groups = [group(rng, columns, 6), group(rng, columns, 9), group(rng, columns, 0)]
-    found = OffBand.of((smaller.indptr, smaller.indices), SHAPE, groups)
-    values, own = found.values(np.full(len(found.indices), np.nan), smaller.nnz)
+    found = SparseAssembly.from_groups((smaller.indptr, smaller.indices), SHAPE, groups)
+    values, own = found.allocate(np.full(len(found.indices), np.nan), smaller.nnz)
     own[:] = smaller.data
     further = [rng.normal(size=len(rows)) for rows, _ in groups]
-    found.fill(values, own, further)
+    found.assemble(values, own, further)
     whole = sp.csc_array((values, found.indices, found.indptr), shape=SHAPE)
     assert whole.has_canonical_format
     expected = np.zeros(SHAPE)
@@ -36,17 +36,21 @@ def test_values_of_all_groups_add_up_where_their_entries_are(rng, columns):
     for (rows, places), more in zip(groups, further, strict=True):
         expected[rows, places] += more
     np.testing.assert_array_equal(whole.toarray(), expected)
-    untouched = OffBand.of((smaller.indptr, smaller.indices), SHAPE, [])
+    untouched = SparseAssembly.from_groups((smaller.indptr, smaller.indices), SHAPE, [])
     np.testing.assert_array_equal(untouched.indices, smaller.indices)
 
 
 def test_the_values_of_a_matrix_are_written_in_place_where_nothing_comes_between(rng):
     smaller = sp.csc_array(np.triu(np.ones((4, 4))))
-    after = OffBand.of((smaller.indptr, smaller.indices), SHAPE, [group(rng, range(4, 7), 5)])
-    between = OffBand.of((smaller.indptr, smaller.indices), SHAPE, [(np.array([4]), np.array([0]))])
+    after = SparseAssembly.from_groups(
+        (smaller.indptr, smaller.indices), SHAPE, [group(rng, range(4, 7), 5)]
+    )
+    between = SparseAssembly.from_groups(
+        (smaller.indptr, smaller.indices), SHAPE, [(np.array([4]), np.array([0]))]
+    )
     for entries, in_place in ((after, True), (between, False)):
-        values, own = entries.values(None, smaller.nnz)
+        values, own = entries.allocate(None, smaller.nnz)
         assert np.shares_memory(values, own) == in_place
         np.testing.assert_array_equal(
-            entries.indices[entries.places_of(np.arange(smaller.nnz))], smaller.indices
+            entries.indices[entries.positions_of(np.arange(smaller.nnz))], smaller.indices
         )

@@ -11,9 +11,9 @@ from fits_small import PARAMETERS, Problem, autoregressive, problem
 from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
-from collocation_sysid.statistics.autocorrelation import dependence, error_processes
-from collocation_sysid.statistics.linearised import LinearisedFit, information
-from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_of
+from collocation_sysid.statistics.autocorrelation import error_processes, test_dependence
+from collocation_sysid.statistics.linearised import LinearisedFit, factorise_information
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRAWS = 60
 PROBLEMS = {
@@ -41,7 +41,7 @@ def held(uncertainty: Uncertainty, wrong: np.ndarray) -> np.ndarray:
 
 def coverage(of: Problem, phi: float, shared: float = 0.0, count: int = DRAWS, **options) -> float:
     hits = [
-        held(uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(**options)), wrong)
+        held(uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(**options)), wrong)
         for fit, wrong in draws(of, phi, shared, count)
     ]
     return float(np.mean(hits))
@@ -83,7 +83,7 @@ def test_textbook_intervals_fail_where_errors_persist():
 def test_intervals_rarely_change_for_white_errors():
     of = PROBLEMS["one marker, 40 samples"]
     chosen = [
-        uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(noise="estimated")).errors
+        uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(noise="estimated")).errors
         for fit, wrong in draws(of, 0.0)
     ]
     assert np.mean([errors == "autocorrelated" for errors in chosen]) < 0.06  # 1 % of two tests
@@ -93,7 +93,7 @@ def test_intervals_rarely_change_for_white_errors():
 def test_the_test_for_persistence_knows_what_the_fit_took_out(name):
     scores = []
     for fit, _ in draws(PROBLEMS[name], 0.0):
-        found = dependence(fit, information(fit))
+        found = test_dependence(fit, factorise_information(fit))
         scores.append(found.lag1 / found.lag1_deviation)
     assert kstest(scores, "norm").pvalue > 1e-3
 
@@ -104,13 +104,13 @@ def test_a_sample_that_is_alone_among_its_times_follows_on_none():
     (block,) = fit.blocks
     alone = np.arange(len(block.t_s))[:, None] == 3
     kept = {
-        "present": block.present & alone,
+        "present": block.is_present & alone,
         "residual": np.where(alone[..., None], block.residual, 0.0),
-        "slope": np.where(alone[..., None, None], block.slope, 0.0),
+        "slope": np.where(alone[..., None, None], block.jacobian, 0.0),
     }
     single = replace(fit, blocks=[replace(block, **kept)])
     with np.errstate(all="raise"):
-        found = dependence(single, information(single))
+        found = test_dependence(single, factorise_information(single))
     assert (found.lag1, found.lag1_deviation) == (0.0, np.inf)
 
 
@@ -118,7 +118,7 @@ def test_autocorrelation_is_that_of_the_errors_not_of_the_residuals():
     of = PROBLEMS["one marker, 40 samples"]
     corrected, raw = [], []
     for fit, _ in draws(of, 0.85):
-        corrected.append(dependence(fit, information(fit)).lag1)
+        corrected.append(test_dependence(fit, factorise_information(fit)).lag1)
         residual = fit.blocks[0].channels[0]
         raw.append(np.sum(residual[1:] * residual[:-1]) / np.sum(residual**2))
     assert np.median(raw) < 0.75
@@ -132,17 +132,19 @@ def test_processes_of_the_errors_are_found():
     resonance = [1, -2 * 0.9 * np.cos(0.5), 0.81]
     first = 0.1 * lfilter([1], resonance, rng.normal(size=(700, 6)), axis=0)[300:] @ mix
     fit, _ = of.fit([first.reshape(400, 2, 3), autoregressive(rng, 300, 2, 0.0)], np.zeros(18))
-    resonant, white = error_processes(fit, information(fit))
+    resonant, white = error_processes(fit, factorise_information(fit))
     impulse = 0.1 * lfilter([1], resonance, np.eye(1, 500)[0])
     expected = np.correlate(impulse, impulse, "full")[499:]
     assert resonant.order >= 2
-    np.testing.assert_allclose(resonant.along_time[:10], expected[:10] / expected[0], atol=0.15)
+    np.testing.assert_allclose(
+        resonant.autocorrelation[:10], expected[:10] / expected[0], atol=0.15
+    )
     scale = np.trace(mix @ mix) * expected[0]
     np.testing.assert_allclose(
-        resonant.among_channels / scale, mix @ mix * expected[0] / scale, atol=0.05
+        resonant.channel_covariance / scale, mix @ mix * expected[0] / scale, atol=0.05
     )
     assert white.order == 0
-    np.testing.assert_allclose(white.among_channels, np.eye(6), atol=0.3)
+    np.testing.assert_allclose(white.channel_covariance, np.eye(6), atol=0.3)
 
 
 # NuisanceMap parameters
@@ -156,15 +158,15 @@ def sample(seed: int = 0, phi: float = 0.0, **options) -> tuple[LinearisedFit, n
 
 
 def plain_information(fit: LinearisedFit) -> np.ndarray:
-    rows = np.concatenate([b.slope.reshape(-1, len(fit.names)) for b in fit.blocks])
-    return rows.T @ rows + np.diag(fit.prior_slope**2)
+    rows = np.concatenate([b.jacobian.reshape(-1, len(fit.names)) for b in fit.blocks])
+    return rows.T @ rows + np.diag(fit.prior_jacobian**2)
 
 
 def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_parameters():
     fit, wrong = sample()
-    full, k = plain_information(fit), fit.shared
+    full, k = plain_information(fit), fit.shared_count
     schur = full[:k, :k] - full[:k, k:] @ np.linalg.solve(full[k:, k:], full[k:, :k])
-    found = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     scale = np.sqrt(np.diag(found.covariance))
     np.testing.assert_allclose(
         found.covariance / np.outer(scale, scale),
@@ -178,7 +180,7 @@ def test_shared_covariance_is_the_inverse_of_the_schur_complement_over_local_par
 
 def test_local_parameters_have_standard_deviations():
     fit, wrong = sample()
-    found = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert tuple(found.nuisance) == fit.names[4:]
     expected = np.sqrt(np.diag(np.linalg.inv(plain_information(fit))))[4:]
     np.testing.assert_allclose(list(found.nuisance.values()), expected, rtol=1e-6)
@@ -187,9 +189,9 @@ def test_local_parameters_have_standard_deviations():
 @pytest.mark.parametrize("bounded", [1, 4])
 def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free(bounded):
     fit, wrong = sample()
-    at_bound = replace(fit, at_bound=np.arange(len(fit.names)) == bounded)
+    at_bound = replace(fit, is_at_bound=np.arange(len(fit.names)) == bounded)
     found, free = (
-        uncertainty_of(each, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
+        uncertainty_from_fit(each, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
         for each in (at_bound, fit)
     )
     shown = np.arange(4) != bounded
@@ -203,9 +205,9 @@ def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free
 
 def test_a_parameter_that_a_prior_determines_costs_no_degree_of_freedom():
     fit, wrong = sample()
-    tight = replace(fit, prior_slope=np.where(np.arange(len(fit.names)) < 4, 0.0, 1e6))
-    found = uncertainty_of(tight, PARAMETERS, wrong[:4])
-    assert found.degrees_of_freedom == pytest.approx(fit.measurements - 4, abs=1e-3)
+    tight = replace(fit, prior_jacobian=np.where(np.arange(len(fit.names)) < 4, 0.0, 1e6))
+    found = uncertainty_from_fit(tight, PARAMETERS, wrong[:4])
+    assert found.degrees_of_freedom == pytest.approx(fit.measurement_count - 4, abs=1e-3)
 
 
 # What is said of the residuals
@@ -213,11 +215,11 @@ def test_a_parameter_that_a_prior_determines_costs_no_degree_of_freedom():
 
 def test_errors_that_persist_are_told_once():
     fit, wrong = sample(phi=0.9)
-    found = uncertainty_of(fit, PARAMETERS, wrong[:4])
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
     assert found.errors == "autocorrelated"
     (note,) = [note for note in found.notes if "persist" in note]
     assert "0.8" in note or "0.9" in note
-    forced = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
+    forced = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert forced.errors == "independent"
     assert any("too small" in note for note in forced.notes)
 
@@ -225,7 +227,7 @@ def test_errors_that_persist_are_told_once():
 def test_persistent_errors_far_below_the_sigma_given_change_nothing():
     fit, wrong = sample(phi=0.9)
     small = replace(fit, blocks=tuple(replace(b, residual=0.01 * b.residual) for b in fit.blocks))
-    found = uncertainty_of(small, PARAMETERS, wrong[:4])
+    found = uncertainty_from_fit(small, PARAMETERS, wrong[:4])
     assert found.errors == "independent"
     np.testing.assert_allclose(
         found.covariance, np.linalg.inv(plain_information(fit))[:4, :4], rtol=1e-6
@@ -234,8 +236,8 @@ def test_persistent_errors_far_below_the_sigma_given_change_nothing():
 
 def test_error_bars_never_fall_below_those_of_the_sigma_given():
     fit, wrong = sample(phi=0.9)
-    given = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="autocorrelated"))
-    independent = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
+    given = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="autocorrelated"))
+    independent = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
     assert (np.diag(given.covariance) >= 0.999999 * np.diag(independent.covariance)).all()
 
 
@@ -243,14 +245,16 @@ def test_error_bars_follow_the_units_of_the_residuals():
     fit, wrong = sample(phi=0.7)
     scaled = replace(
         fit,
-        blocks=tuple(replace(b, residual=7 * b.residual, slope=7 * b.slope) for b in fit.blocks),
-        prior_slope=7 * fit.prior_slope,
+        blocks=tuple(
+            replace(b, residual=7 * b.residual, jacobian=7 * b.jacobian) for b in fit.blocks
+        ),
+        prior_jacobian=7 * fit.prior_jacobian,
     )
     for errors in ("independent", "autocorrelated"):
         before, after = (
-            uncertainty_of(f, PARAMETERS, wrong[:4], ErrorModel("estimated", errors)).covariance
-            for f in (replace(fit, prior_slope=0 * fit.prior_slope),
-                      replace(scaled, prior_slope=0 * fit.prior_slope))
+            uncertainty_from_fit(f, PARAMETERS, wrong[:4], ErrorModel("estimated", errors)).covariance
+            for f in (replace(fit, prior_jacobian=0 * fit.prior_jacobian),
+                      replace(scaled, prior_jacobian=0 * fit.prior_jacobian))
         )  # fmt: skip
         np.testing.assert_allclose(after, before, rtol=1e-6)
 
@@ -258,5 +262,5 @@ def test_error_bars_follow_the_units_of_the_residuals():
 def test_a_record_of_two_samples_is_no_error():
     fit, wrong = sample(samples=(2, 3), markers=2, offsets=False)
     for errors in ("auto", "independent", "autocorrelated"):
-        found = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors=errors))
+        found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors=errors))
         assert np.isfinite(found.degrees_of_freedom)

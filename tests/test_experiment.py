@@ -66,13 +66,13 @@ def test_sizes_follow_from_times_and_grasps():
     swing = experiment()
     assert swing.timestep_s == pytest.approx(0.01)
     assert swing.duration_s == pytest.approx(0.05)
-    np.testing.assert_array_equal(swing.held_dofs, np.arange(9))
+    np.testing.assert_array_equal(swing.prescribed_dofs, np.arange(9))
     np.testing.assert_array_equal(swing.free_dofs, np.arange(9, 15))
 
 
 def test_held_positions_follow_the_order_of_held_dofs():
     swing = experiment(grasps=(lifted([4, 1, 2]), lifted([0, 3], speed_m_s=-2.0)))
-    held = swing.held_positions([0.0, 0.02]).reshape(2, 5, 3)
+    held = swing.prescribed_positions([0.0, 0.02]).reshape(2, 5, 3)
     np.testing.assert_allclose(held[0], NODES)
     np.testing.assert_allclose(held[1, :, 2] - NODES[:, 2], [-0.04, 0.02, 0.02, -0.04, 0.02])
     np.testing.assert_allclose(held[1, 1, :2], [0.1 * np.cos(0.02), 0.1 * np.sin(0.02)])
@@ -81,14 +81,14 @@ def test_held_positions_follow_the_order_of_held_dofs():
 def test_rigid_positions_carry_the_whole_body_with_the_first_grasp():
     swing = experiment(grasps=(lifted([0, 1, 2]), lifted([3], speed_m_s=-2.0)))
     np.testing.assert_allclose(
-        swing.rigid_positions(TIMES), swing.grasps[0].poses.carry(NODES, TIMES)
+        swing.rigid_positions(TIMES), swing.grasps[0].poses.carried_positions(NODES, TIMES)
     )
 
 
 def test_without_a_grasp_the_body_stays_undeformed_and_all_nodes_are_free():
     free = experiment(grasps=(), start="undeformed")
     np.testing.assert_array_equal(free.rigid_positions([0.0, 0.1]), [NODES, NODES])
-    assert free.held_positions([0.0, 0.1]).shape == (2, 0)
+    assert free.prescribed_positions([0.0, 0.1]).shape == (2, 0)
     np.testing.assert_array_equal(free.free_dofs, np.arange(15))
 
 
@@ -282,11 +282,11 @@ def test_several_grasps_are_cut_to_the_time_they_share():
 def test_a_grasp_that_has_let_go_needs_no_poses_any_more():
     t = 0.01 * np.arange(100)
     sequence = moving_poses(0.005 * np.arange(104))  # 0.515 s
-    found = align([sequence], moving_table(t), held_s=[(-np.inf, 0.513)])
+    found = align([sequence], moving_table(t), hold_s=[(-np.inf, 0.513)])
     assert found.notes == ()
     assert len(found.t_s) == 100
     assert found.poses[0].at([0.513])[1][0, 0] == pytest.approx(0.513)
-    still_held = align([sequence], moving_table(t), held_s=[(-np.inf, 0.6)])
+    still_held = align([sequence], moving_table(t), hold_s=[(-np.inf, 0.6)])
     assert still_held.t_s[-1] == pytest.approx(0.51)
 
 

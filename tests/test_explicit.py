@@ -18,7 +18,7 @@ from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Pe
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.program.collocation import Collocation, carried_over
+from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.recording import Experiment
 
 CORE = Region("core", np.arange(6), prony=["slow"])
@@ -54,8 +54,8 @@ def fitted(branches: int, steps: int, noise_m: float = 0.0) -> Collocation:
 
 
 def explicit(collocation: Collocation) -> Collocation:
-    found = collocation.made_explicit()
-    assert found.explicit
+    found = collocation.with_lifted_variables()
+    assert found.has_lifted_variables
     return found
 
 
@@ -63,16 +63,16 @@ def test_the_recursion_holds_where_the_memory_follows_from_the_motion():
     collocation = fitted(2, 4)
     program = explicit(collocation)
     p = collocation.guess_p
-    positions = [np.tile(s.body.nodes_m.ravel(), (s.grid_rows, 1)) for s in program.segments]
+    positions = [np.tile(s.body.nodes_m.ravel(), (s.grid_times, 1)) for s in program.transcriptions]
     positions[0] *= 1 + 0.1 * np.random.default_rng(0).random(positions[0].shape)
     z, given = program.pack(p, positions), collocation.pack(p, positions)
     rows = program.constraint_values(z)
-    np.testing.assert_allclose(rows[collocation.constraints :], 0.0, atol=1e-14)
+    np.testing.assert_allclose(rows[collocation.constraint_count :], 0.0, atol=1e-14)
     np.testing.assert_allclose(
-        rows[: collocation.constraints], collocation.constraint_values(given), atol=1e-12
+        rows[: collocation.constraint_count], collocation.constraint_values(given), atol=1e-12
     )
-    np.testing.assert_allclose(carried_over(z, program, collocation), given, rtol=1e-14)
-    assert Collocation([hung_cube(3)], GUESS).made_explicit().variables < len(z)
+    np.testing.assert_allclose(convert_variables(z, program, collocation), given, rtol=1e-14)
+    assert Collocation([hung_cube(3)], GUESS).with_lifted_variables().variable_count < len(z)
 
 
 # What methods find ------------------------------------------------------------------------------

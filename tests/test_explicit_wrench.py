@@ -21,7 +21,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.parameters import Parameters, Unknown
-from collocation_sysid.program.collocation import Collocation, carried_over
+from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Nuisance
 
@@ -39,7 +39,7 @@ ALL_UNKNOWN = Nuisance.none(
 
 
 def free_density() -> Parameters:
-    return Parameters.of({name: Unknown(1.1 * value) for name, value in DENSE.items()})
+    return Parameters.from_mapping({name: Unknown(1.1 * value) for name, value in DENSE.items()})
 
 
 def weighed(experiment: Experiment) -> Experiment:
@@ -63,16 +63,16 @@ def test_the_equations_hold_where_the_wrench_follows_from_the_motion(rng):
     collocation = Collocation([wristed_cube(6, ALL_UNKNOWN, frame="grasp")], GUESS)
     program, p = explicit(collocation), collocation.guess_p
     p[collocation.nq :] = 0.1
-    positions = [np.tile(s.body.nodes_m.ravel(), (s.grid_rows, 1)) for s in program.segments]
+    positions = [np.tile(s.body.nodes_m.ravel(), (s.grid_times, 1)) for s in program.transcriptions]
     positions[0] += 1e-3 * rng.normal(size=positions[0].shape)
     z, given = program.pack(p, positions), collocation.pack(p, positions)
-    rows = program.constraint_values(z)[collocation.constraints :]
+    rows = program.constraint_values(z)[collocation.constraint_count :]
     np.testing.assert_allclose(rows, 0.0, atol=1e-13)
     assert program.objective(z) == pytest.approx(collocation.objective(given), rel=1e-12)
-    np.testing.assert_allclose(carried_over(z, program, collocation), given, rtol=1e-14)
-    (sensor,) = collocation.segments[0].sensors
-    of_reactions = 7 * len(sensor.channel.places)
-    assert program.added("wrench") == 12 * sensor.channel.count + of_reactions
+    np.testing.assert_allclose(convert_variables(z, program, collocation), given, rtol=1e-14)
+    (sensor,) = collocation.transcriptions[0].sensors
+    of_reactions = 7 * len(sensor.observable.node_dofs)
+    assert program.lifted_count("wrench") == 12 * sensor.observable.count + of_reactions
 
 
 # What methods find ------------------------------------------------------------------------------

@@ -85,7 +85,7 @@ def held_bar(
     markers = vertex_markers(body, nodes_where(body, 0, BAR_M[0]), t_s)
     kind = "dynamic" if moving else "static"
     experiment = Experiment(body, t_s, grasps, markers, nuisance=IDEAL, kind=kind)
-    theta = body.theta({**OTHERS, **values})
+    theta = body.theta_from_values({**OTHERS, **values})
     shapes = simulate(experiment, theta).positions_m if moving else None
     return Identified("a bar", "good", (), {}, body, theta, experiment, shapes)
 
@@ -121,7 +121,9 @@ def test_a_run_without_a_guess_is_exported_too(run_folder, tmp_path):
     folder = Path(shutil.copytree(run_folder, tmp_path / "run"))
     problem = folder / "problem.toml"
     problem.write_text(re.sub(r"(?m)^mu_pa .*", "mu_pa = {}", problem.read_text()))
-    assert Problem.read(problem, folder=run_folder.parent).parameters.unguessed == ("mu_pa",)
+    assert Problem.read(problem, folder=run_folder.parent).parameters.names_without_guess == (
+        "mu_pa",
+    )
     assert run_command("export", folder, "--to", "json", "--out", tmp_path / "out").code == 0
     (region,) = json.loads((tmp_path / "out" / "identified.json").read_text())["regions"]
     result = json.loads((folder / "result.json").read_text())
@@ -241,7 +243,7 @@ def test_usd_gets_the_motion_of_the_gripper_and_what_it_holds(tmp_path):
         # USD's matrices act on rows.
         matrix = np.array(UsdGeom.Xformable(gripper).ComputeLocalToWorldTransform(t * rate_hz))
         there = local @ matrix[:3, :3] + matrix[3, :3]
-        held = body.experiment.grasped([t])[1][0][body.grasped]
+        held = body.experiment.prescribed_displacements([t])[1][0][body.grasped]
         np.testing.assert_allclose(there, held, atol=1e-7, err_msg=f"sample {k}")
 
 
@@ -288,7 +290,9 @@ def test_usd_gets_a_material_for_each_region_and_says_what_simulators_make_of_th
     markers = vertex_markers(body, nodes_where(body, 0, BAR_M[0]), t_s)
     experiment = Experiment(body, t_s, [still], markers, nuisance=IDEAL)
     values = {f"{r.name}.{n}": v for r in regions for n, v in {**MODULI, **OTHERS}.items()}
-    body_ = Identified("a bar", "good", (), {}, body, body.theta(values), experiment, None)
+    body_ = Identified(
+        "a bar", "good", (), {}, body, body.theta_from_values(values), experiment, None
+    )
     stage = stage_of(exported(body_, "usd", tmp_path))
     subset = stage.GetPrimAtPath("/World/Body/Mesh/soft_end")
     assert len(subset.GetAttribute("indices").Get()) == 6
@@ -439,7 +443,7 @@ def test_any_title_or_name_is_written_in_the_form_of_the_target(to: str, tmp_pat
     experiment = Experiment(body, t_s, [still], markers, nuisance=IDEAL)
     touching = experiment.with_obstacles([wall])
     values = {f"{name}.{n}": v for name in names for n, v in {**MODULI, **OTHERS}.items()}
-    theta, words = body.theta(values), (HOSTILE, "good", (HOSTILE,))
+    theta, words = body.theta_from_values(values), (HOSTILE, "good", (HOSTILE,))
     identified = Identified(*words, {}, body, theta, experiment, None, touching)
     folder = exported(identified, to, tmp_path)
     for file in folder.iterdir():
@@ -652,7 +656,7 @@ def laid_block(shape: Solid) -> Identified:
     values = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.02, "gamma_m_1_s": 0.0}
     motion = simulate(fallen, values, "bdf2", substeps=4).positions_m
     still = alone(fallen)
-    theta, shapes = still.body.theta(values), motion[:, : len(block.nodes_m)]
+    theta, shapes = still.body.theta_from_values(values), motion[:, : len(block.nodes_m)]
     return Identified("b", "good", (), {}, still.body, theta, still, shapes, fallen)
 
 
@@ -729,7 +733,7 @@ def pressed_block(
     whole = Experiment(block, t_s, grasps, seen, nuisance=IDEAL, kind="static")
     still = alone(whole)
     values = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-    theta = still.body.theta(values)
+    theta = still.body.theta_from_values(values)
     return Identified("b", "good", (), {}, still.body, theta, still, None, whole)
 
 
@@ -767,9 +771,9 @@ def test_a_body_of_which_only_a_force_was_measured_is_exported(tmp_path):
     assert body.touching is not None
     (tip,) = body.obstacles
     felt = replace(tip, wrench=Wrench(body.touching.t_s, np.zeros((3, 6)), 0.01, 1.0))
-    whole = replace(body.touching, grasps=[*body.touching.gripping, felt], markers=None)
+    whole = replace(body.touching, grasps=[*body.touching.body_grasps, felt], markers=None)
     still = alone(whole)
-    np.testing.assert_array_equal(still.held([0.0])[0], body.held)
+    np.testing.assert_array_equal(still.is_prescribed([0.0])[0], body.held)
     lone = replace(body, experiment=still, body=still.body, touching=whole)
     decks = [
         (exported(each, "calculix", tmp_path / str(k)) / "body.inp").read_text()
@@ -865,7 +869,7 @@ def test_newton_says_where_obstacles_touch_differently(tmp_path):
     assert alike.touching is not None
     first, second = alike.obstacles
     obstacles = [first, replace(second, friction=0.8)]
-    whole = replace(alike.touching, grasps=[*alike.touching.gripping, *obstacles])
+    whole = replace(alike.touching, grasps=[*alike.touching.body_grasps, *obstacles])
     unlike = replace(alike, touching=whole)
     for body, count in ((alike, 0), (unlike, 1)):
         folder = exported(body, "newton", tmp_path / str(count))

@@ -13,7 +13,7 @@ from problems_small import GUESS, TRUTH, hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.refinement import refined
+from collocation_sysid.fem.refinement import refine_body
 from collocation_sysid.methods import METHODS
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.simulation import simulate, with_markers
@@ -30,13 +30,13 @@ def drag(x, v, at, drag_coefficient):
 def in_fluid(steps: int = 10, law=drag, **changes) -> Experiment:
     """A hung cube in a fluid, without what is unknown by default."""
     old = hung_cube(steps, nuisance=Nuisance.none())
-    forces = [cs.NodeForce.of(law, cs.Constant("drag_coefficient", "c", usual=1.0))]
+    forces = [cs.NodeForce.from_law(law, cs.Constant("drag_coefficient", "c", usual=1.0))]
     body = cs.Body(old.body.mesh, density_kg_m3=30.0, forces=forces, **changes)
     return replace(old, body=body)
 
 
 def parameters(guess: float) -> cs.Parameters:
-    own = cs.Parameters.of({"drag_coefficient": cs.Unknown(guess)})
+    own = cs.Parameters.from_mapping({"drag_coefficient": cs.Unknown(guess)})
     return cs.Parameters((*GUESS.items, *own.items))
 
 
@@ -63,7 +63,7 @@ def squeezed(x, v, at, squeeze_pa):
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_a_users_pressure_on_faces_is_found(element, method):
     low = cs.Box((-1, -1, -1), (1, 1, 0.051))
-    force = cs.NodeForce.of(squeezed, nodes=low, on="faces")
+    force = cs.NodeForce.from_law(squeezed, nodes=low, on="faces")
     mesh = hung_cube(2, (1, 1, 2)).body.mesh
     body = cs.Body(mesh, density_kg_m3=30.0, element=element, forces=[force])
     old = hung_cube(12)
@@ -75,7 +75,9 @@ def test_a_users_pressure_on_faces_is_found(element, method):
     truth = {**TRUTH, "squeeze_pa": 8.0}
     made = with_markers(made, simulate(made, truth, "midpoint", substeps=1).markers_m)
     unknown = {"mu_pa": cs.Unknown(200.0), "squeeze_pa": cs.Unknown(5.0)}
-    problem = cs.Problem([made], cs.Parameters.of({**truth, **unknown}), method=METHODS[method]())
+    problem = cs.Problem(
+        [made], cs.Parameters.from_mapping({**truth, **unknown}), method=METHODS[method]()
+    )
     found = cs.solve(problem).parameters
     assert found["squeeze_pa"] == pytest.approx(8.0, rel=1e-3)
     assert found["mu_pa"] == pytest.approx(TRUTH["mu_pa"], rel=1e-3)
@@ -110,13 +112,15 @@ def test_left_out_the_verdict_doubts_the_answer():
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
 def test_on_a_finer_mesh_it_is_the_same_force(element):
     mesh = hung_cube().body.mesh
-    body = cs.Body(mesh, density_kg_m3=30.0, element=element, forces=[cs.NodeForce.of(drag)])
+    body = cs.Body(mesh, density_kg_m3=30.0, element=element, forces=[cs.NodeForce.from_law(drag)])
     wind = np.array([0.3, -0.2, 0.5])
     theta = np.array([1e-9, 1e-9, 0.0, 0.0, DRAG])
     of_both = []
-    for each in (body, refined(body)):
+    for each in (body, refine_body(body)):
         moving = np.tile(wind, len(each.nodes_m))[None]
-        total = Forces.on(each, theta).total(each.nodes_m.reshape(1, -1), moving.reshape(1, -1))
+        total = Forces.of_body_alone(each, theta).total(
+            each.nodes_m.reshape(1, -1), moving.reshape(1, -1)
+        )
         of_both.append(total.reshape(-1, 3).sum(axis=0))
     expected = -5.0 * DRAG * 6 * 0.1**2 * np.linalg.norm(wind) * wind
     np.testing.assert_allclose(of_both, [expected, expected], rtol=1e-6)
@@ -176,11 +180,13 @@ def lift(x, v, at, spin_n_s_m4):
 @pytest.mark.parametrize("method", ["reduced-space", "interior-point"])
 def test_a_force_across_the_velocity_is_found(method: str):
     old, truth = hung_cube(12, nuisance=Nuisance.none()), {**TRUTH, "spin_n_s_m4": 400.0}
-    body = cs.Body(old.body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.of(lift)])
+    body = cs.Body(old.body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.from_law(lift)])
     made = replace(old, body=body)
     seen = with_markers(made, simulate(made, truth, "midpoint", substeps=1).markers_m)
     unknown = {"spin_n_s_m4": cs.Unknown(150.0), "mu_pa": cs.Unknown(GUESS.items[0].guess)}
-    problem = cs.Problem([seen], cs.Parameters.of({**truth, **unknown}), method=METHODS[method]())
+    problem = cs.Problem(
+        [seen], cs.Parameters.from_mapping({**truth, **unknown}), method=METHODS[method]()
+    )
     found = cs.solve(problem).parameters
     assert found["spin_n_s_m4"] == pytest.approx(400.0, rel=1e-3)
     fine = simulate(made, truth, "newmark", timestep_s=made.timestep_s / 8).markers_m
@@ -230,7 +236,7 @@ def test_a_constant_that_the_body_has_is_refused():
         return -mu_pa * v
 
     with pytest.raises(InputError, match="'mu_pa', which another part of the body has"):
-        cs.Body(hung_cube().body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.of(mine)])
+        cs.Body(hung_cube().body.mesh, density_kg_m3=30.0, forces=[cs.NodeForce.from_law(mine)])
 
 
 def test_a_law_that_is_not_finite_at_rest_is_refused():
@@ -238,4 +244,4 @@ def test_a_law_that_is_not_finite_at_rest_is_refused():
         return -drag_coefficient * ca.sqrt(ca.sumsqr(v)) * v
 
     with pytest.raises(InputError, match="not finite where the node is at rest"):
-        cs.NodeForce.of(mine)
+        cs.NodeForce.from_law(mine)

@@ -7,15 +7,15 @@ from problems_small import TRUTH, box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.pattern import SymmetricPattern
-from collocation_sysid.program.block_band import whole
+from collocation_sysid.program.block_band import full_matrix
 from collocation_sysid.program.factorisation import Factoriser
-from collocation_sysid.program.supernodal import library
+from collocation_sysid.program.supernodal import load_mkl
 
 # On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
 BAR = box((0.04, 0.04, 0.4), (1, 1, 10))
-FULL = SymmetricPattern.of_cells(np.arange(90)[None], 90)
-WIDE = SymmetricPattern.of_cells(np.arange(300)[None], 300)
-SMALL = SymmetricPattern.of_cells(np.arange(7)[None], 7)
+FULL = SymmetricPattern.from_cells(np.arange(90)[None], 90)
+WIDE = SymmetricPattern.from_cells(np.arange(300)[None], 300)
+SMALL = SymmetricPattern.from_cells(np.arange(7)[None], 7)
 CHOICES = [
     ("band", BAR.pattern),
     ("sparse", BAR.pattern),
@@ -24,7 +24,7 @@ CHOICES = [
     ("auto", SMALL),
 ]
 IDS = ["bar-band", "bar-sparse", "full-auto", "full-sparse", "small-auto"]
-if library() is not None:
+if load_mkl() is not None:
     CHOICES += [("supernodal", BAR.pattern), ("supernodal", FULL), ("supernodal", SMALL)]
     IDS += ["bar-supernodal", "full-supernodal", "small-supernodal"]
 
@@ -40,7 +40,7 @@ def without_first_nodes(pattern: SymmetricPattern) -> np.ndarray:
 
 def random_values(pattern: SymmetricPattern, shift: float, seed: int = 0) -> np.ndarray:
     """Lower-triangle values of a random symmetric matrix with `shift` on its diagonal."""
-    values = np.random.default_rng(seed).normal(size=pattern.entries)
+    values = np.random.default_rng(seed).normal(size=pattern.entry_count)
     values[pattern.diagonal] += shift
     return values
 
@@ -51,13 +51,13 @@ def kept(pattern: SymmetricPattern, values: np.ndarray, free: np.ndarray) -> np.
 
 def test_the_band_is_taken_where_it_costs_less():
     free = without_first_nodes(BAR.pattern)
-    assert Factoriser(BAR.pattern, free).banded
+    assert Factoriser(BAR.pattern, free).is_banded
     # A star: hardly any fill-in, and the widest of bands.
     cells = np.column_stack([np.zeros(1500, int), np.arange(1, 4501).reshape(-1, 3)])
-    star = SymmetricPattern.of_cells(cells, 4501)
+    star = SymmetricPattern.from_cells(cells, 4501)
     factoriser = Factoriser(star, np.arange(star.size))
-    assert not factoriser.banded
-    assert factoriser.numbers < factoriser.half_bandwidth * star.size / 100
+    assert not factoriser.is_banded
+    assert factoriser.factor_size < factoriser.half_bandwidth * star.size / 100
 
 
 @pytest.mark.parametrize("columns", [None, 0, 1, 5])
@@ -89,7 +89,7 @@ def test_a_skew_part_is_solved_for_exactly_also_transposed(
     values, skew = random_values(pattern, shift), random_values(pattern, 0.0, seed=3)
     skew[pattern.diagonal] = 0
     symmetric = kept(pattern, values, free)
-    matrix = whole(pattern, values, skew).toarray()[np.ix_(free, free)]
+    matrix = full_matrix(pattern, values, skew).toarray()[np.ix_(free, free)]
     assert not np.allclose(matrix, matrix.T)
     shape = (len(free),) if columns is None else (len(free), columns)
     right = np.random.default_rng(1).normal(size=shape)
@@ -108,7 +108,7 @@ def test_a_skew_part_may_outweigh_the_symmetric_one(size: float):
     free = without_first_nodes(pattern)
     values, skew = random_values(pattern, 20.0), size * random_values(pattern, 0.0, seed=3)
     skew[pattern.diagonal] = 0
-    matrix = whole(pattern, values, skew).toarray()[np.ix_(free, free)]
+    matrix = full_matrix(pattern, values, skew).toarray()[np.ix_(free, free)]
     right = np.random.default_rng(1).normal(size=(len(free), 2))
     solved = Factoriser(pattern, free, "band").factorise(values, skew).solve(right)
     accurate = np.linalg.solve(matrix, right)
@@ -123,7 +123,7 @@ def test_in_wide_bands_the_skew_part_is_solved_for_whether_or_not_it_is_small(
     free = without_first_nodes(WIDE)
     values, skew = random_values(WIDE, 100.0), size * random_values(WIDE, 0.0, seed=3)
     skew[WIDE.diagonal] = 0
-    matrix = whole(WIDE, values, skew).toarray()[np.ix_(free, free)]
+    matrix = full_matrix(WIDE, values, skew).toarray()[np.ix_(free, free)]
     factoriser = Factoriser(WIDE, free, "band")
     assert factoriser.skyline is None
     factor = factoriser.factorise(values, skew)
@@ -138,7 +138,7 @@ def test_in_wide_bands_the_skew_part_is_solved_for_whether_or_not_it_is_small(
 @pytest.mark.parametrize("stiffness", [1.0, -1.0])
 def test_in_wide_bands_pivots_tell_whether_what_slides_is_stable(choice, stiffness: float):
     """A pressure that grows along z, and pushes along x by friction: half of that is symmetric."""
-    values, skew = np.zeros(WIDE.entries), np.zeros(WIDE.entries)
+    values, skew = np.zeros(WIDE.entry_count), np.zeros(WIDE.entry_count)
     values[WIDE.diagonal] = stiffness
     values[WIDE.diagonal[2::3]] = 1000.0
     pushed = np.flatnonzero((WIDE.rows % 3 == 2) & (WIDE.columns == WIDE.rows - 2))
@@ -147,7 +147,9 @@ def test_in_wide_bands_pivots_tell_whether_what_slides_is_stable(choice, stiffne
     factor = Factoriser(WIDE, np.arange(WIDE.size), choice).factorise(values, skew)
     assert factor.positive_definite == (stiffness > 0)
     right = np.random.default_rng(3).normal(size=WIDE.size)
-    np.testing.assert_allclose(whole(WIDE, values, skew) @ factor.solve(right), right, atol=1e-9)
+    np.testing.assert_allclose(
+        full_matrix(WIDE, values, skew) @ factor.solve(right), right, atol=1e-9
+    )
 
 
 def test_factors_that_live_together_do_not_share_their_memory():
@@ -173,7 +175,7 @@ def test_what_is_asked_for_and_not_installed_is_told(monkeypatch):
 def test_a_factor_in_a_room_is_that_of_the_last_matrix_put_there():
     free = without_first_nodes(BAR.pattern)
     factoriser = Factoriser(BAR.pattern, free, "band")
-    room, right = factoriser.room(sides=2), np.ones(len(free))
+    room, right = factoriser.allocate(sides=2), np.ones(len(free))
     for seed, skewed in enumerate((True, False, True)):
         values = random_values(BAR.pattern, 100.0, seed)
         skew = skewed * random_values(BAR.pattern, 0.0, seed=9)

@@ -17,16 +17,16 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import MU
 from collocation_sysid.fem.field import FieldModes, Laplacian
-from collocation_sysid.fem.refinement import refined
+from collocation_sysid.fem.refinement import refine_body
 from collocation_sysid.result.pictures.field import field_picture
 from collocation_sysid.result.replay import GROUPS, LAYOUT, WRENCH, read_run
-from collocation_sysid.runs.check.body import body_finding
-from collocation_sysid.runs.forward_simulation import roll_out
-from collocation_sysid.statistics.considered import assumed
-from collocation_sysid.statistics.fields import FieldEstimate, fields_of
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.numerical import shifts
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.runs.check.body import check_body
+from collocation_sysid.runs.forward_simulation import simulate_experiment
+from collocation_sysid.statistics.considered import changes_of_assumptions
+from collocation_sysid.statistics.fields import FieldEstimate, field_estimates
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.numerical import estimate_changes
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
 KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
@@ -69,8 +69,10 @@ def found(ratio: float = 1.0, above_m: float = 0.119, **stated) -> FieldEstimate
     solution = cs.solve(problem(ratio, above_m, **stated))
     assert solution.status.converged
     collocation = solution.collocation
-    known = covariance(collocation, solution.z)
-    (field,) = fields_of(collocation.segments[0].body, collocation.parameters, solution.q, known)
+    known = uncertainty_at(collocation, solution.z)
+    (field,) = field_estimates(
+        collocation.transcriptions[0].body, collocation.parameters, solution.q, known
+    )
     return field
 
 
@@ -80,37 +82,41 @@ def truth(ratio: float) -> np.ndarray:
 
 def held_share(field: FieldEstimate, ratio: float) -> float:
     """Of the elements that the data tell, those whose interval holds the truth."""
-    low, high = np.log(field.ci95)
-    return float(((low < truth(ratio)) & (truth(ratio) < high))[field.told].mean())
+    low, high = np.log(field.statistical95)
+    return float(((low < truth(ratio)) & (truth(ratio) < high))[field.is_informed].mean())
 
 
 def test_the_prior_falls_off_as_materns_does():
     mesh = cs.box_mesh((1.0, 1.0, 1.0), (12, 12, 12))
-    modes = FieldModes.of(cs.Field(0.15, modes=120), mesh, np.arange(len(mesh.tetrahedra)), (MU,))
+    modes = FieldModes.from_field(
+        cs.Field(0.15, modes=120), mesh, np.arange(len(mesh.tetrahedra)), (MU,)
+    )
     middles = mesh.points_m[mesh.tetrahedra].mean(axis=1)
     away_m = np.linalg.norm(middles - middles[5000], axis=1)
     correlation = modes.shapes @ modes.shapes[5000] / 0.25
     for away in (0.15, 0.2, 0.3, 0.4):
         here = np.abs(away_m - away) < 0.02
         assert correlation[here].mean() == pytest.approx(np.exp(-away / 0.15), abs=0.06)
-    variance = (modes.shapes**2).sum(axis=1) + modes.left_out**2
+    variance = (modes.shapes**2).sum(axis=1) + modes.omitted_deviation**2
     np.testing.assert_allclose(variance, 0.25)
 
 
 def test_shapes_have_their_share_of_all():
     mesh, length_m = cs.box_mesh(SIZE_M, (3, 3, 9)), 0.03
-    few = Laplacian.of(mesh, np.arange(len(mesh.tetrahedra)), 20)
+    few = Laplacian.from_mesh(mesh, np.arange(len(mesh.tetrahedra)), 20)
     all_values = np.linalg.eigvalsh(few.matrix.toarray())[1:]
     np.testing.assert_allclose(few.values, all_values[:20], rtol=1e-8)
     weights = (1 / length_m**2 + all_values) ** -2
-    assert few.share(length_m) == pytest.approx(weights[:20].sum() / weights.sum(), rel=0.01)
+    assert few.variance_share(length_m) == pytest.approx(
+        weights[:20].sum() / weights.sum(), rel=0.01
+    )
 
 
 def test_pieces_that_do_not_touch_have_a_stiffness_each():
     mesh = cs.box_mesh(SIZE_M, (2, 2, 6))
     layer = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2] // 0.02
     apart = np.flatnonzero((layer < 1) | (layer > 4))
-    first = Laplacian.of(mesh, apart, 5).vectors[0]
+    first = Laplacian.from_mesh(mesh, apart, 5).vectors[0]
     lower, upper = (first[part] for part in (layer[apart] < 1, layer[apart] > 4))
     assert np.ptp(lower) < 1e-6 * abs(lower[0])
     assert upper[0] == pytest.approx(-lower[0])
@@ -124,14 +130,14 @@ def uneven(kind: dict, rng: np.random.Generator) -> tuple[Body, list[np.ndarray]
     """A body, places, velocities and weights of its nodes, and θ with shares at its end."""
     body = bar(cs.Field(0.05, modes=4), divisions=(1, 1, 3), **kind)
     memory = {"slow.share": 0.3, "slow.tau_s": 0.1}
-    shares = dict(zip(body.mode_names, rng.normal(size=4), strict=True))
+    shares = dict(zip(body.field_coefficient_names, rng.normal(size=4), strict=True))
     x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
-    theta = body.theta({**KNOWN, **memory, "young_pa": YOUNG_PA, **shares})
+    theta = body.theta_from_values({**KNOWN, **memory, "young_pa": YOUNG_PA, **shares})
     return body, [x, *rng.normal(size=(2, *x.shape))], theta
 
 
 def share_steps(body: Body) -> np.ndarray:
-    return 0.1 * np.isin(np.arange(len(body.constants)), np.r_[body.mode_places[0]])
+    return 0.1 * np.isin(np.arange(len(body.constants)), np.r_[body.field_slices[0]])
 
 
 @pytest.mark.parametrize("kind", [REMEMBERING, AVERAGING, SLOWLY], ids=str)
@@ -148,10 +154,10 @@ def test_slopes_by_the_shares_are_those_of_differences(kind: dict, rng):
 @pytest.mark.parametrize("kind", [REMEMBERING, SLOWLY], ids=str)
 def test_curvature_by_the_shares_is_that_of_differences(kind: dict, rng):
     body, (x, v, w), theta = uneven(kind, rng)
-    by_both = body.curvature(x, v, w, theta).theta_theta[0]
+    by_both = body.second_derivatives(x, v, w, theta).theta_theta[0]
 
     def slope(at: np.ndarray) -> np.ndarray:
-        return body.curvature(x, v, w, at).theta[0]
+        return body.second_derivatives(x, v, w, at).theta[0]
 
     assert_derivative(slope, lambda d: by_both @ d, theta, rng, scale=share_steps(body))
 
@@ -162,8 +168,8 @@ def test_a_hidden_stiff_half_is_found():
     upper, lower = (np.log(field.value[part]).mean() for part in (z_m > 0.08, z_m < 0.04))
     assert np.exp(lower - upper) == pytest.approx(2.0, rel=0.15)
     assert held_share(field, 2.0) >= 0.9
-    assert field.told.mean() > 0.9
-    assert 5 < field.identified <= 20
+    assert field.is_informed.mean() > 0.9
+    assert 5 < field.identified_modes <= 20
 
 
 @pytest.mark.parametrize("method", [cs.InteriorPoint(), cs.Shooting()], ids=type)
@@ -191,8 +197,8 @@ def test_a_body_of_another_size_moves_a_field_as_its_budget_says():
     ]
     moved = np.subtract(*(solution.q for solution in reversed(solutions)))
     fitted = solutions[0]
-    changes = assumed(fitted.collocation, fitted.z, {"body_scale": larger})
-    told = shifts(linearised_fit(fitted.collocation, fitted.z), changes.blocks)
+    changes = changes_of_assumptions(fitted.collocation, fitted.z, {"body_scale": larger})
+    told = estimate_changes(linearise_fit(fitted.collocation, fitted.z), changes.blocks)
     size = changes.names.index("body_scale")
     assert np.abs(moved).max() > 0.05
     np.testing.assert_allclose(moved, -told[: len(moved), size], atol=0.03 * np.abs(moved).max())
@@ -215,9 +221,9 @@ def weighed() -> tuple[cs.Solution, FieldEstimate]:
     unknown = {**KNOWN, "young_pa": cs.Unknown(0.7 * YOUNG_PA)}
     solution = cs.solve(cs.Problem([seen], unknown, substeps=1))
     collocation = solution.collocation
-    known = covariance(collocation, solution.z)
-    body = collocation.segments[0].body
-    (field,) = fields_of(body, collocation.parameters, solution.q, known)
+    known = uncertainty_at(collocation, solution.z)
+    body = collocation.transcriptions[0].body
+    (field,) = field_estimates(body, collocation.parameters, solution.q, known)
     return solution, field
 
 
@@ -226,8 +232,8 @@ def test_a_heavier_half_is_found_beside_the_stiffness():
     assert solution.status.converged
     z_m, light = centres(bar())[:, 2], 200.0 / (1 + HEAVY)
     truth = light * np.where(z_m < 0.06, HEAVY, 1.0)
-    low, high = field.ci95
-    told = field.told
+    low, high = field.statistical95
+    told = field.is_informed
     assert told.mean() > 0.5
     assert np.mean((low < truth) & (truth < high)) > 0.9
     upper, lower = (field.value[part].mean() for part in (z_m > 0.08, z_m < 0.04))
@@ -238,8 +244,12 @@ def test_a_heavier_half_is_found_beside_the_stiffness():
 def test_a_field_of_density_weighs_what_its_shapes_say(rng):
     body = bar(OF_DENSITY)
     shares = rng.normal(size=20)
-    values = {**KNOWN, "young_pa": YOUNG_PA, **dict(zip(body.mode_names, shares, strict=True))}
-    mass_kg = body.mass_of_dofs(body.theta(values))[::3]
+    values = {
+        **KNOWN,
+        "young_pa": YOUNG_PA,
+        **dict(zip(body.field_coefficient_names, shares, strict=True)),
+    }
+    mass_kg = body.mass_of_dofs(body.theta_from_values(values))[::3]
     local = 100.0 * (1 + body.parts[0].field.shapes @ shares)
     expected = np.zeros(len(body.nodes_m))
     np.add.at(expected, body.cells, (local * body.mesh.volumes_m3 / 4)[:, None])
@@ -264,14 +274,14 @@ def test_an_answer_without_mass_somewhere_is_doubtful_and_says_why_it_cannot_be_
     assert "field/negative" not in [concern.code for concern in field.concerns]
     light = too_light(solution)
     collocation = light.collocation
-    (light_field,) = fields_of(
-        collocation.segments[0].body, collocation.parameters, light.q, np.eye(len(light.q))
+    (light_field,) = field_estimates(
+        collocation.transcriptions[0].body, collocation.parameters, light.q, np.eye(len(light.q))
     )
     concern = light_field.concerns[0]
     assert (concern.code, concern.grade) == ("field/negative", "doubtful")
-    assert "density_kg_m3 is not above zero in" in concern.sentence
+    assert "density_kg_m3 is not above zero in" in concern.message
     problem = cs.Problem(collocation.experiments, collocation.parameters, substeps=1)
-    said = roll_out(problem, problem.experiments[0], light)
+    said = simulate_experiment(problem, problem.experiments[0], light)
     assert isinstance(said, str)
     assert "expected masses above zero" in said
 
@@ -285,15 +295,15 @@ def test_a_solve_keeps_clear_of_masses_below_zero():
     body = bar(cs.Field(0.03, "density_kg_m3", 12, 0.5))
     seen = cs.with_markers(swung(body, steps=8), tracks)
     solution = cs.solve(cs.Problem([seen], values, substeps=1))
-    body = solution.collocation.segments[0].body
-    assert body.mass_of_dofs(body.theta(solution.parameters)).min() > 0
+    body = solution.collocation.transcriptions[0].body
+    assert body.mass_of_dofs(body.theta_from_values(solution.parameters)).min() > 0
 
 
 def test_densities_by_the_default_amplitude_have_masses_above_zero(rng):
     body = bar(cs.Field(0.03, "density_kg_m3", 30))
     for _ in range(200):
-        shares = dict(zip(body.mode_names, rng.normal(size=30), strict=True))
-        theta = body.theta({**KNOWN, "young_pa": YOUNG_PA, **shares})
+        shares = dict(zip(body.field_coefficient_names, rng.normal(size=30), strict=True))
+        theta = body.theta_from_values({**KNOWN, "young_pa": YOUNG_PA, **shares})
         assert body.mass_of_dofs(theta).min() > 0
 
 
@@ -306,8 +316,8 @@ def test_an_even_body_is_found_even():
 def test_what_does_not_deform_is_as_the_prior_has_it():
     field = found(1.0, 0.055)
     above = (bar().nodes_m[bar().cells, 2] > 0.055).all(axis=1)
-    assert field.over_prior[above & (centres(bar())[:, 2] > 0.1)].min() > 0.9
-    assert field.over_prior[~above].max() < 0.5
+    assert field.deviation_over_prior[above & (centres(bar())[:, 2] > 0.1)].min() > 0.9
+    assert field.deviation_over_prior[~above].max() < 0.5
 
 
 def test_an_amplitude_that_is_too_small_is_told():
@@ -330,12 +340,12 @@ def test_evidence_is_that_of_a_normal_marginal_likelihood(rng):
         return -float(data @ np.linalg.solve(total, data) + np.linalg.slogdet(total)[1]) / 2
 
     beyond = replace(field, covariance=2 * np.eye(6))  # the model misses by more than noise
-    assert beyond.likelier(factor=3.0) == 0.0
+    assert beyond.log_evidence_ratio(factor=3.0) == 0.0
     for length_m, factor in ((None, 3.0), (0.02, 1.0), (0.1, 0.5)):
-        other = modes if length_m is None else modes.at(length_m)
+        other = modes if length_m is None else modes.with_length(length_m)
         turn = factor * np.linalg.lstsq(modes.shapes, other.shapes, rcond=None)[0]
         expected = exact(turn @ turn.T) - exact(np.eye(6))
-        assert field.likelier(length_m, factor) == pytest.approx(expected, abs=1e-6)
+        assert field.log_evidence_ratio(length_m, factor) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -391,7 +401,7 @@ def test_a_run_folder_has_the_field_in_every_element(tmp_path):
     run.save(tmp_path / "run")
     result, (replay,) = read_run(tmp_path / "run")
     stored, field = replay.fields["young_pa"], run.fields["young_pa"]
-    assert result.fields["young_pa"].identified == field.identified
+    assert result.fields["young_pa"].identified == field.identified_modes
     np.testing.assert_array_equal(stored[field.cells, 0], field.value)
     assert (stored[:, 1] < stored[:, 0]).all()
     assert (stored[:, 0] < stored[:, 2]).all()
@@ -438,12 +448,12 @@ def _brightness(figure: Figure) -> float:
 def test_a_finer_mesh_has_the_same_field():
     core = cs.Region("core", np.arange(30), field=cs.Field((0.02, 0.04), "mu_pa", 3))
     body = bar(cs.Field(0.05, modes=4), regions=[core])
-    body = body.with_lengths(body.lengths_m | {"core.mu_pa": 0.04})
-    finer = refined(body)
-    assert finer.lengths_m == {"young_pa": 0.05, "core.mu_pa": 0.04}
+    body = body.with_field_lengths(body.field_lengths_m | {"core.mu_pa": 0.04})
+    finer = refine_body(body)
+    assert finer.field_lengths_m == {"young_pa": 0.05, "core.mu_pa": 0.04}
     for coarse, fine in zip(body.parts, finer.parts, strict=True):
         np.testing.assert_array_equal(fine.field.shapes, np.repeat(coarse.field.shapes, 8, axis=0))
-    shares = dict.fromkeys(body.mode_names, 0.3)
+    shares = dict.fromkeys(body.field_coefficient_names, 0.3)
     values = {"poisson": 0.3, **shares, "young_pa": YOUNG_PA}
     stretched = np.diag([1.02, 0.99, 1.05])
     energies = [
@@ -477,7 +487,7 @@ def test_a_file_states_fields_of_the_body_and_of_a_region(tiny: Path):
 @pytest.mark.parametrize(("length_m", "codes"), [(0.05, []), (0.003, ["field/shapes"])])
 def test_a_check_tells_what_the_shapes_can_show(length_m: float, codes: list[str]):
     body = bar(cs.Field(length_m, modes=10))
-    seen = body_finding(body, body.theta({**KNOWN, "young_pa": YOUNG_PA}), ("swing",))
+    seen = check_body(body, body.theta_from_values({**KNOWN, "young_pa": YOUNG_PA}), ("swing",))
     assert [each.code for each in seen.concerns if each.topic == "field"] == codes
     assert seen.fields["young_pa"].modes == 10
     assert "field_1" not in seen.guess

@@ -18,9 +18,9 @@ from collocation_sysid.fem.selection import Box
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameters, Unknown
-from collocation_sysid.program.block_band import whole
+from collocation_sysid.program.block_band import full_matrix
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.segment import Segment
+from collocation_sysid.program.segment import Transcription
 from collocation_sysid.recording import Experiment, Force, Markers, Nuisance, PointMass
 
 # Of a tendon whose tension grows and a pressure that stays.
@@ -61,10 +61,13 @@ def foundation(x, v, at, bed_n_m3, whirl_n_m3):
 def cube_in_air() -> Collocation:
     """A hung cube with forces of a user, on all of its nodes and on some."""
     old = hung_cube(8)
-    forces = [NodeForce.of(drag), NodeForce.of(foundation, nodes=nodes_where(old.body, 2, 0.0))]
+    forces = [
+        NodeForce.from_law(drag),
+        NodeForce.from_law(foundation, nodes=nodes_where(old.body, 2, 0.0)),
+    ]
     body = Body(old.body.mesh, density_kg_m3=30.0, forces=forces)
     given = {"drag_coefficient": 1.1, "bed_n_m3": 900.0, "whirl_n_m3": 4e4}
-    known = Parameters.of({name: Unknown(value) for name, value in given.items()})
+    known = Parameters.from_mapping({name: Unknown(value) for name, value in given.items()})
     return Collocation([replace(old, body=body)], Parameters((*GUESS.items, *known.items)))
 
 
@@ -78,11 +81,11 @@ def breath(x, v, at, breath_pa, brake_pa_s_m):
 def breathed(element: str) -> Collocation:
     """A hung cube with a force of a user on some of its faces."""
     old = hung_cube(8, (1, 1, 2))
-    force = NodeForce.of(breath, nodes=Box((-1, -1, -1), (1, 1, 0.051)), on="faces")
+    force = NodeForce.from_law(breath, nodes=Box((-1, -1, -1), (1, 1, 0.051)), on="faces")
     body = Body(old.body.mesh, density_kg_m3=30.0, element=element, forces=[force])
     markers = Markers(old.t_s, np.zeros((9, 1, 3)), 1e-3, places_m=[[0.1, 0.1, 0.0]])
     grasp = replace(old.grasps[0], nodes=nodes_where(body, 2, 0.1), selection=None)
-    known = Parameters.of({"breath_pa": Unknown(3.0), "brake_pa_s_m": Unknown(2.0)})
+    known = Parameters.from_mapping({"breath_pa": Unknown(3.0), "brake_pa_s_m": Unknown(2.0)})
     experiment = replace(old, body=body, grasps=[grasp], markers=markers)
     return Collocation([experiment], Parameters((*GUESS.items, *known.items)))
 
@@ -100,64 +103,70 @@ CASES = {
 
 
 @pytest.fixture(params=CASES)
-def segment(request) -> Segment:
-    return CASES[request.param]().segments[0]
+def segment(request) -> Transcription:
+    return CASES[request.param]().transcriptions[0]
 
 
-def states(segment: Segment, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def states(segment: Transcription, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities at the evaluations of `ROWS`."""
     nodes_m = segment.body.nodes_m.ravel()
-    count = len(range(*ROWS.indices(segment.grid_rows)))
+    count = len(range(*ROWS.indices(segment.grid_times)))
     xi = nodes_m + rng.normal(scale=2e-4, size=(count, len(nodes_m)))
     return xi, 0.1 * rng.normal(size=xi.shape)
 
 
-def some_inputs(segment: Segment, rng: np.random.Generator) -> np.ndarray:
+def some_inputs(segment: Transcription, rng: np.random.Generator) -> np.ndarray:
     """U (T, U), shaken."""
-    p = np.concatenate([segment.parameters.guess_q, np.zeros(len(segment.nuisance.moving))])
-    u = segment.inputs.at(p)[0][ROWS]
+    p = np.concatenate([segment.parameters.guess_q, np.zeros(len(segment.nuisance.motion_indices))])
+    u = segment.inputs.evaluate_at(p)[0][ROWS]
     return u * (1 + 0.1 * rng.normal(size=u.shape[1]))
 
 
-def forces_at(segment: Segment, u: np.ndarray) -> Forces:
+def forces_at(segment: Transcription, u: np.ndarray) -> Forces:
     """The forces at inputs."""
-    whole = np.broadcast_to(u[0], (segment.grid_rows, u.shape[1])).copy()
+    whole = np.broadcast_to(u[0], (segment.grid_times, u.shape[1])).copy()
     whole[ROWS] = u
-    return segment.dynamics.at(whole).forces.rows(ROWS)
+    return segment.dynamics.with_inputs(whole).forces.at_times(ROWS)
 
 
 def test_tendons_and_pressures_are_lengths_and_volumes_times_what_drives_them(rng):
-    xi = states(Collocation([BAR], GUESS).segments[0], rng)[0][:2]
+    xi = states(Collocation([BAR], GUESS).transcriptions[0], rng)[0][:2]
     tendon, pressure = BAR.actuators
     expected = -tension_n(FROM_S)[:, None] * tendon.measure.gradient(xi)
     expected += 20.0 * pressure.measure.gradient(xi)
     given = States(xi, np.zeros_like(xi), np.zeros(0))
-    found = sum(term.force(given) for term in Forces.of(BAR, FROM_S).further)
+    found = sum(term.force(given) for term in Forces.from_experiment(BAR, FROM_S).external_terms)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_what_is_lost_and_a_factor_count_and_a_tendon_only_pulls():
     tendon, pressure = BAR.actuators
     stated = tension_n(FROM_S)
-    np.testing.assert_allclose(tendon.off_by(1.2, 0.003).amplitude(FROM_S), 1.2 * stated - 0.003)
-    np.testing.assert_array_equal(tendon.off_by(1.0, 1.0).amplitude(FROM_S), 0.0)
-    np.testing.assert_allclose(pressure.off_by(0.9, 2.0).amplitude(FROM_S), -(0.9 * 20.0 - 2.0))
+    np.testing.assert_allclose(
+        tendon.with_factor_and_offset(1.2, 0.003).energy_amplitude_at(FROM_S), 1.2 * stated - 0.003
+    )
+    np.testing.assert_array_equal(
+        tendon.with_factor_and_offset(1.0, 1.0).energy_amplitude_at(FROM_S), 0.0
+    )
+    np.testing.assert_allclose(
+        pressure.with_factor_and_offset(0.9, 2.0).energy_amplitude_at(FROM_S), -(0.9 * 20.0 - 2.0)
+    )
 
 
 def test_forces_on_the_way_to_other_times_lie_between_them(segment, rng):
     x, v = states(segment, rng)
     theta = segment.constants.theta(segment.parameters.guess_q)
-    here, there = (Forces.of(segment.experiment, t_s, theta) for t_s in (FROM_S, TO_S))
+    here, there = (Forces.from_experiment(segment.experiment, t_s, theta) for t_s in (FROM_S, TO_S))
     ends = [each.total(x[:2], v[:2]) for each in (here, there)]
     for share in (0.0, SHARE, 1.0):
-        found = here.towards(there, share).total(x[:2], v[:2])
+        found = here.interpolate(there, share).total(x[:2], v[:2])
         np.testing.assert_allclose(found, (1 - share) * ends[0] + share * ends[1], atol=1e-12)
 
 
 def test_a_share_is_one_of_all_that_acts(segment, rng):
     x, _ = states(segment, rng)
     theta, still = segment.constants.theta(segment.parameters.guess_q), np.zeros_like(x[:2])
-    whole = Forces.of(segment.experiment, FROM_S, theta)
+    whole = Forces.from_experiment(segment.experiment, FROM_S, theta)
     internal = segment.body.force(x[:2], still, theta)
     outer = whole.total(x[:2], still) - internal
     found = whole.scaled(SHARE).total(x[:2], still) - internal
@@ -168,7 +177,7 @@ def test_a_share_is_one_of_all_that_acts(segment, rng):
 def matrix_times(forces: Forces, lower: np.ndarray, skew: np.ndarray, ways: np.ndarray):
     """(T, 3n) products with matrices given by symmetric and skew parts."""
     parts = zip(lower, skew, ways, strict=True)
-    return np.stack([whole(forces.pattern, a, b) @ way for a, b, way in parts])
+    return np.stack([full_matrix(forces.pattern, a, b) @ way for a, b, way in parts])
 
 
 def test_slopes_of_forces_are_those_of_what_they_are(segment, rng):
@@ -199,7 +208,7 @@ def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
     (xi, nu), u = states(segment, rng), some_inputs(segment, rng)
     w = rng.normal(size=xi.shape)
     forces = forces_at(segment, u)
-    at = forces.curvature(xi, nu, w)
+    at = forces.weighted_hessian(xi, nu, w)
     none = np.zeros((len(xi), 0))
 
     def slopes(x: np.ndarray, v: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -263,7 +272,7 @@ def test_without_any_nothing_is_added():
     body = hung_cube().body
     x = body.nodes_m.ravel()[None]
     theta = np.array([1e3, 1e3, 0.0, 0.0])
-    alone = Forces.on(body, theta)
+    alone = Forces.of_body_alone(body, theta)
     np.testing.assert_array_equal(alone.total(x, 0 * x), body.force(x, 0 * x, theta))
     assert alone.linearise(x, 0 * x).by_theta.shape[2] == len(theta)
 
@@ -272,11 +281,17 @@ def test_without_any_nothing_is_added():
 def test_a_pressure_on_all_faces_is_what_grows_the_volume_inside(element, rng):
     """It has no resultant, and its work is what it grows; a tetrahedron of flat faces is exact."""
     mesh = hung_cube(2).body.mesh
-    force = NodeForce.of(lambda x, v, at, inner_pa: inner_pa * at.area_m2 * at.normal, on="faces")
+    force = NodeForce.from_law(
+        lambda x, v, at, inner_pa: inner_pa * at.area_m2 * at.normal, on="faces"
+    )
     body = Body(mesh, density_kg_m3=30.0, element=element, forces=[force])
     theta = np.array([1e-9, 1e-9, 0.0, 0.0, 7.0])
     x = body.nodes_m + rng.normal(scale=2e-3, size=body.nodes_m.shape)
-    total = Forces.on(body, theta).total(x.reshape(1, -1), np.zeros((1, x.size))).reshape(-1, 3)
+    total = (
+        Forces.of_body_alone(body, theta)
+        .total(x.reshape(1, -1), np.zeros((1, x.size)))
+        .reshape(-1, 3)
+    )
     np.testing.assert_allclose(total.sum(axis=0), 0.0, atol=1e-12)
     if element == "tet4":
         grown = np.einsum("ij,ij->", total, x)  # 3 p V, V being of third degree
@@ -285,11 +300,13 @@ def test_a_pressure_on_all_faces_is_what_grows_the_volume_inside(element, rng):
 
 def test_a_force_on_faces_that_are_not_there_is_refused():
     inside = Box((0.04, 0.04, 0.04), (0.06, 0.06, 0.06))
-    force = NodeForce.of(breath, nodes=inside, on="faces")
+    force = NodeForce.from_law(breath, nodes=inside, on="faces")
     with pytest.raises(InputError, match="'breath' is on faces, but none of the surface"):
-        Forces.on(Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]), np.zeros(1))
+        Forces.of_body_alone(
+            Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]), np.zeros(1)
+        )
     with pytest.raises(InputError, match="on 'edges'; expected one of nodes, faces"):
-        NodeForce.of(breath, on="edges")  # pyright: ignore[reportArgumentType]
+        NodeForce.from_law(breath, on="edges")  # pyright: ignore[reportArgumentType]
 
 
 def volumes(points_m: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:

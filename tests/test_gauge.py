@@ -72,15 +72,17 @@ def swung(steps: int = 24) -> Experiment:
     inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
     gauges = accelerometer(inner), strain_gauge(cube.t_s[::2])
     made = replace(cube, markers=Markers.none(cube.t_s), readings=gauges)
-    accelerations, strains = simulate(made, TRUTH, "midpoint", substeps=1).readings
+    accelerations, strains = simulate(made, TRUTH, "midpoint", substeps=1).custom_sensor_values
     return with_readings(made, [accelerations + np.array([0, 0, 0.3]), 1.04 * strains])
 
 
 def noisy(experiment: Experiment) -> Experiment:
     rng = np.random.default_rng(0)
     read = [
-        np.where(rng.random(g.measured.shape) < 0.1, np.nan, 3 * g.sigma * rng.normal(size=(1,)))
-        + g.measured
+        np.where(
+            rng.random(g.measured_values.shape) < 0.1, np.nan, 3 * g.sigma * rng.normal(size=(1,))
+        )
+        + g.measured_values
         for g in experiment.readings
     ]
     return with_readings(experiment, read)
@@ -90,8 +92,12 @@ def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
     cube = replace(hung_cube(20), nuisance=IDEAL)
     top = cube.grasps[0].nodes[0]
     at_top = accelerometer(cube.t_s, points_m=cube.body.nodes_m[[top]])
-    (found,) = simulate(instrumented(cube, at_top), TRUTH, "midpoint", substeps=1).readings
-    carried = cube.grasps[0].carry(cube.body.nodes_m, np.linspace(0, cube.t_s[-1], 2001))[:, 0]
+    (found,) = simulate(
+        instrumented(cube, at_top), TRUTH, "midpoint", substeps=1
+    ).custom_sensor_values
+    carried = cube.grasps[0].positions_at(cube.body.nodes_m, np.linspace(0, cube.t_s[-1], 2001))[
+        :, 0
+    ]
     expected = np.gradient(np.gradient(carried, axis=0), axis=0)[::100] / (cube.t_s[-1] / 2000) ** 2
     inside = slice(3, -3)
     error = np.abs(found - expected - [0, 0, 9.81])[inside].max()
@@ -121,7 +127,7 @@ def test_a_static_experiment_is_read_too():
     low, high = static.body.nodes_m.min(axis=0), static.body.nodes_m.max(axis=0)
     ends = [(low + high) / 2, [*((low + high) / 2)[:2], high[2]]]
     foil = replace(strain_gauge(static.t_s), points_m=ends)
-    (found,) = simulate(instrumented(static, foil), TRUTH).readings
+    (found,) = simulate(instrumented(static, foil), TRUTH).custom_sensor_values
     positions = simulate(static, TRUTH).positions_m
     assert np.ptp(found) > 0
     assert len(found) == len(positions)
@@ -173,7 +179,7 @@ def test_what_a_reading_lacks_is_said(changes: dict, words: str):
 def test_a_grasp_has_a_number_from_one_on():
     cube = hung_cube(9)
     last = replace(accelerometer(cube.t_s), points_m=(), grasp=1, **CLAMPED)
-    assert instrumented(cube, last).sensed == (0,)
+    assert instrumented(cube, last).instrumented_grasps == (0,)
     with pytest.raises(
         InputError, match="looks at grasp 0; expected the number of a grasp, 1 to 1"
     ):
@@ -203,7 +209,7 @@ def clamped(steps: int = 16) -> Experiment:
     inner = np.linspace(cube.t_s[2], cube.t_s[-3], 2 * steps)
     cell = Gauge("cell", pull, inner, np.zeros(len(inner)), 1e-3, unknowns={"gain": 0.1}, grasp=1)
     made = replace(cube, markers=Markers.none(cube.t_s), readings=[cell, strain_gauge(cube.t_s)])
-    felt, strains = simulate(made, TRUTH, "midpoint", substeps=1).readings
+    felt, strains = simulate(made, TRUTH, "midpoint", substeps=1).custom_sensor_values
     return with_readings(made, [1.05 * felt, 1.04 * strains])
 
 
@@ -223,10 +229,10 @@ def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
         )
         made = replace(cube, grasps=[replace(grasp, wrench=wrench)], readings=[both])
         found = simulate(made, TRUTH, "midpoint", substeps=20)
-        there = np.isfinite(found.wrenches[0]) & np.isfinite(found.readings[0])
+        there = np.isfinite(found.wrenches[0]) & np.isfinite(found.custom_sensor_values[0])
         assert there.any(axis=0).all()
         size = np.nanmax(np.abs(found.wrenches[0]))
-        assert np.abs(found.wrenches[0] - found.readings[0])[there].max() < 1e-4 * size
+        assert np.abs(found.wrenches[0] - found.custom_sensor_values[0])[there].max() < 1e-4 * size
 
 
 @pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.recording import Grasp, PoseSequence, held_nodes
+from collocation_sysid.recording import Grasp, PoseSequence, prescribed_nodes
 
 POINTS = np.array([[0.1, 0.0, 0.0], [0.0, 0.2, 0.3]])
 
@@ -163,7 +163,9 @@ def test_after_moves_by_the_matrix_first():
     body = gripper.after(of_body)
     in_gripper = POINTS @ of_body[:3, :3].T + of_body[:3, 3]
     np.testing.assert_allclose(
-        body.carry(POINTS, gripper.t_s), gripper.carry(in_gripper, gripper.t_s), atol=1e-14
+        body.carried_positions(POINTS, gripper.t_s),
+        gripper.carried_positions(in_gripper, gripper.t_s),
+        atol=1e-14,
     )
     quaternion = Rotation.from_matrix(of_body[:3, :3]).as_quat()
     by_pose = gripper.after(PoseSequence([0.0], [of_body[:3, 3]], [quaternion]))
@@ -195,7 +197,7 @@ def test_hold_is_not_fooled_by_rounding_of_the_time():
 
 def test_carry_rotates_then_moves_undeformed_points():
     poses = turning_poses()
-    carried = poses.carry(POINTS, [0.0, 0.4])
+    carried = poses.carried_positions(POINTS, [0.0, 0.4])
     assert carried.shape == (2, 2, 3)
     np.testing.assert_allclose(carried[0], POINTS)
     np.testing.assert_allclose(carried[1], [[0.4, 0.1, 0.0], [0.2, 0.0, 0.3]], atol=1e-14)
@@ -203,7 +205,9 @@ def test_carry_rotates_then_moves_undeformed_points():
 
 def test_fixed_leaves_points_alone_at_any_time():
     poses = PoseSequence.fixed()
-    np.testing.assert_array_equal(poses.carry(POINTS, [-1.0, 0.0, 9.0]), np.stack([POINTS] * 3))
+    np.testing.assert_array_equal(
+        poses.carried_positions(POINTS, [-1.0, 0.0, 9.0]), np.stack([POINTS] * 3)
+    )
 
 
 def test_a_single_pose_holds_for_all_time():
@@ -211,7 +215,7 @@ def test_a_single_pose_holds_for_all_time():
         np.array([2.0]), np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 1.0, 0.0]])
     )
     expected = POINTS * [-1, -1, 1] + [0, 0, 1]
-    np.testing.assert_allclose(poses.carry(POINTS, [0.0, 5.0])[1], expected, atol=1e-15)
+    np.testing.assert_allclose(poses.carried_positions(POINTS, [0.0, 5.0])[1], expected, atol=1e-15)
 
 
 @pytest.mark.parametrize(("interpolation", "off"), [("linear", 1e-12), ("smooth", 1e-3)])
@@ -310,12 +314,12 @@ def test_unusable_grasp_nodes_are_refused(nodes):
 def test_held_nodes_is_the_sorted_union():
     poses = PoseSequence.fixed()
     grasps = [Grasp(np.array([8, 1]), poses), Grasp(np.array([4]), poses)]
-    np.testing.assert_array_equal(held_nodes(grasps), [1, 4, 8])
-    assert held_nodes([]).shape == (0,)
+    np.testing.assert_array_equal(prescribed_nodes(grasps), [1, 4, 8])
+    assert prescribed_nodes([]).shape == (0,)
 
 
 def test_a_node_in_two_grasps_is_refused_by_name():
     poses = PoseSequence.fixed()
     grasps = [Grasp(np.array(nodes), poses) for nodes in ([9], [3, 1, 7], [7, 3])]
     with pytest.raises(InputError, match="node 3 is held by the grasps 2 and 3"):
-        held_nodes(grasps)
+        prescribed_nodes(grasps)

@@ -10,7 +10,12 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.runs.check.body import Hold, hold_concerns, hold_sentence, holds_of
+from collocation_sysid.runs.check.body import (
+    GraspCheck,
+    check_grasps,
+    grasp_concerns,
+    grasp_sentence,
+)
 
 # Layers of nodes are so far apart, so a tenth of an edge is 2 mm.
 EDGE_M = 0.02
@@ -21,7 +26,7 @@ CORNER = Box((-1, -1, 0.079), (0.021, 0.021, 1))
 Point = tuple[float, float, float]
 
 
-def held(region: Box, *moves: tuple[Point, Point], axes: str = "xyz") -> Hold:
+def held(region: Box, *moves: tuple[Point, Point], axes: str = "xyz") -> GraspCheck:
     """A cube of 100 mm held by a region, after some of its nodes were moved."""
     mesh = box_mesh((0.1, 0.1, 0.1), (5, 5, 5))
     points_m = mesh.points_m.copy()
@@ -33,7 +38,7 @@ def held(region: Box, *moves: tuple[Point, Point], axes: str = "xyz") -> Hold:
     if axes != "xyz":
         grasps.append(Grasp(BOTTOM, PoseSequence.fixed()))
     seen = vertex_markers(body, [100], t_s)
-    return holds_of(Experiment(body, t_s, grasps, seen, name="cube"), EDGE_M)[0]
+    return check_grasps(Experiment(body, t_s, grasps, seen, name="cube"), EDGE_M)[0]
 
 
 @pytest.mark.parametrize(
@@ -69,7 +74,7 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
 ):
     found = held(region, *moves)
     assert (found.nearly_held, found.nearly_free) == (nearly_held, nearly_free)
-    (said, *more) = [each.sentence for each in hold_concerns(found)] or [""]
+    (said, *more) = [each.message for each in grasp_concerns(found)] or [""]
     assert not more
     assert ("cuts through elements" in said) == bool(nearly_held + nearly_free)
     if said:
@@ -80,10 +85,10 @@ def test_nodes_beside_a_face_that_cuts_elements_are_counted(
 def test_a_grasp_is_told_with_its_nodes_its_size_and_where_it_is():
     found = held(CORNER)
     assert (found.nodes, found.share) == (8, 8 / 216)
-    assert hold_sentence(found) == (
+    assert grasp_sentence(found) == (
         "8 nodes, 4% of all, in a box of 20 × 20 × 20 mm at (0, 0, 80) mm"
     )
-    assert hold_sentence(held(TOP, axes="xz")) == (
+    assert grasp_sentence(held(TOP, axes="xz")) == (
         "72 nodes, 33% of all, in a box of 100 × 100 × 20 mm at (0, 0, 80) mm, "
         "held along x and z only"
     )

@@ -24,8 +24,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import (
     box_of_edge,
-    counts_of_box,
-    counts_of_cylinder,
+    count_box_elements,
+    count_cylinder_elements,
     cylinder_of_edge,
 )
 from collocation_sysid.problem import Problem, loading, size
@@ -295,8 +295,8 @@ def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(
 @pytest.mark.parametrize(
     ("made", "counts"),
     [
-        (box_of_edge((0.06, 0.05, 0.09), 0.01), counts_of_box((0.06, 0.05, 0.09), 0.01)),
-        (cylinder_of_edge(0.06, 0.09, 0.01), counts_of_cylinder(0.06, 0.09, 0.01)),
+        (box_of_edge((0.06, 0.05, 0.09), 0.01), count_box_elements((0.06, 0.05, 0.09), 0.01)),
+        (cylinder_of_edge(0.06, 0.09, 0.01), count_cylinder_elements(0.06, 0.09, 0.01)),
     ],
 )
 def test_generated_meshes_have_the_counts_that_were_expected(made: TetMesh, counts: tuple):

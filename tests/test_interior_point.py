@@ -29,20 +29,20 @@ from test_explicit import of_branches, swung
 from wrenches_small import sensed, wristed_cube
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.moduli import engineering
-from collocation_sysid.methods.condensed import condensed
+from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.methods.condensed import condense
 from collocation_sysid.methods.initial_point import NEAR, adjoint_multipliers
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.methods.start import carried_rigidly, initial_variables, placed_at_guess
+from collocation_sysid.methods.start import associated_at_guess, initial_variables, rigid_trajectory
 from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.collocation import Collocation, carried_over
+from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Markers, Nuisance
-from collocation_sysid.runs.warm_start import Earlier
+from collocation_sysid.runs.warm_start import WarmStart
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -103,14 +103,15 @@ def test_every_hessian_leads_to_the_same_answer(options: dict):
 def test_explicit_grasps_lead_to_the_same_answer(make):
     made = measured(make())
     answers = [
-        PRECISE(Collocation([made], GUESS, explicit_grasps=explicit)) for explicit in (False, True)
+        PRECISE(Collocation([made], GUESS, has_grasp_constraints=explicit))
+        for explicit in (False, True)
     ]
     np.testing.assert_allclose(answers[0].theta, answers[1].theta, rtol=1e-5)
     np.testing.assert_allclose(answers[0].positions_m[0], answers[1].positions_m[0], atol=1e-9)
 
 
 def test_fixed_parameters_stay_and_the_others_are_found():
-    fixed = [Parameter(name, TRUTH[name], fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
+    fixed = [Parameter(name, TRUTH[name], is_fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
     collocation = Collocation([measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed)))
     solution = PRECISE(collocation)
     assert np.abs(relative_errors(solution)).max() < 1e-5
@@ -126,21 +127,21 @@ def test_young_and_poisson_are_found_as_well():
         )
     )
     solution = PRECISE(Collocation([measured(hung_cube())], parameters))
-    young_pa, poisson = engineering(TRUTH["lambda_pa"], TRUTH["mu_pa"])
+    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
     assert solution.parameters["young_pa"] == pytest.approx(young_pa, rel=1e-5)
     assert solution.parameters["poisson"] == pytest.approx(poisson, rel=1e-5)
 
 
 def test_the_positions_satisfy_grasp_and_motion():
     solution = solved_cube()
-    segment = cube().segments[0]
+    segment = cube().transcriptions[0]
     positions = solution.positions_m[0]
     np.testing.assert_allclose(
-        positions.reshape(len(positions), -1)[:, segment.experiment.held_dofs],
-        segment.experiment.held_positions(segment.dynamics.t_s),
+        positions.reshape(len(positions), -1)[:, segment.experiment.prescribed_dofs],
+        segment.experiment.prescribed_positions(segment.dynamics.t_s),
         atol=1e-9,
     )
-    assert solution.multipliers.shape == (cube().constraints,)
+    assert solution.multipliers.shape == (cube().constraint_count,)
 
 
 # The start
@@ -155,8 +156,8 @@ def soft_guess() -> Parameters:
 def test_a_guess_that_cannot_be_simulated_starts_from_the_rigid_shape():
     collocation = Collocation([measured(hung_cube())], soft_guess())
     start, notes = initial_variables(collocation)
-    segment = collocation.segments[0]
-    expected = carried_rigidly(segment, as_theta(soft_guess()))
+    segment = collocation.transcriptions[0]
+    expected = rigid_trajectory(segment, as_theta(soft_guess()))
     np.testing.assert_allclose(collocation.unpack(start)[1][0], expected, atol=1e-15)
     assert len(notes) == 1
     assert notes[0].startswith("experiment 'hung cube': the simulation at the guess failed (")
@@ -174,11 +175,11 @@ def test_a_guess_that_can_be_simulated_starts_on_the_constraints():
 
 
 def test_the_start_shape_is_carried_with_the_grasp():
-    segment = cube().segments[0]
-    x = carried_rigidly(segment, as_theta(TRUTH)).reshape(segment.grid_rows, -1, 3)
+    segment = cube().transcriptions[0]
+    x = rigid_trajectory(segment, as_theta(TRUTH)).reshape(segment.grid_times, -1, 3)
     np.testing.assert_allclose(
-        x.reshape(len(x), -1)[:, segment.experiment.held_dofs],
-        segment.experiment.held_positions(segment.dynamics.t_s),
+        x.reshape(len(x), -1)[:, segment.experiment.prescribed_dofs],
+        segment.experiment.prescribed_positions(segment.dynamics.t_s),
         atol=1e-12,
     )
     lengths = np.linalg.norm(x - x[:, :1], axis=2)
@@ -259,14 +260,14 @@ def test_initial_multipliers_balance_the_lagrangian(name: str):
     given = {k: Unknown(v, 0.1 * v, 10 * v) for k, v in truth.items()}
     collocation = Problem([make()], given, scheme="midpoint").collocation()
     z, _ = initial_variables(collocation)
-    program = condensed(collocation.made_explicit())
+    program = condense(collocation.with_lifted_variables())
     found = adjoint_multipliers(program, collocation, z)
     assert found is not None
-    at = carried_over(z, collocation, program)
+    at = convert_variables(z, collocation, program)
     slope = program.gradient(at) + program.jacobian(at).T @ found.constraints
     lower, upper = program.bounds()
-    of_p = np.zeros(program.variables, dtype=bool)
-    of_p[: program.nq] = of_p[program.of_phi] = True
+    of_p = np.zeros(program.variable_count, dtype=bool)
+    of_p[: program.nq] = of_p[program.phi_columns] = True
     scale = np.abs(program.gradient(at)).max()
     assert np.abs(slope[~of_p & (lower < upper)]).max() < 1e-8 * scale
     bounded = of_p & (np.isfinite(lower) | np.isfinite(upper))
@@ -282,7 +283,7 @@ def soft_bar(divisions: tuple[int, int, int] = (4, 1, 1), samples: int = 31) -> 
 
 def alone_from_the_guess(problem: Problem) -> Solution:
     """IPOPT from the simulation at the guess, with unknown places where that has them."""
-    return ALONE(placed_at_guess(problem.collocation()))
+    return ALONE(associated_at_guess(problem.collocation()))
 
 
 def test_distant_guesses_lead_to_the_optimum_of_reduced_space():
@@ -334,7 +335,7 @@ def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
 
 def test_a_start_with_finer_steps_is_continued_with_these():
     problem = soft_bar()
-    answer = Earlier.of(ReducedSpace()(replace(problem, substeps=2).collocation()))
+    answer = WarmStart.of(ReducedSpace()(replace(problem, substeps=2).collocation()))
     assert answer.substeps == 2
     assert solve(problem, start=answer).collocation.substeps == 2
     assert solve(replace(problem, substeps=1), start=answer).collocation.substeps == 1
@@ -394,7 +395,7 @@ def test_the_iteration_limit_is_a_status_and_violations_are_listed():
     assert solution.message.endswith("(IPOPT: Maximum_Iterations_Exceeded)")
     worst = solution.largest_violations[0]
     assert worst.experiment == "hung cube"
-    assert abs(worst.newtons) == pytest.approx(solution.max_violation_n)
+    assert abs(worst.residual_n) == pytest.approx(solution.max_violation_n)
     assert 1e-8 < solution.max_violation_relative < 1
 
 
@@ -524,7 +525,7 @@ def test_the_history_counts_iterations_and_ends_at_the_answer():
     assert (np.diff([iteration.time_s for iteration in seen]) >= 0).all()
     np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
     np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)
-    loss = cube().objective(solution.z) * cube().measurements
+    loss = cube().objective(solution.z) * cube().measurement_count
     assert seen[-1].loss == pytest.approx(loss)
 
 

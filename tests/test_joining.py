@@ -21,11 +21,11 @@ from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOption
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
-from collocation_sysid.recording.loads import ramp
+from collocation_sysid.recording.loads import smooth_ramp
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import uncertainty_of
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 TIP = nodes_where(box(), 2, 0.0)
 DAMPING = ("gamma_r_s", "gamma_m_1_s")
@@ -55,8 +55,8 @@ def with_noise(experiment: Experiment, seed: int) -> Experiment:
 @pytest.mark.parametrize("late", [0.0, 0.17, 0.5, 0.99])
 def test_shares_of_what_joins_between_two_steps_add_up_to_the_time_left(late: float):
     u = np.arange(-5.0, 6.0) - late
-    assert ramp(u).sum() == pytest.approx(5.5 - late)
-    below, above = ramp(u - 1e-6), ramp(u + 1e-6)
+    assert smooth_ramp(u).sum() == pytest.approx(5.5 - late)
+    below, above = smooth_ramp(u - 1e-6), smooth_ramp(u + 1e-6)
     hat = np.maximum(0.0, 1 - np.abs(u))
     np.testing.assert_allclose((above - below) / 2e-6, hat, atol=1e-6)
 
@@ -74,7 +74,7 @@ def test_what_joins_in_free_fall_falls_along(integrator: str):
 
 def test_a_load_may_leave_again():
     for_a_while = hung_cube(8, masses=(PointMass(TIP, 0.05, 0.02, until_s=0.05),))
-    mass = for_a_while.node_mass_kg([0.0, 0.035, 0.07])[:, TIP[0]]
+    mass = for_a_while.moving_node_mass_kg([0.0, 0.035, 0.07])[:, TIP[0]]
     own = for_a_while.body.node_mass[TIP[0]]
     np.testing.assert_allclose(mass - own, [0.0, 0.05 / len(TIP), 0.0])
     with pytest.raises(InputError, match=r"from 2 s until 1 s; expected from_s < until_s"):
@@ -84,8 +84,11 @@ def test_a_load_may_leave_again():
 def test_a_load_from_before_the_recording_is_there_from_the_start():
     always, before = (hung_cube(8, masses=(PointMass(TIP, 0.05, t),)) for t in (-np.inf, 0.0))
     t_s = always.t_s
-    np.testing.assert_array_equal(always.node_mass_kg(t_s), before.node_mass_kg(t_s))
-    assert NuisanceMap.of(replace(before, nuisance=Nuisance.none(joining_s=0.01))).size == 0
+    np.testing.assert_array_equal(always.moving_node_mass_kg(t_s), before.moving_node_mass_kg(t_s))
+    assert (
+        NuisanceMap.from_experiment(replace(before, nuisance=Nuisance.none(joining_s=0.01))).size
+        == 0
+    )
 
 
 def test_the_scheme_keeps_its_order_where_a_mass_joins():
@@ -101,14 +104,17 @@ def test_the_scheme_keeps_its_order_where_a_mass_joins():
 
 def test_the_estimated_time_acts_as_if_it_were_stated():
     bar = bar_loaded(8)
-    (segment,) = Collocation([bar], GUESS).segments
+    (segment,) = Collocation([bar], GUESS).transcriptions
     phi = np.array([0.3, -0.5, 1.3, -0.7, 0.4, 0.9])
-    moved, really = segment.setting(GUESS.guess_q, phi).dynamics, segment.corrected(phi)
+    moved, really = (
+        segment.equations_at(GUESS.guess_q, phi).dynamics,
+        segment.corrected_experiment(phi),
+    )
     stated = replace(segment, experiment=replace(really, nuisance=IDEAL)).dynamics
     assert really.masses[0].from_s == pytest.approx(bar.masses[0].from_s + 1.3 * 0.004)
-    np.testing.assert_allclose(moved.mass.kg, stated.mass.kg, atol=1e-15)
+    np.testing.assert_allclose(moved.mass.inertia_kg, stated.mass.inertia_kg, atol=1e-15)
     both = moved.forces, stated.forces
-    np.testing.assert_allclose(*(each.mass.kg for each in both), atol=1e-15)
+    np.testing.assert_allclose(*(each.mass.inertia_kg for each in both), atol=1e-15)
     np.testing.assert_allclose(*(each.weight.external_n for each in both), atol=1e-15)
 
 
@@ -121,7 +127,7 @@ def test_the_time_is_found_beside_the_material(method: str):
     precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-5))
     solution = solve(Problem([replace(cube, markers=precise)], GUESS), method)
     assert solution.status.converged
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     assert 0.01 * part.phi[0] == pytest.approx(0.0034, abs=1e-5)
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
@@ -131,10 +137,10 @@ def test_errors_of_the_time_are_as_large_as_its_deviation_says():
     for seed in range(5):
         collocation = Collocation([with_noise(exact, seed)], GUESS)
         found = ReducedSpace()(collocation)
-        fit = linearised_fit(collocation, found.z)
-        uncertainty = uncertainty_of(fit, GUESS, found.q)
-        (name,) = collocation.segments[0].nuisance.names
-        (part,) = collocation.parts(found.z)
+        fit = linearise_fit(collocation, found.z)
+        uncertainty = uncertainty_from_fit(fit, GUESS, found.q)
+        (name,) = collocation.transcriptions[0].nuisance.names
+        (part,) = collocation.iterates(found.z)
         scores.append((part.phi[0] - 0.34) / uncertainty.nuisance[name])
     # χ² of five, beyond which one in a thousand lies on either side.
     assert 0.21 < np.sum(np.square(scores)) < 20.5

@@ -19,7 +19,7 @@ from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.program.block_band import whole
+from collocation_sysid.program.block_band import full_matrix
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment
 
@@ -58,7 +58,7 @@ def damping_force(body: Body, x: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def times(body: Body, lower: np.ndarray, skew: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Product with a matrix of one state, given by symmetric and skew part."""
-    return (whole(body.pattern, lower, skew) @ vector.ravel())[None]
+    return (full_matrix(body.pattern, lower, skew) @ vector.ravel())[None]
 
 
 # What the force is -----------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def test_linearise_gives_the_slopes_of_the_force(material, element, evaluator, r
 def test_curvature_gives_the_slopes_of_the_weighted_slopes(element, evaluator, rng):
     body = small_body("neo-hookean", element, evaluator)
     theta, (x, v), (_, w) = theta_for(body), state(body, rng), state(body, rng)
-    at = body.curvature(x, v, w, theta)
+    at = body.second_derivatives(x, v, w, theta)
     none = np.zeros(0)
 
     def by_position(x, v, theta):
@@ -253,7 +253,7 @@ def momenta(body: Body, x: np.ndarray, step_s: float) -> np.ndarray:
     Marsden & West 2001, sec. 2.6: Σ x_t × p_t is what it keeps where no torque acts.
     """
     v, middle = np.diff(x, axis=0) / step_s, (x[1:] + x[:-1]) / 2
-    force = body.force(middle, v, body.theta(CONSTANTS | {"gamma_r_s": 5e-3}))
+    force = body.force(middle, v, body.theta_from_values(CONSTANTS | {"gamma_r_s": 5e-3}))
     return body.node_mass[:, None] * v + step_s / 2 * force.reshape(v.shape)
 
 

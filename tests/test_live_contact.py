@@ -11,8 +11,8 @@ from problems_small import nodes_where
 from test_live import NO_TIME, frames_of
 
 import collocation_sysid as cs
-from collocation_sysid.live.estimator import Estimator
-from collocation_sysid.live.model import Model
+from collocation_sysid.live.estimator import LiveEstimator
+from collocation_sysid.live.model import LiveModel
 
 TRUTH = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.3}
 UNKNOWN = {"young_pa": cs.Unknown(8e3), "gamma_r_s": cs.Unknown(0.015)}
@@ -50,7 +50,7 @@ def touching(name: str, nuisance: cs.Nuisance) -> cs.Problem:
         (table,) = seen_there.obstacles
         table = replace(table, wrench=replace(forces, values=felt))
         seen_there = seen_there.with_obstacles([table])
-    known = cs.Parameters.of({**TRUTH, **UNKNOWN, **sought})
+    known = cs.Parameters.from_mapping({**TRUTH, **UNKNOWN, **sought})
     return cs.Problem([seen_there], known, scheme="bdf2")
 
 
@@ -69,11 +69,11 @@ def solved(name: str) -> tuple[cs.Problem, cs.Run]:
 @pytest.mark.parametrize("name", CASES)
 def test_what_touches_the_body_is_followed_to_where_the_batch_ends(name: str):
     problem, batch = solved(name)
-    live = Estimator(problem, NO_TIME)
+    live = LiveEstimator(problem, NO_TIME)
     live.budget_s = np.inf
     for frame in frames_of(problem, live):
-        update = live.take(frame)
-    settled = live.settle()
+        update = live.process_frame(frame)
+    settled = live.finish()
     assert settled is not None
     for parameter in (item.name for item in problem.parameters.free):
         known, last = batch.estimates[parameter], update.estimates[parameter]
@@ -86,4 +86,4 @@ def test_what_touches_the_body_is_followed_to_where_the_batch_ends(name: str):
 def test_an_obstacle_whose_delay_is_estimated_is_refused():
     problem = touching("ball", cs.Nuisance.none(obstacle_time_s=1e-3))
     with pytest.raises(cs.InputError, match="an obstacle whose delay is estimated cannot be live"):
-        Model.of(problem)
+        LiveModel.from_problem(problem)

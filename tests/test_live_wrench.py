@@ -22,9 +22,9 @@ from wrenches_small import POINT_M, SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.live import Estimator, Frame, FrameReader, model, sweep
-from collocation_sysid.live.sources import recorded
-from collocation_sysid.live.track import Track
+from collocation_sysid.live import Frame, FrameReader, LiveEstimator, model, sweep
+from collocation_sysid.live.sources import frames_of_recording
+from collocation_sysid.live.track import WindowPass
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.recording import Nuisance, Wrench
 
@@ -40,7 +40,7 @@ def weighed(scheme: str = "midpoint", frame: str = "grasp", **unknown: float) ->
     clamp = cs.Gauge("clamp", CLAMPED["expression"], inner[::3], None, 2e-3, grasp=1)
     made = instrumented(sensing(seen, inner, frame=frame), clamp)
     told, rng = cs.simulate(made, TRUTH, scheme, substeps=1), np.random.default_rng(3)
-    (wrench,), (force,) = told.wrenches, told.readings
+    (wrench,), (force,) = told.wrenches, told.custom_sensor_values
     wrench = wrench + rng.normal(size=wrench.shape) * np.repeat([SIGMA_N, SIGMA_NM], 3)
     wrench[9], wrench[7, 2] = np.nan, np.nan
     made = cs.with_readings(made, [force + 2e-3 * rng.normal(size=force.shape)])
@@ -53,7 +53,9 @@ def without(experiment: cs.Experiment, waiting: list[tuple[int, float]]) -> cs.E
     """The same without the samples of instruments that still wait, by number and time."""
     (clamp,), (grasp,) = experiment.readings, experiment.grasps
     late = [[t_s for of, t_s in waiting if of == number] for number in (1, 2)]
-    values = np.where(np.isin(clamp.times, late[0])[:, None], np.nan, clamp.measured)
+    values = np.where(
+        np.isin(clamp.sample_times_s, late[0])[:, None], np.nan, clamp.measured_values
+    )
     wrench = np.where(np.isin(grasp.wrench.t_s, late[1])[:, None], np.nan, grasp.wrench.values)
     grasp = replace(grasp, wrench=replace(grasp.wrench, values=wrench))
     return cs.with_readings(replace(experiment, grasps=[grasp]), [values])
@@ -68,37 +70,43 @@ def without(experiment: cs.Experiment, waiting: list[tuple[int, float]]) -> cs.E
     ],
 )
 def test_load_cells_say_what_they_say_to_the_batch(scheme, frame, unknown, monkeypatch):
-    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
     problem = weighed(scheme, frame, **unknown)
     live = streamed(problem)
     waiting = [each[:2] for each in live.intake._waiting]
     assert 2 <= len(waiting) < 12
     seen = without(problem.experiments[0], waiting)
     collocation = replace(problem, experiments=[seen]).collocation()
-    horizon, p = Horizon(collocation, [len(live.log)], prior=model.WEAK), collocation.guess_p
-    point = horizon.evaluate(p, horizon.extend(p)[0])
+    horizon, p = (
+        Horizon(collocation, [len(live.log)], prior=model.WEAK_PRIOR_DEVIATION),
+        collocation.guess_p,
+    )
+    point = horizon.evaluate(p, horizon.simulate(p)[0])
     point = horizon.evaluate(p, [each.x + each.tangent.step for each in point.trajectories])
-    flat = live.model.flat(p)
-    rows = np.column_stack([point.fit.slope, point.fit.residual - point.fit.slope @ flat])
-    batch, ours = rows.T @ rows, normal_equations(live.track.information.triangle)
+    flat = live.model.transformed(p)
+    rows = np.column_stack([point.fit.jacobian, point.fit.residual - point.fit.jacobian @ flat])
+    batch, ours = rows.T @ rows, normal_equations(live.first_pass.information.triangle)
     scale = np.sqrt(np.outer(np.diag(batch), np.diag(batch)))
     np.testing.assert_allclose(ours / scale, batch / scale, atol=1e-8)
 
 
 def test_a_pass_that_turns_moves_what_a_load_cell_looks_at_along_its_slopes(monkeypatch):
-    monkeypatch.setattr(sweep, "LAST_STEP", 1e-12)
+    monkeypatch.setattr(sweep, "LARGEST_CORRECTION", 1e-12)
     live = streamed(weighed(tare=0.1, tool_kg=0.01))
     half, far = len(live.log) // 2, []
     for size in (1e-2, 5e-3):
-        p = live.track.p + size
-        whole, turned = (Track(live.model, at, live.prior, 99) for at in (p, live.track.p))
+        p = live.first_pass.linearisation_point + size
+        whole, turned = (
+            WindowPass(live.model, at, live.prior, 99)
+            for at in (p, live.first_pass.linearisation_point)
+        )
         for number, row in enumerate(live.log):
             if number == half:
-                turned.turn(p)
+                turned.relinearise_at(p)
                 moved, there = (track.sweep.read[-1][2] for track in (turned, whole))
                 far.append(np.abs(moved - there)[..., 0].max() / np.abs(there[..., 0]).max())
-            turned.again([row])
-            whole.again([row])
+            turned.repeat_rows([row])
+            whole.repeat_rows([row])
         assert_same_information(turned.information, whole.information, atol=5 * size)
     assert 0 < far[1] < 0.3 * far[0] < 1e-4  # of second order
 
@@ -112,12 +120,12 @@ def unweighed(problem: cs.Problem) -> cs.Problem:
 
 def test_a_load_cell_tells_the_scale_that_markers_do_not():
     problem = unweighed(weighed(tare=0.1))
-    live = Estimator(problem, replace(NO_TIME, rows=8))
+    live = LiveEstimator(problem, replace(NO_TIME, rows=8))
     for frame in frames_of(problem, live):
-        update = live.take(frame)
-    blind = Estimator(problem, replace(NO_TIME, rows=8))
+        update = live.process_frame(frame)
+    blind = LiveEstimator(problem, replace(NO_TIME, rows=8))
     for frame in frames_of(problem, live):
-        without = blind.take(replace(frame, told=()))
+        without = blind.process_frame(replace(frame, instrument_samples=()))
     for name, true in (TRUTH | {"density_kg_m3": 30.0}).items():
         estimate = update.estimates[name]
         assert abs(estimate.value - true) < 4 * estimate.statistical_std_error
@@ -126,7 +134,7 @@ def test_a_load_cell_tells_the_scale_that_markers_do_not():
         assert (
             without.estimates[name].statistical_std_error is None
         )  # markers alone tell ratios of these
-    settled, batch = live.settle(), cs.run(problem, seek_causes=False)
+    settled, batch = live.finish(), cs.run(problem, seek_causes=False)
     for name, estimate in settled.estimates.items():
         assert estimate.value == pytest.approx(batch.parameters[name], rel=1e-5)
         # The stream is not corrected for the time step, the answer at its end is.
@@ -134,34 +142,44 @@ def test_a_load_cell_tells_the_scale_that_markers_do_not():
         assert away < estimate.statistical_std_error
 
 
-def last_estimates(problem: cs.Problem, frames: list[Frame]) -> tuple[Estimator, np.ndarray]:
-    live = Estimator(problem, NO_TIME)
+def last_estimates(problem: cs.Problem, frames: list[Frame]) -> tuple[LiveEstimator, np.ndarray]:
+    live = LiveEstimator(problem, NO_TIME)
     for frame in frames:
-        update = live.take(frame)
+        update = live.process_frame(frame)
     return live, np.array([each.value for each in update.estimates.values()])
 
 
 def test_samples_of_a_load_cell_may_be_late_or_missing():
     problem = weighed()
-    live = Estimator(problem, NO_TIME)
+    live = LiveEstimator(problem, NO_TIME)
     frames = frames_of(problem, live)
     in_time, expected = last_estimates(problem, frames)
-    before = [(), (), (), *(frame.told for frame in frames[:-3])]
-    late = [replace(frame, told=told) for frame, told in zip(frames, before, strict=True)]
-    late[-1] = replace(late[-1], told=[each for frame in frames[-4:] for each in frame.told])
+    before = [(), (), (), *(frame.instrument_samples for frame in frames[:-3])]
+    late = [
+        replace(frame, instrument_samples=told) for frame, told in zip(frames, before, strict=True)
+    ]
+    late[-1] = replace(
+        late[-1],
+        instrument_samples=[each for frame in frames[-4:] for each in frame.instrument_samples],
+    )
     delayed, found = last_estimates(problem, late)
-    assert delayed.track.information.rows == in_time.track.information.rows
+    assert delayed.first_pass.information.row_count == in_time.first_pass.information.row_count
     np.testing.assert_allclose(found, expected, rtol=1e-6)
-    some = [replace(frame, told=() if 8 < k < 12 else frame.told) for k, frame in enumerate(frames)]
+    some = [
+        replace(frame, instrument_samples=() if 8 < k < 12 else frame.instrument_samples)
+        for k, frame in enumerate(frames)
+    ]
     fewer, found = last_estimates(problem, some)
-    lost = sum(np.isfinite(values).sum() for f in frames[9:12] for _, _, values in f.told)
-    assert fewer.track.information.rows == in_time.track.information.rows - lost
+    lost = sum(
+        np.isfinite(values).sum() for f in frames[9:12] for _, _, values in f.instrument_samples
+    )
+    assert fewer.first_pass.information.row_count == in_time.first_pass.information.row_count - lost
     np.testing.assert_allclose(found, expected, rtol=0.1)
     far = [
-        *(replace(frame, told=()) for frame in frames[:12]),
-        replace(frames[12], told=late[5].told),
+        *(replace(frame, instrument_samples=()) for frame in frames[:12]),
+        replace(frames[12], instrument_samples=late[5].instrument_samples),
     ]
-    assert last_estimates(problem, far)[0].counts["late"] == len(late[5].told) > 0
+    assert last_estimates(problem, far)[0].counts["late"] == len(late[5].instrument_samples) > 0
 
 
 def reader_of(sensors: int = 1) -> FrameReader:
@@ -187,7 +205,7 @@ SIX = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     ],
 )
 def test_frames_bring_wrenches_with_times_of_their_own(given, expected):
-    found = reader_of().read(json.dumps({"t_s": 1.0, "wrench": given})).told
+    found = reader_of().read(json.dumps({"t_s": 1.0, "wrench": given})).instrument_samples
     assert [each[:2] for each in found] == [each[:2] for each in expected]
     for (*_, values), (*_, numbers) in zip(found, expected, strict=True):
         np.testing.assert_array_equal(values, numbers)
@@ -197,11 +215,11 @@ def test_tables_of_frames_have_wrenches_in_their_columns():
     names = "t_s,x_m,y_m,z_m,qx,qy,qz,qw"
     one, two = reader_of(), reader_of(2)
     assert one.read(f"{names},fz_n,fx_n") is None
-    ((number, t_s, values),) = one.read("1,1,2,3,0,0,0,1,0.5,").told
+    ((number, t_s, values),) = one.read("1,1,2,3,0,0,0,1,0.5,").instrument_samples
     assert (number, t_s) == (1, 1.0)
     np.testing.assert_array_equal(values, [np.nan, np.nan, 0.5, *[np.nan] * 3])
     assert two.read(f"{names},2.tx_nm") is None
-    assert two.read("1,1,2,3,0,0,0,1,0.5").told[0][0] == 2
+    assert two.read("1,1,2,3,0,0,0,1,0.5").instrument_samples[0][0] == 2
 
 
 @pytest.mark.parametrize(
@@ -221,9 +239,9 @@ def test_wrenches_that_are_none_are_told_with_their_line(sensors, given, said):
 
 def test_what_live_does_not_take_of_sensors_is_said():
     with pytest.raises(InputError, match=r"a sensor with a low-pass \(sensor_lag\) cannot be live"):
-        Estimator(weighed(sensor_lag_s=3e-3))
-    live = Estimator(swing(nuisance=IDEAL), NO_TIME)
-    for frame in list(recorded(live.problem.experiments[0], live.model))[:3]:
+        LiveEstimator(weighed(sensor_lag_s=3e-3))
+    live = LiveEstimator(swing(nuisance=IDEAL), NO_TIME)
+    for frame in list(frames_of_recording(live.problem.experiments[0], live.model))[:3]:
         seen = live.update(frame.t_s, (frame.pose[0][0], frame.pose[1][0]), frame.tracks_m, SIX)
         left_out = "wrenches are left out: no grasp of the problem has a sensor"
         assert (left_out in seen.notes) == (frame.t_s == 0.0)

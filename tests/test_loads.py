@@ -23,7 +23,7 @@ from problems_small import (
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Force, Grasp, PointMass, PoseSequence
 from collocation_sysid.recording.tables import read_forces
@@ -46,8 +46,8 @@ def test_a_point_mass_pulls_like_its_weight():
     heavy = hung_cube(masses=(PointMass(TIP, 0.004),))
     pulled = hung_cube(forces=(Force(TIP, 0.004 * np.array(GRAVITY_M_S2)),))
     theta = as_theta(TRUTH)
-    np.testing.assert_allclose(rest_state(heavy, theta), rest_state(pulled, theta), atol=1e-12)
-    assert np.abs(rest_state(heavy, theta) - rest_state(hung_cube(), theta)).max() > 5e-4
+    np.testing.assert_allclose(equilibrium(heavy, theta), equilibrium(pulled, theta), atol=1e-12)
+    assert np.abs(equilibrium(heavy, theta) - equilibrium(hung_cube(), theta)).max() > 5e-4
 
 
 @pytest.mark.parametrize("integrator", ["newmark", "midpoint"])
@@ -62,7 +62,7 @@ def test_a_heavy_mass_swings_as_on_a_spring(integrator: str):
         start="undeformed",
         masses=(PointMass(TIP, mass),),
     )
-    sag = (body.nodes_m - rest_state(spring, as_theta(stiff)).reshape(-1, 3))[TIP, 2].mean()
+    sag = (body.nodes_m - equilibrium(spring, as_theta(stiff)).reshape(-1, 3))[TIP, 2].mean()
     period = 2 * np.pi * np.sqrt(sag / 9.81)  # m g = k sag
     motion = simulate(spring, stiff, integrator)
     drop = body.nodes_m[TIP, 2].mean() - motion.markers_m[:, :, 2].mean(axis=1)
@@ -102,7 +102,7 @@ def test_a_force_gives_its_impulse(integrator: str):
 
 def test_a_force_is_linear_between_its_rows_and_nothing_outside():
     force = Force([2, 5], [[0, 0, 0], [0, 0, 4.0]], [1.0, 2.0])
-    at = force.at_nodes([0.5, 1.25, 2.0, 2.1], 6)
+    at = force.node_forces_n([0.5, 1.25, 2.0, 2.1], 6)
     np.testing.assert_allclose(at[:, 5, 2], [0, 0.5, 2.0, 0])
     np.testing.assert_array_equal(at[:, 5], at[:, 2])
     assert not at[:, [0, 1, 3, 4]].any()
@@ -155,11 +155,11 @@ def test_two_grasps_may_hold_a_node_one_after_the_other():
     first = replace(moving, until_s=0.03)
     again = replace(moving, from_s=0.06)
     passed = replace(bar, grasps=(still, first, again))
-    held, positions = passed.grasped(passed.t_s)
+    held, positions = passed.prescribed_displacements(passed.t_s)
     expected = (passed.t_s < 0.035) | (passed.t_s > 0.055)
     np.testing.assert_array_equal(held[:, moving.nodes[0]].all(axis=1), expected)
     assert np.isnan(positions[~expected][:, moving.nodes]).all()
-    np.testing.assert_array_equal(passed.held_dofs, still.dofs)
+    np.testing.assert_array_equal(passed.prescribed_dofs, still.prescribed_dofs)
     with pytest.raises(InputError, match="held by the grasps 2 and 3 at the same time"):
         replace(bar, grasps=(still, first, replace(moving, from_s=0.02)))
 
@@ -176,7 +176,7 @@ def test_a_body_let_go_by_everyone_falls_freely(integrator: str):
     np.testing.assert_allclose(acceleration[-2:], [GRAVITY_M_S2] * 2, atol=remembers)
     np.testing.assert_allclose(
         motion.positions_m[:5, grasp.nodes],
-        grasp.carry(cube.body.nodes_m, dropped.t_s[:5]),
+        grasp.positions_at(cube.body.nodes_m, dropped.t_s[:5]),
         atol=1e-15,
     )
 
@@ -205,7 +205,7 @@ def test_a_release_starts_from_the_equilibrium_in_all_grasps():
     still, moving = bar.grasps
     let_go = replace(bar, grasps=(still, replace(moving, until_s=0.0)))
     both_hold, one_holds = (
-        rest_state(e, as_theta(TRUTH)) for e in (let_go, replace(bar, grasps=(still,)))
+        equilibrium(e, as_theta(TRUTH)) for e in (let_go, replace(bar, grasps=(still,)))
     )
     motion = simulate(let_go, TRUTH, "midpoint", substeps=1)
     np.testing.assert_allclose(motion.positions_m[0].ravel(), both_hold, atol=1e-12)

@@ -28,8 +28,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, read_poses, read_wrench
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.recording.formats.logs import stored_files
-from collocation_sysid.recording.formats.topics import listed_topics
-from collocation_sysid.recording.tables import read_gauge, read_pressure
+from collocation_sysid.recording.formats.topics import list_topics
+from collocation_sysid.recording.tables import read_custom_sensor, read_pressure
 
 T_S = np.arange(40) / 50.0
 STILL = (0.0, 0.0, 0.0, 1.0)
@@ -104,7 +104,7 @@ def test_wrenches_pressures_and_joints_are_read_as_tables(tmp_path: Path) -> Non
     np.testing.assert_allclose(t_s, T_S, atol=1e-9)
     np.testing.assert_allclose(wrench[5], [1, 2, T_S[5], 0.1, 0.2, 0.3])
     np.testing.assert_allclose(read_pressure(f"{log}#/chamber")[1], 1e3 + T_S)
-    _, values, names = read_gauge(f"{log}#/joint_states")
+    _, values, names = read_custom_sensor(f"{log}#/joint_states")
     assert names == ["turn", "slide"]
     np.testing.assert_allclose(values[:, 0], T_S)
 
@@ -137,7 +137,7 @@ def test_an_episode_of_a_dataset_makes_poses_once_the_unit_of_its_joints_is_said
     with pytest.raises(InputError, match="unit of its joints; expected #rad or #deg"):
         read_poses(f"{alone}#observation.state#arm.urdf#base>upper")
     with pytest.raises(InputError, match="has 2 episodes; expected one, as in pick#observation"):
-        read_gauge(f"{folder}#observation.state")
+        read_custom_sensor(f"{folder}#observation.state")
 
 
 def test_json_messages_of_an_mcap_file_are_read_as_those_of_ros(tmp_path: Path) -> None:
@@ -184,13 +184,13 @@ def test_topics_offer_the_chains_of_frames_that_can_be_read(tmp_path: Path) -> N
     )
     moving = [of.tree(t, of.transform(t, "base", "flange", (0, t, 0), STILL)) for t in T_S]
     log = bag(tmp_path / "trial", [of.tree(0.0, *fixed, topic="/tf_static"), *moving])
-    topics = {each.name: each for each in listed_topics(log)}
-    addresses = topics["/tf"].write
+    topics = {each.name: each for each in list_topics(log)}
+    addresses = topics["/tf"].problem_texts
     assert addresses == ("trial#/tf#world>tool0", "trial#/tf#world>flange")
     for address in addresses:  # each can be read as it is written
         np.testing.assert_allclose(read_poses(tmp_path / address).positions_m[:, 1], T_S, atol=1e-6)
-    assert topics["/tf_static"].write == ()
-    assert topics["/tf_static"].serves == "frames that do not move, part of the chains of /tf"
+    assert topics["/tf_static"].problem_texts == ()
+    assert topics["/tf_static"].uses == "frames that do not move, part of the chains of /tf"
 
 
 def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkeypatch) -> None:
@@ -226,7 +226,7 @@ def test_markers_of_several_namespaces_have_these_in_their_names(tmp_path: Path)
     several = [array(t, ("body", "robot")) for t in (0.0, 1.0, 2.0)]
     one = [array(t, ("body",)) for t in (0.0, 1.0, 2.0)]
     log = json_mcap(tmp_path / "run.mcap", {"/several": (name, several), "/one": (name, one)})
-    topics = {each.name: each.serves for each in listed_topics(log)}
+    topics = {each.name: each.uses for each in list_topics(log)}
     assert topics == {
         "/several": "marker tracks: body/0, body/1; robot/0, robot/1",
         "/one": "marker tracks: 0, 1",
@@ -276,10 +276,10 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
     packed = read_depth(Path(f"{log}#{raw}/packed"), 2e-3, 1.0)
     np.testing.assert_allclose(packed.images_m[0], counts * 2e-3)
     np.testing.assert_array_equal(packed.matrix, RAYS["matrix"])
-    topics = {each.name: each for each in listed_topics(log)}
-    assert topics[raw].serves == "depth images, 7 x 5: [[experiment.depth]]"
-    assert topics[raw].write == (f"{log.name}#{raw}",)
-    assert topics["/camera/camera_info"].serves == (
+    topics = {each.name: each for each in list_topics(log)}
+    assert topics[raw].uses == "depth images, 7 x 5: [[experiment.depth]]"
+    assert topics[raw].problem_texts == (f"{log.name}#{raw}",)
+    assert topics["/camera/camera_info"].uses == (
         "the camera's matrix, for the depth images beside it"
     )
 
@@ -418,7 +418,7 @@ def test_a_camera_that_does_not_tell_its_lens_is_not_taken(tmp_path: Path) -> No
     read = read_depth(Path(f"{log}#/depth"), None, 1.0)
     np.testing.assert_allclose(read.images_m[0], [[0.4, 0.4]])
     assert read.matrix is None
-    told = {each.name: each.serves for each in listed_topics(log)}
+    told = {each.name: each.uses for each in list_topics(log)}
     assert "camera" not in told["/camera_info"]
 
 
@@ -514,7 +514,7 @@ def test_frames_without_a_chain_between_them_are_refused(tmp_path: Path) -> None
     log = bag(tmp_path / "trial", trees)
     with pytest.raises(InputError, match="no chain of frames leads from a to d"):
         read_poses(f"{log}#/tf#a>d")
-    assert [each.name for each in listed_topics(log)] == ["/tf"]
+    assert [each.name for each in list_topics(log)] == ["/tf"]
 
 
 def test_the_node_of_the_pages_makes_frames_that_live_reads(

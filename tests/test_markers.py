@@ -10,7 +10,7 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.program.channel import operator_of
+from collocation_sysid.program.channel import interpolation_matrix
 from collocation_sysid.recording import Markers, Placement, place_markers
 
 
@@ -175,7 +175,7 @@ def test_an_unknown_attachment_is_refused():
 
 def as_matrix(markers):
     placement = markers.placement
-    return operator_of(placement.nodes, placement.weights, placement.node_count)
+    return interpolation_matrix(placement.nodes, placement.weights, placement.node_count)
 
 
 def test_observe_and_operator_agree(body):
@@ -184,7 +184,7 @@ def test_observe_and_operator_agree(body):
     points[2] = body.nodes_m[5]
     markers = track(place_markers(points, body.nodes_m, body))
     x = body.nodes_m + 0.01 * rng.normal(size=(4, *body.nodes_m.shape))
-    seen = markers.observe(x)
+    seen = markers.predict_positions(x)
     assert seen.shape == (4, 6, 3)
     operator = as_matrix(markers)
     assert operator.shape == (18, x[0].size)
@@ -213,10 +213,10 @@ def test_a_sample_needs_all_three_coordinates():
     positions[2:, 1] = np.nan
     markers = track(vertex_placement(), positions_m=positions)
     np.testing.assert_array_equal(
-        markers.present, [[True, True], [False, True], [True, False], [True, False]]
+        markers.is_present, [[True, True], [False, True], [True, False], [True, False]]
     )
-    np.testing.assert_array_equal(markers.missing, [1, 2])
-    assert markers.samples == 5
+    np.testing.assert_array_equal(markers.missing_counts, [1, 2])
+    assert markers.sample_count == 5
     assert np.isnan(markers.positions_m[1, 0]).all()
 
 

@@ -16,7 +16,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
 from collocation_sysid.fem.materials import MATERIALS
 from collocation_sysid.fem.mesh import TetMesh
-from collocation_sysid.program.block_band import whole
+from collocation_sysid.program.block_band import full_matrix
 
 OBJECTIVE = [name for name in MATERIALS if name != "linear"]
 # Small-strain constants (λ, μ) of `materials_small` [Pa], and γ_r [s].
@@ -53,7 +53,7 @@ def damping_force(body: Body, x: np.ndarray, v: np.ndarray, gamma_r_s: float = G
 
 def matrix_times(body: Body, lower: np.ndarray, skew: np.ndarray, vector: np.ndarray):
     """Product with a matrix of one state, given by symmetric and skew part."""
-    return (whole(body.pattern, lower, skew) @ vector.ravel())[None]
+    return (full_matrix(body.pattern, lower, skew) @ vector.ravel())[None]
 
 
 def potential_w(body: Body, x: np.ndarray, v: np.ndarray) -> float:
@@ -230,7 +230,7 @@ def test_curvature_gives_the_slopes_of_the_weighted_slopes(element, rng):
     theta = theta_for(body)
     x, v = moving_state(body, rng)
     _, w = moving_state(body, rng)
-    at = body.curvature(x, v, w, theta)
+    at = body.second_derivatives(x, v, w, theta)
     none = np.zeros(0)
 
     def by_position(x, v, theta):
@@ -270,11 +270,11 @@ def test_a_memory_leaves_the_damping_force_as_it_is(rng):
     plain = damped_body()
     with_memory = damped_body(prony=["prony_1"])
     x, v = moving_state(plain, rng)
-    theta = plain.theta(
+    theta = plain.theta_from_values(
         {"lambda_pa": LAME_PA, "mu_pa": SHEAR_PA, "gamma_r_s": GAMMA_R_S, "gamma_m_1_s": 0.0}
     )
     values = dict(zip(plain.constants, theta, strict=True))
-    full = with_memory.theta(values | {"prony_1.share": 0.5, "prony_1.tau_s": 0.1})
+    full = with_memory.theta_from_values(values | {"prony_1.share": 0.5, "prony_1.tau_s": 0.1})
     still = np.zeros_like(v)
     found = with_memory.force(x, v, full) - with_memory.force(x, still, full)
     assert relative_error(found, damping_force(plain, x, v)) < 1e-12
@@ -327,7 +327,7 @@ def test_a_bar_stretched_at_a_constant_rate_follows_the_closed_form():
     strain = (stretch**2 - 1) / 2
     across = np.sqrt(1 - 2 * poisson * strain)
     force_n = EDGE_M**2 * stretch * young_pa * (strain + GAMMA_R_S * stretch * rate_1_s)
-    theta = body.theta(constants)
+    theta = body.theta_from_values(constants)
     for k in range(2, len(t_s)):  # after the start, where the velocity jumps
         x = motion.positions_m[k].reshape(1, -1)
         expected = body.nodes_m * [across[k], across[k], stretch[k]]
@@ -365,7 +365,9 @@ def test_a_stretched_body_spins_on_and_loses_no_angular_momentum():
     x = cs.simulate(experiment, constants, "midpoint", substeps=1).positions_m
     velocity = np.diff(x, axis=0) / step_s
     between = ((x[1:] + x[:-1]) / 2).reshape(len(velocity), -1)
-    force = body.force(between, velocity.reshape(len(velocity), -1), body.theta(constants))
+    force = body.force(
+        between, velocity.reshape(len(velocity), -1), body.theta_from_values(constants)
+    )
     momentum = body.node_mass[:, None] * velocity + step_s / 2 * force.reshape(velocity.shape)
     kept = np.cross(x[1:], momentum).sum(axis=1)[:, 2]
     np.testing.assert_allclose(kept / kept[0], 1.0, rtol=1e-7)

@@ -253,7 +253,7 @@ def test_constants_of_a_users_material_are_the_functions_arguments(small_mesh):
         return 0.5 * mu_pa / growth * (ca.exp(growth * strain) - 1) + 0.5 * kappa_pa * (J - 1) ** 2
 
     growth = Constant("growth", "b", bounds=(0.01, 10.0))
-    material = Material.of(fung, "", growth)
+    material = Material.from_energy(fung, "", growth)
     assert material.name == "fung"
     assert [c.name for c in material.constants] == ["mu_pa", "growth", "kappa_pa"]
     assert [c.symbol for c in material.constants] == ["μ", "b", "κ"]
@@ -264,8 +264,8 @@ def test_constants_of_a_users_material_are_the_functions_arguments(small_mesh):
 
 
 def test_a_name_is_given_or_that_of_the_function():
-    assert Material.of(linear_elastic).name == "linear-elastic"
-    assert Material.of(neo_hookean, "gel").name == "gel"
+    assert Material.from_energy(linear_elastic).name == "linear-elastic"
+    assert Material.from_energy(neo_hookean, "gel").name == "gel"
 
 
 def with_energy_at_rest(F, mu_pa):
@@ -305,7 +305,7 @@ def test_unusable_energies_are_refused(energy, message):
 
 def test_a_constant_told_but_not_used_is_refused_with_the_nearest():
     with pytest.raises(InputError, match="has no constant 'mu_p'; did you mean 'mu_pa'"):
-        Material.of(stiffening, "stiffening", Constant("mu_p"))
+        Material.from_energy(stiffening, "stiffening", Constant("mu_p"))
 
 
 def test_a_material_is_itself_and_names_are_looked_up():

@@ -76,7 +76,7 @@ def test_second_derivatives_are_slopes_of_the_first(material, rng):
     body = small_body(material, "casadi")
     theta = theta_for(body)
     x, (v, w) = deformed(body, rng).ravel(), rng.standard_normal((2, body.nodes_m.size))
-    curvature = body.curvature(x, v, w, theta)
+    curvature = body.second_derivatives(x, v, w, theta)
     xx, xv = (
         body.pattern.matrix(matrix[0])
         for matrix in (curvature.position_position, curvature.position_velocity)
@@ -325,9 +325,9 @@ TRUTH = {"young_pa": 2000.0, "poisson": 0.499, "gamma_r_s": 0.002, "gamma_m_1_s"
 GUESS = Parameters(
     (
         Parameter("young_pa", 1400.0, 10.0, 1e6),
-        Parameter("poisson", 0.499, 0.0, 0.4999, fixed=True),
+        Parameter("poisson", 0.499, 0.0, 0.4999, is_fixed=True),
         Parameter("gamma_r_s", 0.004, 1e-5, 1.0),
-        Parameter("gamma_m_1_s", 1.0, 1e-3, 100.0, fixed=True),
+        Parameter("gamma_m_1_s", 1.0, 1e-3, 100.0, is_fixed=True),
     )
 )
 

@@ -11,8 +11,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods.comparison.shooting import Shooting
 from collocation_sysid.methods.continuation import Continuation
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.program.collocation import Collocation, Part
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.collocation import Collocation, ExperimentIterate
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.program.sweep import Sweep
 
@@ -42,15 +42,15 @@ def some_parameters(collocation: Collocation) -> np.ndarray:
     return np.concatenate([collocation.parameters.guess_q, phi])
 
 
-def marched(collocation: Collocation, p: np.ndarray) -> Part:
+def marched(collocation: Collocation, p: np.ndarray) -> ExperimentIterate:
     """The experiment simulated at p."""
-    (segment,) = collocation.segments
-    (part,) = collocation.parts_at(p, [np.zeros((0, segment.dofs))])
-    x = march(segment.experiment, part.setting.dynamics)
-    return Part(segment, part.q, part.phi, x)
+    (segment,) = collocation.transcriptions
+    (part,) = collocation.iterates_at(p, [np.zeros((0, segment.dof_count))])
+    x = simulate_scheme(segment.experiment, part.equations.dynamics)
+    return ExperimentIterate(segment, part.q, part.phi, x)
 
 
-def disturbed(part: Part, size_m: float = 1e-4) -> np.ndarray:
+def disturbed(part: ExperimentIterate, size_m: float = 1e-4) -> np.ndarray:
     """Positions that do not satisfy the equations of motion."""
     segment = part.segment
     change = np.zeros_like(part.x)
@@ -58,7 +58,7 @@ def disturbed(part: Part, size_m: float = 1e-4) -> np.ndarray:
     change[:, segment.free_dofs] = np.random.default_rng(0).standard_normal(free)
     first = segment.dynamics.first_row
     x = part.x.copy()
-    x[first:] += size_m * segment.dynamics.without_taken(change)[first:]
+    x[first:] += size_m * segment.dynamics.zero_held_forces(change)[first:]
     return x
 
 
@@ -70,19 +70,19 @@ def test_marched_trajectories_satisfy_the_equations(collocation: Collocation):
 def test_sensitivities_are_those_of_simulations(collocation: Collocation):
     p = some_parameters(collocation)
     part = marched(collocation, p)
-    found = Sweep(part.segment).forward(part.x, part.setting).by_p
-    for k, place in enumerate(part.segment.moving):
+    found = Sweep(part.segment).forward(part.x, part.equations).by_p
+    for k, place in enumerate(part.segment.dynamic_parameters):
         expected = directional_derivative(
             lambda at: marched(collocation, at).x, p, np.eye(len(p))[place]
         )
         assert relative_error(found[:, :, k], expected) < 1e-6
-    rows = Sweep(part.segment).sensitivities(part.x, part.setting)
+    rows = Sweep(part.segment).sensitivities(part.x, part.equations)
     np.testing.assert_array_equal(np.stack(list(rows)), found)
 
 
 def test_a_sweep_may_be_continued(collocation: Collocation):
     part = marched(collocation, some_parameters(collocation))
-    x, setting = disturbed(part), part.setting
+    x, setting = disturbed(part), part.equations
     known = Sweep(part.segment, 3).forward(x[:3], setting)
     continued = Sweep(part.segment).forward(x, setting, known)
     whole = Sweep(part.segment).forward(x, setting)
@@ -92,7 +92,7 @@ def test_a_sweep_may_be_continued(collocation: Collocation):
 
 def test_the_feasibility_step_solves_the_linearised_equations(collocation: Collocation):
     part = marched(collocation, some_parameters(collocation))
-    segment, setting, x = part.segment, part.setting, disturbed(part)
+    segment, setting, x = part.segment, part.equations, disturbed(part)
     step = Sweep(segment).forward(x, setting).step
     change = directional_derivative(lambda at: segment.residual_n(at, setting), x, step)
     assert relative_error(change, -segment.residual_n(x, setting)) < 1e-9
@@ -100,13 +100,13 @@ def test_the_feasibility_step_solves_the_linearised_equations(collocation: Collo
 
 def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     part = marched(collocation, some_parameters(collocation))
-    segment, setting, x = part.segment, part.setting, disturbed(part)
+    segment, setting, x = part.segment, part.equations, disturbed(part)
     gradient = rng.standard_normal(x.shape)
     y = Sweep(segment).backward(x, setting, gradient)
     step = Sweep(segment).forward(x, setting).step
     residual = setting.dynamics.residual(x)
-    residual[:, segment.held_dofs] = 0
-    residual = setting.dynamics.without_taken(residual)
+    residual[:, segment.prescribed_dofs] = 0
+    residual = setting.dynamics.zero_held_forces(residual)
     expected = float(np.sum(gradient[:, segment.free_dofs] * step[:, segment.free_dofs]))
     assert float(np.sum(y * residual)) == pytest.approx(expected, rel=1e-9)
 
@@ -115,11 +115,13 @@ def test_derivatives_are_pulled_back_through_the_memory(collocation: Collocation
     part = marched(collocation, some_parameters(collocation))
     p = some_parameters(collocation)
     z = collocation.pack(p, [disturbed(part)])
-    multipliers, direction = (rng.standard_normal(n) for n in (collocation.constraints, len(z)))
+    multipliers, direction = (
+        rng.standard_normal(n) for n in (collocation.constraint_count, len(z))
+    )
     expected = directional_derivative(
         lambda at: multipliers @ collocation.constraint_values(at), z, 0.1 * direction
     )
-    found = collocation.pulled_back(z, multipliers) @ (0.1 * direction)
+    found = collocation.jacobian_vjp(z, multipliers) @ (0.1 * direction)
     assert found == pytest.approx(float(expected), rel=1e-8)
 
 

@@ -18,8 +18,8 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Experiment
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.estimates import Estimate, memory_notes
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_of
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 NOISE_M = 2e-4
 
@@ -33,7 +33,7 @@ def found(experiment: Experiment) -> Uncertainty:
     parameters = guesses(ONE, 1.2)
     collocation = Collocation([noisy], parameters)
     solution = ReducedSpace()(collocation)
-    return uncertainty_of(linearised_fit(collocation, solution.z), parameters, solution.q)
+    return uncertainty_from_fit(linearise_fit(collocation, solution.z), parameters, solution.q)
 
 
 def test_the_instantaneous_modulus_has_an_error_bar():
@@ -62,7 +62,7 @@ def test_a_branch_slower_than_the_recordings_is_told():
     (note,) = memory_notes(slow, 2.0)
     assert "slower than the longest recording of 2 s" in note
     assert not memory_notes(slow, 8.0)
-    (note,) = memory_notes(slow | {"prony_1.share": Estimate(0.0, at_bound=True)}, 8.0)
+    (note,) = memory_notes(slow | {"prony_1.share": Estimate(0.0, is_at_bound=True)}, 8.0)
     assert note.startswith("no memory found: the share of prony_1 ended at 0")
 
 
@@ -87,7 +87,7 @@ def test_a_problem_file_describes_a_memory(tiny):
     assert "prony_1.tau_s" in experiment.body.constants
     assert experiment.loaded_since_s == 2.5
     given = {item.name: item for item in problem.parameters.items}
-    assert given["prony_1.share"].fixed
+    assert given["prony_1.share"].is_fixed
     assert given["prony_1.tau_s"].guess is None
 
 
@@ -116,11 +116,11 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     MEMORY(tiny)
     problem = Problem.read(tiny / "problem.toml", [GUESSED])
     findings = check_problem(problem)
-    program = problem.collocation().made_explicit()
-    assert program.explicit
-    assert findings.overstresses == program.added("memory")
-    assert findings.variables + findings.overstresses == program.variables
-    assert findings.constraints + findings.overstresses == program.constraints
+    program = problem.collocation().with_lifted_variables()
+    assert program.has_lifted_variables
+    assert findings.overstresses == program.lifted_count("memory")
+    assert findings.variables + findings.overstresses == program.variable_count
+    assert findings.constraints + findings.overstresses == program.constraint_count
     assert findings.jacobian_nonzeros == len(program.jacobian_structure[1])
     assert findings.hessian_nonzeros == len(program.hessian_structure[1])
     assert findings.derivatives_agree

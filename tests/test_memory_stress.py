@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.materials import Prony
-from collocation_sysid.fem.memory import fading
+from collocation_sysid.fem.memory import fading_coefficients
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.model.viscoelasticity import Fading, History, Remembered
-from collocation_sysid.program.block_band import whole
+from collocation_sysid.model.viscoelasticity import FadingCoefficients, MemoryHistory, MemoryState
+from collocation_sysid.program.block_band import full_matrix
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 
@@ -41,12 +41,14 @@ def strained(body: Body, size_m: float = 0.003, states: int = 1) -> np.ndarray:
     return body.nodes_m.ravel() + size_m * rng.standard_normal((states, body.pattern.size))
 
 
-def total_force(body: Body, x: np.ndarray, theta: np.ndarray, memory: Remembered) -> np.ndarray:
-    return memory.now(Forces.on(body, theta)).total(x, np.zeros_like(x))[0]
+def total_force(body: Body, x: np.ndarray, theta: np.ndarray, memory: MemoryState) -> np.ndarray:
+    return memory.insert_at_same_time(Forces.of_body_alone(body, theta)).total(x, np.zeros_like(x))[
+        0
+    ]
 
 
-def after(memory: Remembered, x: np.ndarray, interval_s: float) -> Remembered:
-    return memory.following(Forces.on(memory.body, memory.theta), x, 0 * x, interval_s)
+def after(memory: MemoryState, x: np.ndarray, interval_s: float) -> MemoryState:
+    return memory.advance(Forces.of_body_alone(memory.body, memory.theta), x, 0 * x, interval_s)
 
 
 # Closed forms of the standard linear solid ------------------------------------------------------
@@ -55,8 +57,8 @@ def after(memory: Remembered, x: np.ndarray, interval_s: float) -> Remembered:
 @pytest.mark.parametrize("intervals", [1, 7], ids=["one-interval", "many"])
 def test_the_force_of_a_held_shape_relaxes_exponentially(intervals: int):
     body, held_s = body_of(), 0.3
-    theta, (x,) = body.theta(ONE), strained(body)
-    memory = after(Remembered.at_start(body, body.nodes_m.ravel(), theta, np.inf), x, 1e-12)
+    theta, (x,) = body.theta_from_values(ONE), strained(body)
+    memory = after(MemoryState.at_start(body, body.nodes_m.ravel(), theta, np.inf), x, 1e-12)
     long_term = body.force(x, 0 * x, theta)[0]
     at_once = total_force(body, x, theta, memory)
     assert relative_error(at_once, (1 + SHARE) * long_term) < 1e-9
@@ -68,9 +70,9 @@ def test_the_force_of_a_held_shape_relaxes_exponentially(intervals: int):
 
 def test_a_load_held_for_a_time_has_relaxed_for_that_time():
     body, held_s = body_of(), 0.3
-    theta, (x,) = body.theta(ONE), strained(body)
+    theta, (x,) = body.theta_from_values(ONE), strained(body)
     expected = (1 + SHARE * np.exp(-held_s / TAU_S)) * body.force(x, 0 * x, theta)[0]
-    memory = Remembered.at_start(body, x, theta, held_s)
+    memory = MemoryState.at_start(body, x, theta, held_s)
     assert relative_error(total_force(body, x, theta, memory), expected) < 1e-12
 
 
@@ -102,11 +104,11 @@ def test_a_bar_creeps_under_a_constant_load():
 def test_an_oscillating_strain_has_the_storage_and_loss_modulus():
     """1 + g (ωτ)²/(1 + (ωτ)²), and g ωτ/(1 + (ωτ)²), at small strain."""
     body, omega, step_s = body_of("tet4"), 8.0, 1e-3
-    theta, stretch = body.theta(ONE), body.nodes_m[:, :1] * [1.0, 0.0, 0.0]
+    theta, stretch = body.theta_from_values(ONE), body.nodes_m[:, :1] * [1.0, 0.0, 0.0]
     t_s = step_s * np.arange(4000)
     xi = (body.nodes_m + 1e-5 * np.sin(omega * t_s)[:, None, None] * stretch).reshape(len(t_s), -1)
-    history = History.of(body, xi, theta, np.full(len(t_s), step_s), np.inf)
-    carried = history.carried(slice(None))
+    history = MemoryHistory.from_states(body, xi, theta, np.full(len(t_s), step_s), np.inf)
+    carried = history.past_at(slice(None))
     borne = (1 + carried.stiffening) * history.stress + carried.overstress
     size = history.stress[:, 0].max()
     last = t_s > t_s[-1] - 2 * np.pi / omega
@@ -122,8 +124,8 @@ def test_an_oscillating_strain_has_the_storage_and_loss_modulus():
 
 def test_turning_rigidly_turns_the_force_and_changes_no_stress():
     body = body_of(prony=["prony_1", "prony_2"])
-    theta, (first, second) = body.theta(TWO), strained(body, states=2)
-    memory = after(Remembered.at_start(body, first, theta, 0.05), second, 0.02)
+    theta, (first, second) = body.theta_from_values(TWO), strained(body, states=2)
+    memory = after(MemoryState.at_start(body, first, theta, 0.05), second, 0.02)
     turn = Rotation.from_rotvec([0.7, -1.1, 2.0]).as_matrix()
     turned = (second.reshape(-1, 3) @ turn.T).ravel()
     np.testing.assert_allclose(
@@ -136,14 +138,14 @@ def test_turning_rigidly_turns_the_force_and_changes_no_stress():
 
 def test_no_cyclic_deformation_gains_energy(rng):
     body = body_of("tet4", prony=["prony_1", "prony_2"])
-    theta, t_s = body.theta(TWO | CONSTANTS), np.linspace(0.0, 1.0, 401)
+    theta, t_s = body.theta_from_values(TWO | CONSTANTS), np.linspace(0.0, 1.0, 401)
     shapes = 2e-3 * rng.standard_normal((3, body.pattern.size))
     waves = np.stack([np.sin(2 * np.pi * k * t_s) for k in (1, 2, 5)], axis=1)
     x = body.nodes_m.ravel() + waves @ shapes
     xi = np.concatenate([x[:1], (x[1:] + x[:-1]) / 2])
     intervals = np.append(np.diff(np.append(0.0, (t_s[1:] + t_s[:-1]) / 2)), t_s[1])
-    history = History.of(body, xi, theta, intervals, np.inf)
-    force = body.force(xi, np.zeros_like(xi), theta, carried=history.carried(slice(None)))
+    history = MemoryHistory.from_states(body, xi, theta, intervals, np.inf)
+    force = body.force(xi, np.zeros_like(xi), theta, memory_input=history.past_at(slice(None)))
     work = -np.cumsum(np.sum(force[1:] * np.diff(x, axis=0), axis=1))
     stored = np.array([body.energy(each, lambda_pa=200.0, mu_pa=300.0) for each in x[1:]])
     # Beside the long-term energy there is that of the branches' springs, and what was lost.
@@ -182,19 +184,19 @@ def constants_of(body: Body) -> np.ndarray:
 
 def test_the_stress_gives_the_elastic_force(body: Body):
     theta, x = constants_of(body), strained(body, states=2)
-    found = body.stresses.force(x, body.stresses.stress(x, theta), theta)
+    found = body.stresses.memory_force(x, body.stresses.stress(x, theta), theta)
     assert relative_error(found, body.force(x, 0 * x, theta)) < 1e-12
 
 
 def test_stresses_change_along_positions_and_constants(body: Body, rng):
     theta, x, stresses = constants_of(body), strained(body), body.stresses
     assert_derivative(
-        lambda at: stresses.stress(at, theta), lambda v: stresses.along(x, v, theta), x, rng, 1e-7,
+        lambda at: stresses.stress(at, theta), lambda v: stresses.stress_jvp(x, v, theta), x, rng, 1e-7,
         scale=1e-2,
     )  # fmt: skip
     assert_derivative(
         lambda at: stresses.stress(x, at),
-        lambda v: stresses.stress_by(x, theta, v[:, None])[:, 0],
+        lambda v: stresses.stress_theta_derivatives(x, theta, v[:, None])[:, 0],
         theta, rng, 1e-7, scale=0.1 * theta,
     )  # fmt: skip
 
@@ -202,10 +204,10 @@ def test_stresses_change_along_positions_and_constants(body: Body, rng):
 def test_transposed_derivatives_are_those(body: Body, rng):
     theta, x, stresses = constants_of(body), strained(body, states=2), body.stresses
     v, weights = rng.standard_normal(x.shape), rng.standard_normal((2, stresses.width))
-    pulled = np.sum(stresses.pulled(x, weights, theta) * v)
-    assert pulled == pytest.approx(np.sum(weights * stresses.along(x, v, theta)), rel=1e-10)
-    pushed = np.sum(stresses.against(x, v, theta) * weights)
-    assert pushed == pytest.approx(np.sum(v * stresses.force(x, weights, theta)), rel=1e-10)
+    pulled = np.sum(stresses.stress_vjp(x, weights, theta) * v)
+    assert pulled == pytest.approx(np.sum(weights * stresses.stress_jvp(x, v, theta)), rel=1e-10)
+    pushed = np.sum(stresses.memory_force_vjp(x, v, theta) * weights)
+    assert pushed == pytest.approx(np.sum(v * stresses.memory_force(x, weights, theta)), rel=1e-10)
 
 
 def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
@@ -213,16 +215,16 @@ def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
     v = rng.standard_normal(x.shape)
     stiffening = np.outer([0.1, 0.3, 0.3], np.arange(1.0, 1.0 + len(body.parts)))
     overstress = 30.0 * rng.standard_normal((3, body.stresses.width))
-    carried = replace(body.memory.nothing(3), overstress=overstress, stiffening=stiffening)
-    at = body.linearise(x, v, theta, carried=carried)
+    carried = replace(body.memory.relaxed(3), overstress=overstress, stiffening=stiffening)
+    at = body.linearise(x, v, theta, memory_input=carried)
     np.testing.assert_allclose(
-        at.force, body.force(x, v, theta, carried=carried), rtol=1e-11, atol=1e-12
+        at.force, body.force(x, v, theta, memory_input=carried), rtol=1e-11, atol=1e-12
     )
     slopes = at.by_position, at.by_position_skew
     assert_derivative(
-        lambda state: body.force(state, v, theta, carried=carried),
+        lambda state: body.force(state, v, theta, memory_input=carried),
         lambda d: np.stack(
-            [whole(body.pattern, *both) @ row for *both, row in zip(*slopes, d, strict=True)]
+            [full_matrix(body.pattern, *both) @ row for *both, row in zip(*slopes, d, strict=True)]
         ),
         x, rng, 1e-7, scale=1e-2,
     )  # fmt: skip
@@ -230,18 +232,19 @@ def test_forces_at_a_given_memory_are_linearised(body: Body, rng):
 
 def test_how_fast_a_branch_fades_is_exact_and_differentiated():
     body, until_next_s, loaded_s = body_of(), np.array([1e-4, 0.01, 0.3]), 0.1
-    (branch,), theta = body.memory.branches, body.theta(ONE)
+    (branch,), theta = body.memory.branches, body.theta_from_values(ONE)
     share, tau_s = theta[branch.share], theta[branch.tau]
-    here = Fading.of(body, theta, until_next_s, loaded_s)
+    here = FadingCoefficients.from_body(body, theta, until_next_s, loaded_s)
     np.testing.assert_allclose(here.d[0], np.exp(-until_next_s / tau_s))
     np.testing.assert_allclose(here.c[0, 0], share * np.exp(-loaded_s / tau_s))
-    _, c = fading(share, tau_s, until_next_s[1])
+    _, c = fading_coefficients(share, tau_s, until_next_s[1])
     np.testing.assert_allclose(here.c[0, 2], c)
     np.testing.assert_allclose(here.a[0, 1], here.d[0, 1] * here.c[0, 1] - c)
     for k, place in enumerate((branch.share, branch.tau)):
         step = 1e-6 * np.eye(len(theta))[place]
         ahead, behind = (
-            Fading.of(body, at, until_next_s, loaded_s) for at in (theta + step, theta - step)
+            FadingCoefficients.from_body(body, at, until_next_s, loaded_s)
+            for at in (theta + step, theta - step)
         )
         for j, name in enumerate("cda"):
             slope = (getattr(ahead, name) - getattr(behind, name))[0] / 2e-6
@@ -261,7 +264,7 @@ def test_branches_declare_their_constants():
         "tip.p.share",
         "tip.p.tau_s",
     ]
-    shared = body.theta(ONE | {"tip.p.share": 0.1, "tip.p.tau_s": 1.0})
+    shared = body.theta_from_values(ONE | {"tip.p.share": 0.1, "tip.p.tau_s": 1.0})
     assert list(shared).count(SHARE) == 2
 
 

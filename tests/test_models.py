@@ -26,25 +26,25 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.plan import PlannedRun, plan_models
 from collocation_sysid.plan.choice import (
     advice,
-    evidence_of,
+    evidence_from_fit,
+    fit_record,
+    hold_out,
     law_disagreements,
-    model_record,
     model_rows,
-    without,
 )
 from collocation_sysid.plan.laws import law_table
 from collocation_sysid.plan.variants import (
+    as_inline_toml,
     file_variants,
     models,
     parse_branches,
     parse_dampings,
     parse_materials,
-    toml,
     variants,
 )
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.recording import (
     Experiment,
     Markers,
@@ -52,7 +52,7 @@ from collocation_sysid.recording import (
     write_poses_csv,
 )
 from collocation_sysid.result.synthesis import Recipe, write_data
-from collocation_sysid.statistics.linearised import Derived
+from collocation_sysid.statistics.linearised import DerivedModuli
 
 BOTH = ("neo-hookean", "yeoh")
 DAMPING = "gamma_r_s = 0.009, gamma_m_1_s = 1.0, lambda_pa = 120.0"
@@ -87,8 +87,7 @@ def compared(file: Path) -> list[dict]:
     """The rows of a comparison, its runs done here."""
     planned = plan_models(Problem.read(file), variants(file, (), BOTH, (), TIMES_S))
     records = {
-        run.key: {"model": model_record(read(run), run.method, run.held_out or "")}
-        for run in planned
+        run.key: {"model": fit_record(read(run), run.method, run.held_out or "")} for run in planned
     }
     return model_rows(planned, json.loads(json.dumps(records)))
 
@@ -147,10 +146,12 @@ def pressed_block(platen: str, name: str, z_m: np.ndarray, load_n: np.ndarray) -
 
 def load_n(experiment: Experiment) -> np.ndarray:
     """What the upper platen gives, by the truth."""
-    collocation = fitted(experiment, Parameters.of(TRUTH))
-    x = march(experiment, collocation.segments[0].dynamics.with_theta(as_theta(TRUTH)))
-    (part,) = collocation.parts_at(np.zeros(0), [x])
-    return part.sensing.wrenches(x)[0][:, 2]
+    collocation = fitted(experiment, Parameters.from_mapping(TRUTH))
+    x = simulate_scheme(
+        experiment, collocation.transcriptions[0].dynamics.with_theta(as_theta(TRUTH))
+    )
+    (part,) = collocation.iterates_at(np.zeros(0), [x])
+    return part.observation.predict_wrenches(x)[0][:, 2]
 
 
 def test_forces_rank_the_platens_where_there_are_no_markers():
@@ -165,7 +166,7 @@ def test_forces_rank_the_platens_where_there_are_no_markers():
     models = []
     for platen, experiments in found.items():
         problem = Problem(experiments, TRUTH | {"mu_pa": Unknown(300.0)})
-        records = {each: model_record(problem, "reduced-space", each) for each in ("", "a", "b")}
+        records = {each: fit_record(problem, "reduced-space", each) for each in ("", "a", "b")}
         models.append({"model": platen, "found": records})
     sticking, sliding = rows = rows_of(*models)
     assert sticking["chosen"]
@@ -178,7 +179,7 @@ def test_forces_rank_the_platens_where_there_are_no_markers():
 
 def test_of_one_pressing_the_end_of_its_load_is_held_out():
     pressing = pressed_block("xyz", "a", np.linspace(0.0, -0.03, 9), np.zeros(9))
-    left, start_s = without(Problem([pressing], TRUTH), "a")
+    left, start_s = hold_out(Problem([pressing], TRUTH), "a")
     wrench = left.experiments[0].grasps[1].wrench
     np.testing.assert_array_equal(np.isnan(wrench.values[:, 2]), wrench.t_s > start_s)
     assert 0 < np.isnan(wrench.values[:, 2]).sum() < 9
@@ -204,18 +205,18 @@ def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
 
 def test_of_two_recordings_one_is_held_out(tmp_path: Path):
     several = Problem.read(write_problem(tmp_path, {"a": 6, "b": 7}))
-    left, start_s = without(several, "b")
+    left, start_s = hold_out(several, "b")
     assert [(e.name, e.validation) for e in left.experiments] == [("a", False), ("b", True)]
     assert start_s == -np.inf
 
 
 def test_of_one_recording_the_last_third_is_held_out(tiny: Path):
     alone = Problem.read(tiny / "problem.toml")
-    left, start_s = without(alone, "swing")
+    left, start_s = hold_out(alone, "swing")
     (kept,), (whole,) = left.experiments, alone.experiments
     later = kept.t_s > start_s
     assert later.sum() == 3  # of 9
-    assert not kept.markers.present[later].any()
+    assert not kept.markers.is_present[later].any()
     earlier = kept.markers.positions_m[~later]
     np.testing.assert_array_equal(earlier, whole.markers.positions_m[~later])
 
@@ -252,7 +253,7 @@ def test_a_material_brings_its_constants_and_the_rest_stays_as_stated(bar, mater
     problem = changed(bar, material, {material: 0, "linear": 0}, overrides=overrides)
     assert problem.bodies[0].parts[0].material.name == material
     assert set(problem.parameters.names) == set(expected.split())
-    fixed = [i.name for i in problem.parameters.items if i.fixed]
+    fixed = [i.name for i in problem.parameters.items if i.is_fixed]
     assert fixed == ["gamma_m_1_s"]
     given = {i.name: (i.guess, i.lower, i.upper) for i in problem.parameters.items}
     assert given["lambda_pa"] == (400.0, 10.0, 1e5)
@@ -264,7 +265,7 @@ def test_the_fixed_poisson_ratio_stays_whatever_the_material(bar):
     assert set(problem.parameters.names) == {
         *("poisson", "gamma_r_s", "gamma_m_1_s", "c10_pa", "c20_pa", "c30_pa")
     }
-    assert next(i.guess for i in problem.parameters.items if i.fixed) == 0.45
+    assert next(i.guess for i in problem.parameters.items if i.is_fixed) == 0.45
     back = changed(bar, "neo-hookean", BOTH, overrides=(*_as_yeoh(), "object.density_kg_m3=40"))
     assert set(back.parameters.names) == {"kappa_pa", "mu_pa", "gamma_r_s", "gamma_m_1_s"}
 
@@ -347,7 +348,7 @@ def test_files_are_combined_with_materials(bar, tiny):
 
 def test_a_value_is_written_as_toml_reads_it():
     value = {"a.b": {"guess": 1e-5, "bounds": [1, -2.5]}, "text": 'a "quoted" ß', "flag": True}
-    assert tomllib.loads(f"value = {toml(value)}")["value"] == value
+    assert tomllib.loads(f"value = {as_inline_toml(value)}")["value"] == value
 
 
 def test_bad_models_are_refused_in_one_line(bar, tiny):
@@ -420,7 +421,7 @@ def test_measurements_are_worth_as_many_independent_as_the_mean_of_their_errors_
     found = []
     for seed in range(6):
         errors = [autoregressive(np.random.default_rng(seed), 400, 4, phi)]
-        evidence = evidence_of(of.fit(errors, np.zeros(len(of.names)))[0])
+        evidence = evidence_from_fit(of.fit(errors, np.zeros(len(of.names)))[0])
         found.append(evidence.independent / evidence.measurements)
     # Of a first-order process 1 + 2 Σ φᵏ = (1 + φ) / (1 − φ).
     assert np.mean(found) == pytest.approx((1 - phi) / (1 + phi), rel=0.3)
@@ -429,7 +430,7 @@ def test_measurements_are_worth_as_many_independent_as_the_mean_of_their_errors_
 def test_errors_that_all_markers_share_count_once():
     of = problem((400,), markers=4, offsets=False)
     errors = [autoregressive(np.random.default_rng(0), 400, 4, 0.0, shared=0.98)]
-    evidence = evidence_of(of.fit(errors, np.zeros(len(of.names)))[0])
+    evidence = evidence_from_fit(of.fit(errors, np.zeros(len(of.names)))[0])
     assert evidence.independent == pytest.approx(400, rel=0.2)  # of 4800
 
 
@@ -445,7 +446,8 @@ def test_a_needless_parameter_costs_two_and_gains_one_on_average():
     for _ in range(80):
         errors = [autoregressive(rng, 60, 2, 0.0)]
         small, large = (
-            evidence_of(each.fit(errors, np.zeros(len(each.names)))[0]) for each in (fewer, of)
+            evidence_from_fit(each.fit(errors, np.zeros(len(each.names)))[0])
+            for each in (fewer, of)
         )
         assert large.fitted - small.fitted == pytest.approx(1, abs=1e-4)
         changes.append(large.criterion(360) - small.criterion(360))
@@ -537,11 +539,11 @@ def test_every_law_has_a_stiffness_at_small_strain(law):
     values = own | {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
     body = Body(box().mesh, density_kg_m3=30.0, material=law)
     hung = replace(hung_cube(2), body=body)
-    collocation = Collocation([hung], Parameters.of(values))
-    constants = (segment.constants for segment in collocation.segments)
-    numbers = Derived.of(constants, collocation.guess_p[: collocation.nq])
+    collocation = Collocation([hung], Parameters.from_mapping(values))
+    constants = (segment.constants for segment in collocation.transcriptions)
+    numbers = DerivedModuli.from_bodies(constants, collocation.guess_p[: collocation.nq])
     assert numbers.values["young_pa"] > 0
-    assert numbers.by_q["young_pa"].any()
+    assert numbers.derivatives["young_pa"].any()
 
 
 def test_a_model_that_fits_better_but_predicts_worse_is_not_taken():

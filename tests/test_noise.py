@@ -13,16 +13,16 @@ import pytest
 from fits_small import PARAMETERS, Problem, problem
 from scipy.stats import binom, kstest
 
-from collocation_sysid.statistics.linearised import information
-from collocation_sysid.statistics.noise import noise_level
-from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_of
+from collocation_sysid.statistics.linearised import factorise_information
+from collocation_sysid.statistics.noise import estimate_noise_level
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from study_coverage import CASES, reference, truth, twin
 
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.linearised import linearise_fit
 
 DRAWS = 100
 # What chance makes of a right share in 998 of 1000 such counts.
@@ -55,16 +55,19 @@ def draws(of: Problem, deviations: tuple[float, ...], count: int = DRAWS):
 @cache
 def found(name: str, errors: str) -> list[tuple[Uncertainty, np.ndarray]]:
     fits = draws(PROBLEMS[name], ERRORS[errors])
-    return [(uncertainty_of(fit, PARAMETERS, wrong[:4]), wrong[:4]) for fit, wrong in fits]
+    return [(uncertainty_from_fit(fit, PARAMETERS, wrong[:4]), wrong[:4]) for fit, wrong in fits]
 
 
 def test_a_parameter_that_one_marker_tells_has_its_degrees_of_freedom_in_any_unit():
     fit, _ = next(draws(PROBLEMS["three markers"], (1.0,)))
-    level = noise_level(fit, information(fit))
+    level = estimate_noise_level(fit, factorise_information(fit))
     of_one = np.zeros((3, 1, 1))
     of_one[0] = 7.0
     level = replace(
-        level, freedoms=np.array([10.0, 1e3, 1e4]), shares=of_one, extra=np.zeros((1, 1))
+        level,
+        freedoms=np.array([10.0, 1e3, 1e4]),
+        shares=of_one,
+        known_score_covariance=np.zeros((1, 1)),
     )
     for unit in (1e-6, 1.0, 1e6):
         told = SimpleNamespace(prior=np.zeros((1, 1)), fit=SimpleNamespace(root=unit * np.eye(1)))
@@ -106,10 +109,10 @@ def test_p_values_are_uniform_without_a_fault(name):
 def test_variances_of_the_markers_are_found_without_bias():
     for name in PROBLEMS:
         levels = [each.level for each, _ in found(name, "one marker three times as noisy")]
-        mean = np.mean([level.by_marker for level in levels], axis=0)
+        mean = np.mean([level.variances for level in levels], axis=0)
         truth = [9.0 if name.endswith("m0") else 1.0 for name in levels[0].names]
         np.testing.assert_allclose(mean, truth, rtol=0.08)
-        spread = np.std([level.by_marker for level in levels], axis=0) / truth
+        spread = np.std([level.variances for level in levels], axis=0) / truth
         np.testing.assert_allclose(spread, np.sqrt(2 / levels[0].freedoms), rtol=0.3)
 
 
@@ -122,7 +125,7 @@ def test_a_common_variance_would_not_do_where_markers_differ():
     held = {"auto": [], "estimated": []}
     for fit, wrong in draws(split, (3.0, 0.5), 200):
         for noise, hits in held.items():
-            each = uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(noise))  # type: ignore[arg-type]
+            each = uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(noise))  # type: ignore[arg-type]
             half = each.quantiles * np.sqrt(np.diag(each.covariance))
             hits.append((np.abs(wrong[:4]) < half)[0])
     assert np.mean(held["estimated"]) < 0.9 < np.mean(held["auto"])
@@ -136,18 +139,20 @@ def test_what_is_expected_besides_is_no_noise():
     extra = np.sqrt(variance) * rng.normal(size=(400, *variance.shape))
     errors = np.sqrt(1 + variance) * rng.normal(size=variance.shape)
     fit, wrong = of.fit([errors], np.zeros(len(of.names)))
-    factored = information(fit)
-    assert noise_level(fit, factored).kind == "by-marker"
-    known = noise_level(fit.disturbed([extra]), factored)
-    assert known.kind == "given"
+    factored = factorise_information(fit)
+    assert estimate_noise_level(fit, factored).suggested_noise == "by-marker"
+    known = estimate_noise_level(fit.with_disturbances([extra]), factored)
+    assert known.suggested_noise == "given"
     assert known.pooled == pytest.approx(1.0, abs=1.0)  # a deviation of 0.32
     without, widened = (
-        uncertainty_of(each, PARAMETERS, wrong[:4], ErrorModel("given", "independent")).covariance
-        for each in (fit, fit.disturbed([extra]))
+        uncertainty_from_fit(
+            each, PARAMETERS, wrong[:4], ErrorModel("given", "independent")
+        ).covariance
+        for each in (fit, fit.with_disturbances([extra]))
     )
     assert (np.diag(widened) > 1.5 * np.diag(without)).any()
-    rows = fit.blocks[0].slope.reshape(-1, len(of.names))
-    prior = np.diag(fit.prior_slope**2)
+    rows = fit.blocks[0].jacobian.reshape(-1, len(of.names))
+    prior = np.diag(fit.prior_jacobian**2)
     inverse = np.linalg.inv(rows.T @ rows + prior)
     more = rows.T @ ((1 + variance).reshape(-1, 1) * rows) + prior
     expected = np.sqrt(np.diag(inverse @ more @ inverse)[:4])
@@ -164,9 +169,11 @@ def test_error_bars_for_correlated_errors_hold_what_is_expected_besides(noise):
     steps = rng.normal(size=(201, 64, 3))
     samples[:, :, 1] = 1.3 * sum(steps[:, k : k + 60] for k in range(5))
     fit, wrong = of.fit([samples[0] + rng.normal(size=samples[0].shape)], np.zeros(len(of.names)))
-    fit = fit.disturbed([samples[1:]])
+    fit = fit.with_disturbances([samples[1:]])
     correlated, independent = (
-        np.diag(uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(noise, errors)).covariance)
+        np.diag(
+            uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(noise, errors)).covariance
+        )
         for errors in ("autocorrelated", "independent")
     )
     assert (correlated > 0.999999 * independent).all()
@@ -177,7 +184,7 @@ def test_error_bars_for_correlated_errors_hold_what_is_expected_besides(noise):
 
 def notes(deviations: tuple[float, ...], **options) -> tuple[str, ...]:
     fit, wrong = next(draws(PROBLEMS["three markers"], deviations, 1))
-    return uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(**options)).notes
+    return uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(**options)).notes
 
 
 def test_a_wrong_sigma_is_told_with_how_much():
@@ -210,8 +217,8 @@ def test_intervals_of_a_whole_identification_follow_the_residuals(claimed):
     for seed in range(2):
         collocation, _ = twin(stated, x, CASES[0], sigma_m, np.random.default_rng(seed))
         solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation)
-        fit = linearised_fit(collocation, solution.z)
-        each = uncertainty_of(fit, collocation.parameters, solution.q)
+        fit = linearise_fit(collocation, solution.z)
+        each = uncertainty_from_fit(fit, collocation.parameters, solution.q)
         assert each.noise == ("by-marker" if claimed == "uneven" else "estimated")
         for name, value in truth().items():
             low, high = {**each.estimates, **each.derived}[name].statistical95 or (0.0, np.inf)

@@ -27,11 +27,11 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.program.charts import Chart
+from collocation_sysid.program.charts import MarkerAssociation
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 ONE_OF_EACH = {
     "place": Nuisance.none(marker_offset_m=0.003),
@@ -52,15 +52,15 @@ def alone(experiment: Experiment, **options) -> Collocation:
 def readings(experiment: Experiment, phi: np.ndarray) -> np.ndarray:
     """What the markers read at the truth with φ; the scheme's own trajectory."""
     collocation = alone(experiment)
-    followed, p = collocation.following(np.append(GUESS.guess_q, phi))
-    (segment,) = followed.segments
-    motion = simulate(segment.corrected(phi), TRUTH, "midpoint", substeps=1)
-    return segment.markers.of_samples(motion.positions_m, p[followed.nq :])
+    followed, p = collocation.follow_estimates(np.append(GUESS.guess_q, phi))
+    (segment,) = followed.transcriptions
+    motion = simulate(segment.corrected_experiment(phi), TRUTH, "midpoint", substeps=1)
+    return segment.markers.predict_samples(motion.positions_m, p[followed.nq :])
 
 
 def seen_with(experiment: Experiment, phi: np.ndarray) -> Experiment:
     tracks = readings(experiment, phi)
-    present = experiment.markers.present[:, :, None]
+    present = experiment.markers.is_present[:, :, None]
     return with_markers(experiment, np.where(present, tracks, np.nan))
 
 
@@ -72,14 +72,14 @@ def test_without_nuisance_markers_read_where_they_are():
     plain = simulate(cube, TRUTH, "midpoint", substeps=1).markers_m
     np.testing.assert_allclose(readings(cube, np.zeros(0)), plain, atol=1e-15)
     everything = cube_with_nuisance()
-    zero = np.zeros(NuisanceMap.of(everything).size)
+    zero = np.zeros(NuisanceMap.from_experiment(everything).size)
     np.testing.assert_allclose(readings(everything, zero), plain, atol=1e-12)
 
 
 def test_an_error_of_a_place_turns_with_the_body():
     cube = replace(cube_with_gaps(), nuisance=ONE_OF_EACH["place"])
-    phi = np.random.default_rng(1).uniform(-2, 2, NuisanceMap.of(cube).size)
-    places = cube.markers.observe(cube.body.nodes_m) + 0.003 * phi.reshape(-1, 3)
+    phi = np.random.default_rng(1).uniform(-2, 2, NuisanceMap.from_experiment(cube).size)
+    places = cube.markers.predict_positions(cube.body.nodes_m) + 0.003 * phi.reshape(-1, 3)
     really = replace(cube, markers=point_markers(cube.body, places, cube.t_s), nuisance=IDEAL)
     expected = simulate(really, TRUTH, "midpoint", substeps=1).markers_m
     assert np.ptp(expected - readings(cube, 0 * phi), axis=0).max() > 1e-3
@@ -92,7 +92,9 @@ def test_a_motion_in_the_grasp_is_a_body_held_elsewhere():
     cube = replace(plain, nuisance=Nuisance.none(hand_eye_m=0.003, hand_eye_rad=0.05))
     phi = np.array([1.0, -0.6, 0.8, 0.5, -1.0, 0.3])
     (grasp,) = plain.grasps
-    moved = Grasp(grasp.nodes, grasp.poses.after(NuisanceMap.of(cube).in_grasp(phi)))
+    moved = Grasp(
+        grasp.nodes, grasp.poses.after(NuisanceMap.from_experiment(cube).grasp_motion_matrix(phi))
+    )
     expected = simulate(replace(plain, grasps=(moved,)), TRUTH, "midpoint", substeps=1).markers_m
     assert np.abs(expected - readings(cube, 0 * phi)).max() > 3e-3
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-9)
@@ -100,12 +102,12 @@ def test_a_motion_in_the_grasp_is_a_body_held_elsewhere():
 
 def test_the_start_given_says_where_the_body_is_in_its_grasp():
     cube = replace(released_cube(), nuisance=Nuisance.none(hand_eye_m=0.003, hand_eye_rad=0.05))
-    assert NuisanceMap.of(cube).size == 0
+    assert NuisanceMap.from_experiment(cube).size == 0
 
 
 def test_a_camera_offset_moves_its_marker():
     cube = replace(hung_cube(), nuisance=ONE_OF_EACH["offset"])
-    phi = np.zeros(NuisanceMap.of(cube).size)
+    phi = np.zeros(NuisanceMap.from_experiment(cube).size)
     phi[3:6] = [1.0, -2.0, 0.5]
     change = readings(cube, phi) - readings(cube, 0 * phi)
     expected = np.zeros_like(change)
@@ -116,9 +118,9 @@ def test_a_camera_offset_moves_its_marker():
 @pytest.mark.parametrize("share", [-0.6, 0.3, 1.0])
 def test_a_time_shift_reads_the_motion_at_another_time(share: float):
     cube = replace(hung_cube(20), nuisance=Nuisance.none(time_shift_s=0.01))
-    (segment,) = alone(cube, substeps=10).segments
+    (segment,) = alone(cube, substeps=10).transcriptions
     grid = simulate(cube, TRUTH, "midpoint", substeps=10)
-    found = segment.markers.of_samples(grid.positions_m, np.array([share]))
+    found = segment.markers.predict_samples(grid.positions_m, np.array([share]))
     dense = replace(cube, t_s=np.linspace(0, 0.2, 201), markers=_on(cube, np.linspace(0, 0.2, 201)))
     expected = simulate(dense, TRUTH, "midpoint", substeps=1).markers_m
     moved = np.abs(expected - expected[0]).max()
@@ -130,7 +132,7 @@ def test_a_time_shift_reads_the_motion_at_another_time(share: float):
 def test_before_the_start_a_body_at_rest_reads_its_start():
     cube = replace(released_cube(), nuisance=Nuisance.none(time_shift_s=0.01))
     late = readings(cube, np.array([-1.0]))
-    start = cube.markers.observe(cube.body.nodes_m)
+    start = cube.markers.predict_positions(cube.body.nodes_m)
     np.testing.assert_allclose(late[:2], [start, start], atol=1e-12)
 
 
@@ -157,7 +159,7 @@ def test_a_corrected_pose_is_another_grasp_under_the_same_gravity():
 
 
 def test_a_tilt_turns_gravity_and_keeps_its_size():
-    nuisance = NuisanceMap.of(replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"]))
+    nuisance = NuisanceMap.from_experiment(replace(hung_cube(), nuisance=ONE_OF_EACH["tilt"]))
     gravity = nuisance.gravity(np.array([1.0, -2.0]))
     assert np.linalg.norm(gravity) == pytest.approx(9.81)
     angle = np.arccos(gravity @ nuisance.gravity_m_s2 / 9.81**2)
@@ -166,7 +168,7 @@ def test_a_tilt_turns_gravity_and_keeps_its_size():
 
 def test_without_gravity_there_is_no_tilt():
     floating = hung_cube(start="undeformed", gravity_m_s2=np.zeros(3))
-    nuisance = NuisanceMap.of(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
+    nuisance = NuisanceMap.from_experiment(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
     assert nuisance.size == 0
     np.testing.assert_array_equal(nuisance.gravity(np.zeros(0)), np.zeros(3))
 
@@ -192,10 +194,10 @@ def test_nuisance_is_found_beside_the_material(kind: str, method: str, rng):
     cube = replace(cube_with_gaps(14), nuisance=ONE_OF_EACH[kind])
     precise = replace(cube.markers, sigma_m=np.full(len(cube.markers.names), 1e-7))
     cube = replace(cube, markers=precise)
-    phi = rng.uniform(-1, 1, NuisanceMap.of(cube).size)
+    phi = rng.uniform(-1, 1, NuisanceMap.from_experiment(cube).size)
     solution = solve(Problem([seen_with(cube, phi)], GUESS), method)
     assert solution.status.converged
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     np.testing.assert_allclose(part.phi, phi, atol=1e-3)
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
@@ -208,7 +210,7 @@ def test_a_prior_keeps_what_the_data_do_not_tell():
     tracks = measured(one).markers.positions_m + np.array([0.005, 0.0, 0.0])
     both = replace(with_markers(one, tracks), nuisance=nuisance)
     solution = ReducedSpace()(alone(both))
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     offset, shift = 0.002 * part.phi[0], 0.001 * part.phi[3]
     assert offset / shift == pytest.approx(4.0, rel=0.05)  # as their variances
     assert offset + shift == pytest.approx(0.005, rel=0.05)
@@ -219,7 +221,7 @@ def test_a_prior_keeps_what_the_data_do_not_tell():
 )
 def test_the_clock_is_limited_to_samples_read_and_a_quarter_of_the_recording(about, low, high):
     cube = replace(hung_cube(40), nuisance=Nuisance.none(time_shift_s=0.02))
-    limits = np.concatenate(NuisanceMap.of(cube).limits(about))
+    limits = np.concatenate(NuisanceMap.from_experiment(cube).bounds(about))
     np.testing.assert_allclose(limits, np.array([low, high]) * cube.timestep_s / 0.02)
 
 
@@ -229,8 +231,8 @@ def test_a_shift_of_several_samples_is_found(samples: int):
     phi = np.array([samples * cube.timestep_s / 0.03])
     solution = solve(Problem([seen_with(cube, phi)], GUESS), "reduced-space")
     assert solution.status.converged
-    (part,) = solution.collocation.parts(solution.z)
-    assert part.segment.chart.samples == samples
+    (part,) = solution.collocation.iterates(solution.z)
+    assert part.segment.association.clock_samples == samples
     # The prior pulls towards no shift.
     np.testing.assert_allclose(part.phi, phi, atol=1e-2)
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=0.02)
@@ -269,12 +271,12 @@ def test_unknown_places_are_found_from_any_guess():
         guess = GUESS.with_guess({name: factor * value for name, value in TRUTH.items()})
         solution = solve(Problem([experiment], guess), "reduced-space")
         assert solution.status.converged
-        (part,) = solution.collocation.parts(solution.z)
-        found.append(part.segment.places_m(part.phi))
+        (part,) = solution.collocation.iterates(solution.z)
+        found.append(part.segment.marker_places_m(part.phi))
         values.append(solution.theta)
     np.testing.assert_allclose(values[0], values[1], rtol=1e-4)
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
-    bars = covariance(solution.collocation, solution.z)
+    bars = uncertainty_at(solution.collocation, solution.z)
     deviations_m = np.array(list(bars.nuisance.values())) * part.segment.nuisance.scales
     assert deviations_m.max() < 0.01
     assert np.abs((found[0] - places) / deviations_m.reshape(-1, 3)).max() < 3.5
@@ -299,8 +301,8 @@ def test_places_on_the_surface_stay_there():
         assert collocation.nphi == (4 if on_surface else 6)
         solution = ReducedSpace()(collocation)
         assert solution.status.converged
-        (part,) = solution.collocation.parts(solution.z)
-        places = part.segment.places_m(part.phi)
+        (part,) = solution.collocation.iterates(solution.z)
+        places = part.segment.marker_places_m(part.phi)
         off_m.append(np.abs([places[0, 2], places[1, 0]]).max())
     assert off_m[0] > 1e-3
     assert off_m[1] < 1e-12
@@ -319,10 +321,13 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
         places_sigma_m=0.01,
         on_surface=True,
     )
-    chart, found = Chart.of(replace(cube, markers=markers)), []
+    chart, found = MarkerAssociation.from_experiment(replace(cube, markers=markers)), []
     for _ in range(8):
-        nearest = chart.axes[0].T @ (ball - chart.points_m[0]) / chart.sigma_m[0]
-        before, (chart, phi) = chart, chart.following(chart.centre + nearest, 0.0)
+        nearest = chart.axes[0].T @ (ball - chart.centre_places_m[0]) / chart.sigma_m[0]
+        before, (chart, phi) = (
+            chart,
+            chart.follow_estimates(chart.centre_coordinates + nearest, 0.0),
+        )
         found.append(chart.places_m(phi)[0])
     assert chart is before
     np.testing.assert_allclose(found[-1], found[-2])
@@ -333,10 +338,15 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
 
 def test_a_problem_with_other_places_does_not_keep_the_charts_of_the_old_ones():
     cube = replace(hung_cube(4), nuisance=ONE_OF_EACH["place"])
-    charted = Collocation([cube], GUESS, charts={cube.name: Chart.of(cube)})
+    charted = Collocation(
+        [cube], GUESS, associations={cube.name: MarkerAssociation.from_experiment(cube)}
+    )
     exact = replace(charted, experiments=[replace(cube, nuisance=IDEAL)])
     assert len(exact.guess_p) == exact.nq
-    assert replace(charted, substeps=2).segments[0].chart is charted.charts[cube.name]
+    assert (
+        replace(charted, substeps=2).transcriptions[0].association
+        is charted.associations[cube.name]
+    )
 
 
 def test_nuisance_parameters_widen_the_error_bars_of_the_material():
@@ -344,7 +354,7 @@ def test_nuisance_parameters_widen_the_error_bars_of_the_material():
     known = ReducedSpace()(alone(plain))
     unknown = ReducedSpace()(alone(replace(plain, nuisance=cube_with_nuisance().nuisance)))
     narrow, wide = (
-        np.sqrt(np.diag(covariance(s.collocation, s.z).covariance)) for s in (known, unknown)
+        np.sqrt(np.diag(uncertainty_at(s.collocation, s.z).covariance)) for s in (known, unknown)
     )
     assert (wide > 1.05 * narrow).all()
 
@@ -358,9 +368,9 @@ def test_experiments_keep_their_nuisance_to_themselves(rng):
         for e in both
     ]
     solution = ReducedSpace()(Collocation(exact, GUESS))
-    found = solution.collocation.parameters_of(solution.z)[4:]
+    found = solution.collocation.parameters_from(solution.z)[4:]
     np.testing.assert_allclose(found, [0.7, -0.4], atol=1e-3)
-    assert solution.collocation.names[4:] == (
+    assert solution.collocation.parameter_names[4:] == (
         "hung cube: time shift [s]",
         "second: time shift [s]",
     )

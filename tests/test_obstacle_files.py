@@ -15,9 +15,9 @@ from problems_small import TRUTH, as_theta, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.model.contact import contacts
+from collocation_sysid.model.contact import contact_terms
 from collocation_sysid.model.force_term import States
-from collocation_sysid.program.touches import on_surface
+from collocation_sysid.program.touches import surface_gaps_and_pressures
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
 from collocation_sysid.result.page import write_page
 from collocation_sysid.result.pictures.shapes import contact_shapes
@@ -84,13 +84,13 @@ def test_what_a_file_says_of_obstacles(tmp_path: Path):
     assert (ball.name, wall.name) == ("ball", "obstacle 2")
     assert isinstance(ball.shape, cs.Sphere)
     assert ball.shape.radius_m == 0.05
-    np.testing.assert_allclose(wall.shape.normal, [1, 0, 0])
+    np.testing.assert_allclose(wall.shape.offset_direction, [1, 0, 0])
     assert wall.stiffness_pa_m == 4e4
     assert ball.wrench is not None
     assert ball.wrench.sigma_n == 0.3
     friction = problem.parameters.items[-1]
     assert (friction.name, friction.lower, friction.upper) == ("ball_friction", 0.0, 2.0)
-    (segment,) = problem.collocation().segments
+    (segment,) = problem.collocation().transcriptions
     labels = [name.partition(": ")[2] for name in segment.nuisance.names]
     assert [label for label in labels if "ball" in label or "obstacle" in label] == [
         "place of ball [m]",
@@ -141,7 +141,7 @@ def test_two_obstacles_have_two_names():
 
 def test_a_body_keeps_its_nodes_and_mass_and_its_obstacles_come_last():
     cube = pressed_cube(3)
-    plain = replace(cube, grasps=cube.gripping)
+    plain = replace(cube, grasps=cube.body_grasps)
     assert plain.body.frames.size == 0
     assert cube.body.mass_kg == plain.body.mass_kg
     nodes = len(plain.body.nodes_m)
@@ -180,7 +180,7 @@ def test_pictures_have_outlines_where_obstacles_are_and_keep_them():
     np.testing.assert_allclose(distance_m[np.isfinite(distance_m)], ball.shape.radius_m)
     kept = Replay.from_arrays(cube.name, seen.arrays())
     np.testing.assert_array_equal(kept.obstacles_m, seen.obstacles_m)
-    assert Replay.of(replace(cube, grasps=cube.gripping)).obstacles_m is None
+    assert Replay.of(replace(cube, grasps=cube.body_grasps)).obstacles_m is None
 
 
 def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path: Path):
@@ -189,8 +189,8 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path:
     cube = replace(both, grasps=[held, plate])
     motion = cs.simulate(cube, TRUTH, "bdf2", substeps=1)
     x = motion.positions_m.reshape(len(motion.t_s), -1)
-    touched = gaps_m, pressures_pa = on_surface(cube, theta, x)
-    (term,) = contacts(cube)
+    touched = gaps_m, pressures_pa = surface_gaps_and_pressures(cube, theta, x)
+    (term,) = contact_terms(cube)
     force = term.force(States(x, np.zeros_like(x), theta)).reshape(len(x), -1, 3)
     own, surface = cube.body.mesh.points_m, cube.body.mesh.surface
     areas_m2 = np.linalg.norm(
@@ -200,7 +200,7 @@ def test_pictures_show_where_something_presses_and_how_far_the_rest_is(tmp_path:
     given_n = np.linalg.norm(force[:, : len(own)].sum(axis=1), axis=1)
     assert given_n[-1] > 0
     np.testing.assert_allclose(pressures_pa @ areas_m2 / 2, given_n, rtol=1e-9)
-    assert np.all(gaps_m[pressures_pa == 0] >= term.contact.width_m)
+    assert np.all(gaps_m[pressures_pa == 0] >= term.law_of_contact.largest_width_m)
     seen = Replay.of(cube, (motion.positions_m, motion.markers_m), touched=touched)
     kept = Replay.from_arrays(cube.name, seen.arrays())
     assert set(contact_shapes(kept)) == {"pressure", "gap"}

@@ -12,7 +12,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.continuation import Continuation
-from collocation_sysid.methods.options import built
+from collocation_sysid.methods.options import method_from_options
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.stated import documented
@@ -36,7 +36,7 @@ def test_every_method_is_known_by_its_name_and_has_a_schema(name: str):
 
 
 def test_a_method_is_built_from_a_table():
-    method = built(ReducedSpace, {"ladder": [0.5, 1], "max_iterations": 3}, "solver")
+    method = method_from_options(ReducedSpace, {"ladder": [0.5, 1], "max_iterations": 3}, "solver")
     assert method == ReducedSpace(ladder=(0.5, 1.0), max_iterations=3)
 
 
@@ -57,7 +57,7 @@ def test_a_method_is_built_from_a_table():
 )
 def test_what_an_option_cannot_be_is_refused_by_its_key(kind: str, options: dict, message: str):
     with pytest.raises(InputError, match=message):
-        built(METHODS[kind], options, "solver")
+        method_from_options(METHODS[kind], options, "solver")
 
 
 def test_a_changed_method_is_checked_again():

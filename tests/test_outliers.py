@@ -14,9 +14,9 @@ import collocation_sysid as cs
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Wrench
-from collocation_sysid.statistics.diagnostics import diagnose, set_apart
-from collocation_sysid.statistics.trust import Trust, fit_concerns
-from collocation_sysid.statistics.uncertainty import uncertainty_of
+from collocation_sysid.statistics.diagnostics import diagnose_markers, remove_outliers
+from collocation_sysid.statistics.trust import Assessment, fit_concerns
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 RNG = np.random.default_rng
 OF = problem((60,), markers=3)
@@ -33,19 +33,19 @@ def with_outlier(errors: np.ndarray) -> np.ndarray:
     return spoiled
 
 
-def judged(errors: np.ndarray) -> tuple[Trust, float]:
+def judged(errors: np.ndarray) -> tuple[Assessment, float]:
     fit, wrong = fit_to(errors)
-    found = uncertainty_of(fit, PARAMETERS, wrong[:4])
-    return Trust.of(fit_concerns(found)), found.dependence.lag1
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
+    return Assessment.from_concerns(fit_concerns(found)), found.dependence.lag1
 
 
 def test_a_sample_that_spoils_the_rest_is_named():
     fit, _ = fit_to(with_outlier(RNG(0).normal(size=(60, 3, 3))))
-    rest, (outlier,) = set_apart(fit)
+    rest, (outlier,) = remove_outliers(fit)
     assert (outlier.series, outlier.t_s) == ("swing 0/m1", pytest.approx(0.2))
     assert outlier.share > 0.9
     assert outlier.deviations == pytest.approx(158, rel=0.1)
-    assert rest.measurements == fit.measurements - 3
+    assert rest.measurement_count == fit.measurement_count - 3
     trust, _ = judged(with_outlier(RNG(0).normal(size=(60, 3, 3))))
     assert any("swing 0/m1: the sample at t = 0.2 s, off by 1.5e+02" in r for r in trust.reasons)
 
@@ -54,7 +54,7 @@ def test_noise_has_no_such_sample_be_it_white_or_not():
     for seed in range(100):
         for errors in (RNG(seed).normal(size=(60, 3, 3)), autoregressive(RNG(seed), 60, 3, 0.95)):
             fit, _ = fit_to(errors)
-            assert set_apart(fit) == (fit, ())
+            assert remove_outliers(fit) == (fit, ())
 
 
 def test_a_sample_that_does_not_pull_is_only_to_be_checked():
@@ -81,12 +81,12 @@ def test_several_are_set_apart_but_no_more_than_exceptions():
     residual = fit.blocks[0].residual.copy()
     residual[:12, 0, 0] += 1e5 / 3.0 ** np.arange(12)
     spoiled = replace(fit, blocks=(replace(fit.blocks[0], residual=residual),))
-    assert [outlier.sample for outlier in set_apart(spoiled)[1]] == [0, 1, 2, 3, 4, 5]
+    assert [outlier.sample for outlier in remove_outliers(spoiled)[1]] == [0, 1, 2, 3, 4, 5]
 
 
 def test_the_diagnosis_of_its_marker_names_it_in_place_of_a_pattern():
     fit, _ = fit_to(with_outlier(RNG(0).normal(size=(60, 3, 3))))
-    (said,) = (each.sentence for each in diagnose(fit) if each.marker == "m1")
+    (said,) = (each.sentence for each in diagnose_markers(fit) if each.marker == "m1")
     assert "mm RMS; the sample at t = 0.2 s, off by 1.5e+02 sigma, alone has 94 %" in said
 
 

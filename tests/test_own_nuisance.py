@@ -50,7 +50,7 @@ def known_to(experiment: cs.Experiment, sigma_m: float) -> cs.Experiment:
 
 def test_readings_are_changed_as_said():
     cube = replace(hung_cube(), nuisance=only(SCALE, SAG))
-    phi = np.zeros(NuisanceMap.of(cube).size)
+    phi = np.zeros(NuisanceMap.from_experiment(cube).size)
     plain = seen_with(cube, phi).markers.positions_m
     phi[0], phi[4:7] = 0.5, (1.0, 0.0, -2.0)
     scaled = seen_with(cube, phi).markers.positions_m
@@ -81,10 +81,10 @@ FOUND_BY = [
 def test_what_a_user_adds_is_found_beside_the_material(name: str, method: str, rng):
     steps, sigma_m = (14, 1e-7) if method == "reduced-space" else (9, 1e-5)
     cube = known_to(replace(cube_with_gaps(steps), nuisance=only(ROWS[name])), sigma_m)
-    phi = rng.uniform(-1, 1, NuisanceMap.of(cube).size)
+    phi = rng.uniform(-1, 1, NuisanceMap.from_experiment(cube).size)
     solution = solve(cs.Problem([seen_with(cube, phi)], GUESS), method)
     assert solution.status.converged
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     np.testing.assert_allclose(part.phi, phi, atol=1e-3)
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 

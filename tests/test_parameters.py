@@ -8,7 +8,7 @@ from problems_small import box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.moduli import engineering
+from collocation_sysid.fem.moduli import engineering_constants
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
@@ -18,7 +18,7 @@ from collocation_sysid.model.parameters import (
     ThetaMap,
     Tied,
     Unknown,
-    theta_of,
+    resolve_theta,
 )
 
 DAMPING = (Parameter("gamma_r_s", 0.02, 1e-5, 1.0), Parameter("gamma_m_1_s", 0.5, 1e-3, 100.0))
@@ -31,17 +31,17 @@ IN_ENGINEERING = Parameters(
 MIXED = Parameters(
     (
         Parameter("young_pa", 700.0, 10.0, 1e5),
-        Parameter("poisson", 0.2, fixed=True),
+        Parameter("poisson", 0.2, is_fixed=True),
         DAMPING[0],
-        Parameter("gamma_m_1_s", 0.0, fixed=True),
+        Parameter("gamma_m_1_s", 0.0, is_fixed=True),
     )
 )
 ALL_FIXED = Parameters(
-    tuple(Parameter(item.name, item.guess, fixed=True) for item in IN_LAME.items)
+    tuple(Parameter(item.name, item.guess, is_fixed=True) for item in IN_LAME.items)
 )
 DAMPED = {"gamma_r_s": Unknown(0.02), "gamma_m_1_s": Unknown(0.5)}
 
-YOUNG_PA, POISSON = engineering(*LAME)
+YOUNG_PA, POISSON = engineering_constants(*LAME)
 # The same stiffness in every pair of moduli.
 PAIRS = {
     "lambda and mu": {"lambda_pa": LAME[0], "mu_pa": LAME[1]},
@@ -69,23 +69,25 @@ def two_regions(material: str | None = None) -> Body:
 
 def unknowns(values: dict[str, float]) -> Parameters:
     """All of them estimated, with the damping."""
-    return Parameters.of({**{name: Unknown(value) for name, value in values.items()}, **DAMPED})
+    return Parameters.from_mapping(
+        {**{name: Unknown(value) for name, value in values.items()}, **DAMPED}
+    )
 
 
 def assert_derivatives(parameters: Parameters, body: Body, rng: np.random.Generator) -> None:
     """Of constants and derived moduli by q, around the guess."""
     constants, q = ThetaMap(parameters, body), parameters.guess_q
     scale, size = 0.3, len(body.constants)
-    first = constants.slopes(q)
+    first = constants.jacobian(q)
     assert first.shape == (size, len(q))
     for k in range(size):
         assert_derivative(
             lambda q, k=k: constants.theta(q)[k], lambda d, k=k: first[k] @ d, q, rng, scale=scale
         ) if first[k].any() else None
-    _, slopes = constants.derived(q)
+    _, slopes = constants.derived_moduli(q)
     if len(slopes):
         assert_derivative(
-            lambda q: constants.derived(q)[0], lambda d: slopes @ d, q, rng, scale=scale
+            lambda q: constants.derived_moduli(q)[0], lambda d: slopes @ d, q, rng, scale=scale
         )
 
 
@@ -128,9 +130,9 @@ def test_with_everything_fixed_the_constants_are_the_guess():
     assert ALL_FIXED.guess_q.shape == (0,)
     constants = ThetaMap(ALL_FIXED, box())
     np.testing.assert_allclose(constants.theta([]), [400.0, 150.0, 0.02, 0.5])
-    assert constants.slopes(np.zeros(0)).shape == (4, 0)
-    values, slopes = constants.derived(np.zeros(0))
-    np.testing.assert_allclose(values, engineering(400.0, 150.0))
+    assert constants.jacobian(np.zeros(0)).shape == (4, 0)
+    values, slopes = constants.derived_moduli(np.zeros(0))
+    np.testing.assert_allclose(values, engineering_constants(400.0, 150.0))
     assert slopes.shape == (2, 0)
 
 
@@ -165,7 +167,7 @@ def test_bounds_and_guesses_are_logarithms():
 def test_a_prior_pulls_on_the_logarithm():
     drawn = Parameter("mu_pa", 150.0, 10.0, 1e5, prior=(300.0, 0.1))
     parameters = Parameters((IN_LAME.items[0], drawn, *DAMPING))
-    residuals, slopes = parameters.prior(np.log([400.0, 330.0, 0.02, 0.5]))
+    residuals, slopes = parameters.prior_residuals(np.log([400.0, 330.0, 0.02, 0.5]))
     np.testing.assert_allclose(residuals, [0, np.log(1.1) / 0.1, 0, 0])
     np.testing.assert_allclose(slopes, [0, 10, 0, 0])
 
@@ -174,29 +176,34 @@ def test_a_prior_pulls_on_the_logarithm():
 
 
 def test_poisson_is_estimated_on_a_linear_scale_by_tenths():
-    (young, poisson, *_) = Parameters.of(
+    (young, poisson, *_) = Parameters.from_mapping(
         {"young_pa": Unknown(700.0), "poisson": Unknown(0.2, 0.05, 0.45), **DAMPED}
     ).items
     assert (young.scale, poisson.scale, poisson.unit) == ("log", "linear", 0.1)
-    assert poisson.q(0.2) == pytest.approx(2.0)
-    assert poisson.value(3.0) == pytest.approx(0.3)
-    assert poisson.per_value(0.2) == 0.1
+    assert poisson.to_coordinate(0.2) == pytest.approx(2.0)
+    assert poisson.from_coordinate(3.0) == pytest.approx(0.3)
+    assert poisson.value_derivative(0.2) == 0.1
     assert (poisson.lower, poisson.upper) == (0.05, 0.45)
 
 
 def test_the_scale_may_be_told():
     given = {"young_pa": Unknown(700.0), "poisson": Unknown(0.2, scale="log"), **DAMPED}
-    logarithm = Parameters.of(given)
+    logarithm = Parameters.from_mapping(given)
     assert logarithm.guess_q[1] == pytest.approx(np.log(0.2))
-    any_sign = Parameters.of({"mu_pa": Unknown(20.0, scale="linear")}).items[0]
+    any_sign = Parameters.from_mapping({"mu_pa": Unknown(20.0, scale="linear")}).items[0]
     assert any_sign.lower < 0
     assert any_sign.unit == 20.0  # its guess tells its size
-    assert Parameters.of({"mu_pa": Unknown(20.0, scale="linear", typical=5.0)}).guess_q[0] == 4.0
+    assert (
+        Parameters.from_mapping({"mu_pa": Unknown(20.0, scale="linear", typical=5.0)}).guess_q[0]
+        == 4.0
+    )
 
 
 def test_a_linear_parameter_may_be_negative_or_zero():
     given = {"c10_pa": 150.0, "c20_pa": Unknown(-40.0, -100.0, 50.0), "c30_pa": 0.0}
-    parameters = Parameters.of({**given, "kappa_pa": KAPPA_PA, "gamma_r_s": 0.0, "gamma_m_1_s": 0})
+    parameters = Parameters.from_mapping(
+        {**given, "kappa_pa": KAPPA_PA, "gamma_r_s": 0.0, "gamma_m_1_s": 0}
+    )
     np.testing.assert_allclose(parameters.guess_q, [-1.0])
     lower, upper = parameters.bounds_q
     np.testing.assert_allclose([lower[0], upper[0]], [-2.5, 1.25])
@@ -206,16 +213,16 @@ def test_a_linear_parameter_may_be_negative_or_zero():
 
 def test_a_linear_parameter_of_no_size_is_refused():
     with pytest.raises(InputError, match=r"c20_pa: guess = 0 .*expected typical"):
-        Parameters.of({"c20_pa": Unknown(0.0)})
-    assert Parameters.of({"c20_pa": Unknown(0.0, typical=10.0)}).items[0].unit == 10.0
+        Parameters.from_mapping({"c20_pa": Unknown(0.0)})
+    assert Parameters.from_mapping({"c20_pa": Unknown(0.0, typical=10.0)}).items[0].unit == 10.0
 
 
 def test_a_prior_of_a_linear_parameter_pulls_on_its_value():
     poisson = Unknown(0.2, prior=(0.3, 0.02))
-    parameters = Parameters.of({"young_pa": Unknown(700.0), "poisson": poisson, **DAMPED})
+    parameters = Parameters.from_mapping({"young_pa": Unknown(700.0), "poisson": poisson, **DAMPED})
     q = parameters.guess_q
     q[1] = 0.35 / 0.1
-    residuals, slopes = parameters.prior(q)
+    residuals, slopes = parameters.prior_residuals(q)
     np.testing.assert_allclose(residuals, [0, 0.05 / 0.02, 0, 0])
     np.testing.assert_allclose(slopes, [0, 0.1 / 0.02, 0, 0])
 
@@ -225,7 +232,7 @@ def test_a_prior_of_a_linear_parameter_pulls_on_its_value():
 
 def test_a_tied_parameter_is_a_multiple_of_another(rng):
     given = {"mu_pa": Unknown(300.0), "lambda_pa": Tied("mu_pa", 2.0), **DAMPED}
-    parameters = Parameters.of(given)
+    parameters = Parameters.from_mapping(given)
     assert [item.name for item in parameters.free] == ["mu_pa", "gamma_r_s", "gamma_m_1_s"]
     assert parameters.guesses == pytest.approx(
         {"mu_pa": 300.0, "lambda_pa": 600.0, "gamma_r_s": 0.02, "gamma_m_1_s": 0.5}
@@ -237,7 +244,7 @@ def test_a_tied_parameter_is_a_multiple_of_another(rng):
 
 def test_a_tie_to_a_fixed_value_is_fixed_with_it():
     given = {"mu_pa": 300.0, "lambda_pa": Tied("mu_pa"), "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-    parameters = Parameters.of(given)
+    parameters = Parameters.from_mapping(given)
     np.testing.assert_allclose(ThetaMap(parameters, box()).theta([]), [300.0, 300.0, 0.0, 0.0])
 
 
@@ -250,8 +257,8 @@ def test_a_parameter_that_only_another_is_tied_to_counts_as_used():
         "core.mu_pa": Tied("mu_pa", 3.0),
         **DAMPED,
     }
-    parameters = Parameters.of(given)
-    parameters.fit([body])
+    parameters = Parameters.from_mapping(given)
+    parameters.require_constants_of([body])
     theta = ThetaMap(parameters, body).theta(parameters.guess_q)
     np.testing.assert_allclose(theta, [200, 300, 0.02, 0.5, 600, 900, 0.02, 0.5])
 
@@ -268,7 +275,7 @@ def test_a_parameter_that_only_another_is_tied_to_counts_as_used():
 def test_ties_to_what_has_no_value_are_refused(tied, message):
     given = {"lambda_pa": tied, "mu_pa": 1.0, "gamma_r_s": Tied("mu_pa"), "gamma_m_1_s": 0.0}
     with pytest.raises(InputError, match=message):
-        Parameters.of(given)
+        Parameters.from_mapping(given)
 
 
 # Regions ----------------------------------------------------------------------------------------
@@ -286,8 +293,8 @@ def test_regions_share_names_without_a_region_and_have_their_own(rng):
         "gamma_m_1_s": Unknown(1.0),
         "core.gamma_m_1_s": Unknown(2.0),
     }
-    parameters = Parameters.of(given)
-    parameters.fit([body])
+    parameters = Parameters.from_mapping(given)
+    parameters.require_constants_of([body])
     theta = ThetaMap(parameters, body).theta(parameters.guess_q)
     kappa = 1000.0 + 2 / 3 * 1000.0  # of the core, with ν = ¼ like the rest: λ = μ
     expected = [400.0, 400.0, 0.01, 1.0, 300.0, 200.0, kappa, 0.01, 2.0]
@@ -298,8 +305,8 @@ def test_regions_share_names_without_a_region_and_have_their_own(rng):
 def test_a_region_takes_of_shared_moduli_what_its_material_needs():
     given = {"young_pa": 1.0, "poisson": 0.2, **GIVEN, "core.c10_pa": 1.0, "core.c01_pa": 2.0}
     body = two_regions("mooney-rivlin")
-    Parameters.of(given).fit([body])
-    lam, mu = body.lame(body.theta(given))["core"]
+    Parameters.from_mapping(given).require_constants_of([body])
+    lam, mu = body.lame(body.theta_from_values(given))["core"]
     assert mu == pytest.approx(6.0)
     assert lam / (2 * (lam + mu)) == pytest.approx(0.2)
 
@@ -307,21 +314,21 @@ def test_a_region_takes_of_shared_moduli_what_its_material_needs():
 def test_a_regions_own_modulus_goes_with_a_shared_one():
     body = two_regions()
     given = {"mu_pa": 300.0, "poisson": 0.25, "core.mu_pa": 500.0}
-    theta = body.theta({**given, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
+    theta = body.theta_from_values({**given, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
     np.testing.assert_allclose(theta, [300.0, 300.0, 0.0, 0.0, 500.0, 500.0, 0.0, 0.0])
 
 
 def test_a_regions_own_pair_may_be_another_one():
     body = two_regions()
     given = {"lambda_pa": 300.0, "mu_pa": 300.0, "core.young_pa": 1000.0, "core.poisson": 0.25}
-    theta = body.theta({**given, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
+    theta = body.theta_from_values({**given, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
     np.testing.assert_allclose(theta, [300.0, 300.0, 0.0, 0.0, 400.0, 400.0, 0.0, 0.0])
 
 
 def test_several_bodies_take_their_constants_from_the_same_parameters():
     one, two = box(), body_of("gent")
     parameters = unknowns({"mu_pa": LAME[1], "poisson": POISSON, "gent_limit": 8.0})
-    parameters.fit([one, two])
+    parameters.require_constants_of([one, two])
     np.testing.assert_allclose(ThetaMap(parameters, one).theta(parameters.guess_q)[:2], LAME)
     found = ThetaMap(parameters, two).theta(parameters.guess_q)
     np.testing.assert_allclose(found, [LAME[1], 8.0, KAPPA_PA, 0.02, 0.5])
@@ -343,7 +350,7 @@ def test_moduli_that_were_not_given_are_derived(pair, expected):
     parameters = unknowns(PAIRS[pair])
     constants = ThetaMap(parameters, box())
     found = dict(
-        zip(constants.derived_names, constants.derived(parameters.guess_q)[0], strict=True)
+        zip(constants.derived_names, constants.derived_moduli(parameters.guess_q)[0], strict=True)
     )
     assert found == pytest.approx(expected)
 
@@ -358,7 +365,7 @@ def test_moduli_are_derived_for_every_region():
         *("young_pa", "poisson", "core.young_pa", "core.poisson")
     }
     found = dict(
-        zip(constants.derived_names, constants.derived(parameters.guess_q)[0], strict=True)
+        zip(constants.derived_names, constants.derived_moduli(parameters.guess_q)[0], strict=True)
     )
     for name in ("", "core."):
         assert found[f"{name}young_pa"] == pytest.approx(YOUNG_PA)
@@ -371,22 +378,22 @@ def test_moduli_are_derived_for_every_region():
 def test_constants_from_guesses_a_mapping_or_numbers():
     expected = np.array([400.0, 400.0, 0.01, 2.0])
     by_name = {"gamma_m_1_s": 2.0, "gamma_r_s": 0.01, "young_pa": 1000.0, "poisson": 0.25}
-    np.testing.assert_allclose(theta_of(box(), by_name), expected)
-    np.testing.assert_array_equal(theta_of(box(), [400, 400, 0.01, 2]), expected)
-    np.testing.assert_array_equal(theta_of(box(), expected), expected)
-    np.testing.assert_allclose(theta_of(box(), IN_LAME), (400.0, 150.0, 0.02, 0.5))
+    np.testing.assert_allclose(resolve_theta(box(), by_name), expected)
+    np.testing.assert_array_equal(resolve_theta(box(), [400, 400, 0.01, 2]), expected)
+    np.testing.assert_array_equal(resolve_theta(box(), expected), expected)
+    np.testing.assert_allclose(resolve_theta(box(), IN_LAME), (400.0, 150.0, 0.02, 0.5))
 
 
 def test_a_mapping_is_checked_like_a_problem():
     with pytest.raises(InputError, match="gamma_m_1_s is missing"):
-        theta_of(box(), {"young_pa": 1000.0, "poisson": 0.2, "gamma_r_s": 0.01})
+        resolve_theta(box(), {"young_pa": 1000.0, "poisson": 0.2, "gamma_r_s": 0.01})
     with pytest.raises(InputError, match="gama_r_s: no such parameter"):
-        theta_of(box(), {"young_pa": 1000.0, "poisson": 0.2, "gama_r_s": 0.01})
+        resolve_theta(box(), {"young_pa": 1000.0, "poisson": 0.2, "gama_r_s": 0.01})
 
 
 def test_as_many_numbers_as_constants_are_taken():
     with pytest.raises(InputError, match="3 parameters given, expected 4: lambda_pa, mu_pa"):
-        theta_of(box(), [400.0, 400.0, 0.01])
+        resolve_theta(box(), [400.0, 400.0, 0.01])
 
 
 def test_with_guess_changes_only_what_it_names():
@@ -394,7 +401,7 @@ def test_with_guess_changes_only_what_it_names():
     assert other.guesses == pytest.approx(
         {"young_pa": 800.0, "poisson": 0.3, "gamma_r_s": 0.02, "gamma_m_1_s": 0.0}
     )
-    assert [item.fixed for item in other.items] == [item.fixed for item in MIXED.items]
+    assert [item.is_fixed for item in other.items] == [item.is_fixed for item in MIXED.items]
 
 
 def test_with_guess_refuses_unknown_names_and_values_out_of_bounds():
@@ -435,7 +442,7 @@ def test_unusable_parameters_are_refused_by_name(changes: dict, message: str):
 
 def test_a_guess_beyond_assumed_bounds_is_refused_with_a_word_on_them():
     with pytest.raises(InputError, match=r"mu_pa: guess = 1e\+10, .* these bounds are assumed"):
-        Parameters.of({"mu_pa": Unknown(1e10)})
+        Parameters.from_mapping({"mu_pa": Unknown(1e10)})
 
 
 @pytest.mark.parametrize("name", ["poisson", "core.poisson"])
@@ -491,7 +498,7 @@ SETS = {
 def test_other_sets_of_parameters_are_refused_with_one_message(name: str):
     given, message = SETS[name]
     with pytest.raises(InputError, match=message) as caught:
-        Parameters.of(given).fit([box()])
+        Parameters.from_mapping(given).require_constants_of([box()])
     assert "\n" not in str(caught.value)
 
 
@@ -521,7 +528,7 @@ def test_parameters_that_do_not_fit_the_regions_are_refused(name: str):
         Region("skin", Box([0.05, -1, -1], [1] * 3)),
     )
     with pytest.raises(InputError, match=message) as caught:
-        Parameters.of(given).fit([body_of(regions=halves)])
+        Parameters.from_mapping(given).require_constants_of([body_of(regions=halves)])
     assert "\n" not in str(caught.value)
 
 
@@ -532,9 +539,9 @@ def test_a_name_given_twice_is_refused():
 
 def test_what_was_found_below_zero_can_be_fixed_there():
     """So are the constants of a recording that is predicted only."""
-    free = Parameters.of({"c10_pa": 1e4, "c01_pa": Unknown(-1e3, scale="linear")})
-    fixed = free.fixed_at({"c01_pa": -1.4e3})
+    free = Parameters.from_mapping({"c10_pa": 1e4, "c01_pa": Unknown(-1e3, scale="linear")})
+    fixed = free.only_fixed({"c01_pa": -1.4e3})
     assert (fixed.names, fixed.free) == (("c01_pa",), ())
     assert fixed.values(np.zeros(0)) == {"c01_pa": -1.4e3}
     with pytest.raises(InputError, match=r"c01_pa.*fixed = -1400, expected a number >= 0"):
-        Parameters.of({"c01_pa": -1.4e3})
+        Parameters.from_mapping({"c01_pa": -1.4e3})

@@ -20,8 +20,8 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.comparison.inner import FIRST_ORDER, minimise
-from collocation_sysid.methods.comparison.merit import Merit, Unconstrained
+from collocation_sysid.methods.comparison.inner import FIRST_ORDER, minimise_merit
+from collocation_sysid.methods.comparison.merit import MeritFunction, PenaltyProblem
 from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.start import initial_variables
@@ -35,9 +35,9 @@ def collocation_of(name: str, noise_m: float = 0.0, steps: int = 10) -> Collocat
     return Collocation([noisy(SMALL_EXPERIMENTS[name](steps), noise_m)], GUESS)
 
 
-def disturbed(problem: Unconstrained, rng: np.random.Generator) -> np.ndarray:
-    z, _ = initial_variables(problem.given)
-    return z + np.where(problem.free, 0.01 * rng.standard_normal(len(z)), 0.0)
+def disturbed(problem: PenaltyProblem, rng: np.random.Generator) -> np.ndarray:
+    z, _ = initial_variables(problem.original)
+    return z + np.where(problem.is_free, 0.01 * rng.standard_normal(len(z)), 0.0)
 
 
 # The merit function
@@ -45,29 +45,30 @@ def disturbed(problem: Unconstrained, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_the_gradient_of_the_merit_is_that_of_differences(name: str, rng):
-    problem = Unconstrained(collocation_of(name))
-    merit = Merit(problem, 30.0, rng.standard_normal(problem.nlp.constraints))
+    problem = PenaltyProblem(collocation_of(name))
+    merit = MeritFunction(problem, 30.0, rng.standard_normal(problem.nlp.constraint_count))
     z = disturbed(problem, rng)
     _, gradient = merit.value_and_gradient(z)
-    assert not gradient[~problem.free].any()
-    scale = 0.1 * problem.free
+    assert not gradient[~problem.is_free].any()
+    scale = 0.1 * problem.is_free
     assert_derivative(merit.value, lambda d: gradient @ d, z, rng, tolerance=1e-6, scale=scale)
 
 
 def test_grasps_are_paid_for_and_given_starts_are_not():
     hung, released = (
-        Unconstrained(Collocation([measured(make())], GUESS)) for make in (hung_cube, released_cube)
+        PenaltyProblem(Collocation([measured(make())], GUESS))
+        for make in (hung_cube, released_cube)
     )
-    assert hung.free.all()
-    (start,) = released.nlp.segments
-    assert np.count_nonzero(~released.free) == start.dofs
-    assert hung.nlp.constraints > hung.given.constraints
+    assert hung.is_free.all()
+    (start,) = released.nlp.transcriptions
+    assert np.count_nonzero(~released.is_free) == start.dof_count
+    assert hung.nlp.constraint_count > hung.original.constraint_count
 
 
 def test_an_inverted_element_costs_infinitely_much():
-    problem = Unconstrained(collocation_of("hung-cube"))
-    merit = Merit(problem, 1.0, np.zeros(problem.nlp.constraints))
-    z, _ = initial_variables(problem.given)
+    problem = PenaltyProblem(collocation_of("hung-cube"))
+    merit = MeritFunction(problem, 1.0, np.zeros(problem.nlp.constraint_count))
+    z, _ = initial_variables(problem.original)
     q, (x,) = problem.nlp.unpack(z)
     inverted = problem.nlp.pack(q, [-x])
     assert np.isfinite(merit.value(z))
@@ -76,13 +77,15 @@ def test_an_inverted_element_costs_infinitely_much():
 
 
 def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
-    problem = Unconstrained(collocation_of("bar-let-go"))
-    answer = problem.answer(disturbed(problem, rng))
-    rows = problem.nlp.constraint_values(answer).reshape(-1, problem.nlp.segments[0].dofs)
-    (segment,) = problem.nlp.segments
-    assert segment.dynamics.taken.any()
-    np.testing.assert_allclose(rows[:, segment.held_dofs], 0, atol=1e-12)
-    np.testing.assert_allclose(rows[segment.dynamics.taken], 0, atol=1e-12)
+    problem = PenaltyProblem(collocation_of("bar-let-go"))
+    answer = problem.to_original(disturbed(problem, rng))
+    rows = problem.nlp.constraint_values(answer).reshape(
+        -1, problem.nlp.transcriptions[0].dof_count
+    )
+    (segment,) = problem.nlp.transcriptions
+    assert segment.dynamics.is_temporarily_held.any()
+    np.testing.assert_allclose(rows[:, segment.prescribed_dofs], 0, atol=1e-12)
+    np.testing.assert_allclose(rows[segment.dynamics.is_temporarily_held], 0, atol=1e-12)
 
 
 # The answer
@@ -117,14 +120,14 @@ def test_the_slack_falls_as_one_over_rho_and_the_bias_with_it():
 @pytest.mark.parametrize("inner", FIRST_ORDER)
 def test_methods_of_first_order_lower_the_merit_and_stay_upright(inner):
     collocation = collocation_of("hung-cube", 0.0, 5)
-    problem = Unconstrained(collocation)
+    problem = PenaltyProblem(collocation)
     options = Penalty(inner, schedule="constant", rho=1e3, max_iterations=120)
     lines: list[Iteration] = []
     solution = options(collocation, lines.append)
-    merit = Merit(problem, 1e3, np.zeros(problem.nlp.constraints))
+    merit = MeritFunction(problem, 1e3, np.zeros(problem.nlp.constraint_count))
     start, _ = initial_variables(collocation)
     assert merit.value(solution.z) < 1e-3 * merit.value(start)
-    assert problem.is_upright(solution.z)
+    assert problem.has_valid_elements(solution.z)
     assert [line.number for line in lines] == sorted({line.number for line in lines})
     lower, upper = problem.lower, problem.upper
     assert ((solution.z >= lower) & (solution.z <= upper)).all()
@@ -132,11 +135,13 @@ def test_methods_of_first_order_lower_the_merit_and_stay_upright(inner):
 
 def test_conjugate_gradients_lower_the_merit_in_every_step():
     collocation = collocation_of("hung-cube", 0.0, 5)
-    problem = Unconstrained(collocation)
-    merit = Merit(problem, 1e3, np.zeros(problem.nlp.constraints))
+    problem = PenaltyProblem(collocation)
+    merit = MeritFunction(problem, 1e3, np.zeros(problem.nlp.constraint_count))
     start, _ = initial_variables(collocation)
     values = []
-    minimise("cg-descent", merit, start, 1e-12, 150, lambda z, value, slope: values.append(value))
+    minimise_merit(
+        "cg-descent", merit, start, 1e-12, 150, lambda z, value, slope: values.append(value)
+    )
     changes = np.diff(values)
     assert len(changes) > 50
     assert (changes <= 1e-6 * np.abs(values[:-1])).all()  # what the approximate conditions allow
@@ -200,12 +205,12 @@ def test_an_interruption_keeps_the_last_and_best_iterate():
 
 def test_both_layouts_of_grasps_give_the_same_answer():
     made = noisy(hung_cube(), 1e-4)
-    bounds, rows = (Collocation([made], GUESS, explicit_grasps=e) for e in (False, True))
+    bounds, rows = (Collocation([made], GUESS, has_grasp_constraints=e) for e in (False, True))
     options = replace(NEWTON, rho=1e6)
     solution, explicit = options(bounds), options(rows)
     np.testing.assert_allclose(solution.z, explicit.z, atol=1e-6)
-    assert len(solution.multipliers) == bounds.constraints
-    assert len(explicit.multipliers) == rows.constraints
+    assert len(solution.multipliers) == bounds.constraint_count
+    assert len(explicit.multipliers) == rows.constraint_count
     low, high = bounds.bounds()
     assert ((solution.z >= low) & (solution.z <= high)).all()
 

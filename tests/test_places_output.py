@@ -17,8 +17,8 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.start import initial_variables
 from collocation_sysid.result.pictures.mesh import mesh_picture
 from collocation_sysid.result.replay import read_run
-from collocation_sysid.runs.warm_start import Earlier
-from collocation_sysid.statistics.uncertainty import Place, covariance, places_of
+from collocation_sysid.runs.warm_start import WarmStart
+from collocation_sysid.statistics.uncertainty import MarkerPlace, marker_places, uncertainty_at
 
 PLACES_M = {"low": [0.0, 0.0, 0.0], "mid": [0.03, 0.02, 0.03], "side": [0.06, 0.06, 0.03]}
 # One as it is, one 4 mm off, one not given.
@@ -80,7 +80,7 @@ def test_exact_places_have_no_error(folder: Path):
     assert (place.prior_m, place.given) == (0.0, True)
     assert place.std_error_m is not None
     assert not place.std_error_m.any()
-    assert place.moved_m == 0.0
+    assert place.displacement_m == 0.0
 
 
 def test_errors_on_the_surface_lie_in_its_face(folder: Path):
@@ -95,23 +95,23 @@ def test_errors_on_the_surface_lie_in_its_face(folder: Path):
         assert (np.delete(place.std_error_m, across) > 1e-5).all()
 
 
-def places_at_the_guess(folder: Path, overrides: tuple[str, ...]) -> dict[str, Place]:
+def places_at_the_guess(folder: Path, overrides: tuple[str, ...]) -> dict[str, MarkerPlace]:
     """Places and errors that a solve from the truth would begin with."""
     problem = cs.Problem.read(folder / "problem.toml", [*AT_TRUTH, *overrides])
     collocation = problem.collocation()
     z, _ = initial_variables(collocation)
-    (part,) = collocation.parts(z)
-    return places_of(part, covariance(collocation, z))
+    (part,) = collocation.iterates(z)
+    return marker_places(part, uncertainty_at(collocation, z))
 
 
 def test_a_later_solve_starts_from_the_places_found(folder: Path, result: dict):
-    earlier = Earlier.read(folder / "run")
-    problem = earlier.started(cs.Problem.read(folder / "problem.toml", OPTIONS[1::2]))
-    collocation = earlier.placed(problem.collocation())
-    (segment,) = collocation.segments
+    earlier = WarmStart.read(folder / "run")
+    problem = earlier.apply_to_problem(cs.Problem.read(folder / "problem.toml", OPTIONS[1::2]))
+    collocation = earlier.apply_to_places(problem.collocation())
+    (segment,) = collocation.transcriptions
     found = [place["position_m"] for place in result["places"]["swing"].values()]
-    assert segment.places_m(segment.guess_phi) == pytest.approx(np.array(found), abs=1e-9)
-    z = earlier.variables(collocation)
+    assert segment.marker_places_m(segment.guess_phi) == pytest.approx(np.array(found), abs=1e-9)
+    z = earlier.simulated_variables(collocation)
     assert z is not None
     again = cs.solve(problem, "reduced-space", start=folder / "run")
     assert again.status.converged
@@ -123,13 +123,15 @@ def test_places_travel_to_another_mesh(folder: Path):
     mesh = box_mesh((0.06, 0.06, 0.09), (3, 3, 4))
     cs.TetMesh(mesh.points_m, mesh.tetrahedra).write(folder / "finer.vtu")
     other = settings("object.mesh='finer.vtu'")
-    earlier = Earlier.read(folder / "run")
-    problem = earlier.started(cs.Problem.read(folder / "problem.toml", [*OPTIONS, *other][1::2]))
-    (segment,) = earlier.placed(problem.collocation()).segments
-    places_m = segment.places_m(segment.guess_phi)
+    earlier = WarmStart.read(folder / "run")
+    problem = earlier.apply_to_problem(
+        cs.Problem.read(folder / "problem.toml", [*OPTIONS, *other][1::2])
+    )
+    (segment,) = earlier.apply_to_places(problem.collocation()).transcriptions
+    places_m = segment.marker_places_m(segment.guess_phi)
     for m, name in enumerate(segment.experiment.markers.names):
         assert places_m[m] == pytest.approx(earlier.places_m["swing"][name], abs=1e-9)
-        of_nodes, reading = segment.markers.channel.shape(segment.guess_phi)
+        of_nodes, reading = segment.markers.observable.shape_functions(segment.guess_phi)
         there = reading.weights[m] @ segment.body.nodes_m[of_nodes[m]]
         assert there == pytest.approx(places_m[m], abs=1e-9)
 
@@ -138,7 +140,7 @@ def test_a_record_without_places_is_no_start(folder: Path, tmp_path: Path, resul
     broken = {**result, "places": {"swing": {"low": {"position_m": [1.0, 2.0]}}}}
     (tmp_path / "result.json").write_text(json.dumps(broken))
     with pytest.raises(cs.InputError, match="damaged"):
-        Earlier.read(tmp_path)
+        WarmStart.read(tmp_path)
 
 
 # Shown
@@ -186,5 +188,5 @@ def legend_of(places_m: np.ndarray, given_m: np.ndarray, seen) -> set[str]:
 
 
 def test_a_place_that_was_not_given_has_not_moved():
-    place = Place(np.zeros(3), None, 0.1, None)
-    assert (place.given, place.moved_m) == (False, None)
+    place = MarkerPlace(np.zeros(3), None, 0.1, None)
+    assert (place.given, place.displacement_m) == (False, None)

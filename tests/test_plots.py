@@ -29,7 +29,7 @@ from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.methods.solution import Iteration, Solution, Status, Timing
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.result.pictures import (
     Confidence,
@@ -86,9 +86,9 @@ def solved(make=hung_cube, scheme="midpoint") -> Solution:
     """A solution found by knowing it."""
     experiment = measured(make(), scheme)
     collocation = Collocation([experiment], GUESS.with_guess(TRUTH), scheme)
-    x = march(experiment, Dynamics.of(experiment, scheme).with_theta(THETA))
+    x = simulate_scheme(experiment, Dynamics.from_experiment(experiment, scheme).with_theta(THETA))
     z = collocation.pack(collocation.parameters.guess_q, [x])
-    multipliers = np.zeros(collocation.constraints)
+    multipliers = np.zeros(collocation.constraint_count)
     return Solution(
         Status.CONVERGED, "", "known", collocation, z, multipliers, 5, history(), Timing()
     )
@@ -255,10 +255,10 @@ def test_sparsity_needs_few_of_the_timesteps():
 
 def test_sparsity_shows_the_mesh_graph_of_one_block():
     solution = solved()
-    segment = solution.collocation.segments[0]
+    segment = solution.collocation.transcriptions[0]
     block = rasters(jacobian_sparsity(solution.collocation, solution.z))[2]
     rows, columns, _ = segment.body.pattern.full
-    expected = np.zeros((segment.dofs, segment.dofs), dtype=bool)
+    expected = np.zeros((segment.dof_count, segment.dof_count), dtype=bool)
     expected[rows, columns] = True
     drawn = ~np.ma.getmaskarray(block)
     np.testing.assert_array_equal(drawn, expected[segment.free_dofs])

@@ -13,8 +13,8 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Grasp, Nuisance, PoseSequence
 from collocation_sysid.recording.poses import Interpolation
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.pose_noise import roughness, with_pose_noise
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.pose_noise import estimate_pose_noise, with_pose_noise
 
 # So small that all is linear, and markers as exact, so that it counts.
 SIGMA_M, SIGMA_RAD = 1e-7, 1e-6
@@ -47,10 +47,10 @@ def reading(of: Collocation, poses: PoseSequence, phi: np.ndarray) -> tuple[np.n
     (experiment,) = of.experiments
     (grasp,) = experiment.grasps
     moved = replace(experiment, grasps=(replace(grasp, poses=poses),))
-    (segment,) = replace(of, experiments=(moved,)).segments
-    motion = simulate(segment.corrected(phi), TRUTH, of.scheme, substeps=1)
+    (segment,) = replace(of, experiments=(moved,)).transcriptions
+    motion = simulate(segment.corrected_experiment(phi), TRUTH, of.scheme, substeps=1)
     positions = motion.positions_m.reshape(len(motion.positions_m), -1)
-    return segment.markers.of_positions(positions, phi), positions
+    return segment.markers.predict_positions(positions, phi), positions
 
 
 @pytest.mark.parametrize("scheme", ["midpoint", "bdf2"])
@@ -58,14 +58,14 @@ def reading(of: Collocation, poses: PoseSequence, phi: np.ndarray) -> tuple[np.n
 @pytest.mark.parametrize("nuisance", [Nuisance.none(), Nuisance()], ids=["ideal", "usual"])
 def test_draws_are_how_readings_follow_poses(nuisance, interpolation, scheme):
     of = precise(nuisance, interpolation, scheme)
-    (experiment,), (segment,) = of.experiments, of.segments
+    (experiment,), (segment,) = of.experiments, of.transcriptions
     poses = experiment.grasps[0].poses
     phi = 0.5 * np.random.default_rng(1).normal(size=segment.nuisance.size)
     before, positions = reading(of, poses, phi)
     z = of.pack(np.concatenate([GUESS.with_guess(TRUTH).guess_q, phi]), [positions])
-    fit, (noise,) = with_pose_noise(linearised_fit(of, z), of, z, seed=0)
+    fit, (noise,) = with_pose_noise(linearise_fit(of, z), of, z, seed=0)
     draws = fit.blocks[0].disturbances
-    assert (noise.sigma_m, noise.sigma_rad, noise.judged) == (SIGMA_M, SIGMA_RAD, False)
+    assert (noise.sigma_m, noise.sigma_rad, noise.is_estimated) == (SIGMA_M, SIGMA_RAD, False)
     assert draws is not None
     white = np.random.default_rng(0).normal(size=(2, len(poses.t_s), 3 * len(draws)))
     white = white.reshape(2, len(poses.t_s), len(draws), 3)
@@ -88,25 +88,27 @@ def swung(noise_m: float, noise_rad: float, count: int, seed: int = 0) -> PoseSe
 
 
 def test_a_smooth_motion_is_not_rough():
-    assert roughness(swung(0.0, 0.0, 100)) == (0.0, 0.0)
-    assert roughness(PoseSequence.fixed()) == (0.0, 0.0)
+    assert estimate_pose_noise(swung(0.0, 0.0, 100)) == (0.0, 0.0)
+    assert estimate_pose_noise(PoseSequence.fixed()) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(("noise_m", "noise_rad"), [(5e-4, 5e-3), (2e-5, 2e-4), (5e-4, 0.0)])
 def test_noise_is_judged_by_how_rough_poses_are(noise_m, noise_rad):
-    found = np.mean([roughness(swung(noise_m, noise_rad, 200, seed)) for seed in range(10)], axis=0)
+    found = np.mean(
+        [estimate_pose_noise(swung(noise_m, noise_rad, 200, seed)) for seed in range(10)], axis=0
+    )
     np.testing.assert_allclose(found, (noise_m, noise_rad), rtol=0.1)
 
 
 def test_one_recording_tells_the_noise():
-    found = [roughness(swung(5e-4, 5e-3, 100, seed)) for seed in range(40)]
+    found = [estimate_pose_noise(swung(5e-4, 5e-3, 100, seed)) for seed in range(40)]
     assert (np.abs(np.array(found) / (5e-4, 5e-3) - 1).std(axis=0) < 0.1).all()
 
 
 def test_a_jump_is_no_noise():
     poses = swung(0.0, 0.0, 200)
     jumped = replace(poses, positions_m=poses.positions_m + 0.1 * (poses.t_s > 1.0)[:, None])
-    assert roughness(jumped) == (0.0, 0.0)
+    assert estimate_pose_noise(jumped) == (0.0, 0.0)
 
 
 def test_noise_that_hardly_moves_a_marker_costs_nothing():
@@ -116,5 +118,5 @@ def test_noise_that_hardly_moves_a_marker_costs_nothing():
     coarse = replace(of, experiments=(coarse,))
     _, positions = reading(of, experiment.grasps[0].poses, np.zeros(0))
     z = coarse.pack(GUESS.with_guess(TRUTH).guess_q, [positions])
-    fit, noises = with_pose_noise(linearised_fit(coarse, z), coarse, z)
+    fit, noises = with_pose_noise(linearise_fit(coarse, z), coarse, z)
     assert (fit.blocks[0].disturbances, noises) == (None, ())

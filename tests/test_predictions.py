@@ -15,10 +15,10 @@ from scipy.interpolate import CubicSpline
 import collocation_sysid as cs
 from collocation_sysid.display import plain_text
 from collocation_sysid.program.depth_comparison import DepthError
-from collocation_sysid.program.skin import Skin
+from collocation_sysid.program.skin import VisibleSurface
 from collocation_sysid.result.record import replays
 from collocation_sysid.result.run_sections import summary
-from collocation_sysid.runs.prediction import CopyError, copy_error
+from collocation_sysid.runs.prediction import CopyError, nearest_recording_error
 from collocation_sysid.runs.result import Result
 from collocation_sysid.statistics.trust import prediction_concerns
 from collocation_sysid.tree import as_json, read
@@ -63,8 +63,8 @@ def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
     for concern in concerns:
         rms_mm = 1e3 * finished.rollouts["hung cube"].rms_m
         assert concern.grade == verdict
-        assert "misses the markers by" in concern.sentence
-        assert f"{rms_mm:.3g} mm RMS" in concern.sentence
+        assert "misses the markers by" in concern.message
+        assert f"{rms_mm:.3g} mm RMS" in concern.message
         assert concern.data["sigmas"] == pytest.approx(rms_mm / np.sqrt(3), rel=0.01)
 
 
@@ -108,9 +108,11 @@ def hanging(gravity: tuple[float, float, float], depth: cs.Depth, **changes) -> 
 def recorded(gravity: tuple[float, float, float], **changes) -> cs.Experiment:
     """The same with a depth image, taken at the truth."""
     x = cs.simulate(hanging(gravity, NOTHING), BAR_TRUTH).positions_m[0]
-    skin, camera = Skin.of(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE)
+    skin, camera = VisibleSurface.from_body(bar(), NOTHING), cs.DepthCamera(MATRIX, pose=POSE)
     shape_m = x[skin.nodes]
-    image_m = cs.depth_image(camera, SHAPE, (skin.triangles(shape_m) - POSE[:3, 3]) @ POSE[:3, :3])
+    image_m = cs.depth_image(
+        camera, SHAPE, (skin.subdivided_triangles(shape_m) - POSE[:3, 3]) @ POSE[:3, :3]
+    )
     image_m = image_m + DEPTH_NOISE_M * np.random.default_rng(0).normal(size=SHAPE)
     depth = cs.Depth.of_images("front", image_m, camera, DEPTH_NOISE_M, spacing_m=0.004)
     return hanging(gravity, depth, **changes)
@@ -210,20 +212,22 @@ def test_a_blind_prediction_has_the_nuisance_parameters_of_the_fitted_recordings
     for finished in (alike, other):
         rollout = finished.rollouts["new"]
         assert rollout.rms_m == pytest.approx(np.sqrt(3) * 2e-4, rel=0.2)
-        assert rollout.blind is not None
-    assert alike.rollouts["new"].blind.rms_m == pytest.approx(alike.rollouts["new"].rms_m, rel=0.05)
-    assert other.rollouts["new"].blind.rms_m > 3 * other.rollouts["new"].rms_m
+        assert rollout.blind_error is not None
+    assert alike.rollouts["new"].blind_error.rms_m == pytest.approx(
+        alike.rollouts["new"].rms_m, rel=0.05
+    )
+    assert other.rollouts["new"].blind_error.rms_m > 3 * other.rollouts["new"].rms_m
     found = stored(other)["rollout"]
-    assert found["new"]["blind"]["rms_m"] == other.rollouts["new"].blind.rms_m
+    assert found["new"]["blind"]["rms_m"] == other.rollouts["new"].blind_error.rms_m
     assert "blind" not in found["fitted"]
     said = shown(other)
     assert "with the nuisance parameters of the fitted recordings (blind): " in said
-    assert f"{1e3 * other.rollouts['new'].blind.rms_m:.3f} mm RMS" in said
+    assert f"{1e3 * other.rollouts['new'].blind_error.rms_m:.3f} mm RMS" in said
 
 
 def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     alike = validated(4e-3)
-    copied = alike.rollouts["new"].copied
+    copied = alike.rollouts["new"].copy_error
     assert isinstance(copied, CopyError)
     assert copied.copied == "fitted"
     assert copied.error.rms_m == pytest.approx(np.sqrt(6) * 2e-4, rel=0.1)  # the noise of both
@@ -234,13 +238,13 @@ def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
 def test_the_nearest_recording_is_copied_or_the_output_says_why_none_is():
     new = swing("new", 0.0, 1)
     near, far = swing("near", 1e-3, 2), swing("far", 8e-3, 3)
-    found = copy_error(new, [far, near])
+    found = nearest_recording_error(new, [far, near])
     assert isinstance(found, CopyError)
     assert found.copied == "near"
-    assert copy_error(new, [swing("long", 0.0, 2, steps=17)]) == (
+    assert nearest_recording_error(new, [swing("long", 0.0, 2, steps=17)]) == (
         "no fitted recording can be copied (long: 18 samples instead of 17)"
     )
     faster = replace(near, t_s=0.9 * near.t_s, markers=replace(near.markers, t_s=0.9 * near.t_s))
-    assert "other times" in copy_error(new, [faster])
+    assert "other times" in nearest_recording_error(new, [faster])
     renamed = replace(near.markers, names=[f"{name}'" for name in near.markers.names])
-    assert "other markers" in copy_error(new, [replace(near, markers=renamed)])
+    assert "other markers" in nearest_recording_error(new, [replace(near, markers=renamed)])

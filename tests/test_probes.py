@@ -53,7 +53,7 @@ def swung(fault: str = "", off: float = 0.0) -> Problem:
     tracks = tracks + NOISE_M * np.random.default_rng(0).standard_normal(tracks.shape)
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(recorded.markers, positions_m=tracks, sigma_m=sigma_m)
-    parameters = Parameters.of({name: Unknown(value) for name, value in TRUTH.items()})
+    parameters = Parameters.from_mapping({name: Unknown(value) for name, value in TRUTH.items()})
     exact = {n: "none" for n in Assumptions().deviations if n not in FREED}
     stated = Assumptions(**exact, density_gradient=0.1)
     options = UncertaintyOptions(assumptions=stated)

@@ -37,7 +37,7 @@ from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.derivatives import shortened
+from collocation_sysid.runs.check.derivatives import shortened_problem
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"
@@ -130,7 +130,9 @@ def test_elastic_parameters_may_be_young_and_poisson(tiny):
     )(tiny)
     problem = load(tiny)
     parameters = problem.parameters
-    assert problem.bodies[0].theta(parameters.guesses)[:2] == pytest.approx([200.0, 300.0])
+    assert problem.bodies[0].theta_from_values(parameters.guesses)[:2] == pytest.approx(
+        [200.0, 300.0]
+    )
     assert [item.name for item in parameters.free] == ["young_pa", "gamma_r_s", "gamma_m_1_s"]
 
 
@@ -208,7 +210,7 @@ def test_a_surface_is_filled_once_and_kept(tiny):
 )
 def test_every_kind_of_selection_finds_its_nodes(tiny, selection):
     replace_text(BOX, selection)(tiny)
-    np.testing.assert_array_equal(experiment_of(tiny).held_dofs, dofs_of(top_nodes()))
+    np.testing.assert_array_equal(experiment_of(tiny).prescribed_dofs, dofs_of(top_nodes()))
 
 
 def test_a_grasp_is_a_table_or_a_list_of_tables(tiny):
@@ -223,9 +225,11 @@ def test_a_second_hand_without_poses_stays_where_it_is(tiny):
     second = "{ nodes = { box_m = [[-1, -1, -1], [1, 1, 0.001]] } }"
     replace_text(GRASP, f"[{GRASP}, {second}]")(tiny)
     experiment = experiment_of(tiny)
-    assert len(experiment.held_dofs) == 54
+    assert len(experiment.prescribed_dofs) == 54
     nodes = experiment.grasps[1].nodes
-    still = experiment.grasps[1].poses.carry(experiment.body.nodes_m[nodes], experiment.t_s)
+    still = experiment.grasps[1].poses.carried_positions(
+        experiment.body.nodes_m[nodes], experiment.t_s
+    )
     np.testing.assert_allclose(still - experiment.body.nodes_m[nodes], 0.0, atol=1e-15)
 
 
@@ -245,7 +249,9 @@ def test_places_of_markers_without_a_reference_start_from_their_first_sample(tin
     assert not markers.located.any()
     np.testing.assert_allclose(experiment.place_sigma_m, np.linalg.norm(SIZE_M))
     # The first pose is that of the undeformed body, and this marker is inside.
-    np.testing.assert_allclose(markers.observe(nodes_m)[1], markers.positions_m[0, 1], atol=1e-9)
+    np.testing.assert_allclose(
+        markers.predict_positions(nodes_m)[1], markers.positions_m[0, 1], atol=1e-9
+    )
 
 
 def test_some_markers_may_have_a_reference_and_others_not(tiny):
@@ -257,7 +263,9 @@ def test_some_markers_may_have_a_reference_and_others_not(tiny):
     assert found.located.tolist() == [True, False, True]
     assert (experiment.place_sigma_m > 0).tolist() == [False, True, False]
     shape, given = np.random.default_rng(0).normal(size=(36, 3)), [0, 2]
-    np.testing.assert_allclose(found.observe(shape)[given], known.observe(shape)[given])
+    np.testing.assert_allclose(
+        found.predict_positions(shape)[given], known.predict_positions(shape)[given]
+    )
 
 
 def test_a_marker_that_is_late_is_placed_where_it_was_first_seen(tiny):
@@ -265,8 +273,8 @@ def test_a_marker_that_is_late_is_placed_where_it_was_first_seen(tiny):
     replace_cell(MARKERS, 2, 1, "")(tiny)
     experiment = experiment_of(tiny)
     markers = experiment.markers
-    assert markers.missing.tolist() == [1, 0, 0]
-    start_m = markers.observe(experiment.body.nodes_m)[0]
+    assert markers.missing_counts.tolist() == [1, 0, 0]
+    start_m = markers.predict_positions(experiment.body.nodes_m)[0]
     (turn,), (shift_m,) = experiment.grasps[0].poses.at(experiment.t_s[1:2])
     back_m = turn.T @ (markers.positions_m[1, 0] - shift_m)
     assert np.linalg.norm(start_m - back_m) < 5e-3
@@ -391,7 +399,7 @@ def test_poses_of_another_rate_need_no_resampling(tiny):
     assert "recorded at 137.5 Hz, were interpolated (smooth) at the markers' times, 100 Hz" in note
     np.testing.assert_array_equal(experiment.t_s, expected.t_s)
     np.testing.assert_array_equal(experiment.markers.positions_m, expected.markers.positions_m)
-    held = [e.held_positions(e.t_s) for e in (experiment, expected)]
+    held = [e.prescribed_positions(e.t_s) for e in (experiment, expected)]
     np.testing.assert_allclose(*held, atol=1e-5)
 
 
@@ -404,7 +412,7 @@ def test_poses_of_the_gripper_carry_the_body_that_it_holds(tiny):
     write_poses_csv(tiny / POSES, poses.after(np.linalg.inv(of_body)))  # what the gripper did
     of_gripper = "{ position_m = [0.02, -0.3, 0.1], quaternion_xyzw = [0.5, -0.5, 0.5, 0.5] }"
     found = experiment_of(tiny, f"experiment.0.grasp.gripper_to_body={of_gripper}")
-    held = [e.held_positions(e.t_s) for e in (found, expected)]
+    held = [e.prescribed_positions(e.t_s) for e in (found, expected)]
     np.testing.assert_allclose(*held, atol=1e-9)
 
 
@@ -417,7 +425,9 @@ def test_poses_may_be_faster_than_markers(tiny):
     np.testing.assert_allclose(experiment.t_s, poses.t_s[::2])
     assert len(experiment.grasps[0].poses.t_s) == len(poses.t_s)
     np.testing.assert_allclose(
-        experiment.held_positions(poses.t_s), every.held_positions(poses.t_s), atol=1e-15
+        experiment.prescribed_positions(poses.t_s),
+        every.prescribed_positions(poses.t_s),
+        atol=1e-15,
     )
 
 
@@ -431,7 +441,7 @@ def test_experiments_for_validation_are_loaded_but_not_fitted(tiny):
     problem = load(tiny, "experiment.again.validation=true")
     assert [e.name for e in problem.experiments] == ["swing", "again"]
     collocation = Collocation(problem.experiments, problem.parameters)
-    assert [s.experiment.name for s in collocation.segments] == ["swing"]
+    assert [s.experiment.name for s in collocation.transcriptions] == ["swing"]
 
 
 # Simulation ---------------------------------------------------------------------------------------
@@ -464,10 +474,10 @@ def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
             raise
         pytest.skip(str(error))
     few = replace(problem, experiments=problem.experiments[:2], substeps=1)
-    findings = check_problem(shortened(few))
+    findings = check_problem(shortened_problem(few))
     assert findings.derivatives_agree
     for each in problem.experiments:
-        assert each.markers.present.any() or any(grasp.wrench for grasp in each.grasps)
+        assert each.markers.is_present.any() or any(grasp.wrench for grasp in each.grasps)
     assert all(body.smallest_element_quality > 0.1 for body in findings.bodies)
 
 
@@ -525,10 +535,10 @@ def test_masses_and_forces_are_read(loaded):
     experiment = experiment_of(loaded)
     (mass,) = experiment.masses
     assert (mass.mass_kg, mass.from_s, len(mass.nodes)) == (0.002, 0.03, 9)
-    assert experiment.node_mass_kg([0.0, 0.04]).sum(axis=1) == pytest.approx(
+    assert experiment.moving_node_mass_kg([0.0, 0.04]).sum(axis=1) == pytest.approx(
         [experiment.body.mass_kg, experiment.body.mass_kg + 0.002]
     )
-    total = experiment.node_forces_n([0.025]).sum(axis=1)[0]
+    total = experiment.stated_node_forces_n([0.025]).sum(axis=1)[0]
     np.testing.assert_allclose(total, [0.0, 0.1, 0.1], atol=1e-12)
 
 
@@ -542,9 +552,9 @@ def test_nuisance_is_read(loaded):
 
 def test_a_grasp_may_hold_for_a_while(tiny):
     experiment = experiment_of(tiny, "experiment.swing.grasp.until_s=0.02")
-    held, _ = experiment.grasped([0.0, 0.02, 0.03])
+    held, _ = experiment.prescribed_displacements([0.0, 0.02, 0.03])
     np.testing.assert_array_equal(held.any(axis=(1, 2)), [True, True, False])
-    assert len(experiment.held_dofs) == 0
+    assert len(experiment.prescribed_dofs) == 0
 
 
 def test_every_takes_only_some_samples(tiny):

@@ -49,7 +49,7 @@ from wrenches_small import EVERYTHING, felt, sensing, wristed_cube
 import collocation_sysid as cs
 from collocation_sysid.fem.node_force import On
 from collocation_sysid.fem.selection import Indices
-from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulated
+from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulate_variables
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.schemes import SCHEMES
@@ -72,11 +72,11 @@ def cleared_clock(samples: int) -> Collocation:
     """Read whole samples away from where its recording says."""
     nuisance = Nuisance.none(marker_offset_m=2e-3, time_shift_s=0.01)
     collocation = program(replace(swung(steps=8), nuisance=nuisance))
-    (segment,) = collocation.segments
+    (segment,) = collocation.transcriptions
     phi = np.zeros(segment.nuisance.size)
-    phi[segment.nuisance.of_clock] = float(samples)
-    read, _ = collocation.following(np.concatenate([GUESS.guess_q, phi]))
-    assert read.segments[0].chart.samples == samples
+    phi[segment.nuisance.clock_indices] = float(samples)
+    read, _ = collocation.follow_estimates(np.concatenate([GUESS.guess_q, phi]))
+    assert read.transcriptions[0].association.clock_samples == samples
     return read
 
 
@@ -137,11 +137,14 @@ def in_field(
     **memory,
 ) -> Collocation:
     """With a force of a user."""
-    force, cube = cs.NodeForce.of(law, on=on, carries=carries), moved or hung_cube(5, (1, 1, 2))
+    force, cube = (
+        cs.NodeForce.from_law(law, on=on, carries=carries),
+        moved or hung_cube(5, (1, 1, 2)),
+    )
     body = cs.Body(
         cube.body.mesh, density_kg_m3=30.0, forces=[force], prony=["prony_1"] if memory else []
     )
-    own = Parameters.of({force.constants[0].name: cs.Unknown(40.0), **memory})
+    own = Parameters.from_mapping({force.constants[0].name: cs.Unknown(40.0), **memory})
     known = Parameters((*GUESS.items, *own.items))
     return program(replace(cube, body=body), parameters=known, scheme=scheme)
 
@@ -150,17 +153,17 @@ def differing(moved: Experiment, scheme: str = "midpoint", values=GUESS, **body)
     """Stiffness from place to place, of a body that is uneven already."""
     field = cs.Field(0.1, modes=3)
     made = cs.Body(moved.body.mesh, density_kg_m3=30.0, **({"field": field} | body))
-    made = made.with_free_densities(made.weighed_by(values.names))
+    made = made.with_free_densities(made.parts_with_free_density(values.names))
     known = values.with_fields([made])
-    uneven = {name: 0.4 * (-1) ** k for k, name in enumerate(made.mode_names)}
-    uneven |= dict.fromkeys(made.contrasts, 1.7)
+    uneven = {name: 0.4 * (-1) ** k for k, name in enumerate(made.field_coefficient_names)}
+    uneven |= dict.fromkeys(made.contrast_deviations, 1.7)
     return program(replace(moved, body=made), parameters=known.with_guess(uneven), scheme=scheme)
 
 
 TWO_PHASES = cs.Field(0.1, modes=3, prior="two-phase")
 IN_MASS, OF_DENSITY = (
     cs.Field(0.1, "density_kg_m3", 3),
-    Parameters.of({"density_kg_m3": cs.Unknown(25.0)}),
+    Parameters.from_mapping({"density_kg_m3": cs.Unknown(25.0)}),
 )
 
 
@@ -171,7 +174,7 @@ def hung_when_scanned(moved: Experiment, values=GUESS, scheme: str = "midpoint",
     scan = cs.UnderGravity(Indices(low.tolist()), (2.0, 1.0, -5.0))
     settings = {"density_kg_m3": 30.0, "rest_shape": scan} | body
     made = cs.Body(mesh, **settings)
-    made = made.with_free_densities(made.weighed_by(values.names))
+    made = made.with_free_densities(made.parts_with_free_density(values.names))
     return program(replace(moved, body=made), parameters=values, scheme=scheme)
 
 
@@ -200,7 +203,7 @@ def touched(
         pressed = replace(pressed, grasps=[held, replace(ball, wrench=forces), plate])
     pressed = pressed.with_obstacles([replace(o, relaxed=relaxed) for o in pressed.obstacles])
     own = {friction: cs.Unknown(0.5)} if isinstance(friction, str) else {}
-    known = Parameters((*GUESS.items, *Parameters.of(own).items))
+    known = Parameters((*GUESS.items, *Parameters.from_mapping(own).items))
     return program(measured(pressed) if not own else pressed, parameters=known, scheme=scheme)
 
 
@@ -550,21 +553,21 @@ SIMULATED = [name for name in PROGRAMS if name not in (*WITH_ROWS, "all fixed")]
 def made(request: pytest.FixtureRequest) -> Collocation:
     """The tests of a program follow each other."""
     found = PROGRAMS[request.param]()
-    assert found.remembers == (request.param in REMEMBERING)
-    assert found.explicit_grasps == (request.param in WITH_ROWS)
+    assert found.has_eliminated_histories == (request.param in REMEMBERING)
+    assert found.has_grasp_constraints == (request.param in WITH_ROWS)
     return found
 
 
 def test_matrices_are_those_of_differences_and_laid_out_in_order(made: Collocation, rng):
-    made = made.made_explicit()
-    z, y = some_point(made, rng), rng.normal(size=made.constraints)
+    made = made.with_lifted_variables()
+    z, y = some_point(made, rng), rng.normal(size=made.constraint_count)
 
     def slope(at: np.ndarray) -> np.ndarray:
         return 1.3 * made.gradient(at) + made.jacobian(at).T @ y
 
     jacobian, hessian, gradient = made.jacobian(z), made.hessian(z, 1.3, y), made.gradient(z)
     assert_derivative(made.objective, lambda d: gradient @ d, z, rng, 1e-7, 0.1, 1)
-    for own in (slice(None), slice(made.nq), made.of_phi, slice(made.of_phi.stop, None)):
+    for own in (slice(None), slice(made.nq), made.phi_columns, slice(made.phi_columns.stop, None)):
         scale = np.zeros(len(z))  # some columns would drown among the others
         scale[own] = 0.05
         if scale.any():
@@ -573,8 +576,8 @@ def test_matrices_are_those_of_differences_and_laid_out_in_order(made: Collocati
                 assert_derivative(values, lambda d: jacobian @ d, z, rng, 1e-7, scale, 1)
             assert_derivative(slope, lambda d: hessian @ d, z, rng, 1e-7, scale, 1)
     for indptr, rows in (made.jacobian_structure, made.hessian_structure):
-        columns = np.repeat(np.arange(made.variables), np.diff(indptr))
-        entries = columns * max(made.variables, made.constraints) + rows
+        columns = np.repeat(np.arange(made.variable_count), np.diff(indptr))
+        entries = columns * max(made.variable_count, made.constraint_count) + rows
         assert (np.diff(entries) > 0).all(), "an entry twice, or out of order"
         assert columns.shape == rows.shape
     assert (rows <= columns).all(), "an entry below the diagonal"
@@ -585,12 +588,12 @@ FAR_OFF = ["places unknown", "places unknown, huber", "wrench, huber"]
 
 @pytest.mark.parametrize("made", FAR_OFF, indirect=True)
 def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(made: Collocation, rng):
-    made = made.made_explicit()
+    made = made.with_lifted_variables()
     z = some_point(made, rng)
     convex = np.linalg.eigvalsh(made.hessian(z, 1.0, None).toarray())
     assert convex[0] > -1e-12 * convex[-1]
-    if not made.explicit:
-        exact = made.hessian(z, 1.0, np.zeros(made.constraints)).toarray()
+    if not made.has_lifted_variables:
+        exact = made.hessian(z, 1.0, np.zeros(made.constraint_count)).toarray()
         assert np.linalg.eigvalsh(exact)[0] < -1e-6 * convex[-1]
 
 
@@ -598,9 +601,12 @@ def test_gauss_newtons_hessian_is_convex_however_far_readings_are_off(made: Coll
 def test_sensitivities_keep_the_linearised_constraints(made: Collocation, rng):
     z = some_point(made, rng)
     jacobian, found = made.jacobian(z), []
-    for part in made.parts(z):
-        found.append(Sweep(part.segment).forward(part.x, part.setting).by_p)
-    moving = [segment.places[segment.moving].tolist() for segment in made.segments]
+    for part in made.iterates(z):
+        found.append(Sweep(part.segment).forward(part.x, part.equations).by_p)
+    moving = [
+        segment.parameter_indices[segment.dynamic_parameters].tolist()
+        for segment in made.transcriptions
+    ]
     for place in sorted(set(chain(*moving))):
         p = np.eye(made.nq + made.nphi)[place]
         still = [np.zeros(by_p.shape[:2]) for by_p in found]
@@ -618,15 +624,15 @@ def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(
     made: Collocation, rng
 ):
     q, phi = made.parameters.guess_q, 0.1 + 0.3 * np.abs(rng.normal(size=made.nphi))
-    p = np.clip(np.concatenate([q, phi]), *made.bounds_p)
-    z = simulated(made, p)
-    rows = [segment.grid_rows for segment in made.segments]
+    p = np.clip(np.concatenate([q, phi]), *made.parameter_bounds)
+    z = simulate_variables(made, p)
+    rows = [segment.grid_times for segment in made.transcriptions]
     point = Horizon(made, rows).evaluate(p, made.unpack(z)[1])
     forward, backward = 2 * made.loss_scale * point.fit.score, adjoint_gradient(made, z)
     assert point.loss == pytest.approx(made.objective(z) / made.loss_scale, rel=1e-7)
     np.testing.assert_allclose(backward, forward, atol=1e-6 * np.abs(forward).max())
 
     def loss(at: np.ndarray) -> float:
-        return made.objective(simulated(made, at))
+        return made.objective(simulate_variables(made, at))
 
     assert_derivative(loss, lambda d: forward @ d, p, rng, 1e-5, 0.1, 1)

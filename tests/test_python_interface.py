@@ -64,7 +64,7 @@ def test_an_experiment_finds_nodes_poses_and_places_on_its_body():
     np.testing.assert_array_equal(grasp.nodes, np.flatnonzero(box().nodes_m[:, 2] > 0.09))
     np.testing.assert_allclose(grasp.poses.at(swing.t_s)[0], lifted(swing.t_s)[:, :3, :3])
     assert swing.markers.names == ("m1", "m2")
-    places = swing.markers.observe(box().nodes_m)
+    places = swing.markers.predict_positions(box().nodes_m)
     np.testing.assert_allclose(places, [(0.0, 0.0, 0.0), (0.07, 0.03, 0.02)], atol=1e-12)
     np.testing.assert_array_equal(swing.gravity_m_s2, [0.0, 0.0, -9.81])
 
@@ -86,7 +86,9 @@ def test_markers_without_places_start_where_the_first_samples_are():
     tracks = np.tile([(0.01, 0.02, 0.0), (0.1, 0.05, 0.03)], (11, 1, 1))
     somewhere = cs.Markers(t_s, tracks, 1e-3)
     swing = cs.Experiment(box(), t_s, [cs.Grasp(TOP, lifted(t_s))], somewhere)
-    np.testing.assert_allclose(swing.markers.observe(box().nodes_m), tracks[0], atol=1e-12)
+    np.testing.assert_allclose(
+        swing.markers.predict_positions(box().nodes_m), tracks[0], atol=1e-12
+    )
     assert not swing.markers.located.any()
     assert (swing.place_sigma_m > EDGE_M).all()
 
@@ -212,7 +214,9 @@ def test_a_notebook_shows_the_body_of_a_run_once():
 def test_a_drawn_body_is_coloured_by_what_its_material_feels(field):
     run = identified()
     (positions_m,), body = run.solution.positions_m, run.problem.bodies[0]
-    felt = ElementFields.of(body, body.theta(run.parameters)).at(positions_m[[0, -1]])[field]
+    felt = ElementFields.of(body, body.theta_from_values(run.parameters)).at(positions_m[[0, -1]])[
+        field
+    ]
     (bar,) = run.plot(field=field, count=2).axes[0].child_axes
     low, high = bar.get_ylim()
     outer = felt[:, body.mesh.surface_cells]

@@ -25,16 +25,16 @@ from problems_small import (
 )
 
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.fem.moduli import engineering
-from collocation_sysid.methods.curvature import updated, with_curvature
+from collocation_sysid.fem.moduli import engineering_constants
+from collocation_sysid.methods.curvature import secant_update, with_curvature
 from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
-from collocation_sysid.methods.start import carried_rigidly, initial_variables
+from collocation_sysid.methods.start import initial_variables, rigid_trajectory
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.least_squares import LeastSquares
+from collocation_sysid.program.least_squares import SquareRootInformation
 from collocation_sysid.program.simulation import with_markers
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -102,7 +102,7 @@ def test_every_layout_is_fitted(options: dict):
 
 
 def test_fixed_parameters_stay_and_the_others_are_found():
-    fixed = [Parameter(name, TRUTH[name], fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
+    fixed = [Parameter(name, TRUTH[name], is_fixed=True) for name in ("gamma_r_s", "gamma_m_1_s")]
     collocation = Collocation([measured(hung_cube())], Parameters((*GUESS.items[:2], *fixed)))
     solution = ReducedSpace()(collocation)
     assert np.abs(relative_errors(solution)).max() < 1e-6
@@ -110,7 +110,7 @@ def test_fixed_parameters_stay_and_the_others_are_found():
 
 
 def test_with_all_parameters_fixed_it_simulates():
-    fixed = Parameters(tuple(Parameter(name, TRUTH[name], fixed=True) for name in TRUTH))
+    fixed = Parameters(tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH))
     solution = ReducedSpace()(Collocation([measured(hung_cube())], fixed))
     assert solution.status is Status.CONVERGED
     assert solution.rms_m < 1e-9
@@ -121,7 +121,7 @@ def test_young_and_poisson_are_found_as_well():
     elastic = (Parameter("young_pa", 300.0, 10.0, 1e5), Parameter("poisson", 0.4, 0.01, 0.49))
     parameters = Parameters((*elastic, *GUESS.items[2:]))
     solution = ReducedSpace()(Collocation([measured(hung_cube())], parameters))
-    young_pa, poisson = engineering(TRUTH["lambda_pa"], TRUTH["mu_pa"])
+    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
     assert solution.parameters["young_pa"] == pytest.approx(young_pa, rel=1e-6)
     assert solution.parameters["poisson"] == pytest.approx(poisson, rel=1e-6)
 
@@ -188,7 +188,7 @@ def test_it_starts_from_given_variables():
 @pytest.mark.parametrize("make", [hung_cube, released_cube, bar_let_go])
 @pytest.mark.parametrize("explicit", [False, True])
 def test_positions_to_start_from_need_satisfy_neither_dynamics_nor_grasps(make, explicit, rng):
-    collocation = Collocation([measured(make())], GUESS, explicit_grasps=explicit)
+    collocation = Collocation([measured(make())], GUESS, has_grasp_constraints=explicit)
     q, (x,) = collocation.unpack(initial_variables(collocation)[0])
     start = collocation.pack(q + 0.2, [x + 1e-4 * rng.normal(size=x.shape)])
     solution = ReducedSpace()(collocation, start=start)
@@ -223,8 +223,8 @@ def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
             raise SimulationError("it fails", 0.0)
         return tried(self, q, before, step)
 
-    tried = Horizon.tried
-    monkeypatch.setattr(Horizon, "tried", first_only)
+    tried = Horizon.evaluate_step
+    monkeypatch.setattr(Horizon, "evaluate_step", first_only)
     solution = ReducedSpace()(cube())
     assert solution.status is Status.STALLED
     np.testing.assert_allclose(solution.theta, as_theta(GUESS), rtol=1e-12)
@@ -240,8 +240,8 @@ def test_rows_that_can_be_simulated_are_solved_first(monkeypatch: pytest.MonkeyP
             return [found.x[:12]], SimulationError("it fails", 0.12)
         return [found], failure
 
-    extend = Horizon.extend
-    monkeypatch.setattr(Horizon, "extend", short_at_the_guess)
+    extend = Horizon.simulate
+    monkeypatch.setattr(Horizon, "simulate", short_at_the_guess)
     collocation = Collocation([measured(hung_cube(30))], GUESS)
     solution = ReducedSpace(ladder=(0.5, 1.0))(collocation)
     assert solution.status is Status.CONVERGED
@@ -253,8 +253,8 @@ def test_rows_that_stay_out_of_reach_are_a_status(monkeypatch: pytest.MonkeyPatc
         (found,), _ = extend(self, q, x)
         return [found.x[:12]], SimulationError("it fails", 0.12, 7)
 
-    extend = Horizon.extend
-    monkeypatch.setattr(Horizon, "extend", short)
+    extend = Horizon.simulate
+    monkeypatch.setattr(Horizon, "simulate", short)
     solution = ReducedSpace()(Collocation([measured(hung_cube(30))], GUESS))
     assert solution.status is Status.NOT_SIMULABLE
     assert solution.message.endswith("it fails (t = 0.12 s, element 7).")
@@ -284,8 +284,8 @@ def test_rows_not_reached_are_carried_by_the_grasp():
         raise KeyboardInterrupt
 
     solution = ReducedSpace()(Collocation([measured(hung_cube(40))], GUESS), watch=interrupt)
-    (segment,) = solution.collocation.segments
-    (found,), expected = solution.positions_m, carried_rigidly(segment, as_theta(GUESS))
+    (segment,) = solution.collocation.transcriptions
+    (found,), expected = solution.positions_m, rigid_trajectory(segment, as_theta(GUESS))
     away_m = np.abs(found - expected.reshape(found.shape)).max(axis=(1, 2))
     reached = 10  # a quarter of 41 rows
     assert (away_m[1:reached] > 1e-5).all()
@@ -321,13 +321,15 @@ def point_of(q: np.ndarray, before: Iterate | None = None) -> Iterate:
     """A point that has these."""
     residual, slope = residuals(q)
     crossed = np.zeros(len(q)) if before is None else residuals(before.p)[1].T @ residual
-    return Iterate(q, [], [], LeastSquares.none(len(q)).add(residual, slope), crossed)
+    return Iterate(
+        q, [], [], SquareRootInformation.empty(len(q)).with_rows(residual, slope), crossed
+    )
 
 
 def test_the_learned_curvature_explains_the_last_step():
     before = point_of(np.array([2.0, 3.0]))
     after = point_of(np.array([2.1, 3.2]), before)
-    b = updated(np.zeros((2, 2)), before, after)
+    b = secant_update(np.zeros((2, 2)), before, after)
     residual, slope = residuals(after.p)
     missing = (slope - residuals(before.p)[1]).T @ residual
     np.testing.assert_allclose(b @ (after.p - before.p), missing)
@@ -338,7 +340,7 @@ def test_curvature_joins_the_triangle_unless_that_is_indefinite(rng):
     triangle, right = np.triu(rng.normal(size=(4, 4))) + 3 * np.eye(4), rng.normal(size=4)
     b = rng.normal(size=(4, 4))
     b += b.T
-    fit = LeastSquares(np.column_stack([triangle, right]))
+    fit = SquareRootInformation(np.column_stack([triangle, right]))
     joined = with_curvature(fit, b)
     np.testing.assert_allclose(joined.information, triangle.T @ triangle + b, atol=1e-12)
     np.testing.assert_allclose(joined.score, triangle.T @ right, atol=1e-12)
@@ -357,7 +359,7 @@ def test_the_history_is_what_was_watched_and_ends_at_the_answer():
     assert numbers[-1] <= solution.iterations
     np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
     np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)
-    assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurements)
+    assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurement_count)
 
 
 def test_timings_are_parts_of_the_whole():

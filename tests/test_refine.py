@@ -19,7 +19,7 @@ from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOption
 from collocation_sysid.runs.refine import refine
 from collocation_sysid.statistics.assumptions import Assumptions
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.numerical import Refinement, numerical_error
+from collocation_sysid.statistics.numerical import Refinement, discretisation_error
 from collocation_sysid.statistics.trust import numerical_concerns
 
 FREE = ("mu_pa", "gamma_r_s")
@@ -31,7 +31,7 @@ def errors_of(x, order, levels=3, **options):
     """Errors of a quantity whose logarithm is x + h^order at h = 1."""
     values = [float(np.exp(x + 0.1 * 2.0 ** (-order * k))) for k in range(levels)]
     answer = Estimate(values[0], 1.0, (values[0] / 1.01, values[0] * 1.01))
-    return numerical_error("mu_pa", answer, values[1:], [], **options)
+    return discretisation_error("mu_pa", answer, values[1:], [], **options)
 
 
 @pytest.mark.parametrize("order", [1.0, 1.5, 2.0])
@@ -53,13 +53,13 @@ def test_the_mesh_may_converge_more_slowly():
     for order in (0.55, 1.0, 2.0, 4.0):
         values = [float(np.exp(5.0 - 0.1 * 2.0 ** (-order * k))) for k in range(2)]
         answer = Estimate(values[0], 0.01, (values[0] * 0.9999, values[0] * 1.0001))
-        low, high = numerical_error("mu_pa", answer, [], values[1:]).interval95 or (0, 0)
+        low, high = discretisation_error("mu_pa", answer, [], values[1:]).interval95 or (0, 0)
         assert low < np.exp(5.0) < high
 
 
 def test_without_numerical_error_the_interval_is_that_of_the_noise():
     answer = Estimate(0.3, 0.01, (0.27, 0.33))
-    found = numerical_error("poisson", answer, [0.3, 0.3], [0.3])
+    found = discretisation_error("poisson", answer, [0.3, 0.3], [0.3])
     assert found.interval95 is not None
     odds = [v / (0.5 - v) for v in (*found.interval95, *answer.statistical95)]  # type: ignore[misc]
     assert odds[1] / odds[0] == pytest.approx(odds[3] / odds[2])
@@ -67,7 +67,7 @@ def test_without_numerical_error_the_interval_is_that_of_the_noise():
 
 
 def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
-    found = numerical_error("mu_pa", Estimate(100.0, 1.0, (98, 102)), [110.0, 121.0], [])
+    found = discretisation_error("mu_pa", Estimate(100.0, 1.0, (98, 102)), [110.0, 121.0], [])
     assert found.step_order is None
     assert found.extrapolated == pytest.approx(121.0)
     low, high = found.interval95 or (0, 0)
@@ -78,13 +78,13 @@ def test_changes_that_do_not_shrink_are_no_ground_to_extrapolate():
 @pytest.mark.parametrize(("value", "half_step"), [(-0.1, -0.11), (0.01, -0.01)])
 def test_a_poisson_ratio_below_zero_has_an_interval(value, half_step):
     estimate = Estimate(value, 0.02, (value - 0.04, value + 0.04))
-    low, high = numerical_error("poisson", estimate, [half_step], []).interval95 or (0, 0)
+    low, high = discretisation_error("poisson", estimate, [half_step], []).interval95 or (0, 0)
     assert low < value + 4 / 3 * (half_step - value) < high
     assert high - low == pytest.approx(0.08, rel=0.1)
 
 
 def test_an_estimate_without_an_interval_gets_none():
-    assert numerical_error("mu_pa", Estimate(100.0), [101.0], [99.0]).interval95 is None
+    assert discretisation_error("mu_pa", Estimate(100.0), [101.0], [99.0]).interval95 is None
 
 
 # On problems
@@ -93,7 +93,7 @@ def test_an_estimate_without_an_interval_gets_none():
 def coarse() -> Problem:
     """Data of a step four times finer, on the same mesh."""
     guess = GUESS.with_guess(TRUTH)
-    items = [i if i.name in FREE else replace(i, fixed=True) for i in guess.items]
+    items = [i if i.name in FREE else replace(i, is_fixed=True) for i in guess.items]
     experiment = measured(hung_cube(16, divisions=(1, 1, 2)), substeps=4)
     sigma_m = np.full(len(experiment.markers.names), 1e-5)
     seen = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m))
@@ -117,7 +117,7 @@ def test_halving_the_step_leads_to_the_truth(refined):
         error = refined.refinement.errors[name]
         assert error.step_order == pytest.approx(2.0, abs=0.4)
         wrong = refined.parameters[name] - TRUTH[name]
-        by_step = numerical_error(
+        by_step = discretisation_error(
             name,
             refined.estimates[name],
             [level.values[name] for level in refined.refinement.levels[:2]],
@@ -128,7 +128,7 @@ def test_halving_the_step_leads_to_the_truth(refined):
 
 def test_finer_answers_start_from_the_coarser(refined):
     assert refined.refinement is not None
-    halved = [(level.halved, level.times) for level in refined.refinement.levels]
+    halved = [(level.refined, level.times) for level in refined.refinement.levels]
     assert halved == [("step", 1), ("step", 2), ("mesh", 1), ("mesh", 2)]
     assert max(level.iterations for level in refined.refinement.levels) <= 6
     assert set(refined.refinement.errors) == {*FREE, "young_pa", "poisson"}
@@ -157,7 +157,7 @@ def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
     combined = {"mu_pa": 1.0}
 
     def concerns(half_step_pa: float) -> list:
-        error = numerical_error("mu_pa", optimum["mu_pa"], [half_step_pa], [])
+        error = discretisation_error("mu_pa", optimum["mu_pa"], [half_step_pa], [])
         return numerical_concerns(optimum, combined, Refinement({"mu_pa": error}))
 
     assert concerns(101.4) == []

@@ -16,7 +16,7 @@ from collocation_sysid.fem.mesh import TetMesh
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.fem.selection import Ball, Box, Indices, Named
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.program.block_band import whole
+from collocation_sysid.program.block_band import full_matrix
 
 EVALUATORS = ["simd", "casadi"]
 LENGTH_M = 0.03  # a large change of a position
@@ -55,7 +55,7 @@ def theta_of_two(body: Body) -> np.ndarray:
     """Constants that differ from region to region."""
     core = CONSTANTS.get(body.parts[1].material.name)
     own = HARD if core is None else {**core, "gamma_r_s": 0.002, "gamma_m_1_s": 3.0}
-    return body.theta({**SOFT, **of_region("core", own)})
+    return body.theta_from_values({**SOFT, **of_region("core", own)})
 
 
 def states(body: Body, rng: np.random.Generator, count: int = 2) -> tuple[np.ndarray, ...]:
@@ -73,7 +73,7 @@ def times(
     vectors = field.reshape(len(triangles), -1)
     skews = np.zeros((len(triangles), 0)) if skew is None else skew
     parts = zip(triangles, skews, vectors, strict=True)
-    return np.stack([whole(body.pattern, lower, other) @ d for lower, other, d in parts])
+    return np.stack([full_matrix(body.pattern, lower, other) @ d for lower, other, d in parts])
 
 
 def transposed_times(body: Body, at: Linearisation, field: np.ndarray) -> np.ndarray:
@@ -146,7 +146,7 @@ def test_regions_with_the_same_constants_are_one_body(evaluator, element, rng):
         assert relative_error(getattr(found, name), getattr(expected, name)) < 1e-12
     summed = found.by_theta[..., :4] + found.by_theta[..., 4:]
     assert relative_error(summed, expected.by_theta) < 1e-12
-    found, expected = two.curvature(x, v, w, both), one.curvature(x, v, w, theta)
+    found, expected = two.second_derivatives(x, v, w, both), one.second_derivatives(x, v, w, theta)
     for name in ("position_position", "position_velocity", "position_velocity_skew"):
         assert relative_error(getattr(found, name), getattr(expected, name)) < 1e-12
     for name in ("position_theta", "velocity_theta", "theta"):

@@ -18,7 +18,7 @@ from collocation_sysid.display import plain_text
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.result import Result, SimulatedExperiment
 from collocation_sysid.statistics.concern import TOPICS, Concern
-from collocation_sysid.statistics.trust import Trust
+from collocation_sysid.statistics.trust import Assessment
 from collocation_sysid.tree import as_json
 
 pytestmark = pytest.mark.long
@@ -228,7 +228,9 @@ def test_concerns_lead_to_what_cures_them(run_folder: Path, tmp_path: Path):
         Concern("scheme/step", data=data),
         Concern("information/bound", data=data | {"names": ["mu_pa"]}),
     )
-    (copy / "result.json").write_text(as_json(replace(whole, trust=Trust.of(concerns))))
+    (copy / "result.json").write_text(
+        as_json(replace(whole, trust=Assessment.from_concerns(concerns)))
+    )
     run_command("report", copy)
     page = (copy / "report.html").read_text()
     for topic in ("scheme", "information"):

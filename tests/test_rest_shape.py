@@ -30,12 +30,12 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem.options import UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.result.fields import ElementFields
 from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.considered import assumed
-from collocation_sysid.statistics.linearised import linearised_fit
+from collocation_sysid.statistics.considered import changes_of_assumptions
+from collocation_sysid.statistics.linearised import linearise_fit
 
 SOFT = TRUTH | {"young_pa": 6e4}
 ELEMENTS = ["tet4", pytest.param("tet10", marks=pytest.mark.long), "tet10-p0"]
@@ -55,22 +55,22 @@ def scanned_body(element: str = "tet4", **changes) -> cs.Body:
 @pytest.mark.parametrize("element", ["tet4", "tet10", "tet10-p0"])
 def test_the_forward_equilibrium_of_the_stress_free_shape_is_the_mesh(element):
     body = scanned_body(element)
-    theta = body.theta(SOFT)
-    stress_free = body.inverse.shape(theta).positions_m
+    theta = body.theta_from_values(SOFT)
+    stress_free = body.inverse_equilibrium.solve(theta).positions_m
     sag_m = np.abs(stress_free - body.nodes_m).max()
     assert sag_m > 0.01
-    held = body.scan.held_nodes(body.nodes)
+    held = body.scan_conditions.held_nodes(body.nodes)
     np.testing.assert_array_equal(stress_free[held], body.nodes_m[held])
     # From halfway between both, under the weight of the scan.
     start = ((stress_free + body.nodes_m) / 2).ravel()
-    found = rest_state(recorded(body), theta, start=start).reshape(-1, 3)
+    found = equilibrium(recorded(body), theta, start=start).reshape(-1, 3)
     assert np.abs(found - body.nodes_m).max() < 1e-9 * 0.12
 
 
 def test_the_mesh_of_a_simulated_scan_leads_back_to_the_straight_bar():
     mesh = hung_mesh()
     body = cs.Body(mesh, mass_kg=straight_bar().mass_kg, rest_shape=as_scanned(mesh))
-    found = body.inverse.shape(body.theta(TRUTH)).positions_m
+    found = body.inverse_equilibrium.solve(body.theta_from_values(TRUTH)).positions_m
     straight_m = straight_bar().nodes_m
     sag_m = np.abs(mesh.points_m - straight_m).max()
     # Mass is distributed as the volume of the mesh is, not as that of the straight bar.
@@ -81,7 +81,7 @@ def test_the_mesh_of_a_simulated_scan_leads_back_to_the_straight_bar():
 def test_forces_are_those_of_a_body_with_the_stress_free_mesh(damping):
     body = scanned_body(damping=damping)
     values = SOFT | {"gamma_m_1_s": 0.0}
-    theta = body.theta(values)
+    theta = body.theta_from_values(values)
     other = cs.Body(body.stress_free_mesh(theta), density_kg_m3=DENSITY_KG_M3, damping=damping)
     rng = np.random.default_rng(0)
     x = body.nodes_m + 1e-3 * rng.standard_normal(body.nodes_m.shape)
@@ -94,7 +94,7 @@ def test_forces_are_those_of_a_body_with_the_stress_free_mesh(damping):
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_forces_follow_from_the_energy_and_the_constants(element):
     body, rng = scanned_body(element), np.random.default_rng(0)
-    theta = body.theta(SOFT)
+    theta = body.theta_from_values(SOFT)
     moduli = {name: SOFT[name] for name in ("young_pa", "poisson")}
     x = body.nodes_m + 1e-4 * rng.standard_normal(body.nodes_m.shape)
     v = 0.1 * rng.standard_normal(x.shape)
@@ -114,17 +114,17 @@ def test_the_shape_follows_the_constants_of_every_region_and_a_free_density():
     body = cs.Body(mesh, density_kg_m3=1000.0, regions=[core], rest_shape=as_scanned(mesh))
     body = body.with_free_densities([""])
     values = SOFT | {"core.mu_pa": 1e5, "core.lambda_pa": 2e5, "density_kg_m3": 1000.0}
-    theta = body.theta(values)
-    places = body.inverse.places
+    theta = body.theta_from_values(values)
+    places = body.inverse_equilibrium.places
     assert len(places) == 5
-    rng, by_input = np.random.default_rng(1), body.inverse.shape(theta).by_input
+    rng, by_input = np.random.default_rng(1), body.inverse_equilibrium.solve(theta).by_input
     x = body.nodes_m + 1e-4 * rng.standard_normal(body.nodes_m.shape)
     v = 0.1 * rng.standard_normal(x.shape)
 
     def moved(own: np.ndarray) -> np.ndarray:
         other = theta.copy()
         other[places] = own
-        return body.inverse.shape(other).positions_m
+        return body.inverse_equilibrium.solve(other).positions_m
 
     own = theta[places]
     assert_derivative(moved, lambda d: np.tensordot(d, by_input, 1), own, rng, 1e-6, own)
@@ -136,8 +136,8 @@ def test_the_shape_follows_the_constants_of_every_region_and_a_free_density():
 
 def test_a_stiff_body_is_as_scanned():
     body = scanned_body()
-    rigid = body.theta(TRUTH | {"young_pa": 1e12})
-    sag_m = np.abs(body.inverse.shape(rigid).positions_m - body.nodes_m).max()
+    rigid = body.theta_from_values(TRUTH | {"young_pa": 1e12})
+    sag_m = np.abs(body.inverse_equilibrium.solve(rigid).positions_m - body.nodes_m).max()
     assert sag_m < 1e-8
     other = scanned_body(rest_shape="stress_free")
     x = body.nodes_m + 1e-4 * np.random.default_rng(0).standard_normal(body.nodes_m.shape)
@@ -147,9 +147,9 @@ def test_a_stiff_body_is_as_scanned():
 
 def test_element_fields_refer_to_the_stress_free_shape():
     body = scanned_body()
-    theta = body.theta(SOFT)
+    theta = body.theta_from_values(SOFT)
     fields = ElementFields.of(body, theta)
-    stress_free = body.inverse.shape(theta).positions_m
+    stress_free = body.inverse_equilibrium.solve(theta).positions_m
     at_rest = fields.at(stress_free[None])
     np.testing.assert_allclose(at_rest["det_f"], 1.0, atol=1e-9)
     assert at_rest["von_mises_pa"].max() < 1e-5 * SOFT["young_pa"]
@@ -180,7 +180,7 @@ def test_slopes_of_a_fit_are_those_of_brute_force_differences(described):
         {name: values[name] for name in ("young_pa", "gamma_r_s")}
     ).guess_q
     z = collocation.pack(q, [x.reshape(len(x), -1)])
-    slope = linearised_fit(collocation, z).blocks[0].slope[..., 0]
+    slope = linearise_fit(collocation, z).blocks[0].jacobian[..., 0]
     step = 1e-4
     ends = [tracks(values["young_pa"] * np.exp(way)) for way in (step, -step)]
     expected = (ends[0] - ends[1]) / (2 * step) / described.markers.sigma_m[:, None]
@@ -225,7 +225,7 @@ def test_interior_point_and_reduced_space_find_the_same_optimum(static):
     problem = problem_of(experiment, **({} if static else ONE_STEP))
     collocation = Collocation(problem.experiments, problem.parameters)
     answers = [cs.ReducedSpace()(collocation), InteriorPoint()(collocation)]
-    values = [collocation.values(answer.z)["young_pa"] for answer in answers]
+    values = [collocation.parameter_values(answer.z)["young_pa"] for answer in answers]
     assert values[1] == pytest.approx(values[0], rel=1e-5)
     assert values[0] == pytest.approx(TRUTH["young_pa"], rel=0.01)
 
@@ -238,7 +238,7 @@ def test_forgetting_how_the_shape_depends_on_the_stiffness_leads_elsewhere(descr
     other = measured_on(kept)
     problem = problem_of(other, **ONE_STEP)
     answer = cs.ReducedSpace()(Collocation(problem.experiments, problem.parameters))
-    young_pa = answer.collocation.values(answer.z)["young_pa"]
+    young_pa = answer.collocation.parameter_values(answer.z)["young_pa"]
     assert abs(young_pa / TRUTH["young_pa"] - 1) > 0.03
 
 
@@ -259,7 +259,7 @@ def changes_of(experiment: cs.Experiment, **deviations) -> dict[str, np.ndarray]
     collocation = Collocation([experiment], parameters)
     x = simulate(experiment, TRUTH, "midpoint", substeps=1).positions_m
     z = collocation.pack(parameters.guess_q, [x.reshape(len(x), -1)])
-    found = assumed(collocation, z, Assumptions(**deviations).deviations)
+    found = changes_of_assumptions(collocation, z, Assumptions(**deviations).deviations)
     return {name: found.blocks[0][..., k] for k, name in enumerate(found.names)}
 
 
@@ -371,7 +371,7 @@ def test_a_scan_goes_from_the_file_to_the_body(tmp_path):
     table += 'scan = { nodes = "top", gravity_m_s2 = [0.0, 0.0, -1.0] }\n'
     file.write_text(text.replace("[object]\n", table))
     body = cs.Problem.read(file).bodies[0]
-    np.testing.assert_array_equal(body.scan.gravity_m_s2, (0.0, 0.0, -1.0))
+    np.testing.assert_array_equal(body.scan_conditions.gravity_m_s2, (0.0, 0.0, -1.0))
     file.write_text(text.replace("[object]\n", '[object]\nrest_shape = "under_gravity"\n'))
     with pytest.raises(InputError, match="belong together"):
         cs.Problem.read(file)
@@ -382,11 +382,11 @@ def test_a_scan_goes_from_the_file_to_the_body(tmp_path):
 
 
 def test_a_finer_mesh_keeps_what_is_stated():
-    from collocation_sysid.fem.refinement import refined
+    from collocation_sysid.fem.refinement import refine_body
 
     body = scanned_body()
-    finer = refined(body)
-    held = finer.scan.held_nodes(finer.nodes)
+    finer = refine_body(body)
+    held = finer.scan_conditions.held_nodes(finer.nodes)
     assert np.abs(finer.nodes.points_m[held, 0]).max() < 1e-9
     assert len(held) == 25
     assert UncertaintyOptions().assumptions.deviations["rest_shape"] == 0.58

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.recording import MarkerTable, align_to_template, fit_poses
-from collocation_sysid.recording.rigid import loosest_marker
+from collocation_sysid.recording.rigid import least_rigid_marker
 
 CLUSTER_M = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.03, 0.03, 0.06]])
 
@@ -131,7 +131,7 @@ def test_a_marker_that_moves_against_the_others_is_found(rng, markers, moving):
     reference = CLUSTER_M[:markers]
     tracks = carried(reference, *motion(rng, 1))
     tracks[0, moving] += 0.1 * (tracks[0, moving] - tracks[0].mean(axis=0))
-    assert loosest_marker(reference, tracks[0]) == moving
+    assert least_rigid_marker(reference, tracks[0]) == moving
     assert fit_poses(reference, tracks).residual_m[0] > 1e-4
 
 

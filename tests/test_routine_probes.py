@@ -38,11 +38,11 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.result.probe_sections import DEEPER, is_deeper_check_worthwhile
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.statistics.assumptions import Assumptions
-from collocation_sysid.statistics.linearised import best_step, linearised_fit
+from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
 from collocation_sysid.statistics.relaxation import (
-    Answered,
-    Move,
+    EstimateChange,
     Probe,
+    SolvedFit,
     has_monotonic_load,
     probed_changes,
 )
@@ -53,7 +53,7 @@ from collocation_sysid.statistics.routine_probes import (
     probed_deviations,
     routine_probes,
 )
-from collocation_sysid.statistics.trust import Trust, probe_concerns
+from collocation_sysid.statistics.trust import Assessment, probe_concerns
 from collocation_sysid.statistics.uncertainty import AUTO
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -87,7 +87,7 @@ def swung(fault: str = "", off: float = 0.0, samples: int = 60) -> Problem:
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
     estimated = {name: Unknown(TRUTH[name]) for name in ("young_pa", "poisson", "gamma_r_s")}
-    parameters = Parameters.of(TRUTH | estimated)
+    parameters = Parameters.from_mapping(TRUTH | estimated)
     # Nothing but the probes is to give concern: all assumptions are stated as exact.
     exact = Assumptions(**dict.fromkeys(Assumptions().deviations, "none"))
     options = UncertaintyOptions(assumptions=exact)
@@ -129,9 +129,9 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
     assert wrongly.trust.verdict == "check"
     (concern,) = wrongly.trust.concerns
     assert concern.code == "assumption/contradicted"
-    assert fault.replace("_", " ") in concern.sentence
+    assert fault.replace("_", " ") in concern.message
     for symbol in ("E = ", "ν = ", "γ_r = "):
-        assert symbol in concern.sentence
+        assert symbol in concern.message
     for name, move in probe.moves.items():
         if name in TRUTH:  # the corrected estimates are right
             assert abs(move.value - TRUTH[name]) < 3.5 * move.std_error
@@ -142,18 +142,18 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
 # Level of significance ----------------------------------------------------------------------------
 
 
-def answered(problem: Problem) -> Answered:
+def answered(problem: Problem) -> SolvedFit:
     """The fit of a problem at its guess, as if that were the answer."""
     collocation = replace(problem.collocation(), substeps=1)
     z, _ = initial_variables(collocation)
-    fit = linearised_fit(collocation, z)
+    fit = linearise_fit(collocation, z)
     deviations = probed_deviations(Assumptions().deviations)
     kept = {name: deviations[name] if name in (DRIFT, CLOCK) else None for name in deviations}
-    return Answered(
+    return SolvedFit(
         collocation=collocation,
         z=z,
         fit=fit,
-        errors=AUTO,
+        error_model=AUTO,
         statistical={},
         budget={},
         deviations=kept,
@@ -166,13 +166,13 @@ def test_faultless_fits_have_no_significant_probe():
     rng, draws, alarms = np.random.default_rng(3), 60, 0
     for _ in range(draws):
         noisy = [
-            replace(b, residual=rng.standard_normal(b.residual.shape) * b.seen, misfit=None)
+            replace(b, residual=rng.standard_normal(b.residual.shape) * b.is_measured, misfit=None)
             for b in at.fit.blocks
         ]
         fit = replace(at.fit, blocks=tuple(noisy))
-        fit = fit.after(best_step(fit))
+        fit = fit.after_step(gauss_newton_step(fit))
         here = replace(at, fit=fit)
-        of_fit = here.found(fit, here.p)
+        of_fit = here.uncertainty_of_refit(fit, here.parameters)
         here = replace(here, statistical={**of_fit.estimates, **of_fit.derived})
         alarms += any(probe.told for probe in routine_probes(here))
     assert FALSE_ALARMS == 1e-4
@@ -189,7 +189,7 @@ def test_what_is_stated_as_exact_is_tested_too():
 
 
 def probe(relevance: float, told: bool = True, name: str = DRIFT, fall: float = 20.0) -> Probe:
-    moves = {"young_pa": Move(8100.0, 40.0, 100.0, 2.0, 0.5)}
+    moves = {"young_pa": EstimateChange(8100.0, 40.0, 100.0, 2.0, 0.5)}
     own = (name,) if told else ()
     return Probe("assumption", name, fall, moves, -0.05, 0.01, own, True, relevance)
 
@@ -205,8 +205,8 @@ def test_the_concern_names_the_assumption_and_every_corrected_estimate():
     both = [probe(1.0, name=CLOCK, fall=12.0), probe(1.0)]
     (concern,) = probe_concerns(both, {"young_pa": 1.01, "poisson": 1.0})
     assert concern.grade == "check"
-    assert Trust.of([concern]).verdict == "check"
-    assert concern.sentence == (
+    assert Assessment.from_concerns([concern]).verdict == "check"
+    assert concern.message == (
         "the data contradict the assumption that the stiffness is constant during a recording: "
         "with stiffness drift = -0.05 ± 0.01 χ² falls by 20, and the estimates are "
         "E = 8181 ± 40 Pa and ν not determined; less well also by clock rate (12)"
@@ -241,10 +241,10 @@ def pressed(heights_m: list[float]) -> Experiment:
 )
 def test_a_static_recording_shows_a_drift_only_where_its_load_returns(heights_m, drifts):
     stiffness = {"lambda_pa": Unknown(800.0), "mu_pa": Unknown(600.0)}
-    guess = Parameters.of({**stiffness, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
+    guess = Parameters.from_mapping({**stiffness, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
     collocation = Collocation([pressed(heights_m)], guess)
     z, _ = initial_variables(collocation)
-    (part,) = collocation.parts(z)
+    (part,) = collocation.iterates(z)
     assert has_monotonic_load(part, collocation) is not drifts
     none = dict.fromkeys(Assumptions().deviations)
     changes = probed_changes(collocation, z, {**none, DRIFT: 0.02})

@@ -13,10 +13,10 @@ from problem_files import TRUTH, run_command, settings, write_problem
 from collocation_sysid import Problem, run
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import read_markers, write_markers_csv
-from collocation_sysid.runs.forward_simulation import Rollout
+from collocation_sysid.runs.forward_simulation import ForwardSimulation
 from collocation_sysid.runs.result import Result
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.profile import profile_of
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.profile import profile_of_solution
 from collocation_sysid.tree import as_json, content, read
 
 NUISANCE = """
@@ -79,7 +79,7 @@ def test_nuisance_is_reported_with_unit_prior_and_error(finished):
 
 def test_a_validation_experiment_gets_its_nuisance_with_the_material_as_found(finished):
     rollout = finished.rollouts["turn"]
-    assert isinstance(rollout, Rollout)
+    assert isinstance(rollout, ForwardSimulation)
     assert rollout.rms_m < 5e-4  # the offset alone is 2.7 mm of one in three markers
     found = [rollout.nuisance[f"turn: camera offset of low, {axis} [m]"] for axis in "xyz"]
     np.testing.assert_allclose(found, OFFSET_M, atol=3e-4)
@@ -140,8 +140,8 @@ def test_every_marker_is_diagnosed(finished):
 
 def test_a_profile_agrees_with_the_error_bar_where_the_loss_is_round(finished):
     solution, uncertainty = finished.solution, finished.uncertainty
-    fit = linearised_fit(solution.collocation, solution.z)
-    profile = profile_of(solution, fit, uncertainty, "mu_pa")
+    fit = linearise_fit(solution.collocation, solution.z)
+    profile = profile_of_solution(solution, fit, uncertainty, "mu_pa")
     np.testing.assert_allclose(
         profile.interval, uncertainty.estimates["mu_pa"].statistical95, rtol=0.01
     )
@@ -161,8 +161,8 @@ def test_a_profile_counts_the_prior_of_its_parameter(finished):
     )
     problem = replace(finished.problem, parameters=held)
     again = run(problem, seek_causes=False)
-    fit = linearised_fit(again.solution.collocation, again.solution.z)
-    profile = profile_of(again.solution, fit, again.uncertainty, "mu_pa")
+    fit = linearise_fit(again.solution.collocation, again.solution.z)
+    profile = profile_of_solution(again.solution, fit, again.uncertainty, "mu_pa")
     lower, upper = profile.interval
     assert upper is not None
     assert lower is not None

@@ -15,7 +15,11 @@ from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import Experiment, Force, PointMass
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.scale import open_scale, relative_moduli, relative_sentence
+from collocation_sysid.statistics.scale import (
+    parameters_of_open_scale,
+    relative_moduli,
+    relative_scale_note,
+)
 
 STIFF = {"lambda_pa": Unknown(300.0), "mu_pa": Unknown(200.0)}
 DAMPED = {"gamma_r_s": Unknown(0.02), "gamma_m_1_s": 1.0}
@@ -29,7 +33,7 @@ def problem(given, **changes) -> Problem:
 
 
 def names_of(found: Problem) -> tuple[str, ...]:
-    return open_scale(found.experiments, found.parameters)
+    return parameters_of_open_scale(found.experiments, found.parameters)
 
 
 def tip(experiment: Experiment) -> np.ndarray:
@@ -76,7 +80,7 @@ def test_a_known_mass_or_force_on_free_nodes_closes_it():
     force = Force(tip(cube), [[0.0, 0.0, 0.1]])
     assert names_of(problem(OPEN, masses=[mass])) == ()
     assert names_of(problem(OPEN, forces=[force])) == ()
-    held = PointMass(cube.held_dofs[[0, 3]] // 3, 0.01)
+    held = PointMass(cube.prescribed_dofs[[0, 3]] // 3, 0.01)
     assert names_of(problem(OPEN, masses=[held])) == NAMES
 
 
@@ -84,9 +88,12 @@ def test_one_of_two_recordings_with_a_known_mass_is_enough():
     cube = hung_cube()
     loaded = replace(cube, name="loaded", masses=(PointMass(tip(cube), 0.01),))
     parameters = Problem([cube], OPEN).parameters
-    assert open_scale([cube, loaded], parameters) == ()
+    assert parameters_of_open_scale([cube, loaded], parameters) == ()
     only_validated = replace(loaded, validation=True)
-    assert open_scale(Problem([cube, only_validated], OPEN).experiments, parameters) == NAMES
+    assert (
+        parameters_of_open_scale(Problem([cube, only_validated], OPEN).experiments, parameters)
+        == NAMES
+    )
 
 
 def test_it_is_said_before_the_solve_and_in_the_verdict():
@@ -112,12 +119,12 @@ def test_where_a_mass_sets_the_scale_the_density_is_found_and_nothing_said():
 def test_moduli_relative_to_a_density_as_stated_are_called_so():
     found = problem(STIFF | DAMPED)
     assert relative_moduli(found.experiments, found.parameters) == ("lambda_pa", "mu_pa")
-    said = relative_sentence(found.experiments, found.parameters)
+    said = relative_scale_note(found.experiments, found.parameters)
     assert said == ("no known force sets the scale: λ and μ are relative to the stated density")
     cube = hung_cube()
     loaded = problem(STIFF | DAMPED, masses=[PointMass(tip(cube), 0.01)])
-    assert relative_sentence(loaded.experiments, loaded.parameters) is None
-    assert relative_sentence(problem(OPEN).experiments, problem(OPEN).parameters) is None
+    assert relative_scale_note(loaded.experiments, loaded.parameters) is None
+    assert relative_scale_note(problem(OPEN).experiments, problem(OPEN).parameters) is None
 
 
 # In a problem file ----------------------------------------------------------------------------
@@ -151,7 +158,7 @@ def test_the_mass_may_be_a_parameter_in_place_of_densities(tiny):
     mass = "\n[parameters]\nmass_kg = { guess = 0.02 }\n"
     found = read(tiny, ("\n[parameters]\n", region + mass))
     body = found.bodies[0]
-    theta = body.theta(found.parameters.guesses)
+    theta = body.theta_from_values(found.parameters.guesses)
     assert body.mass_of_dofs(theta).sum() / 3 == pytest.approx(0.02)
     of_rest, of_core = body.densities(theta)
     assert of_core == pytest.approx(2 * of_rest)
@@ -161,7 +168,7 @@ def test_a_density_stated_for_a_region_stays(tiny):
     cells = "{ box_m = [[-1, -1, -1], [1, 1, 0.045]] }"
     region = f'\n[[object.region]]\nname = "core"\ncells = {cells}\ndensity_kg_m3 = 60.0\n'
     found = read(tiny, ("\n[parameters]\n", region + FREE))
-    assert [part.free_density for part in found.bodies[0].parts] == [True, False]
+    assert [part.has_free_density for part in found.bodies[0].parts] == [True, False]
     assert names_of(found) == ()
 
 

@@ -26,7 +26,13 @@ from collocation_sysid import (
 )
 from collocation_sysid.fem.selection import Box
 from collocation_sysid.fem.structured import box_mesh
-from collocation_sysid.methods.scan import _Trial, _Tried, scan, started, usual_parameters
+from collocation_sysid.methods.scan import (
+    _ScanState,
+    _TrialSimulation,
+    scan_stiffness,
+    start_problem,
+    typical_parameters,
+)
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 
@@ -55,7 +61,7 @@ def guessed(**changes: float) -> Parameters:
 
 @cache
 def scanned():
-    return scan(cube().collocation())
+    return scan_stiffness(cube().collocation())
 
 
 def test_the_scan_finds_the_stiffness():
@@ -82,7 +88,7 @@ def test_the_scan_starts_from_usual_values():
 
 def test_a_guess_that_is_given_is_used():
     given = {**NOTHING, "lambda_pa": Unknown(333.0), "gamma_r_s": 0.009}
-    found = scan(cube(given).collocation()).parameters
+    found = scan_stiffness(cube(given).collocation()).parameters
     assert found.guesses["lambda_pa"] == 333.0
     assert found.guesses["gamma_r_s"] == 0.009
     assert [item.name for item in found.free] == ["lambda_pa", "mu_pa", "gamma_m_1_s"]
@@ -90,7 +96,7 @@ def test_a_guess_that_is_given_is_used():
 
 def test_bounds_clip_the_scan_and_are_tried_once():
     given = {name: Unknown(lower=200.0, upper=2e3) for name in ("lambda_pa", "mu_pa")}
-    found = scan(cube({**NOTHING, **given}).collocation())
+    found = scan_stiffness(cube({**NOTHING, **given}).collocation())
     for value in (found.parameters.guesses["lambda_pa"], found.parameters.guesses["mu_pa"]):
         assert 200.0 <= value <= 2e3
     assert len(found.young_pa) < 8  # of 15, for what lies beyond both bounds is the same
@@ -99,7 +105,7 @@ def test_bounds_clip_the_scan_and_are_tried_once():
 
 def test_a_prior_tells_where_to_start():
     given = {**NOTHING, "gamma_r_s": Unknown(prior=(0.02, 0.5))}
-    assert usual_parameters(Parameters.of(given), 1e3).guesses["gamma_r_s"] == 0.02
+    assert typical_parameters(Parameters.from_mapping(given), 1e3).guesses["gamma_r_s"] == 0.02
 
 
 def test_several_regions_are_scaled_together():
@@ -110,11 +116,11 @@ def test_several_regions_are_scaled_together():
         regions=[Region("core", Box((0, 0, 0), (0.1, 0.1, 0.05)), "yeoh")],
     )
     names = ("c10_pa", "c01_pa", "kappa_pa", "core.c10_pa", "core.c20_pa", "core.c30_pa")
-    parameters = Parameters.of(
+    parameters = Parameters.from_mapping(
         {name: Unknown() for name in (*names, "core.poisson", "gamma_r_s")}
         | {"gamma_m_1_s": 1.0, "core.gamma_r_s": Tied("gamma_r_s", 2.0)}
     )
-    soft, stiff = (usual_parameters(parameters, young) for young in (1e3, 1e5))
+    soft, stiff = (typical_parameters(parameters, young) for young in (1e3, 1e5))
     for name in ("c10_pa", "c01_pa", "kappa_pa", "core.c10_pa"):
         assert stiff.guesses[name] == pytest.approx(100 * soft.guesses[name])
     assert stiff.guesses["core.c20_pa"] == 0.0
@@ -130,13 +136,13 @@ def test_several_regions_are_scaled_together():
 
 def test_a_constant_of_which_nothing_is_known_needs_a_guess():
     with pytest.raises(InputError, match="stiffening: no guess is given and no usual value"):
-        Parameters.of({"stiffening": Unknown()})
-    assert Parameters.of({"bulk_pa": Unknown()}).unguessed == ("bulk_pa",)
+        Parameters.from_mapping({"stiffening": Unknown()})
+    assert Parameters.from_mapping({"bulk_pa": Unknown()}).names_without_guess == ("bulk_pa",)
 
 
 def test_without_a_guess_values_are_refused_by_name():
     with pytest.raises(InputError, match="lambda_pa: there is no guess of it; expected guess = "):
-        _ = Parameters.of(NOTHING).guesses
+        _ = Parameters.from_mapping(NOTHING).guesses
 
 
 class Known:
@@ -152,16 +158,16 @@ class Known:
         return self.misfit(young_pa), None
 
 
-def walked(misfit, step: float = 10.0) -> _Tried:
-    tried = _Tried(Known(misfit))  # type: ignore[arg-type]
-    tried.walk([1e7 / step**k for k in range(6)])
+def walked(misfit, step: float = 10.0) -> _ScanState:
+    tried = _ScanState(Known(misfit))  # type: ignore[arg-type]
+    tried.try_sequence([1e7 / step**k for k in range(6)])
     return tried
 
 
 def test_the_scan_ends_after_two_that_are_worse():
     tried = walked(lambda young: 1.0 if young > 1e5 else 4.0)
     assert [*tried.misfits] == pytest.approx([1e7, 1e6, 1e5, 1e4])
-    assert not tried.at_end(softest=True)
+    assert not tried.is_best_at_end(softest=True)
 
 
 def test_the_scan_ends_after_two_that_cannot_be_simulated():
@@ -177,8 +183,10 @@ def test_the_scan_does_not_end_at_a_resonance():
 @pytest.mark.parametrize(("truth", "softest"), [(3.0, True), (1e9, False)])
 def test_the_scan_goes_on_beyond_an_end_that_is_best(truth, softest):
     tried = walked(lambda young: 1.0 + abs(np.log10(young / truth)))
-    assert tried.at_end(softest)
-    tried.walk_on(min(tried.misfits) if softest else max(tried.misfits), 0.1 if softest else 10.0)
+    assert tried.is_best_at_end(softest)
+    tried.extend_range(
+        min(tried.misfits) if softest else max(tried.misfits), 0.1 if softest else 10.0
+    )
     best = min(tried.misfits, key=lambda young: tried.misfits[young])
     assert 0.1 < best / truth < 10
 
@@ -199,7 +207,7 @@ def felt_offsets(experiment, offset_n):
 
 
 def misfits(experiment):
-    found = scan(Problem([experiment], NOTHING).collocation())
+    found = scan_stiffness(Problem([experiment], NOTHING).collocation())
     return found.young_pa[found.best], found.misfit
 
 
@@ -217,9 +225,14 @@ def test_forces_on_a_hand_tell_the_stiffness_as_markers_do():
 def test_markers_and_forces_count_alike():
     both = sensed(wristed_cube(30))
     seen = replace(both, grasps=[replace(g, wrench=None) for g in both.grasps])
-    trials = [_Trial(Problem([each], GUESS).collocation()) for each in (both, seen, unseen(both))]
-    together, of_markers, of_forces = (trial.guess(whole=False)[0] for trial in trials)
-    counts = [trial.collocation.measurements for trial in trials]
+    trials = [
+        _TrialSimulation(Problem([each], GUESS).collocation())
+        for each in (both, seen, unseen(both))
+    ]
+    together, of_markers, of_forces = (
+        trial.evaluate_guess(is_complete=False)[0] for trial in trials
+    )
+    counts = [trial.collocation.measurement_count for trial in trials]
     assert min(of_markers, of_forces) < together < max(of_markers, of_forces)
     assert counts[0] == counts[1] + counts[2]
 
@@ -239,7 +252,7 @@ def test_a_force_that_is_felt_late_is_waited_for():
 
 def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
     bench = unseen(block("z"))
-    collocation, found = started(Problem([bench], guessed(mu_pa=9e3)).collocation())
+    collocation, found = start_problem(Problem([bench], guessed(mu_pa=9e3)).collocation())
     assert found is not None
     assert "the measurements are missed by more than an undeformed body would" in found.sentence
     assert collocation.parameters.guesses["mu_pa"] < 2 * TRUTH["mu_pa"]
@@ -260,12 +273,12 @@ def test_it_is_solved_without_a_guess(method):
 
 def test_a_guess_that_can_be_simulated_is_kept():
     collocation = cube(GUESS).collocation()
-    assert started(collocation) == (collocation, None)
+    assert start_problem(collocation) == (collocation, None)
 
 
 def test_damping_alone_needs_no_scan():
     given = {**{name: TRUTH[name] for name in ("lambda_pa", "mu_pa")}, "gamma_m_1_s": 1.0}
-    collocation, found = started(cube({**given, "gamma_r_s": Unknown()}).collocation())
+    collocation, found = start_problem(cube({**given, "gamma_r_s": Unknown()}).collocation())
     assert found is None
     assert collocation.parameters.guesses["gamma_r_s"] == pytest.approx(0.003)
 
@@ -280,7 +293,7 @@ def test_a_guess_that_cannot_be_simulated_is_rescued_with_a_note():
 
 def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     monkeypatch.setattr("collocation_sysid.methods.scan._Trial.rigid_misfit", 1e-3)
-    collocation, found = started(cube(guessed(mu_pa=1e4)).collocation())
+    collocation, found = start_problem(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
     assert found.sentence.startswith("at the guess the measurements are missed by more than")
     assert collocation.parameters.guesses["mu_pa"] == pytest.approx(
@@ -291,7 +304,7 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
 def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
     monkeypatch.setattr("collocation_sysid.methods.scan._Trial.rigid_misfit", 0.0)
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
-    assert started(collocation)[0] is collocation
+    assert start_problem(collocation)[0] is collocation
 
 
 def too_soft() -> dict[str, Unknown | float]:
@@ -317,13 +330,13 @@ def test_a_method_that_simulates_everything_gets_a_start_that_can_be(monkeypatch
     monkeypatch.setattr(
         "collocation_sysid.methods.scan._Trial.runs", lambda _, young: young > 1.5 * best
     )
-    found = scan(cube().collocation(), whole=True)
+    found = scan_stiffness(cube().collocation(), is_complete=True)
     assert found.young_pa[found.best] == pytest.approx(scanned().young_pa[scanned().best + 1])
 
 
 def test_several_experiments_are_scanned_together():
     experiments = [swung_cube(), replace(swung_cube(), name="again")]
-    found = scan(Collocation(experiments, Parameters.of(NOTHING)))
+    found = scan_stiffness(Collocation(experiments, Parameters.from_mapping(NOTHING)))
     assert found.samples == 2 * scanned().samples
     np.testing.assert_allclose(found.misfit, scanned().misfit, rtol=1e-9)
 

@@ -8,9 +8,9 @@ from fits_small import PARAMETERS, problem
 from scipy.stats import binom, chi2, t
 
 from collocation_sysid.statistics.linearised import LinearisedFit
-from collocation_sysid.statistics.scatter import Scatter, single_fits
+from collocation_sysid.statistics.scatter import RecordingComparison, single_fits
 from collocation_sysid.statistics.trust import fit_concerns
-from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_of
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 MADE = problem((80, 80, 80, 80), 3, offsets=False)
 RECORDINGS = len(MADE.slopes)
@@ -33,10 +33,10 @@ def fitted(seed: int, spread: float = 0.0) -> tuple[LinearisedFit, np.ndarray]:
 
 def judged(seed: int, spread: float = 0.0) -> Uncertainty:
     fit, wrong = fitted(seed, spread)
-    return uncertainty_of(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
+    return uncertainty_from_fit(fit, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
 
 
-def scatter(found: Uncertainty) -> Scatter:
+def scatter(found: Uncertainty) -> RecordingComparison:
     assert found.scatter is not None
     return found.scatter
 
@@ -62,26 +62,26 @@ def test_a_step_from_the_joint_answer_is_the_fit_to_one_recording():
 def test_recordings_that_agree_have_the_chi_squared_of_chance():
     found = [scatter(judged(seed)) for seed in range(SEEDS)]
     values = np.array([each.chi_squared for each in found]) / (RECORDINGS - 1)
-    assert all((each.freedom == RECORDINGS - 1).all() for each in found)
+    assert all((each.degrees_of_freedom == RECORDINGS - 1).all() for each in found)
     low, high = chi2.ppf([1e-4, 1 - 1e-4], SEEDS * (RECORDINGS - 1)) / SEEDS / (RECORDINGS - 1)
     assert (low < values.mean(axis=0)).all()
     assert (values.mean(axis=0) < high).all()
-    assert sum(each.disagreeing.any() for each in found) <= 3
+    assert sum(each.is_disagreeing.any() for each in found) <= 3
     same = np.array([4.0, 3.0, 2.0, 1.0])
-    np.testing.assert_array_equal(found[0].widened(same), same)
+    np.testing.assert_array_equal(found[0].widen(same), same)
 
 
 def test_recordings_that_disagree_widen_the_interval_of_what_they_disagree_on():
     calm, found = judged(1), judged(1, spread=SPREAD)
-    assert scatter(found).disagreeing.tolist() == [False, True, False, False]
+    assert scatter(found).is_disagreeing.tolist() == [False, True, False, False]
     ratio = np.sqrt(np.diag(found.covariance) / np.diag(calm.covariance))
-    birge = np.sqrt(scatter(found).chi_squared[1] / scatter(found).freedom[1])
+    birge = np.sqrt(scatter(found).chi_squared[1] / scatter(found).degrees_of_freedom[1])
     assert ratio[1] == pytest.approx(birge, rel=0.3)
     assert found.quantiles[1] == pytest.approx(t.ppf(0.975, RECORDINGS - 1))
     assert (ratio[[0, 2, 3]] < 1.3).all()
     (note,) = [note for note in found.notes if "disagree on mu_pa" in note]
     assert "model error decides" in note
-    assert any("disagree on mu_pa" in each.sentence for each in fit_concerns(found))
+    assert any("disagree on mu_pa" in each.message for each in fit_concerns(found))
     assert not any("disagree" in note for note in calm.notes)
 
 
@@ -96,4 +96,4 @@ def test_widened_intervals_hold_the_truth_as_often_as_they_say():
 
 def test_one_recording_cannot_disagree():
     fit, wrong = problem((80,), 3).fit([np.zeros((80, 3, 3))], np.zeros(14))
-    assert uncertainty_of(fit, PARAMETERS, wrong[:4]).scatter is None
+    assert uncertainty_from_fit(fit, PARAMETERS, wrong[:4]).scatter is None

@@ -9,7 +9,11 @@ import pytest
 from problems_small import hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.runs.solving import NEARLY_INCOMPRESSIBLE, _from_elsewhere, second_start
+from collocation_sysid.runs.solving import (
+    NEARLY_INCOMPRESSIBLE,
+    _best_of_second_start,
+    second_start_parameters,
+)
 
 KNOWN = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
 TRUTH = {"young_pa": 600.0, "poisson": 0.46, **KNOWN}
@@ -27,7 +31,7 @@ def answer(*free: str) -> cs.Solution:
 def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
     first = answer("young_pa", "poisson", "gamma_r_s")
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
-    start = second_start(first)
+    start = second_start_parameters(first)
     assert start is not None
     guesses = {item.name: item.guess for item in start.free}
     assert guesses["poisson"] == 0.3
@@ -36,14 +40,14 @@ def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
 
 
 def test_a_ratio_that_is_known_gives_no_second_start():
-    assert second_start(answer("young_pa")) is None
+    assert second_start_parameters(answer("young_pa")) is None
 
 
 def test_the_better_of_two_answers_counts():
     first = answer("young_pa", "poisson", "gamma_r_s")
-    same = _from_elsewhere(cs.ReducedSpace(), first, None)
+    same = _best_of_second_start(cs.ReducedSpace(), first, None)
     assert same is first
     worse = replace(first, history=(replace(first.history[-1], loss=first.history[-1].loss + 5),))
-    better = _from_elsewhere(cs.ReducedSpace(), worse, None)
+    better = _best_of_second_start(cs.ReducedSpace(), worse, None)
     assert "χ² lower by 5" in better.notes[0]
     assert better.parameters["poisson"] == pytest.approx(first.parameters["poisson"], rel=1e-3)

@@ -30,11 +30,11 @@ from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Experiment, Markers, Nuisance
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 PLACES = {"marker_offset_m": "shared"}
 ELASTIC = Parameters(
-    tuple(replace(each, fixed=each.name.startswith("gamma"), prior=None) for each in GUESS.items)
+    tuple(replace(each, is_fixed=each.name.startswith("gamma"), prior=None) for each in GUESS.items)
 )
 
 
@@ -58,8 +58,8 @@ def test_what_is_shared_is_saved():
     fourth = replace(bar_with_nuisance(4), nuisance=Nuisance.none(marker_offset_m=0.003))
     collocation = Collocation([first, sharing(second, *shared), fourth, third], GUESS)
     alone = Collocation([cube, second, fourth, swung_again(cube, "third")], GUESS)
-    saved = [name for name in collocation.names if name.startswith("shared: ")]
-    assert len(set(collocation.names)) == len(alone.names) - len(saved)
+    saved = [name for name in collocation.parameter_names if name.startswith("shared: ")]
+    assert len(set(collocation.parameter_names)) == len(alone.parameter_names) - len(saved)
     assert collocation.nphi == alone.nphi - len(saved)
 
 
@@ -68,8 +68,8 @@ def test_tares_are_shared():
     one = wristed_cube(4, nuisance)
     names = "tare", "sensor_time_s", "sensor_lag_s", "tool_kg", "tool_m", "gravity_rad"
     pair = [sharing(each, *names) for each in (one, swung_again(one, "second"))]
-    program = Collocation(pair, GUESS).made_explicit()
-    assert len({name for name in program.names if "tare" in name}) == 6
+    program = Collocation(pair, GUESS).with_lifted_variables()
+    assert len({name for name in program.parameter_names if "tare" in name}) == 6
 
 
 # Answers
@@ -108,10 +108,10 @@ def test_recordings_that_share_all_are_one_recording(method: str):
     assert two.status.converged
     np.testing.assert_allclose(two.theta, one.theta, rtol=1e-6)
     assert two.collocation.nphi == one.collocation.nphi
-    (part,), parts = (each.collocation.parts(each.z) for each in (one, two))
+    (part,), parts = (each.collocation.iterates(each.z) for each in (one, two))
     for each in parts:
         np.testing.assert_allclose(each.phi, part.phi, atol=1e-5)
-    bars = [covariance(each.collocation, each.z) for each in (one, two)]
+    bars = [uncertainty_at(each.collocation, each.z) for each in (one, two)]
     np.testing.assert_allclose(bars[1].covariance, bars[0].covariance, rtol=1e-3, atol=1e-12)
 
 
@@ -136,26 +136,28 @@ def test_markers_glued_once_are_found_once(on_surface: bool):
     together, really = swings(on_surface)
     solution = ReducedSpace()(Collocation(together, GUESS))
     assert solution.status.converged
-    bars = covariance(solution.collocation, solution.z)
+    bars = uncertainty_at(solution.collocation, solution.z)
     errors = np.log(solution.theta / list(TRUTH.values()))
     assert np.abs(errors / np.sqrt(np.diag(bars.covariance))).max() < 3.5
-    places = [part.segment.places_m(part.phi) for part in solution.collocation.parts(solution.z)]
+    places = [
+        part.segment.marker_places_m(part.phi) for part in solution.collocation.iterates(solution.z)
+    ]
     np.testing.assert_array_equal(*places)
     assert np.abs(places[0] - really).max() < 1e-3
-    one, two = (segment.chart for segment in solution.collocation.segments)
+    one, two = (segment.association for segment in solution.collocation.transcriptions)
     np.testing.assert_array_equal(one.cells, two.cells)
     np.testing.assert_array_equal(one.axes, two.axes)
 
 
 def test_places_found_once_leave_the_data_to_tell_of_the_material():
     whole = equilibria(8)
-    shear = Parameters(tuple(replace(p, fixed=p.name != "mu_pa") for p in ELASTIC.items))
+    shear = Parameters(tuple(replace(p, is_fixed=p.name != "mu_pa") for p in ELASTIC.items))
     shear, spreads = shear.with_guess({"lambda_pa": TRUTH["lambda_pa"]}), []
     for scope in ({}, PLACES):
         cut = [replace(e, nuisance=Nuisance.none(scope=scope)) for e in pieces(whole, 3, 6, 9)]
         solution = ReducedSpace()(Collocation(cut, shear))
         assert solution.status.converged
-        bars = covariance(solution.collocation, solution.z)
+        bars = uncertainty_at(solution.collocation, solution.z)
         spreads.append(float(np.sqrt(bars.covariance[0, 0])))
         assert abs(np.log(solution.theta[1] / TRUTH["mu_pa"])) < 3 * spreads[-1]
     assert spreads[1] < 0.7 * spreads[0]
@@ -168,12 +170,12 @@ def test_methods_agree_where_clamp_and_clock_are_shared():
     nuisance = replace(nuisance, hand_eye_rad=0.02, hand_eye_m=1e-3)
     cube = hung_cube(6, (1, 1, 2), nuisance=nuisance)
     pair = [noisy(cube, 2e-4), noisy(swung_again(cube, "again"), 2e-4, seed=8)]
-    drag = Parameters(tuple(replace(p, fixed=p.name == "gamma_m_1_s") for p in GUESS.items))
+    drag = Parameters(tuple(replace(p, is_fixed=p.name == "gamma_m_1_s") for p in GUESS.items))
     first, second = (solve(Problem(pair, drag), m) for m in ("reduced-space", "interior-point"))
     assert second.status.converged
     assert second.collocation.nphi == 2 * 2 + 7
     np.testing.assert_allclose(second.theta, first.theta, rtol=1e-4)
-    found = [each.collocation.parameters_of(each.z)[3:] for each in (first, second)]
+    found = [each.collocation.parameters_from(each.z)[3:] for each in (first, second)]
     np.testing.assert_allclose(found[1], found[0], atol=1e-3)
 
 
@@ -188,10 +190,10 @@ def test_words_make_several_groups():
         for k, word in enumerate(words)
     ]
     collocation = Collocation(made, GUESS)
-    places = [segment.local.places[0] - 4 for segment in collocation.segments]
+    places = [segment.nuisance_indices.indices[0] - 4 for segment in collocation.transcriptions]
     assert places == [0, 2, 2, 0, 4]
-    assert collocation.names[4] == "shared: tilt of gravity, first [rad]"
-    assert collocation.names[6] == "shared left: tilt of gravity, first [rad]"
+    assert collocation.parameter_names[4] == "shared: tilt of gravity, first [rad]"
+    assert collocation.parameter_names[6] == "shared left: tilt of gravity, first [rad]"
 
 
 OTHERS = {

@@ -17,10 +17,10 @@ import pytest
 from collocation_sysid import Problem, run, simulate, solve
 from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
 from collocation_sysid.pipeline import Run
-from collocation_sysid.program.wrench import without_sensors
+from collocation_sysid.program.wrench import without_grasp_sensors
 from collocation_sysid.recording import Nuisance
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, covariance
+from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_at
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 # A folder with the C3D files of scripts/get_srl_beam.py.
@@ -82,7 +82,9 @@ def test_a_wrist_sensor_tells_stiffness_and_density_apart(felt: bool):
     shorter = [steps, "experiment.swing.window_s=[0.0, 0.5]"]
     problem = Problem.read(PROBLEMS / "wrist_sensor" / "problem.toml", shorter)
     if not felt:
-        problem = replace(problem, experiments=tuple(map(without_sensors, problem.experiments)))
+        problem = replace(
+            problem, experiments=tuple(map(without_grasp_sensors, problem.experiments))
+        )
     finished = run(problem, seek_causes=False)
     assert finished.solution.status.converged
     estimates = finished.uncertainty.estimates
@@ -143,7 +145,7 @@ def test_interior_point_agrees_on_the_measured_beam():
     reduced, interior = solve(problem, "reduced-space"), solve(problem, "interior-point")
     assert reduced.status.converged
     assert interior.status.converged
-    found, expected = (s.collocation.parameters_of(s.z) for s in (interior, reduced))
+    found, expected = (s.collocation.parameters_from(s.z) for s in (interior, reduced))
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
@@ -153,7 +155,9 @@ def test_one_material_fits_the_measured_beam_under_three_loads():
     assert solution.status.converged
     assert 2.7e5 < solution.parameters["young_pa"] < 3.1e5
     limits_m = {"gravity": 0.00030, "load52": 0.00075, "load101": 0.00115}
-    for segment, readings_m in zip(solution.collocation.segments, solution.readings_m, strict=True):
+    for segment, readings_m in zip(
+        solution.collocation.transcriptions, solution.readings_m, strict=True
+    ):
         measured_m = segment.experiment.markers.positions_m
         rms_m = np.sqrt(np.mean(np.sum((readings_m - measured_m) ** 2, axis=2)))
         assert rms_m < limits_m[segment.experiment.name]
@@ -239,7 +243,7 @@ def test_one_silicone_and_one_friction_press_to_a_third_of_the_height():
     assert check_problem(problem).derivatives_agree
     alone = solve(replace(problem, experiments=problem.experiments[:1]))
     assert alone.status.converged
-    wrench = alone.collocation.segments[0].experiment.obstacles[0].wrench
+    wrench = alone.collocation.transcriptions[0].experiment.obstacles[0].wrench
     largest_n = wrench.symmetry * np.abs(wrench.values).max()
     assert pooled_wrench_rms(alone)[0] < 0.002 * largest_n
     assert 6.8e4 < 6 * alone.parameters["c10_pa"] < 7.9e4
@@ -290,7 +294,7 @@ def noisy_fit(huber: bool, offsets: bool) -> Solution:
 def attainable() -> Uncertainty:
     """Error bars of the fit with both remedies for white noise of the sigma_m given."""
     solution = noisy_fit(huber=True, offsets=True)
-    return covariance(solution.collocation, solution.z, ErrorModel(errors="independent"))
+    return uncertainty_at(solution.collocation, solution.z, ErrorModel(errors="independent"))
 
 
 def standard_errors_off(solution: Solution) -> np.ndarray:
@@ -328,8 +332,8 @@ def test_the_misplaced_marker_is_found_where_it_is_glued():
     places = dict(noisy_run().places["swing"])
     found = places.pop(MISPLACED)
     assert (np.abs(found.position_m - GLUED_M) / found.std_error_m).max() < 3.0
-    assert found.moved_m > 0.005
-    assert max(place.moved_m for place in places.values()) < 0.001
+    assert found.displacement_m > 0.005
+    assert max(place.displacement_m for place in places.values()) < 0.001
 
 
 @pytest.mark.long

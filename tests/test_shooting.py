@@ -24,7 +24,11 @@ from problems_small import (
 
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.methods.comparison import shooting
-from collocation_sysid.methods.comparison.shooting import Shooting, adjoint_gradient, simulated
+from collocation_sysid.methods.comparison.shooting import (
+    Shooting,
+    adjoint_gradient,
+    simulate_variables,
+)
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.model.parameters import Parameter, Parameters
@@ -61,10 +65,10 @@ def cube() -> Collocation:
 
 def test_the_adjoint_gradient_is_the_sensitivities_share_of_the_loss():
     collocation = with_noise(bar_let_go())
-    z = simulated(collocation, some_parameters(collocation))
+    z = simulate_variables(collocation, some_parameters(collocation))
     (by_p,) = sensitivities(collocation, z)
     _, (by_x,) = collocation.unpack(collocation.gradient(z))
-    by_x = by_x / collocation.segments[0].length_m ** 2  # a slope, not a length
+    by_x = by_x / collocation.transcriptions[0].length_m ** 2  # a slope, not a length
     expected = np.einsum("td,tdm->m", by_x, by_p)
     np.testing.assert_allclose(adjoint_gradient(collocation, z), expected, rtol=1e-8)
 
@@ -115,7 +119,7 @@ def test_experiments_are_fitted_together_up_to_a_bound(gradient):
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_with_all_parameters_fixed_it_simulates(gradient):
-    fixed = Parameters(tuple(Parameter(name, TRUTH[name], fixed=True) for name in TRUTH))
+    fixed = Parameters(tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH))
     solution = Shooting(gradient)(Collocation([measured(hung_cube())], fixed))
     assert solution.status is Status.CONVERGED
     assert solution.rms_m < 1e-9
@@ -151,10 +155,10 @@ def test_trials_that_cannot_be_simulated_are_stepped_back_from(gradient, monkeyp
         if np.abs(p - GUESS.guess_q).max() > 0.2 and not short.failed:
             short.failed = True
             raise SimulationError("it fails", 0.1)
-        return simulated(collocation, p, stopwatch)
+        return simulate_variables(collocation, p, stopwatch)
 
     short.failed = False
-    monkeypatch.setattr(shooting, "simulated", short)
+    monkeypatch.setattr(shooting, "simulate_variables", short)
     solution = Shooting(gradient)(cube())
     assert solution.status is Status.CONVERGED
     *errors, of_mass_damping = np.abs(relative_errors(solution))
@@ -168,9 +172,9 @@ def test_where_everything_else_fails_it_stalls_at_the_guess(gradient, monkeypatc
     def only_the_guess(collocation, p, stopwatch=None):
         if not np.array_equal(p, GUESS.guess_q):
             raise SimulationError("it fails", 0.1)
-        return simulated(collocation, p, stopwatch)
+        return simulate_variables(collocation, p, stopwatch)
 
-    monkeypatch.setattr(shooting, "simulated", only_the_guess)
+    monkeypatch.setattr(shooting, "simulate_variables", only_the_guess)
     solution = Shooting(gradient)(cube())
     assert solution.status is Status.STALLED
     np.testing.assert_allclose(solution.theta, as_theta(GUESS))
@@ -219,7 +223,7 @@ def test_the_history_is_what_was_watched_and_its_loss_falls(gradient):
     assert list(solution.history) == seen
     losses = [iteration.loss for iteration in seen]
     assert losses == sorted(losses, reverse=True)
-    assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurements)
+    assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurement_count)
     timing = solution.timing
     assert min(timing.evaluations, timing.linear_algebra) > 0
     assert timing.evaluations + timing.linear_algebra + timing.build <= timing.total

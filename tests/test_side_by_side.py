@@ -8,17 +8,17 @@ import pytest
 from memories_small import guesses, recorded, truth
 
 from collocation_sysid import Collocation, ReducedSpace
-from collocation_sysid.fem.kernels import at_once, in_slices, side_by_side
+from collocation_sysid.fem.kernels import concurrent_count, map_experiments, run_in_slices
 
 
 def test_results_are_in_the_order_of_the_items():
-    assert side_by_side(lambda k: k**2, range(7), threads=2) == [k**2 for k in range(7)]
+    assert map_experiments(lambda k: k**2, range(7), threads=2) == [k**2 for k in range(7)]
 
 
 def test_items_wait_for_each_other_only_where_there_are_threads_for_them():
     both = threading.Barrier(2)
-    side_by_side(lambda _: both.wait(timeout=10), range(2), threads=2)
-    alone = side_by_side(lambda _: threading.current_thread(), range(2), threads=1)
+    map_experiments(lambda _: both.wait(timeout=10), range(2), threads=2)
+    alone = map_experiments(lambda _: threading.current_thread(), range(2), threads=1)
     assert alone == [threading.current_thread()] * 2
 
 
@@ -28,16 +28,16 @@ def test_a_failure_of_one_is_raised():
             raise ValueError("the second")
 
     with pytest.raises(ValueError, match="the second"):
-        side_by_side(fail, range(3), threads=2)
+        map_experiments(fail, range(3), threads=2)
 
 
 def test_an_item_shares_nothing_of_its_own_with_other_threads():
     def slices(_: int) -> tuple[list[tuple[int, int]], int]:
         seen: list[tuple[int, int]] = []
-        in_slices(lambda a, b: seen.append((a, b)), 8, threads=4)
-        return seen, at_once(3, threads=4)
+        run_in_slices(lambda a, b: seen.append((a, b)), 8, threads=4)
+        return seen, concurrent_count(3, threads=4)
 
-    assert side_by_side(slices, range(2), threads=2) == [([(0, 8)], 1)] * 2
+    assert map_experiments(slices, range(2), threads=2) == [([(0, 8)], 1)] * 2
     assert len(slices(0)[0]) == 4
 
 
@@ -62,11 +62,11 @@ def test_an_interrupt_ends_the_others_within_their_next_row():
             raise KeyboardInterrupt
         for _ in range(1000):
             begun.set()
-            in_slices(lambda *_: rows.append(0), 1, 1)
+            run_in_slices(lambda *_: rows.append(0), 1, 1)
             time.sleep(0.005)
 
     with pytest.raises(KeyboardInterrupt):
-        side_by_side(run, range(2), threads=2)
+        map_experiments(run, range(2), threads=2)
     assert len(rows) < 900
-    in_slices(lambda *_: rows.append(-1), 1, 1)
+    run_in_slices(lambda *_: rows.append(-1), 1, 1)
     assert rows[-1] == -1

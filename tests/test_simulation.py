@@ -26,11 +26,11 @@ from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.program.marching import march
-from collocation_sysid.program.newton import NewtonOptions, Solver
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.newton import NewtonOptions, NewtonSolver
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence, held_nodes
+from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence, prescribed_nodes
 
 THETA = as_theta(TRUTH)
 ABSURDLY_SOFT = np.array([0.02, 0.03, 0.009, 1.0])
@@ -64,7 +64,9 @@ def jerked_cube(sway_m: float, timestep_s: float, **changes) -> Experiment:
 @pytest.mark.parametrize("young_pa", [1e5, 1e6])
 def test_a_hanging_bar_stretches_by_half_its_weight(young_pa: float):
     bar = hanging_bar()
-    x = rest_state(bar, np.array([0.0, young_pa / 2, 0.0, 0.0])).reshape(-1, 3)  # Poisson's ratio 0
+    x = equilibrium(bar, np.array([0.0, young_pa / 2, 0.0, 0.0])).reshape(
+        -1, 3
+    )  # Poisson's ratio 0
     tip = nodes_where(bar.body, 2, 0.0)
     stretch = (bar.body.nodes_m - x)[tip, 2].mean()
     assert stretch == pytest.approx(30.0 * 9.81 * 0.12**2 / (2 * young_pa), rel=1e-3)
@@ -72,9 +74,9 @@ def test_a_hanging_bar_stretches_by_half_its_weight(young_pa: float):
 
 def assert_stable_equilibrium(experiment: Experiment, theta: np.ndarray, x: np.ndarray) -> None:
     """No net force on free nodes, and a positive definite stiffness there."""
-    body, solver = experiment.body, Solver(experiment)
+    body, solver = experiment.body, NewtonSolver(experiment)
     still = np.zeros_like(x)
-    load = Forces.of(experiment, experiment.t_s[:1]).weight.external_n[0]
+    load = Forces.from_experiment(experiment, experiment.t_s[:1]).weight.external_n[0]
     net = (body.force(x, still, theta)[0] + load)[solver.free]
     assert np.abs(net).max() < 1e-9 * np.abs(load).max()
     stiffness = -body.linearise(x, still, theta).by_position[0]
@@ -84,43 +86,47 @@ def assert_stable_equilibrium(experiment: Experiment, theta: np.ndarray, x: np.n
 @pytest.mark.parametrize("softness", [1, 10, 100])
 def test_the_rest_state_is_a_stable_equilibrium(softness: int):
     cube, theta = hung_cube(), np.array([200 / softness, 300 / softness, 0.0, 0.0])
-    assert_stable_equilibrium(cube, theta, rest_state(cube, theta))
+    assert_stable_equilibrium(cube, theta, equilibrium(cube, theta))
 
 
 def test_the_rest_state_leaves_held_nodes_with_the_grasp():
     cube = hung_cube()
-    x = rest_state(cube, THETA, time_s=0.05).reshape(-1, 3)
+    x = equilibrium(cube, THETA, time_s=0.05).reshape(-1, 3)
     np.testing.assert_allclose(
-        x[held_nodes(cube.grasps)], cube.held_positions([0.05])[0].reshape(-1, 3), rtol=1e-15
+        x[prescribed_nodes(cube.grasps)],
+        cube.prescribed_positions([0.05])[0].reshape(-1, 3),
+        rtol=1e-15,
     )
 
 
 def test_where_newton_fails_the_load_is_applied_in_steps():
     cube, soft = hung_cube(), np.array([2.0, 3.0, 0.0, 0.0])
-    direct = rest_state(cube, soft)
-    hurried = NewtonOptions(iterations=5)
-    in_steps = rest_state(cube, soft, solver=Solver(cube, hurried))
+    direct = equilibrium(cube, soft)
+    hurried = NewtonOptions(max_iterations=5)
+    in_steps = equilibrium(cube, soft, solver=NewtonSolver(cube, hurried))
     np.testing.assert_allclose(in_steps, direct, atol=1e-9)
     with pytest.raises(SimulationError, match="rest state failed: Newton took more than 5"):
-        rest_state(cube, soft, solver=Solver(cube, replace(hurried, halvings=0)))
+        equilibrium(cube, soft, solver=NewtonSolver(cube, replace(hurried, max_halvings=0)))
 
 
 def test_without_load_the_body_rests_where_the_grasp_carries_it():
     cube = hung_cube(gravity_m_s2=np.zeros(3))
-    x = rest_state(cube, THETA, time_s=0.07)
+    x = equilibrium(cube, THETA, time_s=0.07)
     np.testing.assert_allclose(x, cube.rigid_positions([0.07]).ravel(), atol=1e-12)
 
 
 def test_external_forces_deform_the_rest_state():
     weight = box().node_mass[:, None] * np.array(GRAVITY_M_S2)
     carried = hung_cube(forces=tuple(Force([k], -w) for k, w in enumerate(weight)))
-    np.testing.assert_allclose(rest_state(carried, THETA), carried.body.nodes_m.ravel(), atol=1e-12)
+    np.testing.assert_allclose(
+        equilibrium(carried, THETA), carried.body.nodes_m.ravel(), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_body_at_rest_stays_there(integrator: str):
     cube = hung_cube()
-    still = replace(cube, grasps=(Grasp(held_nodes(cube.grasps), PoseSequence.fixed()),))
+    still = replace(cube, grasps=(Grasp(prescribed_nodes(cube.grasps), PoseSequence.fixed()),))
     motion = simulate(still, TRUTH, integrator)
     expected = np.broadcast_to(motion.positions_m[0], motion.positions_m.shape)
     np.testing.assert_allclose(motion.positions_m, expected, atol=1e-9)
@@ -155,25 +161,25 @@ STRAINED = {
 @pytest.mark.parametrize("way", STRAINED)
 def test_two_grasps_may_strain_the_body_at_the_start(way: str):
     bar, theta = bar_in_two_grasps(*STRAINED[way]), np.array([2e4, 3e4, 0.0, 0.0])
-    x = rest_state(bar, theta)
+    x = equilibrium(bar, theta)
     assert_stable_equilibrium(bar, theta, x)
-    at = x.reshape(-1, 3)[held_nodes(bar.grasps)]
+    at = x.reshape(-1, 3)[prescribed_nodes(bar.grasps)]
     np.testing.assert_allclose(
-        at, bar.held_positions([0.0])[0].reshape(-1, 3), rtol=1e-15, atol=1e-17
+        at, bar.prescribed_positions([0.0])[0].reshape(-1, 3), rtol=1e-15, atol=1e-17
     )
 
 
 def test_quadratic_elements_may_be_strained_at_the_start_too():
     bar = bar_in_two_grasps((0.06, 0.0, 0.0), (1.0, 0.0, 0.0), "tet10")
     theta = np.array([2e4, 3e4, 0.0, 0.0])
-    assert_stable_equilibrium(bar, theta, rest_state(bar, theta))
+    assert_stable_equilibrium(bar, theta, equilibrium(bar, theta))
 
 
 def test_a_stretched_bar_pulls_as_its_material_does():
     bar, young_pa, stretch = bar_in_two_grasps((0.03, 0.0, 0.0), (0.0, 0.0, 0.0)), 6e4, 1.2
     light = replace(bar, gravity_m_s2=np.zeros(3))
     theta = np.array([0.0, young_pa / 2, 0.0, 0.0])  # Poisson's ratio 0: no lateral strain
-    x = rest_state(light, theta)
+    x = equilibrium(light, theta)
     force = light.body.force(x, np.zeros_like(x), theta)[0].reshape(-1, 3)
     pull = force[nodes_where(light.body, 0, 0.15), 0].sum()
     # ψ = ½ μ (tr FᵀF − 3) − μ ln J: P = μ (s − 1/s) over the undeformed cross-section.
@@ -192,7 +198,7 @@ def test_a_body_thrown_along_with_its_grasp_stays_undeformed(integrator: str):
     poses = PoseSequence(t_s, np.outer(t_s, speed), upright)
     thrown = replace(
         cube,
-        grasps=(Grasp(held_nodes(cube.grasps), poses),),
+        grasps=(Grasp(prescribed_nodes(cube.grasps), poses),),
         gravity_m_s2=np.zeros(3),
         start="given",
         start_positions_m=cube.body.nodes_m,
@@ -210,8 +216,8 @@ def test_held_nodes_follow_their_grasp(integrator: str):
     cube = hung_cube()
     motion = simulate(cube, TRUTH, integrator)
     np.testing.assert_allclose(
-        motion.positions_m[:, held_nodes(cube.grasps)],
-        cube.held_positions(cube.t_s).reshape(len(cube.t_s), -1, 3),
+        motion.positions_m[:, prescribed_nodes(cube.grasps)],
+        cube.prescribed_positions(cube.t_s).reshape(len(cube.t_s), -1, 3),
         atol=1e-15,
     )
 
@@ -222,7 +228,7 @@ def test_markers_are_observed_at_every_sample_also_where_none_was_measured():
     assert motion.markers_m.shape == cube.markers.positions_m.shape
     assert np.isfinite(motion.markers_m).all()
     np.testing.assert_array_equal(motion.t_s, cube.t_s)
-    np.testing.assert_allclose(motion.markers_m, cube.markers.observe(motion.positions_m))
+    np.testing.assert_allclose(motion.markers_m, cube.markers.predict_positions(motion.positions_m))
 
 
 def test_velocities_are_the_slopes_of_the_positions():
@@ -257,22 +263,22 @@ def test_newmark_halves_steps_that_are_too_large():
     motion = simulate(cube, TRUTH, timestep_s=0.04)
     assert cube.body.volume_ratios(motion.positions_m).min() > 0
     np.testing.assert_allclose(
-        motion.positions_m[:, held_nodes(cube.grasps)],
-        cube.held_positions(cube.t_s).reshape(len(cube.t_s), -1, 3),
+        motion.positions_m[:, prescribed_nodes(cube.grasps)],
+        cube.prescribed_positions(cube.t_s).reshape(len(cube.t_s), -1, 3),
         atol=1e-15,
     )
     with pytest.raises(SimulationError, match="an element is inverted before the first iter"):
-        simulate(cube, TRUTH, timestep_s=0.04, options=NewtonOptions(halvings=0))
+        simulate(cube, TRUTH, timestep_s=0.04, options=NewtonOptions(max_halvings=0))
 
 
 def test_a_scheme_moves_the_grasp_in_parts_where_a_step_is_too_large():
     cube = with_papers_damping(jerked_cube(0.45, timestep_s=0.02))
-    dynamics = Dynamics.of(cube, "midpoint").with_theta(THETA)
-    x = march(cube, dynamics)
-    residual = dynamics.residual(x)[:, Solver(cube).free]
+    dynamics = Dynamics.from_experiment(cube, "midpoint").with_theta(THETA)
+    x = simulate_scheme(cube, dynamics)
+    residual = dynamics.residual(x)[:, NewtonSolver(cube).free]
     assert np.abs(residual).max() < 1e-9 * np.abs(dynamics.forces.weight.external_n).max()
     with pytest.raises(SimulationError, match="the step at row 3 failed: an element is inverted"):
-        march(cube, dynamics, NewtonOptions(halvings=0))
+        simulate_scheme(cube, dynamics, NewtonOptions(max_halvings=0))
 
 
 # Failures

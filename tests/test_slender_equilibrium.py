@@ -17,8 +17,8 @@ from collocation_sysid import (
     box_mesh,
 )
 from collocation_sysid.program.factorisation import Factoriser
-from collocation_sysid.program.newton import NewtonOptions, Solver
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.newton import NewtonOptions, NewtonSolver
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.program.retraction import Retraction
 
 SIZE_M = (0.18, 0.02, 0.02)
@@ -44,7 +44,7 @@ def notched_bar(element: str) -> Experiment:
 def theta_of(body: Body, poisson: float) -> NDArray[np.float64]:
     lame = 2 * MU_PA * poisson / (1 - 2 * poisson)
     values = {"mu_pa": MU_PA, "lambda_pa": lame, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
-    return body.theta(values)
+    return body.theta_from_values(values)
 
 
 @pytest.mark.parametrize(("element", "poisson"), [("tet4", 0.45), ("tet10-p0", 0.49)])
@@ -58,7 +58,7 @@ def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(element, pois
         return factorise(self, *matrix, **options)
 
     monkeypatch.setattr(Factoriser, "factorise", counting)
-    x = rest_state(bar, theta_of(bar.body, poisson)).reshape(-1, 3)
+    x = equilibrium(bar, theta_of(bar.body, poisson)).reshape(-1, 3)
     sag_m = -(x - bar.body.nodes_m)[:, 2].min()
     assert sag_m > 0.5 * SIZE_M[0]
     assert len(factorised) <= 40
@@ -66,9 +66,9 @@ def test_a_notched_bar_finds_its_equilibrium_in_few_factorisations(element, pois
 
 def test_a_limit_on_the_iterations_ends_the_search_with_an_explanation():
     bar = notched_bar("tet4")
-    solver = Solver(bar, NewtonOptions(iterations=2, halvings=1))
+    solver = NewtonSolver(bar, NewtonOptions(max_iterations=2, max_halvings=1))
     with pytest.raises(SimulationError, match="finding the rest state failed: Newton took more"):
-        rest_state(bar, theta_of(bar.body, 0.45), solver=solver)
+        equilibrium(bar, theta_of(bar.body, 0.45), solver=solver)
 
 
 @pytest.mark.parametrize("element", ["tet4", "tet10-p0"])

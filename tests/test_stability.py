@@ -10,15 +10,15 @@ from scipy.sparse.linalg import ArpackNoConvergence
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.constants import GAMMA_R
-from collocation_sysid.fem.kernel import mirrored
-from collocation_sysid.fem.materials import Damping
+from collocation_sysid.fem.kernel import from_lower_triangle
+from collocation_sysid.fem.materials import DampingLaw
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program import stability
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.program.stability import growth_rate_1_s, instabilities
+from collocation_sysid.program.stability import find_instabilities, growth_rate_1_s
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.trust import stability_concerns
 
@@ -36,20 +36,20 @@ def rate_of_stress(psi, F, rate, gamma_r_s):
     """P_v = γ_r F dS/dt: a law that feeds energy into a nearly incompressible body."""
     stiffness, stress = ca.hessian(psi, F)
     change, slope = ca.jtimes(stress, F, rate), ca.SX(0)
-    slope = mirrored(ca.jacobian(change, F))
+    slope = from_lower_triangle(ca.jacobian(change, F))
     inverse, Fdot = ca.inv(ca.reshape(F, 3, 3)), ca.reshape(rate, 3, 3)
-    S = mirrored(inverse @ ca.reshape(stress, 3, 3))
+    S = from_lower_triangle(inverse @ ca.reshape(stress, 3, 3))
     change -= ca.vec(Fdot @ S)
-    turning = mirrored(stiffness) - ca.kron(S, ca.SX.eye(3))
+    turning = from_lower_triangle(stiffness) - ca.kron(S, ca.SX.eye(3))
     slope -= ca.kron(ca.SX.eye(3), Fdot @ inverse) @ turning
     return gamma_r_s * change, gamma_r_s * slope
 
 
-RATE_OF_STRESS = Damping("rate-of-stress", (GAMMA_R,), stress=rate_of_stress)
+RATE_OF_STRESS = DampingLaw("rate-of-stress", (GAMMA_R,), stress=rate_of_stress)
 LAWS = ("kelvin-voigt", RATE_OF_STRESS)
 
 
-def bar(damping: str | Damping = "kelvin-voigt", across: int = 1) -> Body:
+def bar(damping: str | DampingLaw = "kelvin-voigt", across: int = 1) -> Body:
     mesh = box_mesh(SIZE_M, (across, across, 3))
     return Body(mesh, "stable-neo-hookean", 1000.0, damping=damping)
 
@@ -65,7 +65,7 @@ def held_at_both_ends(body: Body, disturbed_m: float = 0.0, samples: int = 101) 
     free = np.setdiff1d(np.arange(len(start)), ends)
     start[free] += disturbed_m * np.random.default_rng(1).uniform(-1, 1, (len(free), 3))
     bottom, top = (nodes_where(body, 2, z) for z in (0.0, SIZE_M[2]))
-    up = PoseSequence.fixed().shifted((0, 0, (STRETCH - 1) * SIZE_M[2]))
+    up = PoseSequence.fixed().with_shift((0, 0, (STRETCH - 1) * SIZE_M[2]))
     stretched = [Grasp(bottom, PoseSequence.fixed()), Grasp(top, up)]
     return Experiment(
         body,
@@ -82,7 +82,7 @@ def held_at_both_ends(body: Body, disturbed_m: float = 0.0, samples: int = 101) 
 
 def equilibrium(body: Body, ends: np.ndarray) -> np.ndarray:
     """Positions (n, 3) of the bar stretched between its ends, by Newton's method."""
-    x, forces = body.nodes_m * [1, 1, STRETCH], Forces.on(body, theta_of(body))
+    x, forces = body.nodes_m * [1, 1, STRETCH], Forces.of_body_alone(body, theta_of(body))
     free = free_dofs(body, ends)
     for _ in range(40):
         at = forces.linearise(x.reshape(1, -1), np.zeros((1, x.size)))
@@ -93,7 +93,7 @@ def equilibrium(body: Body, ends: np.ndarray) -> np.ndarray:
 
 
 def theta_of(body: Body) -> np.ndarray:
-    return body.theta(CONSTANTS)
+    return body.theta_from_values(CONSTANTS)
 
 
 def free_dofs(body: Body, held: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ def free_dofs(body: Body, held: np.ndarray) -> np.ndarray:
 def fastest(forces: Forces, x: np.ndarray, free: np.ndarray) -> float:
     """Largest Re(s) of M s² + D s + K by dense algebra."""
     at = forces.linearise(x.reshape(1, -1), np.zeros((1, x.size)))
-    mass = forces.mass.kg[0, free]
+    mass = forces.mass.inertia_kg[0, free]
     K, D = (
         -forces.pattern.matrix(lower).toarray()[np.ix_(free, free)] / mass[:, None]
         for lower in (at.by_position[0], at.by_velocity[0])
@@ -143,8 +143,8 @@ def test_growth_is_the_eigenvalue_of_dense_algebra(law, dense, monkeypatch):
     monkeypatch.setattr(stability, "DENSE", 10**6 if dense else 0)
     body = bar(law, across=2)
     x, free, theta = equilibrium(body, held(body)), free_dofs(body, held(body)), theta_of(body)
-    expected = fastest(Forces.on(body, theta), x, free)
-    found = growth_rate_1_s(Forces.on(body, theta), x.ravel(), free)
+    expected = fastest(Forces.of_body_alone(body, theta), x, free)
+    found = growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free)
     assert (expected > 0) == (law is RATE_OF_STRESS)
     assert found == pytest.approx(max(expected, 0.0), rel=1e-6)
 
@@ -157,8 +157,8 @@ def test_a_bar_pressed_beyond_buckling_is_not_stable(law, monkeypatch):
     free, theta, found = free_dofs(body, held), theta_of(body), []
     for squeezed in (0.999, 0.7):
         x = body.nodes_m * [1, 1, squeezed]
-        found.append(growth_rate_1_s(Forces.on(body, theta), x.ravel(), free))
-        expected = fastest(Forces.on(body, theta), x, free)
+        found.append(growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free))
+        expected = fastest(Forces.of_body_alone(body, theta), x, free)
         assert found[-1] == pytest.approx(max(expected, 0.0), rel=1e-6)
     assert found[0] == 0 < found[1]
 
@@ -171,14 +171,18 @@ def test_growth_is_found_where_the_search_for_directions_ends_early(monkeypatch)
     monkeypatch.setattr(stability, "eigsh", ended)
     body = bar(RATE_OF_STRESS, across=2)
     x, free, theta = equilibrium(body, held(body)), free_dofs(body, held(body)), theta_of(body)
-    expected = fastest(Forces.on(body, theta), x, free)
-    assert growth_rate_1_s(Forces.on(body, theta), x.ravel(), free) == pytest.approx(expected)
+    expected = fastest(Forces.of_body_alone(body, theta), x, free)
+    assert growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free) == pytest.approx(
+        expected
+    )
 
 
 def test_a_body_that_nobody_holds_is_stable():
     body = bar()
     free = np.arange(3 * len(body.nodes_m))
-    assert growth_rate_1_s(Forces.on(body, theta_of(body)), body.nodes_m.ravel(), free) == 0
+    assert (
+        growth_rate_1_s(Forces.of_body_alone(body, theta_of(body)), body.nodes_m.ravel(), free) == 0
+    )
 
 
 @pytest.mark.parametrize(("law", "told"), [(LAWS[0], False), (LAWS[1], True)])
@@ -186,23 +190,28 @@ def test_what_grows_is_told_with_its_rate(law, told):
     experiment = held_at_both_ends(bar(law, across=2))
     given = {name: value for name, value in CONSTANTS.items() if value}
     items = [Parameter(name, value, 0.5 * value, 2 * value) for name, value in given.items()]
-    parameters = Parameters((*items, Parameter("gamma_m_1_s", 0.0, fixed=True)))
+    parameters = Parameters((*items, Parameter("gamma_m_1_s", 0.0, is_fixed=True)))
     collocation = Collocation([experiment], parameters)
     start = experiment.start_positions_m
     assert start is not None
     resting = np.tile(start.ravel(), (len(experiment.t_s), 1))
     z = collocation.pack(collocation.guess_p, [resting])
-    concerns = stability_concerns(instabilities(collocation, z))
+    concerns = stability_concerns(find_instabilities(collocation, z))
     assert bool(concerns) == told
     if told:
         (concern,) = concerns
-        sentence = concern.sentence
+        sentence = concern.message
         assert "'bar' is not stable" in sentence
         assert "disturbances grow by" in sentence
 
 
 def test_a_body_without_damping_is_stable():
     body = bar()
-    theta = body.theta(CONSTANTS | {"gamma_r_s": 0.0})
+    theta = body.theta_from_values(CONSTANTS | {"gamma_r_s": 0.0})
     free = free_dofs(body, held(body))
-    assert growth_rate_1_s(Forces.on(body, theta), equilibrium(body, held(body)).ravel(), free) == 0
+    assert (
+        growth_rate_1_s(
+            Forces.of_body_alone(body, theta), equilibrium(body, held(body)).ravel(), free
+        )
+        == 0
+    )

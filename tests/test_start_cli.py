@@ -19,7 +19,7 @@ from problem_files import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid.runs.warm_start import Earlier
+from collocation_sysid.runs.warm_start import WarmStart
 
 pytestmark = pytest.mark.long
 
@@ -140,7 +140,7 @@ def test_other_names_of_the_moduli_match(folder):
     given = {"young_pa": cs.Unknown(), "poisson": cs.Unknown(), "gamma_r_s": 0.01}
     problem = cs.Problem.read(folder / "problem.toml")
     other = cs.Problem(problem.experiments, {**given, "gamma_m_1_s": 1.0})
-    guesses = Earlier.read(folder / "run").started(other).parameters.guesses
+    guesses = WarmStart.read(folder / "run").apply_to_problem(other).parameters.guesses
     assert guesses["young_pa"] == pytest.approx(720.0, rel=1e-3)
     assert guesses["poisson"] == pytest.approx(0.2, rel=1e-3)
     assert guesses["gamma_r_s"] == 0.01
@@ -154,12 +154,12 @@ def test_nuisance_parameters_are_taken_over(folder):
     command = ("solve", file, "--method", "reduced-space", *shift)
     assert run_command(*command, "--out", run).code == 0
     nuisance = result_of(run)["nuisance"]["swing"]
-    earlier = Earlier.read(run)
-    problem = earlier.started(cs.Problem.read(file, shift[1::2]))
+    earlier = WarmStart.read(run)
+    problem = earlier.apply_to_problem(cs.Problem.read(file, shift[1::2]))
     collocation = problem.collocation()
-    z = earlier.variables(collocation)
+    z = earlier.simulated_variables(collocation)
     assert z is not None
-    (phi,) = collocation.parameters_of(z)[collocation.nq :] * 0.01
+    (phi,) = collocation.parameters_from(z)[collocation.nq :] * 0.01
     assert phi == pytest.approx(next(iter(nuisance.values()))["value"])
     assert cs.solve(problem, "reduced-space", start=run).iterations < 4
 

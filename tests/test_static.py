@@ -35,8 +35,8 @@ from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.newton import Solver
-from collocation_sysid.program.rest import rest_state
+from collocation_sysid.program.newton import NewtonSolver
+from collocation_sysid.program.rest import equilibrium
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import (
     Experiment,
@@ -50,8 +50,8 @@ from collocation_sysid.result.check_sections import closer_table
 from collocation_sysid.result.run_sections import summary
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.check.derivatives import derivative_errors
-from collocation_sysid.runs.forward_simulation import Rollout
-from collocation_sysid.statistics.scale import stillness_concerns
+from collocation_sysid.runs.forward_simulation import ForwardSimulation
+from collocation_sysid.statistics.scale import static_concerns
 
 # Uneven, as test benches' are.
 TIMES = np.array([0.0, 1.0, 1.5, 4.0])
@@ -115,8 +115,10 @@ def test_sticking_platens_hold_every_axis_and_let_the_side_bulge():
 def test_a_body_goes_along_with_platens_that_press_it_far_at_once(monkeypatch):
     """Moved alone, the platen's nodes would crush the elements below them."""
     tried = []
-    newton = Solver.newton
-    monkeypatch.setattr(Solver, "newton", lambda *a, **k: (tried.append(1), newton(*a, **k))[1])
+    newton = NewtonSolver.solve
+    monkeypatch.setattr(
+        NewtonSolver, "solve", lambda *a, **k: (tried.append(1), newton(*a, **k))[1]
+    )
     experiment = block("xyz", np.array([0.0, 1.0]), np.array([0.0, -0.03]))
     rubber = TRUTH | {"lambda_pa": 100 * TRUTH["mu_pa"]}
     far = simulate(experiment, rubber).positions_m[-1]
@@ -129,19 +131,19 @@ def test_each_static_sample_is_the_rest_state_of_its_time():
     experiment = block("xyz", gravity_m_s2=(0.0, 0.0, -9.81))
     positions = simulate(experiment, TRUTH).positions_m
     for x, time_s in zip(positions, TIMES, strict=True):
-        rest = rest_state(experiment, as_theta(TRUTH), time_s)
+        rest = equilibrium(experiment, as_theta(TRUTH), time_s)
         np.testing.assert_allclose(x.ravel(), rest, atol=1e-10)
 
 
 def test_static_constraints_vanish_at_the_simulation_alone():
     experiment = block("xyz")
-    segment = Collocation([experiment], GUESS.with_guess(TRUTH), substeps=3).segments[0]
-    assert segment.grid_rows == len(TIMES)
+    segment = Collocation([experiment], GUESS.with_guess(TRUTH), substeps=3).transcriptions[0]
+    assert segment.grid_times == len(TIMES)
     x = simulate(experiment, TRUTH).positions_m.reshape(len(TIMES), -1)
-    residual = segment.residual_n(x, segment.setting(segment.parameters.guess_q, np.zeros(0)))
+    residual = segment.residual_n(x, segment.equations_at(segment.parameters.guess_q, np.zeros(0)))
     assert np.abs(residual).max() < 1e-9 * segment.force_n
     x[2, experiment.free_dofs] += 1e-3 * EDGE_M
-    moved = segment.residual_n(x, segment.setting(segment.parameters.guess_q, np.zeros(0)))
+    moved = segment.residual_n(x, segment.equations_at(segment.parameters.guess_q, np.zeros(0)))
     assert (np.abs(moved).max(axis=1) > 1e-6 * segment.force_n).tolist() == [0, 0, 1, 0]
 
 
@@ -202,7 +204,7 @@ def noisy(experiment: Experiment, sigma_m: float = 1e-4) -> Experiment:
 
 
 ELASTIC_ONLY = Parameters(
-    (*GUESS.items[:2], *(replace(i, guess=TRUTH[i.name], fixed=True) for i in GUESS.items[2:]))
+    (*GUESS.items[:2], *(replace(i, guess=TRUTH[i.name], is_fixed=True) for i in GUESS.items[2:]))
 )
 HANGING = (0.0, 0.0, -9.81)
 
@@ -231,7 +233,7 @@ def test_static_and_dynamic_experiments_share_their_parameters():
 def test_the_zero_of_a_displacement_is_found_with_its_derivatives():
     true, experiment = 0.5e-3, block("xyz", nuisance=Nuisance.none(displacement_zero_m=1e-3))
     top = experiment.grasps[1]
-    shifted = replace(top, poses=top.poses.shifted([0.0, 0.0, true]))
+    shifted = replace(top, poses=top.poses.with_shift([0.0, 0.0, true]))
     tracks = measured(replace(experiment, grasps=replaced(experiment.grasps, shifted))).markers
     unsure = replaced(experiment.grasps, replace(top, zero="z"))
     seen = with_markers(replace(experiment, grasps=unsure), tracks.positions_m)
@@ -239,8 +241,8 @@ def test_the_zero_of_a_displacement_is_found_with_its_derivatives():
     z, _ = initial_variables(collocation)
     assert max(derivative_errors(collocation, z)) < 1e-6
     solution = ReducedSpace()(collocation)
-    (phi,) = [part.phi for part in collocation.parts(solution.z)]
-    assert collocation.segments[0].nuisance.names == ("block: zero of grasp 2, z [m]",)
+    (phi,) = [part.phi for part in collocation.iterates(solution.z)]
+    assert collocation.transcriptions[0].nuisance.names == ("block: zero of grasp 2, z [m]",)
     # The prior, about zero, has its say beside markers of a millimetre.
     assert phi[0] * 1e-3 == pytest.approx(true, rel=0.1)
 
@@ -251,14 +253,14 @@ def replaced(grasps, top):
 
 def test_a_static_problem_tells_nothing_of_damping_before_and_after():
     problem = cs.Problem([noisy(block("xyz", gravity_m_s2=HANGING))], parameters=GUESS)
-    (note,) = stillness_concerns(problem.experiments, GUESS)
-    assert note.sentence.startswith(
+    (note,) = static_concerns(problem.experiments, GUESS)
+    assert note.message.startswith(
         "'block' is static: no information on damping; fix gamma_r_s and"
     )
     found = run(problem, seek_causes=False)
     assert found.estimates["gamma_r_s"].statistical_std_error is None
     assert "the data do not determine gamma_r_s and gamma_m_1_s" in found.trust.reasons
-    assert isinstance(found.rollouts["block"], Rollout)
+    assert isinstance(found.rollouts["block"], ForwardSimulation)
     assert found.rollouts["block"].rms_m == pytest.approx(found.solution.rms_m, rel=1e-6)
 
 
@@ -278,11 +280,11 @@ def test_a_held_block_relaxes_as_the_standard_linear_solid():
         start="equilibrium",
     )
     values = TRUTH | {"prony_1.share": share, "prony_1.tau_s": tau_s}
-    theta = body.theta(values)
+    theta = body.theta_from_values(values)
     x = np.tile((body.nodes_m * [1.0, 1.0, 0.8]).ravel(), (len(t_s), 1))
-    dynamics = Dynamics.of(free, "midpoint").with_theta(theta)
-    carried = dynamics.forces_along(dynamics.histories(x)).past
-    force = body.force(x, 0 * x, theta, carried=carried)
+    dynamics = Dynamics.from_experiment(free, "midpoint").with_theta(theta)
+    carried = dynamics.forces_with_histories(dynamics.histories(x)).memory_state
+    force = body.force(x, 0 * x, theta, memory_input=carried)
     relaxed = body.force(x[:1], 0 * x[:1], theta)
     expected = (1 + share * np.exp(-t_s / tau_s))[:, None] * relaxed
     np.testing.assert_allclose(force, expected, rtol=1e-12, atol=1e-12)
@@ -295,7 +297,7 @@ def test_a_relaxing_block_between_platens_creeps_towards_its_rest():
     z_m = np.array([0.0, -0.02, -0.02, -0.02])
     pressing = block("xyz", t_s, z_m, body=body, gravity_m_s2=(0.0, 0.0, -9.81))
     x = simulate(pressing, values).positions_m
-    rest = rest_state(pressing, body.theta(values), 40.0).reshape(-1, 3)
+    rest = equilibrium(pressing, body.theta_from_values(values), 40.0).reshape(-1, 3)
     off = np.abs(x[1:] - rest).max(axis=(1, 2))
     # Over the last interval the stress is taken to fall evenly.
     assert off[2] < 0.05 * off[1] < 0.05 * off[0]
@@ -433,9 +435,9 @@ def bench(folder, zero_m: float = 1e-3) -> Path:
 def test_a_test_bench_without_markers_tells_stiffness_and_zero(tmp_path):
     found = run(cs.Problem.read(bench(tmp_path)), seek_causes=False)
     assert found.estimates["young_pa"].value == pytest.approx(1e5, rel=2e-3)
-    (part,) = found.solution.collocation.parts(found.solution.z)
+    (part,) = found.solution.collocation.iterates(found.solution.z)
     nuisance = part.segment.nuisance
-    (zero,) = nuisance.zero(1)
+    (zero,) = nuisance.displacement_zero_indices(1)
     assert part.phi[zero] * nuisance.scales[zero] == pytest.approx(1e-3, rel=0.05)
     with pictures_drawn():
         found.save(tmp_path / "run")

@@ -21,7 +21,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.scale import motionless
+from collocation_sysid.statistics.scale import is_motionless
 
 
 def hanging(noise_m: float = 5e-4) -> Experiment:
@@ -34,16 +34,16 @@ def hanging(noise_m: float = 5e-4) -> Experiment:
 
 
 def test_only_what_neither_moves_nor_changes_is_motionless():
-    assert motionless(hanging())
-    assert motionless(hanging(noise_m=1e-3))
+    assert is_motionless(hanging())
+    assert is_motionless(hanging(noise_m=1e-3))
     swaying = measured(released_cube(30))  # by half a millimetre
-    assert motionless(swaying)
+    assert is_motionless(swaying)
     finely = replace(swaying.markers, sigma_m=1e-4 * np.ones(len(swaying.markers.names)))
     for moving in (hung_cube(8), replace(swaying, markers=finely), bar_let_go(8)):
-        assert not motionless(measured(moving))
+        assert not is_motionless(measured(moving))
     body = hanging().body
     pull = Force(nodes_where(body, 2, 0.0), [[0, 0, 0], [0, 0, 0.01]], [0.0, 0.08])
-    assert not motionless(replace(hanging(), forces=(pull,)))
+    assert not is_motionless(replace(hanging(), forces=(pull,)))
 
 
 def test_it_is_said_before_solving():
@@ -54,19 +54,21 @@ def test_it_is_said_before_solving():
     assert note in found.warnings
     assert note not in found.notes
     assert Problem([hanging(), measured(hung_cube(8))], GUESS).notes == ()
-    fixed = [replace(i, fixed="gamma" in i.name) for i in GUESS.items]
+    fixed = [replace(i, is_fixed="gamma" in i.name) for i in GUESS.items]
     assert Problem([hanging()], Parameters(tuple(fixed))).notes == ()
 
 
 @pytest.mark.parametrize("guess", [0.02, 1e-5])
 def test_a_damping_of_which_nothing_is_known_did_not_end_at_its_bound(guess):
     items = tuple(
-        replace(i, guess=guess) if i.name == "gamma_r_s" else replace(i, fixed="mu" not in i.name)
+        replace(i, guess=guess)
+        if i.name == "gamma_r_s"
+        else replace(i, is_fixed="mu" not in i.name)
         for i in GUESS.items
     )
     found = run(Problem([hanging()], Parameters(items)))
     estimate = found.estimates["gamma_r_s"]
-    assert not estimate.at_bound
+    assert not estimate.is_at_bound
     assert estimate.statistical95 is None
     assert estimate.reason == "the data do not determine it"
     assert any(

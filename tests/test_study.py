@@ -28,10 +28,10 @@ from collocation_sysid.plan import (
     run_all,
     worker,
 )
-from collocation_sysid.plan.arguments import parse_methods, parse_over, read_truth
-from collocation_sysid.plan.progress import time_left_s
-from collocation_sysid.plan.study import short_keys
-from collocation_sysid.plan.table import Yardstick, method_rows, run_row, wilson_interval
+from collocation_sysid.plan.arguments import parse_methods, parse_swept_keys, read_truth
+from collocation_sysid.plan.progress import remaining_time_s
+from collocation_sysid.plan.study import shortened_keys
+from collocation_sysid.plan.table import SuccessCriterion, method_rows, run_row, wilson_interval
 from collocation_sysid.problem import Problem
 from collocation_sysid.tree import as_json, content
 
@@ -107,7 +107,7 @@ def planned_runs(count: int) -> list[PlannedRun]:
     ],
 )
 def test_swept_values_are_lists_or_ranges(text, values):
-    assert parse_over([text]) == {"a.b": tuple(values)}
+    assert parse_swept_keys([text]) == {"a.b": tuple(values)}
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_swept_values_are_lists_or_ranges(text, values):
 )
 def test_swept_values_that_cannot_be_read_are_quoted(texts, message):
     with pytest.raises(InputError, match=message) as refused:
-        parse_over(texts)
+        parse_swept_keys(texts)
     assert refused.value.where == "--over"
 
 
@@ -235,7 +235,7 @@ def test_other_data_are_other_runs(tiny):
 
 
 def test_a_sweep_has_every_combination(tiny):
-    over = parse_over(["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"])
+    over = parse_swept_keys(["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"])
     planned = plan_sweep(Path("problem.toml"), over, method="reduced-space")
     assert [tuple(run.swept.values()) for run in planned] == [
         (mu, m) for mu in ("100", "200", "400") for m in ("1", "2")
@@ -246,7 +246,7 @@ def test_a_sweep_has_every_combination(tiny):
 
 
 def test_a_sweep_can_be_over_methods(tiny):
-    over = parse_over(["solver.method=interior-point,reduced-space"])
+    over = parse_swept_keys(["solver.method=interior-point,reduced-space"])
     planned = plan_sweep(Path("problem.toml"), over)
     assert [run.method for run in planned] == ["interior-point", "reduced-space"]
 
@@ -261,13 +261,13 @@ def test_a_sweep_can_be_over_methods(tiny):
 )
 def test_swept_keys_the_problem_has_not_are_refused(tiny, over, message):
     with pytest.raises(InputError, match=message):
-        plan_sweep(Path("problem.toml"), parse_over([over]))
+        plan_sweep(Path("problem.toml"), parse_swept_keys([over]))
 
 
 def test_keys_are_shortened_while_they_differ():
     keys = ["parameters.mu_pa.guess", "transcription.substeps", "a.sigma_m", "b.sigma_m"]
     shorts = ["mu_pa.guess", "substeps", "a.sigma_m", "b.sigma_m"]
-    assert list(short_keys(keys)) == list(zip(keys, shorts, strict=True))
+    assert list(shortened_keys(keys)) == list(zip(keys, shorts, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -332,12 +332,12 @@ def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
     record = process.execute(planned.as_dict(), time_limit_s=10.0)
     assert record["outcome"] == "timeout"
     assert record["result"] == json.loads(found)
-    assert run_row(planned, record, Yardstick())["status"] == "timeout"
+    assert run_row(planned, record, SuccessCriterion())["status"] == "timeout"
 
 
 def test_a_stopped_study_ends_its_runs(stand_in):
     stand_in("hangs")
-    record = process.execute(planned_runs(1)[0].as_dict(), stopped=lambda: True)
+    record = process.execute(planned_runs(1)[0].as_dict(), is_stopped=lambda: True)
     assert record["outcome"] == "stopped"
 
 
@@ -348,11 +348,11 @@ def test_what_goes_wrong_in_a_run_becomes_its_record(tiny, monkeypatch):
 
     monkeypatch.setitem(METHODS, "reduced-space", Broken)
     planned = plan_comparison(Problem.read("problem.toml"), ["reduced-space"])[0].as_dict()
-    record = worker.attempt(planned)
+    record = worker.record_of_run(planned)
     assert record["outcome"] == "error"
     assert record["message"] == "ZeroDivisionError: nothing to divide by"
     assert "in __call__" in record["traceback"]
-    refused = worker.attempt({**planned, "overrides": ["parameters.mu_pa.guess=1e9"]})
+    refused = worker.record_of_run({**planned, "overrides": ["parameters.mu_pa.guess=1e9"]})
     assert refused["outcome"] == "error"
     assert "mu_pa: guess = 1e+09" in refused["message"]
 
@@ -414,7 +414,7 @@ def test_a_run_is_done_again_when_there_is_hope(tmp_path):
         store.save({"key": key, "outcome": outcome, "time_limit_s": 10.0})
 
     def kept(limit):
-        return [key for key in outcomes if store.finished(key, limit)]
+        return [key for key in outcomes if store.load_finished(key, limit)]
 
     assert kept(10.0) == kept(5.0) == ["a", "b", "d"]
     assert kept(20.0) == kept(None) == ["a", "b"]
@@ -481,25 +481,25 @@ def test_success_needs_convergence_and_the_truth():
         {**runs[3].as_dict(), "outcome": "timeout", "message": "killed"},
         None,
     ]
-    rows = [run_row(r, c, Yardstick(TRUTH)) for r, c in zip(runs, records, strict=True)]
+    rows = [run_row(r, c, SuccessCriterion(TRUTH)) for r, c in zip(runs, records, strict=True)]
     assert [row["success"] for row in rows] == [True, False, False, False, False]
     assert [row["status"] for row in rows[2:]] == ["iteration-limit", "timeout", "missing"]
     (summary,) = method_rows(rows)
     assert (summary["runs"], summary["converged"], summary["successes"]) == (4, 2, 1)
     assert summary["error_mu_pa"] == pytest.approx(0.005)
     assert summary["iterations"] == 7
-    assert run_row(runs[1], records[1], Yardstick(TRUTH, within=0.05))["success"]
-    assert run_row(runs[1], records[1], Yardstick())["success"]
+    assert run_row(runs[1], records[1], SuccessCriterion(TRUTH, within=0.05))["success"]
+    assert run_row(runs[1], records[1], SuccessCriterion())["success"]
 
 
 def test_the_time_left_follows_from_each_methods_runs():
     walls = {"fast": [1.0, 3.0], "slow": [10.0]}
-    assert time_left_s(["fast", "fast", "slow"], walls, slots=1) == pytest.approx(14.0)
-    assert time_left_s(["fast"] * 8, walls, slots=2) == pytest.approx(8.0)
-    assert time_left_s(["slow"], walls, slots=8) == pytest.approx(10.0)
-    assert time_left_s(["unknown"], {"fast": [2.0]}, slots=1) == pytest.approx(2.0)
-    assert time_left_s(["fast"], {}, 1) is None
-    assert time_left_s([], walls, 1) is None
+    assert remaining_time_s(["fast", "fast", "slow"], walls, slots=1) == pytest.approx(14.0)
+    assert remaining_time_s(["fast"] * 8, walls, slots=2) == pytest.approx(8.0)
+    assert remaining_time_s(["slow"], walls, slots=8) == pytest.approx(10.0)
+    assert remaining_time_s(["unknown"], {"fast": [2.0]}, slots=1) == pytest.approx(2.0)
+    assert remaining_time_s(["fast"], {}, 1) is None
+    assert remaining_time_s([], walls, 1) is None
 
 
 def test_records_are_json(tmp_path):

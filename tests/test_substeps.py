@@ -10,13 +10,13 @@ import pytest
 from problems_small import TRUTH, hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.live.model import Model
+from collocation_sysid.live.model import LiveModel
 from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.refine import refine
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.numerical import MOST_SUBSTEPS, Refinement, numerical_error
+from collocation_sysid.statistics.numerical import MOST_SUBSTEPS, Refinement, discretisation_error
 
 SOFT = {"mu_pa": cs.Unknown(400.0), "gamma_r_s": cs.Unknown(0.005)}
 
@@ -111,7 +111,7 @@ def test_the_interval_holds_the_truth_where_the_noises_alone_misses_it():
     assert not holds(noise.statistical95, TRUTH["mu_pa"])
     assert holds(coarse.interval("mu_pa"), TRUTH["mu_pa"])
     assert holds(coarse.interval("young_pa"), 720.0)
-    assert coarse.result.covers == ("step",)
+    assert coarse.result.discretisation_kinds == ("step",)
 
 
 def test_the_value_is_corrected_for_the_step_and_lies_within_both_intervals():
@@ -136,7 +136,7 @@ def test_what_was_not_estimated_is_not_said_to_be_held():
     coarse = found(3e-4, 1)
     unseen = replace(coarse.problem, rollout=cs.RolloutOptions("scheme"))
     blind = run(unseen, seek_causes=False)
-    assert blind.result.covers == ()
+    assert blind.result.discretisation_kinds == ()
     assert blind.estimates["mu_pa"].value == blind.optimum["mu_pa"].value
     assert blind.estimates["mu_pa"].statistical95 == blind.optimum["mu_pa"].statistical95
     assert "not the step and the mesh" in blind.table()
@@ -150,7 +150,7 @@ def test_as_many_steps_are_taken_as_leave_half_a_standard_error():
     left = finer.refinement
     assert left is not None
     assert finer.solution.collocation.substeps in range(3, MOST_SUBSTEPS)
-    assert left.worst(finer.optimum)[1] < 0.6
+    assert left.largest_correction(finer.optimum)[1] < 0.6
     assert holds(finer.interval("mu_pa"), TRUTH["mu_pa"])
     assert finer.trust.verdict == "good"
 
@@ -167,7 +167,7 @@ def test_it_is_told_what_was_chosen_and_why():
 
 def test_the_guess_and_the_way_from_it_are_kept():
     finer = found(3e-4)
-    assert finer.started_from.guesses["mu_pa"] == pytest.approx(400.0)
+    assert finer.start_parameters.guesses["mu_pa"] == pytest.approx(400.0)
     numbers = [line.number for line in finer.solution.history]
     assert numbers == sorted(numbers)
     assert finer.solution.history[0].parameters["mu_pa"] == pytest.approx(400.0)
@@ -191,17 +191,17 @@ def test_nothing_is_solved_twice_where_one_step_is_enough():
 def test_a_number_that_is_stated_is_kept():
     solved: list[int] = []
     twice = run(twin(3e-4, 2), counting(solved), seek_causes=False)
-    assert twice.result.covers == ("step",)
+    assert twice.result.discretisation_kinds == ("step",)
     assert solved == [2]
 
 
 def test_there_are_no_more_than_the_most():
     estimates = {"mu_pa": Estimate(100.0, 0.1, (99.8, 100.2))}
     for half, order, needed in ((100.01, 2, 1), (100.14, 2, 2), (100.14, 1, 6), (110.0, 2, 8)):
-        error = numerical_error("mu_pa", estimates["mu_pa"], [half], [], order)
-        assert Refinement({"mu_pa": error}).substeps(estimates, order) == needed
+        error = discretisation_error("mu_pa", estimates["mu_pa"], [half], [], order)
+        assert Refinement({"mu_pa": error}).suggested_substeps(estimates, order) == needed
     nothing = {"mu_pa": replace(estimates["mu_pa"], statistical_std_error=None)}
-    assert Refinement({"mu_pa": error}).substeps(nothing, order) == 1
+    assert Refinement({"mu_pa": error}).suggested_substeps(nothing, order) == 1
 
 
 def fails_at_finer_steps(how: BaseException | cs.Status) -> Method:
@@ -227,14 +227,14 @@ def test_the_first_answer_counts_where_the_finer_is_not_found():
 def test_an_interrupt_at_finer_steps_leaves_the_first_answer_and_says_so(how):
     kept = run(twin(3e-4), fails_at_finer_steps(how), seek_causes=False)
     assert kept.parameters["mu_pa"] == pytest.approx(found(3e-4, 1).parameters["mu_pa"])
-    assert "finer steps" in kept.missing
+    assert "finer steps" in kept.omitted_checks
     assert np.isnan(kept.interval("mu_pa")).all()  # systematic effects were not evaluated
     assert "systematic effects were not evaluated" in kept.table()
 
 
 def test_live_estimates_take_one_step_where_none_are_stated():
-    assert Model.of(twin(3e-4)).substeps == 1
-    assert Model.of(twin(3e-4, 2)).substeps == 2
+    assert LiveModel.from_problem(twin(3e-4)).substeps == 1
+    assert LiveModel.from_problem(twin(3e-4, 2)).substeps == 2
 
 
 @pytest.mark.parametrize("given", ["some", 0, -1])
@@ -247,10 +247,10 @@ def test_refine_goes_on_from_the_steps_that_were_chosen():
     finer = found(3e-4)
     refined = refine(finer).refinement
     assert refined is not None
-    rows = {level.halved: level.timesteps for level in refined.levels}
+    rows = {level.refined: level.timesteps for level in refined.levels}
     many = finer.solution.collocation.substeps
     assert rows == {"step": 25 * 2 * many + 1, "mesh": 25 * many + 1}
-    assert refined.holds == ("noise", "step", "mesh")
+    assert refined.contributions == ("noise", "step", "mesh")
 
 
 # Value, interval, verdict and what the interval holds, together

@@ -20,10 +20,10 @@ from problems_small import (
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.solution import constraint_multipliers
 from collocation_sysid.model.schemes import SCHEMES
-from collocation_sysid.model.setting import Setting
+from collocation_sysid.model.setting import EquationsAtParameters
 from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep, Tangent
 
@@ -41,11 +41,11 @@ def disturbed(
     """Variables near the truth whose free dofs do not satisfy the equations of motion."""
     rng = np.random.default_rng(seed)
     positions = []
-    for segment in collocation.segments:
-        x = march(segment.experiment, segment.dynamics.with_theta(as_theta(TRUTH)))
+    for segment in collocation.transcriptions:
+        x = simulate_scheme(segment.experiment, segment.dynamics.with_theta(as_theta(TRUTH)))
         change = np.zeros_like(x)
         change[:, segment.free_dofs] = rng.standard_normal((len(x), len(segment.free_dofs)))
-        change = segment.dynamics.without_taken(change)
+        change = segment.dynamics.zero_held_forces(change)
         x[segment.dynamics.first_row :] += size_m * change[segment.dynamics.first_row :]
         positions.append(x)
     return collocation.pack(some_parameters(collocation), positions), positions
@@ -57,14 +57,14 @@ def some_parameters(collocation: Collocation) -> np.ndarray:
     return np.concatenate([collocation.parameters.guess_q, phi])
 
 
-def only_setting(collocation: Collocation) -> Setting:
-    (segment,) = collocation.segments
-    return segment.setting(*np.split(some_parameters(collocation), [collocation.nq]))
+def only_setting(collocation: Collocation) -> EquationsAtParameters:
+    (segment,) = collocation.transcriptions
+    return segment.equations_at(*np.split(some_parameters(collocation), [collocation.nq]))
 
 
 def forward(collocation: Collocation, positions: list[np.ndarray]) -> list[Tangent]:
-    parts = collocation.parts_at(some_parameters(collocation), positions)
-    return [Sweep(part.segment).forward(part.x, part.setting) for part in parts]
+    parts = collocation.iterates_at(some_parameters(collocation), positions)
+    return [Sweep(part.segment).forward(part.x, part.equations) for part in parts]
 
 
 @pytest.fixture(
@@ -104,10 +104,12 @@ def test_multipliers_make_the_lagrangian_stationary_in_the_positions(collocation
 def test_backward_is_the_transpose_of_forward(collocation: Collocation, rng):
     """gᵀ p = yᵀ c for y with c_xᵀ y = −g and p = −c_x⁻¹ c."""
     _, (x,) = disturbed(collocation)
-    (segment,) = collocation.segments
+    (segment,) = collocation.transcriptions
     setting = only_setting(collocation)
-    goals = setting.held.positions_m  # what is grasped is where it should be: no step of its own
-    x[:, setting.held.dofs] = np.where(np.isnan(goals), x[:, setting.held.dofs], goals)
+    goals = (
+        setting.prescribed.positions_m
+    )  # what is grasped is where it should be: no step of its own
+    x[:, setting.prescribed.dofs] = np.where(np.isnan(goals), x[:, setting.prescribed.dofs], goals)
     gradient = rng.standard_normal(x.shape)
     y = Sweep(segment).backward(x, setting, gradient)
     (found,) = forward(collocation, [x])
@@ -120,7 +122,7 @@ def test_what_is_given_does_not_move():
     collocation = Collocation([released_cube(4)], GUESS)
     _, positions = disturbed(collocation)
     (found,) = forward(collocation, positions)
-    held = collocation.segments[0].held_dofs
+    held = collocation.transcriptions[0].prescribed_dofs
     for part in (found.step[0], found.by_p[0], found.step[:, held], found.by_p[:, held]):
         assert not part.any()
 
@@ -142,7 +144,7 @@ def test_the_first_rows_do_not_depend_on_later_ones(scheme: str):
     collocation = Collocation([hung_cube(8)], GUESS, scheme)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    (segment,) = collocation.segments
+    (segment,) = collocation.transcriptions
     part = Sweep(segment, rows=5).forward(x[:5], only_setting(collocation))
     np.testing.assert_allclose(part.step, whole.step[:5], rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(part.by_p, whole.by_p[:5], rtol=1e-9, atol=1e-15)
@@ -154,7 +156,7 @@ def test_the_first_rows_can_be_continued(scheme: str, done: int):
     collocation = Collocation([hung_cube(8)], GUESS, scheme)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    (segment,) = collocation.segments
+    (segment,) = collocation.transcriptions
     setting = only_setting(collocation)
     first = Sweep(segment, done).forward(x[:done], setting)
     continued = Sweep(segment).forward(x, setting, first)
@@ -167,24 +169,24 @@ def test_rows_one_by_one_are_the_same_sensitivities():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])
-    rows = Sweep(collocation.segments[0]).sensitivities(x, only_setting(collocation))
+    rows = Sweep(collocation.transcriptions[0]).sensitivities(x, only_setting(collocation))
     np.testing.assert_allclose(np.stack(list(rows)), whole.by_p, rtol=1e-9, atol=1e-15)
 
 
 def test_indefinite_blocks_are_counted():
     """Rayleigh's damping makes them so where elements are squashed; the objective law does not."""
     collocation = Collocation([with_papers_damping(hung_cube(6))], GUESS)
-    (segment,) = collocation.segments
-    x = np.tile(segment.body.nodes_m.ravel(), (segment.grid_rows, 1))
+    (segment,) = collocation.transcriptions
+    x = np.tile(segment.body.nodes_m.ravel(), (segment.grid_times, 1))
     x.reshape(len(x), -1, 3)[3:, :, 2] *= 0.05
     jacobian = collocation.jacobian(collocation.pack(GUESS.guess_q, [x])).toarray()
     count, expected = len(segment.free_dofs), 0
-    for t in range(segment.grid_rows):
-        columns = collocation.nq + t * segment.dofs + segment.free_dofs
+    for t in range(segment.grid_times):
+        columns = collocation.nq + t * segment.dof_count + segment.free_dofs
         block = jacobian[t * count : (t + 1) * count, columns]
         expected += int(np.linalg.eigvalsh(-block)[0] <= 0)
     assert expected > 0
-    assert forward(collocation, [x])[0].indefinite == expected
+    assert forward(collocation, [x])[0].indefinite_count == expected
 
 
 def test_states_that_are_not_finite_are_refused_with_their_time():
@@ -199,7 +201,7 @@ def test_time_is_accounted_for():
     collocation = Collocation([hung_cube(5)], GUESS)
     _, (x,) = disturbed(collocation)
     stopwatch = Stopwatch()
-    solver = Sweep(collocation.segments[0], stopwatch=stopwatch)
+    solver = Sweep(collocation.transcriptions[0], stopwatch=stopwatch)
     solver.forward(x, only_setting(collocation))
     assert stopwatch.evaluations > 0
     assert stopwatch.linear_algebra > 0

@@ -19,7 +19,7 @@ from collocation_sysid.model.parameters import Parameters, Tied, Unknown
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.sweep import Sweep
 from collocation_sysid.recording import Experiment
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 LEFT_HALF = Box((-1, -1, -1), (0.075, 1, 1))
 DAMPING = {"gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -76,7 +76,7 @@ def parameters(truth: Mapping[str, float], guesses: Mapping[str, float]) -> Para
     stated = {
         name: Unknown(guesses[name]) if name in guesses else value for name, value in truth.items()
     }
-    return Parameters.of(stated)
+    return Parameters.from_mapping(stated)
 
 
 def collocation_of(name: str) -> Collocation:
@@ -107,7 +107,7 @@ def test_error_bars_of_regions_follow_the_noise(rng):
     markers = replace(clean.markers, positions_m=tracks, sigma_m=np.full(tracks.shape[1], 1e-4))
     collocation = Collocation([replace(clean, markers=markers)], parameters(truth, guesses))
     solution = METHODS["reduced-space"]()(collocation)
-    found = covariance(collocation, solution.z)
+    found = uncertainty_at(collocation, solution.z)
     assert set(found.derived) >= {"young_pa", "stiff.young_pa"}
     for name in guesses:
         error = solution.parameters[name] - truth[name]
@@ -120,7 +120,7 @@ def test_a_tied_parameter_is_no_unknown_of_its_own():
     body, truth, _ = MODELS["two stiffnesses"]
     experiment = measured_with(waved_bar(**body), truth)
     stated = {**truth, "mu_pa": Unknown(450.0), "stiff.mu_pa": Tied("mu_pa", ratio=3.0)}
-    collocation = Collocation([experiment], Parameters.of(stated))
+    collocation = Collocation([experiment], Parameters.from_mapping(stated))
     assert collocation.nq == 1
     solution = METHODS["reduced-space"]()(collocation)
     assert solution.parameters["mu_pa"] == pytest.approx(300.0, rel=1e-5)
@@ -134,8 +134,8 @@ def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypa
     counts = []
     for names in (["mu_pa"], [*guesses, "lambda_pa", "gamma_m_1_s"]):
         stated = {n: Unknown(v) if n in names else v for n, v in truth.items()}
-        collocation = Collocation([experiment], Parameters.of(stated))
-        (segment,) = collocation.segments
+        collocation = Collocation([experiment], Parameters.from_mapping(stated))
+        (segment,) = collocation.transcriptions
         z = METHODS["reduced-space"](max_iterations=1)(collocation).z
         solver = Sweep(segment)
         factorised = []
@@ -146,8 +146,8 @@ def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypa
             return do(matrix, count, *rest)
 
         object.__setattr__(solver.factoriser, "factorise_each", counted)
-        (part,) = collocation.parts(z)
-        tangent = solver.forward(part.x, part.setting)
+        (part,) = collocation.iterates(z)
+        tangent = solver.forward(part.x, part.equations)
         assert tangent.by_p.shape[2] == len(names)
         counts.append(sum(factorised))
     assert counts[0] == counts[1] == segment.constraint_times

@@ -150,7 +150,7 @@ def test_first_and_second_derivatives_are_slopes(rng):
     body = small_body()
     theta = theta_for(body)
     x, v, w = deformed(body, rng, 1), *rng.standard_normal((2, 1, 3 * len(body.nodes_m)))
-    at, curvature = body.linearise(x, v, theta), body.curvature(x, v, w, theta)
+    at, curvature = body.linearise(x, v, theta), body.second_derivatives(x, v, w, theta)
 
     def weighted(matrix, d):
         return body.pattern.matrix(matrix[0]) @ d.ravel()

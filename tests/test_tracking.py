@@ -46,7 +46,7 @@ def change_tracks(folder: Path, change) -> None:
 def tracked(tiny):
     """The tiny problem with four more markers, tied to the gripper."""
     poses, table = read_poses(tiny / POSES), read_markers(tiny / MARKERS)
-    base = poses.carry(list(BASE_M.values()), table.t_s)
+    base = poses.carried_positions(list(BASE_M.values()), table.t_s)
     tracks = np.concatenate([base, table.positions_m], axis=1)
     write_markers_csv(tiny / MARKERS, table.t_s, (*BASE_M, *table.names), tracks)
     return tiny
@@ -55,7 +55,9 @@ def tracked(tiny):
 def assert_same_motion(found, expected):
     np.testing.assert_allclose(found.t_s, expected.t_s)
     np.testing.assert_allclose(
-        found.held_positions(found.t_s), expected.held_positions(expected.t_s), atol=1e-8
+        found.prescribed_positions(found.t_s),
+        expected.prescribed_positions(expected.t_s),
+        atol=1e-8,
     )
     assert found.markers.names == expected.markers.names
     np.testing.assert_allclose(found.markers.positions_m, expected.markers.positions_m, atol=1e-8)
@@ -187,7 +189,7 @@ def filmed(tracked):
     labels = [f"Cam {name}" for name in table.names]
     expected = load(tracked, "experiment.0.markers.names=['low', 'mid', 'side']").experiments[0]
     write_markers_csv(tracked / MARKERS, table.t_s, labels, seen_mm)
-    start = poses.carry(list(BASE_M.values()), [0.0])[0].tolist()
+    start = poses.carried_positions(list(BASE_M.values()), [0.0])[0].tolist()
     driven_by_markers(tracked)
     markers = {
         "labels": {f"Cam {name}": name for name in table.names},

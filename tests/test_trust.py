@@ -25,15 +25,15 @@ from collocation_sysid.statistics.hypothesis import Hypothesis
 from collocation_sysid.statistics.trust import (
     GROSS_MISFIT,
     MISFIT,
-    Trust,
+    Assessment,
     fit_concerns,
-    noise_rms_m,
+    forward_simulation_concerns,
     nuisance_concerns,
     parameter_concerns,
-    rollout_concerns,
+    rms_expected_from_noise_m,
     scheme_concerns,
 )
-from collocation_sysid.statistics.uncertainty import uncertainty_of
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 from collocation_sysid.tree import as_json, content, read
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -56,10 +56,10 @@ def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
-def verdict_of_fit(errors: np.ndarray) -> Trust:
+def verdict_of_fit(errors: np.ndarray) -> Assessment:
     fit, wrong = OF.fit([errors], np.zeros(len(OF.names)))
-    found = uncertainty_of(fit, PARAMETERS, wrong[:4])
-    return Trust.of(fit_concerns(found) + parameter_concerns(found))
+    found = uncertainty_from_fit(fit, PARAMETERS, wrong[:4])
+    return Assessment.from_concerns(fit_concerns(found) + parameter_concerns(found))
 
 
 # The verdict of single findings
@@ -67,20 +67,23 @@ def verdict_of_fit(errors: np.ndarray) -> Trust:
 
 def test_the_gravest_concern_gives_the_verdict():
     light, grave = Concern("solve/acceptable"), Concern("solve/no-error-bars", "doubtful")
-    assert Trust.of([]).verdict == "good"
-    assert Trust.of([light, light]) == Trust((light,))
-    assert Trust.of([light, grave]) == Trust((grave, light))
-    assert (Trust((light,)).verdict, Trust((grave, light)).verdict) == ("check", "doubtful")
+    assert Assessment.from_concerns([]).verdict == "good"
+    assert Assessment.from_concerns([light, light]) == Assessment((light,))
+    assert Assessment.from_concerns([light, grave]) == Assessment((grave, light))
+    assert (Assessment((light,)).verdict, Assessment((grave, light)).verdict) == (
+        "check",
+        "doubtful",
+    )
 
 
 def test_a_concern_keeps_its_code_and_its_numbers_in_files():
-    found = Trust.of(nuisance_concerns(["time"], [4.0], [-9.0], [9.0]))
+    found = Assessment.from_concerns(nuisance_concerns(["time"], [4.0], [-9.0], [9.0]))
     stored = json.loads(as_json(found))
     assert stored["reasons"] == ["time is 4.0 deviations of its prior away from zero"]
     (concern,) = stored["concerns"]
     assert concern["code"] == "nuisance/far"
     assert concern["data"] == {"name": "time", "deviations": 4.0}
-    assert read(Trust, stored) == found
+    assert read(Assessment, stored) == found
 
 
 def test_every_code_that_gives_concern_has_a_sentence_and_a_remedy():
@@ -89,8 +92,8 @@ def test_every_code_that_gives_concern_has_a_sentence_and_a_remedy():
     assert len(codes) > 30
     for code in codes:
         topic, _, rest = code.partition("/")
-        assert rest in TOPICS[topic].said, code
-        assert TOPICS[topic].cure
+        assert rest in TOPICS[topic].messages, code
+        assert TOPICS[topic].remedy
 
 
 def test_white_residuals_of_the_stated_size_are_good():
@@ -144,9 +147,9 @@ def test_gross_residuals_of_single_samples_are_doubtful():
     for size, verdict in ((1.0, "good"), (50.0, "doubtful")):
         errors = [size * RNG(k).normal(size=(1, 4, 3)) for k in range(8)]
         fit, _ = singles.fit(errors, np.zeros(len(singles.names)))
-        found = uncertainty_of(fit, PARAMETERS, np.zeros(4))
+        found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
         assert np.isfinite(found.dependence.lag1)
-        assert Trust.of(fit_concerns(found)).verdict == verdict
+        assert Assessment.from_concerns(fit_concerns(found)).verdict == verdict
 
 
 def test_nuisance_parameters_far_from_their_prior():
@@ -162,12 +165,20 @@ def test_nuisance_parameters_far_from_their_prior():
 
 
 def test_a_roll_out_is_measured_by_the_fit_and_the_noise():
-    assert not rollout_concerns("a", 1.05, 1.0, 1.0, fitted=True)
-    assert not rollout_concerns("a", 0.1, 0.001, 1.0, fitted=True)  # far below the noise
-    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=True)[0].grade for rms in (1.5, 4.0)]
+    assert not forward_simulation_concerns("a", 1.05, 1.0, 1.0, is_fitted=True)
+    assert not forward_simulation_concerns(
+        "a", 0.1, 0.001, 1.0, is_fitted=True
+    )  # far below the noise
+    strengths = [
+        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=True)[0].grade
+        for rms in (1.5, 4.0)
+    ]
     assert strengths == ["check", "doubtful"]
-    assert not rollout_concerns("a", 2.0, 1.0, 1.0, fitted=False)
-    strengths = [rollout_concerns("a", rms, 1.0, 1.0, fitted=False)[0].grade for rms in (4.0, 20.0)]
+    assert not forward_simulation_concerns("a", 2.0, 1.0, 1.0, is_fitted=False)
+    strengths = [
+        forward_simulation_concerns("a", rms, 1.0, 1.0, is_fitted=False)[0].grade
+        for rms in (4.0, 20.0)
+    ]
     assert strengths == ["check", "doubtful"]
 
 
@@ -175,14 +186,16 @@ def test_a_scheme_that_damps_or_slows_is_a_concern():
     assert not scheme_concerns("a", 0.05, 0.0, 0.01)
     (damped,) = scheme_concerns("a", 0.05, 0.02, 0.0)
     assert damped.grade == "check"
-    assert "0.02 to the 0.05" in damped.sentence
+    assert "0.02 to the 0.05" in damped.message
     assert scheme_concerns("a", 0.05, 0.06, 0.0)[0].grade == "doubtful"
     assert scheme_concerns("a", 0.05, 0.0, -0.05)[0].grade == "check"
 
 
 def test_what_noise_alone_would_leave():
-    assert noise_rms_m(np.array([1e-3]), np.array([100.0]), 0) == pytest.approx(1e-3 * np.sqrt(3))
-    fewer = noise_rms_m(np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), 30.0)
+    assert rms_expected_from_noise_m(np.array([1e-3]), np.array([100.0]), 0) == pytest.approx(
+        1e-3 * np.sqrt(3)
+    )
+    fewer = rms_expected_from_noise_m(np.array([1e-3, 2e-3]), np.array([50.0, 50.0]), 30.0)
     assert fewer == pytest.approx(1e-3 * np.sqrt(3 * 2.5 * 0.9))
 
 
@@ -202,7 +215,7 @@ def judged(fault: str, seed: int = 100) -> Run:
 @pytest.mark.parametrize("seed", [100, slow(101)])
 def test_faultless_twins_are_good(seed):
     found = judged("none", seed)
-    assert found.trust == Trust(())
+    assert found.trust == Assessment(())
     assert found.noise_rms_m == pytest.approx(found.solution.rms_m, rel=0.1)
 
 

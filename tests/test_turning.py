@@ -16,9 +16,9 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp
 from collocation_sysid.recording.poses import Interpolation
-from collocation_sysid.recording.turning import fastest_turn
+from collocation_sysid.recording.turning import fastest_rotation
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.trust import turn_concerns
+from collocation_sysid.statistics.trust import rotation_step_concerns
 
 STEPS, FINEST = 8, 32
 
@@ -64,7 +64,7 @@ def test_no_step_removes_what_linear_poses_leave_and_held_ones_get_worse(exact_m
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_the_fastest_turn_is_the_angle_between_the_poses_of_two_grid_times(substeps: int):
     cube = swung(8.0)
-    turn = fastest_turn(cube, substeps)
+    turn = fastest_rotation(cube, substeps)
     # 0.4 rad (1 − cos 20 t) is fastest at t = π / 40 = 0.0785 s, past the middle of the last step.
     step_s = 0.01 / substeps
     assert turn.time_s == pytest.approx(0.08 - step_s)
@@ -75,18 +75,18 @@ def test_the_fastest_turn_is_the_angle_between_the_poses_of_two_grid_times(subst
 
 def test_a_fast_turn_is_warned_of_with_the_substeps_that_cure_it():
     cube = swung(8.0)
-    (concern,) = turn_concerns(cube, 1)
-    warning = concern.sentence
+    (concern,) = rotation_step_concerns(cube, 1)
+    warning = concern.message
     assert "turns by 0.08 rad within a step of 10 ms at t = 0.07 s (7.97 rad" in warning
     assert warning.endswith("set transcription.substeps = 2")
-    assert turn_concerns(cube, 2) == []
-    assert turn_concerns(swung(4.0), 1) == []
+    assert rotation_step_concerns(cube, 2) == []
+    assert rotation_step_concerns(swung(4.0), 1) == []
 
 
 def test_substeps_are_no_remedy_for_poses_that_are_held():
-    (concern,) = turn_concerns(swung(8.0, "hold"), 4)
-    assert 'set interpolation = "smooth"' in concern.sentence
-    assert fastest_turn(swung(8.0, "hold"), 4).angle_rad == pytest.approx(0.0797, abs=1e-3)
+    (concern,) = rotation_step_concerns(swung(8.0, "hold"), 4)
+    assert 'set interpolation = "smooth"' in concern.message
+    assert fastest_rotation(swung(8.0, "hold"), 4).angle_rad == pytest.approx(0.0797, abs=1e-3)
 
 
 def test_only_while_a_grasp_holds_its_turns_count():
@@ -94,7 +94,7 @@ def test_only_while_a_grasp_holds_its_turns_count():
     let_go = replace(cube.grasps[0], until_s=0.02)
     still = Grasp(cube.grasps[0].nodes[:1], np.tile(np.eye(4), (STEPS + 1, 1, 1)), from_s=0.03)
     passing = replace(cube, grasps=(let_go, still), start="undeformed")
-    assert fastest_turn(passing, 1).time_s == pytest.approx(0.01)
+    assert fastest_rotation(passing, 1).time_s == pytest.approx(0.01)
 
 
 def test_a_run_says_that_a_turn_is_too_fast_for_its_step_and_is_to_be_checked():

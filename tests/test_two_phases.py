@@ -13,19 +13,19 @@ from problems_small import IDEAL, point_markers, smooth_poses, times
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.refinement import refined
-from collocation_sysid.fem.two_phase import ElementLogarithms, PhaseFinding, TwoPhaseModes
-from collocation_sysid.live.estimator import Estimator
+from collocation_sysid.fem.refinement import refine_body
+from collocation_sysid.fem.two_phase import ElementLogarithms, PhaseSummary, TwoPhaseModes
+from collocation_sysid.live.estimator import LiveEstimator
 from collocation_sysid.runs.two_phases import solve_two_phases
-from collocation_sysid.statistics.fields import FieldEstimate, fields_of, phase_concerns
+from collocation_sysid.statistics.fields import FieldEstimate, field_estimates, phase_concerns
 from collocation_sysid.statistics.phases import (
     ElementInformation,
-    Faces,
+    InternalFaces,
     SamplerSettings,
-    draw_phases,
-    start_phases,
+    initial_phases,
+    sample_phases,
 )
-from collocation_sysid.statistics.uncertainty import covariance
+from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
 KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
@@ -71,9 +71,9 @@ def answer(ratio: float) -> cs.Solution:
 
 
 def field_of(solution: cs.Solution) -> FieldEstimate:
-    known = covariance(solution.collocation, solution.z)
-    body = solution.collocation.segments[0].body
-    (field,) = fields_of(body, solution.collocation.parameters, solution.q, known)
+    known = uncertainty_at(solution.collocation, solution.z)
+    body = solution.collocation.transcriptions[0].body
+    (field,) = field_estimates(body, solution.collocation.parameters, solution.q, known)
     return field
 
 
@@ -81,12 +81,12 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
     solution = answer(3.0)
     field = field_of(solution)
     assert isinstance(field.modes, TwoPhaseModes)
-    estimate = covariance(solution.collocation, solution.z).estimates["contrast"]
+    estimate = uncertainty_at(solution.collocation, solution.z).estimates["contrast"]
     low, high = estimate.statistical95
     assert low < 3.0 < high
     assert high / low < 2.0
     truth = np.log(YOUNG_PA * np.where(lower_half(), 3.0, 1.0))
-    lower, upper = np.log(field.ci95)
+    lower, upper = np.log(field.statistical95)
     held = (lower < truth) & (truth < upper)
     assert held[lower_half()].mean() >= 0.9
     assert (field.modes.phase == lower_half()).mean() >= 0.9
@@ -98,13 +98,13 @@ def test_a_stiff_half_has_its_boundary_and_its_contrast():
 def test_an_even_body_shows_no_second_material():
     field = field_of(answer(1.0))
     assert "field/one-phase" in [concern.code for concern in field.concerns]
-    low, high = np.log(field.ci95)
+    low, high = np.log(field.statistical95)
     assert np.mean((low < np.log(YOUNG_PA)) & (np.log(YOUNG_PA) < high)) >= 0.9
 
 
 @pytest.mark.parametrize("method", [cs.InteriorPoint()], ids=type)
 def test_other_methods_find_the_same_contrast(method):
-    body = answer(3.0).collocation.segments[0].body
+    body = answer(3.0).collocation.transcriptions[0].body
     (field,) = (part.field for part in body.parts)
     known = problem(3.0).with_fields({"young_pa": field})
     solution = cs.solve(known, method)
@@ -115,7 +115,7 @@ def test_other_methods_find_the_same_contrast(method):
 
 def test_unknown_phases_widen_the_interval_of_the_contrast():
     solution = answer(3.0)
-    body = solution.collocation.segments[0].body
+    body = solution.collocation.transcriptions[0].body
     (samples,) = body.phase_samples
     more = replace(samples, deviations=samples.deviations + 0.04 * np.eye(len(samples.names)))
     (field,) = (part.field for part in body.parts)
@@ -123,7 +123,7 @@ def test_unknown_phases_widen_the_interval_of_the_contrast():
     experiments = [replace(e, body=wider) for e in solution.collocation.experiments]
     collocation = replace(solution.collocation, experiments=experiments)
     before, after = (
-        covariance(each, solution.z).covariance for each in (solution.collocation, collocation)
+        uncertainty_at(each, solution.z).covariance for each in (solution.collocation, collocation)
     )
     place = [item.name for item in collocation.parameters.free].index("contrast")
     assert after[place, place] - before[place, place] == pytest.approx(0.04, rel=1e-6)
@@ -134,29 +134,29 @@ def test_slopes_by_the_contrast_and_by_elements_are_those_of_differences(by_elem
     body = bar(TWO_PHASES)
     field = replace(body.parts[0].field, phase=lower_half().astype(float))
     if by_elements:
-        field = ElementLogarithms.about(field, rng.normal(size=len(field.phase)))
+        field = ElementLogarithms.relative_to(field, rng.normal(size=len(field.phase)))
     own = body.with_fields({"young_pa": field})
     count = len(field.constants)
     x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
     v = rng.normal(size=x.shape)
     w = rng.normal(size=x.shape)
-    theta = own.theta({**KNOWN, "young_pa": YOUNG_PA})
+    theta = own.theta_from_values({**KNOWN, "young_pa": YOUNG_PA})
     theta[-count:] = 1 + 0.3 * rng.normal(size=count)
     steps = 0.1 * (np.arange(len(theta)) >= len(theta) - count)
     by_theta = own.linearise(x, v, theta).by_theta[0]
-    by_both = own.curvature(x, v, w, theta).theta_theta[0]
+    by_both = own.second_derivatives(x, v, w, theta).theta_theta[0]
 
     def force(at: np.ndarray) -> np.ndarray:
         return own.force(x, v, at)[0]
 
     def slope(at: np.ndarray) -> np.ndarray:
-        return own.curvature(x, v, w, at).theta[0]
+        return own.second_derivatives(x, v, w, at).theta[0]
 
     assert_derivative(force, lambda d: by_theta @ d, theta, rng, scale=steps)
     assert_derivative(slope, lambda d: by_both @ d, theta, rng, scale=steps)
 
 
-def small_posterior(rng) -> tuple[ElementInformation, Faces]:
+def small_posterior(rng) -> tuple[ElementInformation, InternalFaces]:
     """Six elements in a row, and two parameters."""
     slopes = rng.normal(size=(12, 8))
     slopes[:, 2:] *= 0.6
@@ -173,13 +173,13 @@ def small_posterior(rng) -> tuple[ElementInformation, Faces]:
         deviation=1.0,
     )
     row = np.arange(5)
-    return data, Faces(np.column_stack([row, row + 1]), np.ones(5), 6)
+    return data, InternalFaces(np.column_stack([row, row + 1]), np.ones(5), 6)
 
 
 def test_samples_are_of_the_posterior_that_enumeration_gives(rng):
     data, faces = small_posterior(rng)
     settings = SamplerSettings(face_nats=0.5, least_steps=6000, steps_per_sample=5)
-    draws = draw_phases(data, faces, np.array([1.0, 1, 0, 0, 0, 0]), settings)
+    draws = sample_phases(data, faces, np.array([1.0, 1, 0, 0, 0, 0]), settings)
     logarithms, means, labels = [], [], []
     constant = data.score_z - data.of_z @ data.base
     for label in product([0.0, 1.0], repeat=6):
@@ -201,7 +201,7 @@ def test_samples_are_of_the_posterior_that_enumeration_gives(rng):
 
 def test_the_start_finds_a_block_in_values_that_are_measured_one_by_one(rng):
     mesh = cs.box_mesh((0.04, 0.04, 0.04), (4, 4, 4))
-    faces = Faces.of(mesh, np.arange(len(mesh.tetrahedra)))
+    faces = InternalFaces.from_mesh(mesh, np.arange(len(mesh.tetrahedra)))
     assert 2 * len(faces.pairs) + len(mesh.surface) == 4 * len(mesh.tetrahedra)
     block = (mesh.points_m[mesh.tetrahedra].mean(axis=1) < 0.02).all(axis=1)
     count = len(block)
@@ -215,23 +215,23 @@ def test_the_start_finds_a_block_in_values_that_are_measured_one_by_one(rng):
         base=np.zeros(count),
         deviation=1.0,
     )
-    found = start_phases(data, faces, mesh.volumes_m3)
+    found = initial_phases(data, faces, mesh.volumes_m3)
     assert (found == block).mean() > 0.98
 
 
 def test_a_third_material_is_a_concern():
-    phases = PhaseFinding((2.0, 2.5, 3.0), (1e-6, 2e-6, 3e-6), 0.5, 1.6, 1.01, 80)
+    phases = PhaseSummary((2.0, 2.5, 3.0), (1e-6, 2e-6, 3e-6), 0.5, 1.6, 1.01, 80)
     (concern,) = phase_concerns(phases, "young_pa")
     assert concern.code == "field/phases"
-    assert "more than two materials" in concern.sentence
+    assert "more than two materials" in concern.message
     assert not phase_concerns(replace(phases, misfit=1.05), "young_pa")
 
 
 def test_an_inclusion_of_few_elements_is_a_concern():
-    phases = PhaseFinding((1.7, 1.9, 2.1), (1e-6, 2e-6, 3e-6), 0.3, 1.0, 1.0, 12)
+    phases = PhaseSummary((1.7, 1.9, 2.1), (1e-6, 2e-6, 3e-6), 0.3, 1.0, 1.0, 12)
     (concern,) = phase_concerns(phases, "young_pa")
     assert concern.code == "field/few"
-    assert "only 12 elements" in concern.sentence
+    assert "only 12 elements" in concern.message
 
 
 @pytest.mark.parametrize(
@@ -258,7 +258,7 @@ def test_two_fields_of_two_phases_are_refused():
 
 def test_live_refuses_phases_that_nobody_knows_yet():
     with pytest.raises(cs.InputError, match="phases of young_pa are not known"):
-        Estimator(problem(3.0))
+        LiveEstimator(problem(3.0))
 
 
 def test_a_contrast_that_is_not_stated_has_the_prior_of_its_field():
@@ -272,7 +272,7 @@ def test_a_contrast_that_is_not_stated_has_the_prior_of_its_field():
 
 def test_a_finer_mesh_has_the_same_phases():
     field = replace(bar(TWO_PHASES).parts[0].field, phase=lower_half().astype(float))
-    finer = refined(bar(TWO_PHASES).with_fields({"young_pa": field}))
+    finer = refine_body(bar(TWO_PHASES).with_fields({"young_pa": field}))
     np.testing.assert_array_equal(finer.parts[0].field.phase, np.repeat(field.phase, 8))
 
 

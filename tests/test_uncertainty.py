@@ -17,16 +17,16 @@ from problems_small import (
 from scipy.stats import chi2
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.moduli import engineering
+from collocation_sysid.fem.moduli import engineering_constants
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
-from collocation_sysid.program.segment import Segment
+from collocation_sysid.program.marching import simulate_scheme
+from collocation_sysid.program.segment import Transcription
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.linearised import marker_sensitivities, sensitivities
-from collocation_sysid.statistics.uncertainty import ErrorModel, covariance
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 AT_TRUTH = GUESS.with_guess(TRUTH)
 NAMES = tuple(TRUTH)
@@ -34,8 +34,8 @@ NAMES = tuple(TRUTH)
 
 def positions(collocation: Collocation, q):
     return [
-        march(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
-        for s in collocation.segments
+        simulate_scheme(s.experiment, s.dynamics.with_theta(s.constants.theta(q)))
+        for s in collocation.transcriptions
     ]
 
 
@@ -67,7 +67,7 @@ def changed(parameters: Parameters, **changes: dict) -> Parameters:
 
 def in_engineering_moduli() -> Parameters:
     """The truth by (E, ν)."""
-    young_pa, poisson = engineering(TRUTH["lambda_pa"], TRUTH["mu_pa"])
+    young_pa, poisson = engineering_constants(TRUTH["lambda_pa"], TRUTH["mu_pa"])
     elastic = (
         Parameter("young_pa", young_pa, 1e-6, 1e6),
         Parameter("poisson", poisson, 1e-6, 0.49),
@@ -126,17 +126,19 @@ def test_what_is_given_does_not_depend_on_the_parameters():
     collocation, z = simulated([released_cube(4)])
     (by_q,) = sensitivities(collocation, z)
     assert not by_q[0].any()
-    assert not by_q[:, collocation.segments[0].held_dofs].any()
+    assert not by_q[:, collocation.transcriptions[0].prescribed_dofs].any()
     assert by_q[1:].any(axis=(1, 2)).all()
 
 
 def test_marker_sensitivities_are_those_of_the_nodes_at_the_samples():
     collocation, z = simulated([cube_with_gaps(4), released_cube(3)], substeps=2)
     nodes, markers = sensitivities(collocation, z), marker_sensitivities(collocation, z)
-    for segment, of_nodes, of_markers in zip(collocation.segments, nodes, markers, strict=True):
-        observe = segment.experiment.markers.observe
+    for segment, of_nodes, of_markers in zip(
+        collocation.transcriptions, nodes, markers, strict=True
+    ):
+        observe = segment.experiment.markers.predict_positions
         for k in range(collocation.nq):
-            expected = observe(of_nodes[::2, :, k].reshape(-1, segment.dofs // 3, 3))
+            expected = observe(of_nodes[::2, :, k].reshape(-1, segment.dof_count // 3, 3))
             np.testing.assert_allclose(
                 of_markers[..., k], expected.reshape(len(expected), -1), atol=1e-15
             )
@@ -145,10 +147,10 @@ def test_marker_sensitivities_are_those_of_the_nodes_at_the_samples():
 # Covariance
 
 
-def residuals(segment: Segment, x: np.ndarray) -> np.ndarray:
+def residuals(segment: Transcription, x: np.ndarray) -> np.ndarray:
     """Of its markers (T, M, 3), without nuisance parameters."""
     phi = np.zeros(0)
-    return segment.markers.residuals(segment.markers.channel.of(x, phi), phi)
+    return segment.markers.residuals(segment.markers.observable.evaluate_positions(x, phi), phi)
 
 
 def test_covariance_is_that_of_the_weighted_least_squares_problem():
@@ -161,7 +163,7 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
                 [
                     residuals(segment, x).ravel()
                     for segment, x in zip(
-                        collocation.segments,
+                        collocation.transcriptions,
                         positions(collocation, AT_TRUTH.guess_q + sign * direction),
                         strict=True,
                     )
@@ -172,7 +174,7 @@ def test_covariance_is_that_of_the_weighted_least_squares_problem():
         columns.append((ahead - behind) / (2 * step))
     matrix = np.stack(columns, axis=1)
     expected = np.linalg.inv(matrix.T @ matrix)
-    found = covariance(collocation, z, ErrorModel("given", "independent")).covariance
+    found = uncertainty_at(collocation, z, ErrorModel("given", "independent")).covariance
     deviations = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(deviations, deviations),
                                expected / np.outer(deviations, deviations), atol=1e-4)  # fmt: skip
@@ -185,7 +187,7 @@ def test_normalised_errors_of_noisy_twins_follow_their_distribution():
     for seed in range(twins):
         collocation = Collocation([noisy(experiment, sigma_m, seed)], AT_TRUTH)
         q = fitted(collocation, AT_TRUTH.guess_q)
-        uncertainty = covariance(collocation, collocation.pack(q, positions(collocation, q)))
+        uncertainty = uncertainty_at(collocation, collocation.pack(q, positions(collocation, q)))
         error = q - AT_TRUTH.guess_q
         squares.append(error @ np.linalg.solve(uncertainty.covariance, error))
         chi_squared.append(uncertainty.reduced_chi_squared)
@@ -198,7 +200,7 @@ def test_normalised_errors_of_noisy_twins_follow_their_distribution():
 
 def fitted(collocation: Collocation, q, steps=2):
     """Gauss–Newton on the simulation."""
-    (segment,) = collocation.segments
+    (segment,) = collocation.transcriptions
     weight = 1 / segment.experiment.markers.sigma_m[0]
     for _ in range(steps):
         (x,) = positions(collocation, q)
@@ -210,7 +212,7 @@ def fitted(collocation: Collocation, q, steps=2):
 
 def test_error_bars_are_relative_in_the_logarithm():
     collocation, z = simulated([with_sigma(measured(hung_cube()), 1e-4)])
-    uncertainty = covariance(collocation, z)
+    uncertainty = uncertainty_at(collocation, z)
     assert uncertainty.names == NAMES
     for name, variance in zip(NAMES, np.diag(uncertainty.covariance), strict=True):
         estimate = uncertainty.estimates[name]
@@ -233,8 +235,8 @@ def test_noise_is_estimated_from_the_residuals():
     for sigma_m in (1e-4, 1e-2):  # what is claimed; the noise has 1 mm
         collocation, z = simulated([with_sigma(noisy(experiment, 1e-3, seed=1), sigma_m)])
         truth, z_truth = simulated([with_sigma(experiment, 1e-3)])
-        estimated = covariance(collocation, z, ErrorModel("estimated"))
-        ratio = estimated.covariance / covariance(truth, z_truth).covariance
+        estimated = uncertainty_at(collocation, z, ErrorModel("estimated"))
+        ratio = estimated.covariance / uncertainty_at(truth, z_truth).covariance
         np.testing.assert_allclose(ratio, ratio[0, 0])
         assert ratio[0, 0] == pytest.approx(1.0, abs=0.2)
 
@@ -242,9 +244,9 @@ def test_noise_is_estimated_from_the_residuals():
 def test_residuals_larger_than_sigma_are_pointed_out():
     experiment = with_sigma(noisy(measured(hung_cube()), 1e-4, seed=1), 1e-5)
     collocation, z = simulated([experiment])
-    (note,) = covariance(collocation, z).notes
+    (note,) = uncertainty_at(collocation, z).notes
     assert "times as large as sigma_m" in note
-    assert covariance(collocation, z, ErrorModel("estimated")).notes == ()
+    assert uncertainty_at(collocation, z, ErrorModel("estimated")).notes == ()
 
 
 def test_noise_needs_more_measurements_than_parameters():
@@ -253,22 +255,22 @@ def test_noise_needs_more_measurements_than_parameters():
     tracks[2, 0] = experiment.markers.positions_m[2, 0]
     collocation, z = simulated([with_markers(experiment, tracks)])
     with pytest.raises(InputError, match="3 measurements of 4 parameters"):
-        covariance(collocation, z, ErrorModel("estimated"))
+        uncertainty_at(collocation, z, ErrorModel("estimated"))
 
 
 def test_unknown_noise_is_refused():
     collocation, z = simulated([hung_cube(3)])
     with pytest.raises(InputError, match="'given' or 'estimated'"):
-        covariance(collocation, z, ErrorModel(noise="guessed"))  # type: ignore[arg-type]
+        uncertainty_at(collocation, z, ErrorModel(noise="guessed"))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="'independent' or 'autocorrelated'"):
-        covariance(collocation, z, ErrorModel(errors="normal"))  # type: ignore[arg-type]
+        uncertainty_at(collocation, z, ErrorModel(errors="normal"))  # type: ignore[arg-type]
 
 
 def test_a_prior_adds_its_information():
     prior = changed(AT_TRUTH, mu_pa={"prior": (300.0, 1e-3)})
     experiment = measured(hung_cube())
     without, with_prior = (
-        covariance(
+        uncertainty_at(
             *simulated([experiment], parameters), ErrorModel(errors="independent")
         ).covariance
         for parameters in (AT_TRUTH, prior)
@@ -283,18 +285,18 @@ def test_a_prior_adds_its_information():
 def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs():
     experiment = measured(hung_cube())
     bound = changed(AT_TRUTH, lambda_pa={"upper": 200.0 * (1 + 1e-8)})
-    uncertainty = covariance(*simulated([experiment], bound))
-    expected = covariance(*simulated([experiment]))
+    uncertainty = uncertainty_at(*simulated([experiment], bound))
+    expected = uncertainty_at(*simulated([experiment]))
     at_bound = uncertainty.estimates["lambda_pa"]
-    assert at_bound.at_bound
+    assert at_bound.is_at_bound
     assert at_bound.statistical_std_error is None
     assert at_bound.statistical95 is None
     np.testing.assert_allclose(uncertainty.covariance[1:, 1:], expected.covariance[1:, 1:])
     assert np.isnan(uncertainty.covariance[0]).all()
     assert np.isnan(uncertainty.correlation[0]).all()
-    assert not uncertainty.estimates["mu_pa"].at_bound
+    assert not uncertainty.estimates["mu_pa"].is_at_bound
     assert uncertainty.degrees_of_freedom == expected.degrees_of_freedom
-    assert uncertainty.derived["poisson"].at_bound
+    assert uncertainty.derived["poisson"].is_at_bound
     assert uncertainty.derived["poisson"].statistical_std_error is None
     assert uncertainty.derived["poisson"].reason
     assert any("lambda_pa ended at its upper bound 200" in note for note in uncertainty.notes)
@@ -303,12 +305,12 @@ def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs(
 def test_fixed_parameters_have_no_error_bar():
     experiment = measured(hung_cube())
     fixed = changed(AT_TRUTH, gamma_m_1_s={"fixed": True})
-    uncertainty = covariance(*simulated([experiment], fixed))
+    uncertainty = uncertainty_at(*simulated([experiment], fixed))
     assert uncertainty.names == NAMES[:3]
     assert uncertainty.estimates["gamma_m_1_s"].value == 1.0
     assert uncertainty.estimates["gamma_m_1_s"].statistical_std_error is None
     everything = changed(AT_TRUTH, **{name: {"fixed": True} for name in NAMES})
-    known = covariance(*simulated([experiment], everything))
+    known = uncertainty_at(*simulated([experiment], everything))
     assert known.derived["young_pa"].statistical_std_error is None
     assert known.derived["young_pa"].value == pytest.approx(720.0)
 
@@ -316,7 +318,7 @@ def test_fixed_parameters_have_no_error_bar():
 def test_damping_of_a_body_at_rest_is_reported_as_undetermined():
     moving = hung_cube(4)
     still = replace(moving, grasps=(Grasp(moving.grasps[0].nodes, PoseSequence.fixed()),))
-    uncertainty = covariance(*simulated([measured(still)]))
+    uncertainty = uncertainty_at(*simulated([measured(still)]))
     assert np.isinf(np.diag(uncertainty.covariance)).tolist() == [False, False, True, True]
     assert uncertainty.estimates["gamma_r_s"].statistical_std_error is None
     assert uncertainty.estimates["mu_pa"].statistical_std_error is not None
@@ -330,8 +332,8 @@ def test_damping_of_a_body_at_rest_is_reported_as_undetermined():
 
 def test_derived_error_bars_are_those_of_a_fit_in_the_other_convention():
     experiment = measured(hung_cube())
-    lame = covariance(*simulated([experiment]))
-    young = covariance(*simulated([experiment], in_engineering_moduli()))
+    lame = uncertainty_at(*simulated([experiment]))
+    young = uncertainty_at(*simulated([experiment], in_engineering_moduli()))
     for derived, direct in ((lame, young), (young, lame)):
         for name, estimate in derived.derived.items():
             assert estimate.value == pytest.approx(direct.estimates[name].value)
@@ -348,13 +350,13 @@ def test_derived_error_bars_are_those_of_a_fit_in_the_other_convention():
 
 def test_the_interval_of_poisson_stays_physical():
     collocation, z = simulated([with_sigma(measured(hung_cube()), 0.03)])
-    low, high = covariance(collocation, z).derived["poisson"].statistical95 or (0.0, 0.0)
+    low, high = uncertainty_at(collocation, z).derived["poisson"].statistical95 or (0.0, 0.0)
     assert 0 < low < 0.2 < high < 0.5
 
 
 def test_an_interval_too_wide_to_be_of_use_has_no_standard_error():
     collocation, z = simulated([measured(hung_cube())])  # sigma of 1 mm: too much for γ_m
-    uncertainty = covariance(collocation, z)
+    uncertainty = uncertainty_at(collocation, z)
     estimate = uncertainty.estimates["gamma_m_1_s"]
     assert estimate.statistical_std_error is None
     assert estimate.statistical95 is not None

@@ -17,8 +17,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.causes import likely_causes
-from collocation_sysid.statistics.hypothesis import ranked
+from collocation_sysid.statistics.causes import find_misspecifications
+from collocation_sysid.statistics.hypothesis import rank
 from collocation_sysid.statistics.trust import cause_concerns
 from collocation_sysid.statistics.wrench_causes import wrench_mistakes
 
@@ -54,13 +54,13 @@ MISTAKES = {
 @pytest.mark.parametrize(("cause", "change"), MISTAKES.items(), ids=MISTAKES)
 def test_a_mistake_is_the_likeliest_cause(cause: str, change: Callable[[Wrench], Wrench]):
     collocation = changed(change)
-    found = likely_causes(ReducedSpace()(collocation), budget=0)
+    found = find_misspecifications(ReducedSpace()(collocation), budget=0)
     assert found[0].code == cause
     assert cause_concerns(found)[0].grade == "doubtful"
 
 
 def test_a_wrench_that_fits_has_no_cause():
-    assert not likely_causes(ReducedSpace()(changed(lambda w: w)), budget=0)
+    assert not find_misspecifications(ReducedSpace()(changed(lambda w: w)), budget=0)
 
 
 # Before solving -----------------------------------------------------------------------------------
@@ -75,7 +75,7 @@ def sensed(fault: str | None, seed: int = 0) -> Problem:
 @pytest.mark.long
 @pytest.mark.parametrize("fault", WRENCH_FAULTS)
 def test_a_mistake_is_named_before_solving(fault: str):
-    found = ranked(wrench_mistakes(sensed(fault).collocation()))
+    found = rank(wrench_mistakes(sensed(fault).collocation()))
     assert found, fault
     assert found[0].cause in WRENCH_FAULTS[fault].causes
 

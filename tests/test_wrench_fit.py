@@ -24,9 +24,13 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.derivatives import derivative_errors, shortened
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.uncertainty import ErrorModel, covariance, uncertainty_of
+from collocation_sysid.runs.check.derivatives import derivative_errors, shortened_problem
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import (
+    ErrorModel,
+    uncertainty_at,
+    uncertainty_from_fit,
+)
 
 NOISE_M = 1e-3
 UNKNOWN = {item.name: cs.Unknown(item.guess, item.lower, item.upper) for item in GUESS.items}
@@ -67,7 +71,7 @@ def test_a_sensor_improves_what_is_known_of_the_stiffness():
     for name, experiment in (("felt", swung()), ("only seen", blind(swung()))):
         collocation = Collocation([experiment], GUESS)
         solution = ReducedSpace()(collocation)
-        found = covariance(collocation, solution.z)
+        found = uncertainty_at(collocation, solution.z)
         (young,) = (found.derived[n] for n in found.derived if n.startswith("young"))
         deviations[name] = young.statistical_std_error
     assert deviations["felt"] < 0.8 * deviations["only seen"]
@@ -76,12 +80,14 @@ def test_a_sensor_improves_what_is_known_of_the_stiffness():
 def test_error_bars_are_those_of_the_slopes():
     collocation = Collocation([swung()], GUESS)
     solution = ReducedSpace()(collocation)
-    markers, sensor = linearised_fit(collocation, solution.z).blocks
-    assert (sensor.stated, markers.stated) == ("sigma_n", "sigma_m")
-    assert sensor.measurements == int(collocation.segments[0].sensors[0].present.sum())
-    rows = [b.slope.reshape(-1, 4)[b.seen.ravel()] for b in (markers, sensor)]
+    markers, sensor = linearise_fit(collocation, solution.z).blocks
+    assert (sensor.sigma_key, markers.sigma_key) == ("sigma_n", "sigma_m")
+    assert sensor.measurement_count == int(
+        collocation.transcriptions[0].sensors[0].is_compared_by_component.sum()
+    )
+    rows = [b.jacobian.reshape(-1, 4)[b.is_measured.ravel()] for b in (markers, sensor)]
     of_both = np.linalg.inv(sum(r.T @ r for r in rows))
-    found = covariance(collocation, solution.z, ErrorModel(noise="given", errors="independent"))
+    found = uncertainty_at(collocation, solution.z, ErrorModel(noise="given", errors="independent"))
     np.testing.assert_allclose(found.covariance, of_both, rtol=1e-6)
     assert {"hung cube/force", "hung cube/torque"} <= set(found.level.names)
 
@@ -93,7 +99,7 @@ def test_the_noise_of_a_sensor_is_judged_by_itself():
     assert grasp.wrench is not None
     quiet = replace(grasp.wrench, sigma_n=grasp.wrench.sigma_n / 4)
     collocation = Collocation([replace(loud, grasps=[replace(grasp, wrench=quiet)])], GUESS)
-    found = covariance(collocation, ReducedSpace()(collocation).z)
+    found = uncertainty_at(collocation, ReducedSpace()(collocation).z)
     assert found.noise == "by-marker"
     assert found.level.factors["hung cube/force"] == pytest.approx(4, rel=0.15)
     assert found.level.factors["hung cube/torque"] == pytest.approx(1, rel=0.15)
@@ -105,7 +111,7 @@ def test_tare_clock_lag_and_tool_are_found():
         tare=20.0, sensor_time_s=0.004, sensor_lag_s=0.01, tool_kg=0.02, tool_m=0.02
     )
     collocation = Collocation([swung(0, wanted, 60)], GUESS)
-    (segment,) = collocation.segments
+    (segment,) = collocation.transcriptions
     names, scales = segment.nuisance.names, segment.nuisance.scales
     true = np.zeros(len(names))
     for part, value in (("tare", 0.005), ("shift of the sensor", 0.003), ("lag", 0.008)):
@@ -116,11 +122,11 @@ def test_tare_clock_lag_and_tool_are_found():
     made = simulate(swung(0, wanted, 60), TRUTH, "midpoint", substeps=1)
     grid, forced = made.reactions
     (sensor,) = segment.sensors
-    read = sensor.on(grid).of_forced(forced, phi)
+    read = sensor.on_grid(grid).predict_reactions(forced, phi)
     measured = with_wrenches(swung(0, wanted, 60), [read])
     collocation = Collocation([with_markers(measured, made.markers_m)], GUESS)
     solution = ReducedSpace()(collocation)
-    found = collocation.parameters_of(solution.z)[4:] * scales
+    found = collocation.parameters_from(solution.z)[4:] * scales
     assert solution.status.converged
     # Priors around zero pull a little.
     np.testing.assert_allclose(found, true, atol=0.1 * scales.max(), rtol=0.1)
@@ -165,7 +171,7 @@ def test_methods_that_need_second_derivatives_in_the_parameters_refuse_wrenches(
 
 def test_check_compares_the_slopes_of_wrenches():
     problem = Problem([swung()], UNKNOWN)
-    short = shortened(problem).collocation()
+    short = shortened_problem(problem).collocation()
     jacobian, hessian = derivative_errors(short, initial_variables(short)[0])
     assert jacobian < 1e-6
     assert 0 < hessian < 1e-6
@@ -174,8 +180,8 @@ def test_check_compares_the_slopes_of_wrenches():
 def test_check_tells_the_variables_that_a_wrench_brings():
     problem = Problem([swung(steps=12)], UNKNOWN)
     collocation = problem.collocation()
-    findings, program = check_problem(problem), collocation.made_explicit()
-    assert findings.wrenches == program.variables - collocation.variables > 0
+    findings, program = check_problem(problem), collocation.with_lifted_variables()
+    assert findings.wrenches == program.variable_count - collocation.variable_count > 0
     assert findings.hessian_nonzeros == len(program.hessian_structure[1])
 
 
@@ -194,17 +200,17 @@ def test_a_sensor_tells_stiffness_and_density_apart():
     felt = Problem([swung()], unknown)
     collocation = felt.collocation()
     solution = ReducedSpace()(collocation)
-    fit = linearised_fit(collocation, solution.z)
-    found = uncertainty_of(fit, felt.parameters, solution.q).estimates
+    fit = linearise_fit(collocation, solution.z)
+    found = uncertainty_from_fit(fit, felt.parameters, solution.q).estimates
     for name, true in {**TRUTH, "density_kg_m3": 30.0}.items():
         assert abs(found[name].value - true) < 4 * found[name].statistical_std_error, name
     # The error bars are those of the slopes that the search has.
     p, x = collocation.unpack(solution.z)
     point = Horizon(collocation, [len(x[0])]).evaluate(p, x)
-    rows = np.concatenate([block.slope.reshape(-1, 5) for block in fit.blocks])
+    rows = np.concatenate([block.jacobian.reshape(-1, 5) for block in fit.blocks])
     np.testing.assert_allclose(rows.T @ rows, point.fit.information, rtol=1e-6)
     seen = Problem([blind(swung())], unknown)
-    told = covariance(seen.collocation(), seen.collocation().pack(p, x)).estimates
+    told = uncertainty_at(seen.collocation(), seen.collocation().pack(p, x)).estimates
     assert told["density_kg_m3"].statistical_std_error is None
 
 

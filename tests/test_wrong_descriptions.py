@@ -22,10 +22,14 @@ from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp
-from collocation_sysid.runs.check import description_causes
-from collocation_sysid.runs.check.body import hold_concerns, holds_of
-from collocation_sysid.statistics.causes import likely_causes
-from collocation_sysid.statistics.plausible import odd_material, oddities, steps
+from collocation_sysid.runs.check import misspecification_hypotheses
+from collocation_sysid.runs.check.body import check_grasps, grasp_concerns
+from collocation_sysid.statistics.causes import find_misspecifications
+from collocation_sysid.statistics.plausible import (
+    material_hypothesis,
+    size_and_density_hypotheses,
+    step_hypotheses,
+)
 from collocation_sysid.statistics.trust import cause_concerns
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
@@ -70,13 +74,13 @@ def _twin(name: str, kind: str, seed: int) -> Problem:
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize(("kind", "seed"), [("soft", 1), ("stiff", 0)])
 def test_a_right_description_is_not_doubted(name: str, kind: str, seed: int):
-    assert description_causes(_twin(name, kind, seed)) == ()
+    assert misspecification_hypotheses(_twin(name, kind, seed)) == ()
 
 
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("fault", BEFORE)
 def test_a_wrong_description_is_named_before_solving(name: str, fault: str, rng):
-    causes = description_causes(FAULTS[fault](soft(name), rng))
+    causes = misspecification_hypotheses(FAULTS[fault](soft(name), rng))
     assert causes, fault
     assert causes[0].cause in FAULTS[fault].causes
     assert causes[0].strength > 2
@@ -85,7 +89,7 @@ def test_a_wrong_description_is_named_before_solving(name: str, fault: str, rng)
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("fault", TRACK_FAULTS)
 def test_tracks_that_no_grasped_body_has_are_named_before_solving(name: str, fault: str, rng):
-    causes = description_causes(TRACK_FAULTS[fault](soft(name), rng))
+    causes = misspecification_hypotheses(TRACK_FAULTS[fault](soft(name), rng))
     assert causes, fault
     assert causes[0].cause in TRACK_FAULTS[fault].causes
 
@@ -93,14 +97,15 @@ def test_tracks_that_no_grasped_body_has_are_named_before_solving(name: str, fau
 def test_the_order_and_signs_of_the_tracks_axes_are_stated(rng):
     exchanged = TRACK_FAULTS["markers: y and z exchanged"](soft("block"), rng)
     assert (
-        "fit with (x, z, y) in the place of (x, y, z)" in description_causes(exchanged)[0].sentence
+        "fit with (x, z, y) in the place of (x, y, z)"
+        in misspecification_hypotheses(exchanged)[0].message
     )
 
 
 def test_a_body_held_still_after_it_is_let_go_undeformed_may_swing():
     tracks = simulate(released_cube(20), TRUTH, "newmark").markers_m
     given = Problem([with_markers(released_cube(20), tracks)], GUESS)
-    assert description_causes(given) == ()
+    assert misspecification_hypotheses(given) == ()
 
 
 def test_an_unstable_simulation_is_named_after_solving(rng):
@@ -119,12 +124,12 @@ def shipped(name: str) -> Problem:
 
 @pytest.mark.parametrize("name", ["laid_block", "poked_block"])
 def test_obstacles_that_are_right_are_not_doubted(name: str):
-    assert description_causes(shipped(name)) == ()
+    assert misspecification_hypotheses(shipped(name)) == ()
 
 
 def test_an_obstacle_that_contains_the_body_has_its_normal_reversed(rng):
     reversed_plate = OBSTACLE_FAULTS["obstacle: normal reversed"](shipped("laid_block"), rng)
-    assert description_causes(reversed_plate)[0].cause == "obstacle-normal"
+    assert misspecification_hypotheses(reversed_plate)[0].cause == "obstacle-normal"
 
 
 @pytest.mark.parametrize("zero", ["z", ""])
@@ -132,9 +137,9 @@ def test_the_load_of_an_indentation_that_pulls_is_named(zero: str, rng):
     """Whether the tip moves by a displacement or by poses."""
     given = shipped("poked_block")
     right = replace(given, experiments=[with_zero(given.experiments[0], zero)])
-    assert description_causes(right) == ()
+    assert misspecification_hypotheses(right) == ()
     wrong = OBSTACLE_FAULTS["obstacle: load reversed"](right, rng)
-    (cause,) = description_causes(wrong)
+    (cause,) = misspecification_hypotheses(wrong)
     assert cause.cause == "sign"
     assert cause_concerns([cause])[0].grade == "doubtful"
 
@@ -146,15 +151,15 @@ def with_zero(experiment: Experiment, zero: str) -> Experiment:
 @pytest.mark.parametrize("name", BODIES)
 def test_a_late_clock_comes_with_its_lag_and_sign(name: str, rng):
     for fault, said in (("clock 100 ms late", "late"), ("clock 30 ms early", "early")):
-        (first, *_) = description_causes(FAULTS[fault](_twin(name, "stiff", 1), rng))
+        (first, *_) = misspecification_hypotheses(FAULTS[fault](_twin(name, "stiff", 1), rng))
         assert first.cause == "clock"
-        assert f"{said} by about {fault.split()[1]} ms" in first.sentence
+        assert f"{said} by about {fault.split()[1]} ms" in first.message
 
 
 def test_the_sentence_says_by_how_much_and_which_key(rng):
-    (first, *_) = description_causes(FAULTS["poses in mm"](soft("block"), rng))
-    assert "0.001 times as large" in first.sentence
-    assert 'grasp.length_unit = "mm"' in first.sentence
+    (first, *_) = misspecification_hypotheses(FAULTS["poses in mm"](soft("block"), rng))
+    assert "0.001 times as large" in first.message
+    assert 'grasp.length_unit = "mm"' in first.message
 
 
 # Names exchanged for a while ----------------------------------------------------------------------
@@ -175,29 +180,29 @@ def test_names_exchanged_midway_are_told_with_their_time(name: str, gap: int):
     given = soft(name)
     (experiment,) = given.experiments
     half, names = len(experiment.t_s) // 2, experiment.markers.names
-    (first, *_) = description_causes(exchanged(given, slice(half, None), gap))
+    (first, *_) = misspecification_hypotheses(exchanged(given, slice(half, None), gap))
     assert first.cause == "markers-exchanged"
-    assert f"from t = {experiment.t_s[half]:.4g} s on" in first.sentence
-    assert f": {names[0]} is {names[1]}, {names[1]} is {names[0]};" in first.sentence
+    assert f"from t = {experiment.t_s[half]:.4g} s on" in first.message
+    assert f": {names[0]} is {names[1]}, {names[1]} is {names[0]};" in first.message
 
 
 def test_names_exchanged_and_back_are_told_with_both_times():
     given = soft("bar")
     t_s = given.experiments[0].t_s
-    (first, *_) = description_causes(exchanged(given, slice(20, 30)))
-    assert f"from t = {t_s[20]:.4g} s to {t_s[29]:.4g} s:" in first.sentence
+    (first, *_) = misspecification_hypotheses(exchanged(given, slice(20, 30)))
+    assert f"from t = {t_s[20]:.4g} s to {t_s[29]:.4g} s:" in first.message
 
 
 def test_a_short_exchange_is_left_to_hubers_loss():
     brief = exchanged(soft("bar"), slice(20, 24))
-    assert description_causes(brief)[0].cause == "markers-exchanged"
-    assert description_causes(replace(brief, huber=3.0)) == ()
+    assert misspecification_hypotheses(brief)[0].cause == "markers-exchanged"
+    assert misspecification_hypotheses(replace(brief, huber=3.0)) == ()
 
 
 def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
     monkeypatch.setattr("collocation_sysid.statistics.causes.ReducedSpace", None)
-    assert [cause.cause for cause in likely_causes(solution)] == ["markers-exchanged"]
+    assert [cause.cause for cause in find_misspecifications(solution)] == ["markers-exchanged"]
 
 
 def test_the_search_for_causes_is_bounded_by_what_the_fit_took(monkeypatch, rng):
@@ -211,7 +216,7 @@ def test_the_search_for_causes_is_bounded_by_what_the_fit_took(monkeypatch, rng)
 
     monkeypatch.setattr("collocation_sysid.statistics.causes.ReducedSpace", Counted)
     monkeypatch.setattr("collocation_sysid.statistics.causes.doubts", lambda *_: ())
-    assert likely_causes(solution)[0].cause == "marker-slip"
+    assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1
     assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done
     assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
@@ -223,7 +228,7 @@ def test_markers_that_are_hardly_ever_seen_are_nothing_sudden(count: int):
     tracks = np.array(experiment.markers.positions_m)
     tracks[: len(tracks) - count, 0] = np.nan
     with warnings.catch_warnings(action="error"):
-        assert list(steps(with_markers(experiment, tracks))) == []
+        assert list(step_hypotheses(with_markers(experiment, tracks))) == []
 
 
 # Sizes and densities ------------------------------------------------------------------------------
@@ -242,7 +247,7 @@ def test_markers_that_are_hardly_ever_seen_are_nothing_sudden(count: int):
 )
 def test_odd_sizes_and_densities_are_told(edge_m, density_kg_m3, expected):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
-    assert [oddity.cause for oddity in oddities(body)] == expected
+    assert [oddity.cause for oddity in size_and_density_hypotheses(body)] == expected
 
 
 def test_an_odd_size_leads_to_what_states_it():
@@ -252,8 +257,8 @@ def test_an_odd_size_leads_to_what_states_it():
         (generated, "check its lengths, which"),
         (read, "check object.length_unit, "),
     ):
-        (oddity,) = oddities(Body(mesh, density_kg_m3=1100.0))
-        assert words in oddity.sentence
+        (oddity,) = size_and_density_hypotheses(Body(mesh, density_kg_m3=1100.0))
+        assert words in oddity.message
 
 
 def test_a_metal_as_soft_as_rubber_is_odd():
@@ -261,8 +266,8 @@ def test_a_metal_as_soft_as_rubber_is_odd():
 
     def found(density_kg_m3: float, young_pa: float) -> str | None:
         body = Body(box_mesh((0.1,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
-        odd = odd_material(body, body.theta(theta | {"young_pa": young_pa}))
-        return odd and odd.sentence
+        odd = material_hypothesis(body, body.theta_from_values(theta | {"young_pa": young_pa}))
+        return odd and odd.message
 
     assert found(1100.0, 5e5) is None
     assert found(7850.0, 2e11) is None
@@ -273,7 +278,7 @@ def test_a_metal_as_soft_as_rubber_is_odd():
 def test_impossible_ones_are_refused(edge_m, density_kg_m3):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
     with pytest.raises(InputError, match="expected"):
-        oddities(body)
+        size_and_density_hypotheses(body)
 
 
 @pytest.mark.parametrize("fault", ["density in g/cm3", "mass in g", "mesh in mm"])
@@ -282,7 +287,7 @@ def test_they_come_first(fault, rng):
     given = soft("block")
     silicone = replace(given, experiments=[replace(given.experiments[0], body=heavy)])
     wrong = FAULTS[fault](silicone, rng)
-    assert description_causes(wrong)[0].cause in FAULTS[fault].causes
+    assert misspecification_hypotheses(wrong)[0].cause in FAULTS[fault].causes
     assert any("expected 10 to" in note or "expected 0.0001" in note for note in wrong.notes)
 
 
@@ -301,10 +306,10 @@ def replace_points(body: Body, points_m: np.ndarray) -> Body:
 
 
 def test_a_layer_is_held_for_sure():
-    (hold,) = holds_of(soft("block").experiments[0], 0.03)
+    (hold,) = check_grasps(soft("block").experiments[0], 0.03)
     assert (hold.nodes, hold.nearly_held, hold.nearly_free) == (9, 0, 0)
     assert hold.share == pytest.approx(9 / 36)
-    assert hold_concerns(hold) == []
+    assert grasp_concerns(hold) == []
 
 
 def test_nodes_at_the_edge_of_the_box_are_warned_of():
@@ -312,9 +317,9 @@ def test_nodes_at_the_edge_of_the_box_are_warned_of():
     top = np.flatnonzero(points_m[:, 2] > 0.089)
     points_m[top[:3], 2] -= 6e-4
     missed = held_of(points_m, 0.0895)
-    (hold,) = holds_of(missed, 0.03)
+    (hold,) = check_grasps(missed, 0.03)
     assert (hold.nodes, hold.nearly_held) == (6, 3)
-    assert "cuts through elements" in hold_concerns(hold)[0].sentence
+    assert "cuts through elements" in grasp_concerns(hold)[0].message
 
 
 # After solving ------------------------------------------------------------------------------------
@@ -322,7 +327,7 @@ def test_nodes_at_the_edge_of_the_box_are_warned_of():
 
 @pytest.mark.parametrize("name", BODIES)
 def test_a_good_fit_has_no_cause(name: str):
-    assert likely_causes(solve(soft(name))) == ()
+    assert find_misspecifications(solve(soft(name))) == ()
 
 
 def test_a_clock_that_is_estimated_is_told(rng):
@@ -337,7 +342,7 @@ def test_a_clock_that_is_estimated_is_told(rng):
     [pytest.param(f, marks=pytest.mark.slow) if f == "gravity" else f for f in AFTER],
 )
 def test_a_wrong_description_is_named_after_solving(fault: str, rng):
-    causes = likely_causes(solve(FAULTS[fault](soft("bar"), rng)))
+    causes = find_misspecifications(solve(FAULTS[fault](soft("bar"), rng)))
     assert causes, fault
     assert causes[0].cause in FAULTS[fault].causes
     assert causes[0].strength > 1.5

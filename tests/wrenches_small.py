@@ -10,7 +10,7 @@ from problems_small import TRUTH, as_theta, hung_cube, measured_with
 
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.marching import march
+from collocation_sysid.program.marching import simulate_scheme
 from collocation_sysid.recording import Experiment, Nuisance, Wrench
 
 SIGMA_N, SIGMA_NM = 1e-3, 1e-4
@@ -72,11 +72,11 @@ def sensed(
 ) -> Experiment:
     """The experiment with the tracks, and the wrenches, that parameters give it in a scheme."""
     made = measured_with(experiment, truth, scheme)
-    collocation = fitted(made, Parameters.of(dict(truth)), scheme)
-    (segment,) = collocation.segments
-    x = march(experiment, segment.dynamics.with_theta(as_theta(truth)))
-    (part,) = collocation.parts_at(np.zeros(collocation.nphi), [x])
-    return with_wrenches(made, part.sensing.wrenches(x))
+    collocation = fitted(made, Parameters.from_mapping(dict(truth)), scheme)
+    (segment,) = collocation.transcriptions
+    x = simulate_scheme(experiment, segment.dynamics.with_theta(as_theta(truth)))
+    (part,) = collocation.iterates_at(np.zeros(collocation.nphi), [x])
+    return with_wrenches(made, part.observation.predict_wrenches(x))
 
 
 def wristed_cube(steps: int = 12, nuisance: Nuisance | None = None, **changes) -> Experiment:

@@ -1,4 +1,4 @@
-"""The command `design`, which finds the motion that makes the error bars smallest."""
+"""The command `design_motion`, which finds the motion that makes the error bars smallest."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import typer
 
 from ..errors import InputError
 from ..files import require_possible, run_name
-from ..plan.design import Criterion, DesignOptions, Limits
-from ..plan.design import design as designed
+from ..plan.design import DesignCriterion, DesignOptions, Limits
+from ..plan.design import design_motion as designed
 from ..plan.design.information import Kind, Over
 from ..result.writers import require_replaceable
 from .common import EXIT_INTERRUPTED, errors
@@ -22,7 +22,7 @@ commands = typer.Typer()
 
 @dataclass(frozen=True, kw_only=True)
 class Design(OfProblem, Told):
-    """Options of `design`.
+    """Options of `design_motion`.
 
     Attributes
     ----------
@@ -68,13 +68,13 @@ def design(options: Design) -> None:
     of the parameters. The folder gets poses.csv, error bars before and after, pictures, a film and
     a problem that simulates it. Ctrl-C keeps the best motion so far.
     """
-    from ..plan.design.folder import DESIGN_FILE, as_dict, write_design
+    from ..plan.design.folder import DESIGN_FILE, design_json, write_design
     from ..plan.design.page import design_summary
     from ..plan.progress import DesignProgress
 
     folder = options.out or Path("runs") / f"{run_name(options.problem)}-design"
     names = () if options.for_ is None else tuple(n.strip() for n in options.for_.split(","))
-    criterion = Criterion(cast("Kind", options.criterion), names, cast("Over", options.over))
+    criterion = DesignCriterion(cast("Kind", options.criterion), names, cast("Over", options.over))
     limits = Limits.read(options.limits)
     problem = options.read(simulation=not options.add)
     require_possible(folder)
@@ -89,12 +89,12 @@ def design(options: Design) -> None:
                 options.search,
                 experiment=options.experiment,
                 add=options.add,
-                watch=progress.tried,
-                say=progress.say,
+                watch=progress.show_best,
+                say=progress.show_activity,
             )
         except InputError as error:
             key = error.where in Limits.model_fields and error.source is None
             raise (error.located(options.limits) if key else error) from error
-        write_design(answer, folder, options.film, progress.say)
-    options.tell(as_dict(answer), design_summary(answer, folder))
-    raise typer.Exit(EXIT_INTERRUPTED if answer.best.interrupted else 0)
+        write_design(answer, folder, options.film, progress.show_activity)
+    options.tell(design_json(answer), design_summary(answer, folder))
+    raise typer.Exit(EXIT_INTERRUPTED if answer.best.is_interrupted else 0)

@@ -20,7 +20,7 @@ from ..pipeline import Run, run
 from ..result.record import draw_run
 from ..result.synthesis import Recipe, write_data
 from ..result.writers import require_replaceable
-from ..runs.check import check_problem, glance
+from ..runs.check import check_problem, quick_check
 from ..runs.result import Result
 from ..starting import INTERRUPTS
 from ..tree import as_json
@@ -119,7 +119,7 @@ def solve(options: Solve) -> None:
     status = finished.solution.status
     if options.pictures and result.elapsed_s.pictures is None:
         raise typer.Exit(EXIT_INTERRUPTED)
-    if status is Status.INTERRUPTED or finished.missing:
+    if status is Status.INTERRUPTED or finished.omitted_checks:
         raise typer.Exit(EXIT_INTERRUPTED)
     if options.strict and finished.trust.verdict == "doubtful":
         raise typer.Exit(EXIT_DOUBTFUL)
@@ -237,7 +237,7 @@ def check(options: Check) -> None:
 
     problem = options.read()
     if not options.as_json:
-        show(glance_table(glance(problem)))
+        show(glance_table(quick_check(problem)))
         _overlay(problem, options.out or Path("runs") / f"{run_name(options.problem)}_check")
     with Progress(errors, quiet=options.quiet) as progress:
         findings = check_problem(problem, progress.say, options.full)

@@ -14,8 +14,8 @@ from rich.text import Text
 from ..checked import NotNegative, Options, Positive
 from ..errors import InputError
 from ..files import require_possible
-from ..live import Estimator, LiveOptions
-from ..live.sources import problem_in
+from ..live import LiveEstimator, LiveOptions
+from ..live.sources import read_problem
 from .common import EXIT_BAD_INPUT, errors, show
 from .options import AllowCode, Overrides, ProblemPath, Told, command
 
@@ -39,11 +39,11 @@ class Estimating(Options):
     set_: Overrides = None
     allow_code: AllowCode = False
 
-    def estimator(self, recording: Path) -> Estimator:
+    def estimator(self, recording: Path) -> LiveEstimator:
         """Return the estimator for a problem file or a run folder, with these options."""
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
-        problem = problem_in(recording, self.set_ or (), self.allow_code)
-        return Estimator(problem, LiveOptions(budget_s, self.window_s))
+        problem = read_problem(recording, self.set_ or (), self.allow_code)
+        return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,12 @@ def live(options: Live) -> None:
     and left out, and the exit code is then 2. An empty datagram ends it.
     """
     from ..live.frames import FrameReader
-    from ..live.sources import as_json, as_text, collected_before, datagrams
+    from ..live.sources import (
+        decode_lines,
+        receive_datagrams,
+        update_as_json,
+        without_garbage_of_startup,
+    )
 
     if options.udp is None and sys.stdin is None:  # closed by whoever started the process
         raise InputError(
@@ -86,20 +91,20 @@ def live(options: Live) -> None:
         errors.print(f"listening on UDP port {port} of this machine")
 
     if options.udp is None:
-        lines = as_text(sys.stdin.buffer)
+        lines = decode_lines(sys.stdin.buffer)
         source = "standard input"
     else:
-        lines = datagrams(options.udp, opened)
+        lines = receive_datagrams(options.udp, opened)
         source = f"UDP port {options.udp}"
     reader = FrameReader(
-        estimator.model.moved_grasps + 1,
+        estimator.model.moving_grasps + 1,
         estimator.names,
         source,
         estimator.model.experiment.readings,
         estimator.model.wrenches,
     )
     bad = 0
-    with collected_before():
+    with without_garbage_of_startup():
         for line in lines:
             try:
                 frame = reader.read(line)
@@ -108,9 +113,9 @@ def live(options: Live) -> None:
                 errors.print(Text(f"error: {error}"), soft_wrap=True)
                 continue
             if frame is not None:
-                typer.echo(as_json(estimator.take(frame)))
-    if (settled := estimator.settle()) is not None:
-        typer.echo(as_json(settled))
+                typer.echo(update_as_json(estimator.process_frame(frame)))
+    if (settled := estimator.finish()) is not None:
+        typer.echo(update_as_json(settled))
     if bad:
         raise typer.Exit(EXIT_BAD_INPUT)
 
@@ -146,32 +151,32 @@ def replay(options: Replay) -> None:
 
     from ..display import on_terminal
     from ..live import view
-    from ..live.sources import as_json as json_line
-    from ..live.sources import collected_before, paced, recorded
+    from ..live.sources import frames_of_recording, paced_frames, without_garbage_of_startup
+    from ..live.sources import update_as_json as json_line
 
     rate = options.rate
     film = options.film
     if film is not None:
         require_possible(film.parent)
-        view.require_film(film)
+        view.require_gif(film)
     estimator = options.estimator(options.recording)
     experiment = estimator.model.experiment
-    frames = recorded(experiment, estimator.model)
+    frames = frames_of_recording(experiment, estimator.model)
     pace = 1.0 / experiment.timestep_s if rate is None else rate
     updates = []
     watched = errors.is_terminal and not options.quiet and not options.as_json
     shown = Live(console=errors, refresh_per_second=10)
-    with collected_before(), shown if watched else nullcontext():
-        for frame in paced(frames, pace) if pace else frames:
-            updates.append(estimator.take(frame))
+    with without_garbage_of_startup(), shown if watched else nullcontext():
+        for frame in paced_frames(frames, pace) if pace else frames:
+            updates.append(estimator.process_frame(frame))
             if options.as_json:
                 typer.echo(json_line(updates[-1]))
             elif watched:
-                shown.update(on_terminal(view.picture(updates)))
-    settled = estimator.settle() or updates[-1]
+                shown.update(on_terminal(view.display_of(updates)))
+    settled = estimator.finish() or updates[-1]
     if options.as_json:
         typer.echo(json_line(settled))
     else:
-        show(view.summary(updates, settled))
+        show(view.final_display(updates, settled))
     if film is not None:
-        typer.echo(view.film(updates, film))
+        typer.echo(view.write_film(updates, film))

@@ -22,8 +22,8 @@ from ..plan import (
     plan_sweep,
     run_all,
 )
-from ..plan.arguments import parse_methods, parse_over, read_truth
-from ..plan.table import Yardstick
+from ..plan.arguments import parse_methods, parse_swept_keys, read_truth
+from ..plan.table import SuccessCriterion
 from ..plan.variants import models, parse_branches, parse_dampings, parse_materials
 from ..problem import Problem
 from .common import errors, interrupted, show
@@ -111,7 +111,7 @@ def compare(options: Compare) -> None:
         )
     free = [item.name for item in problem.parameters.free]
     truth = read_truth(options.truth or (), problem.parameters.names, free)
-    yardstick = Yardstick(truth, options.within)
+    yardstick = SuccessCriterion(truth, options.within)
     planned = plan_comparison(
         problem,
         methods,
@@ -182,7 +182,7 @@ class SweepOptions(Many):
 def sweep(options: SweepOptions) -> None:
     """Solve for every combination of values of some keys."""
     method = parse_methods(options.method, "--method")[0] if options.method else None
-    over = parse_over(options.over)
+    over = parse_swept_keys(options.over)
     overrides = options.set_ or ()
     planned = plan_sweep(options.problem, over, overrides, method, options.allow_code)
     # A missing file would fail every run.
@@ -191,7 +191,10 @@ def sweep(options: SweepOptions) -> None:
 
 
 def _study(
-    kind: str, options: Many, planned: Sequence[PlannedRun], yardstick: Yardstick | None = None
+    kind: str,
+    options: Many,
+    planned: Sequence[PlannedRun],
+    yardstick: SuccessCriterion | None = None,
 ) -> None:
     """Execute the runs that are not finished, write tables and plots, and print the tables.
 
@@ -201,7 +204,7 @@ def _study(
         Name of the study, for its folder and title.
     options : Many
     planned : sequence of PlannedRun
-    yardstick : Yardstick, optional
+    yardstick : SuccessCriterion, optional
         True parameters and tolerance for the success of a run.
 
     Raises
@@ -222,7 +225,7 @@ def _study(
     folder = options.out or Path("runs") / f"{name}-{kind}"
     store = RunStore(folder / "runs")
     limits = options.limits
-    finished = [run.key for run in planned if store.finished(run.key, limits.time_limit_s)]
+    finished = [run.key for run in planned if store.load_finished(run.key, limits.time_limit_s)]
     if options.dry_run:
         if options.as_json:
             listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
@@ -235,7 +238,7 @@ def _study(
     is_complete = True
     try:
         with StudyProgress(errors, remaining, len(planned), options.quiet) as progress:
-            run_all(remaining, store, limits, progress.done)
+            run_all(remaining, store, limits, progress.count_run)
     except KeyboardInterrupt:
         is_complete = False
     report = load_report(f"{kind.capitalize()}: {name}", kind, planned, store, yardstick)

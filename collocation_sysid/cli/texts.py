@@ -50,13 +50,17 @@ class Methods:
 @command(commands, "methods", "methods interior-point")
 def methods(options: Methods) -> None:
     """List the methods, or the options of one: defaults, values, and what they do."""
-    from ..methods import METHODS, options_schema, require_method, summary
+    from ..methods import METHODS, method_options_schema, method_summary, require_method
 
     name = options.name
     if name is not None:
         require_method(name, "NAME")
     if options.as_json:
-        listed = options_schema(name) if name else {each: summary(each) for each in METHODS}
+        listed = (
+            method_options_schema(name)
+            if name
+            else {each: method_summary(each) for each in METHODS}
+        )
         typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
     else:
         parts = _options_table(name) if name else _methods_table()
@@ -73,7 +77,7 @@ def schema() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Explain:
-    """Options of `explain`.
+    """Options of `explain_validation_error`.
 
     Attributes
     ----------
@@ -126,10 +130,10 @@ class Topics:
 @command(commands, "topics run.mcap", "topics bags/2026-05-04 --json")
 def topics(options: Topics) -> None:
     """List what is in a robot's log, what it can serve as, and what to write for it."""
-    from ..recording.formats.topics import listed_topics
+    from ..recording.formats.topics import list_topics
 
     with located(options.log):
-        listed = listed_topics(options.log)
+        listed = list_topics(options.log)
     if options.as_json:
         typer.echo(as_json(listed))
         return
@@ -139,12 +143,12 @@ def topics(options: Topics) -> None:
             each.type,
             f"{each.messages}",
             f"{each.rate_hz:.3g}" if each.rate_hz else "",
-            each.serves,
+            each.uses,
         )
         for each in listed
     )
     heads = ("topic", "type", "messages", "Hz", "serves as")
-    addresses = [f"  {address}" for each in listed for address in each.write]
+    addresses = [f"  {address}" for each in listed for address in each.problem_texts]
     what = ["", "In place of a file write:", *addresses] if addresses else []
     show([Table("", heads, rows, names=2, texts=1), *what])
 
@@ -170,11 +174,11 @@ class New:
 )
 def new(options: New) -> None:
     """Write a commented problem file to start from."""
-    from ..problem.beginning import begin
+    from ..problem.beginning import create_problem
 
     folder = Path(options.name)
     kind = options.kind
-    file, *data = begin(folder, kind and kind.value)
+    file, *data = create_problem(folder, kind and kind.value)
     typer.echo(file)
     for each in data:
         typer.echo(each)
@@ -187,21 +191,29 @@ def new(options: New) -> None:
 
 def _methods_table() -> Table:
     """Return the table of the methods, with a line on each."""
-    from ..methods import METHODS, summary
+    from ..methods import METHODS, method_summary
 
-    return Table("", ("method", ""), tuple((name, summary(name)) for name in METHODS), texts=1)
+    return Table(
+        "", ("method", ""), tuple((name, method_summary(name)) for name in METHODS), texts=1
+    )
 
 
 def _options_table(method: str) -> list[Shown]:
     """Return the description of a method's options: defaults, allowed values and meaning."""
-    from ..methods import options_schema, summary
-    from ..problem.solver_schema import heading
+    from ..methods import method_options_schema, method_summary
+    from ..problem.solver_schema import table_heading
 
     rows = []
-    for name, option in options_schema(method)["properties"].items():
+    for name, option in method_options_schema(method)["properties"].items():
         rows.append((name, _default(option), f"{_values(option)}\n{option['description']}"))
     table = Table("", ("option", "default", ""), tuple(rows), names=2, texts=1)
-    return [summary(method), "", f"In the problem file, under {heading(method)}:", "", table]
+    return [
+        method_summary(method),
+        "",
+        f"In the problem file, under {table_heading(method)}:",
+        "",
+        table,
+    ]
 
 
 def _default(option: Mapping[str, Any]) -> str:

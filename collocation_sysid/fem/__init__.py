@@ -14,11 +14,11 @@ Meshes:
 - `mesh`: tetrahedral mesh and nodes of the elements; `mesh_checks` validates it, `mesh_files` reads
   and writes files.
 - `structured`: boxes and cylinders; `surface`: mesh of a closed surface; `refinement`: finer
-meshes. - `selection`: nodes, cells and faces by position, index or name.
+meshes. - `selection_from_section`: nodes, cells and faces by position, index or name.
 
 Elements and laws:
 
-- `elements`: shape functions, quadrature, mass lumping; `mean_dilatation`: averaged dilatation.
+- `elements`: shape functions, quadrature, mass lumping; `averages_dilatation`: averaged dilatation.
 - `materials`: energies, damping laws and Prony branches; `moduli`: pairs of elastic constants.
 - `memory`, `stress`: viscoelastic memory and the stresses at quadrature points.
 - `node_force`, `force_points`, `touching`: forces on nodes and faces, and contact points.

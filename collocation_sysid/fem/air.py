@@ -21,8 +21,8 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import Array
-from .mesh import Nodes
-from .node_force import AtNode, NodeForce, PlacedForce, surface_of
+from .mesh import ElementNodes
+from .node_force import ForceContext, LocatedForce, NodeForce, surface_shares
 
 # Air at 20 °C and sea level, half humid [kg/m³].
 AIR_KG_M3 = 1.2
@@ -44,22 +44,22 @@ def unit_drag() -> NodeForce:
     Drag is linear in the density.
     """
 
-    def air_drag(x: ca.SX, v: ca.SX, at: AtNode) -> ca.SX:
+    def air_drag(x: ca.SX, v: ca.SX, at: ForceContext) -> ca.SX:
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
         return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
 
-    return replace(NodeForce.of(air_drag, name="air drag"), compiled=True)
+    return replace(NodeForce.from_law(air_drag, name="air drag"), compiled=True)
 
 
-def placed_unit_drag(nodes: Nodes, volume_m3: Array) -> PlacedForce:
+def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
     """Return `unit_drag` on the nodes of a body that have a share of its surface.
 
     Parameters
     ----------
-    nodes : Nodes
+    nodes : ElementNodes
     volume_m3 : (n,)
         Lumped volume of every node of the body, including nodes of obstacle frames.
     """
-    on_surface = np.flatnonzero(surface_of(nodes)[0] > 0)
+    on_surface = np.flatnonzero(surface_shares(nodes)[0] > 0)
     no_constants = np.zeros(0, dtype=np.int64)
-    return PlacedForce.on(unit_drag(), nodes, on_surface, volume_m3, no_constants)
+    return LocatedForce.on_mesh(unit_drag(), nodes, on_surface, volume_m3, no_constants)

@@ -33,15 +33,15 @@ from .air import placed_unit_drag
 from .constants import DENSITY, Constant
 from .discretisation import Discretisation
 from .field import Field, FieldModes
-from .materials import Damping, Energy, Material, Prony
-from .memory import Past
+from .materials import DampingLaw, Energy, Material, Prony
+from .memory import MemoryInput
 from .mesh import TetMesh
-from .node_force import NodeForce, PlacedForce
-from .pattern import Joined, SymmetricPattern
-from .regions import BodyPart, Model, Region, Theta, parts_of
+from .node_force import LocatedForce, NodeForce
+from .pattern import JointPattern, SymmetricPattern
+from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
 from .selection import Selection
-from .stress import Stresses
+from .stress import StressEvaluator
 from .two_phase import PhaseSamples, TwoPhaseModes
 
 
@@ -76,7 +76,7 @@ class Linearisation:
 
 
 @dataclass(frozen=True, eq=False)
-class Curvature:
+class SecondDerivatives:
     """First derivatives by θ and second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states.
 
     Attributes
@@ -113,7 +113,7 @@ class Body(Discretisation):
     mesh : TetMesh
     material : str, Material or callable, default "neo-hookean"
         Name in `materials.MATERIALS`, or energy function ``(F, **constants) -> ψ`` in CasADi SX,
-        see `Material.of`.
+        see `Material.from_energy`.
     density_kg_m3 : float, optional
         Density of all regions without a density. Give either this or `mass_kg`.
     element : str, default "tet4"
@@ -122,7 +122,7 @@ class Body(Discretisation):
         dilatation over each element: accurate up to a Poisson's ratio of 0.4999.
     mass_kg : float, optional
         Mass of the whole body, regions included.
-    damping : str or Damping, default "kelvin-voigt"
+    damping : str or DampingLaw, default "kelvin-voigt"
         Name in `materials.DAMPINGS`; "rayleigh" is the law of the paper.
     regions : sequence of Region
         Parts with different properties.
@@ -178,7 +178,7 @@ class Body(Discretisation):
         element: str = "tet4",
         *,
         mass_kg: float | None = None,
-        damping: str | Damping = "kelvin-voigt",
+        damping: str | DampingLaw = "kelvin-voigt",
         regions: Sequence[Region] = (),
         prony: Sequence[str | Prony] = (),
         forces: Sequence[NodeForce] = (),
@@ -187,7 +187,9 @@ class Body(Discretisation):
         evaluator: str = "auto",
         threads: int | None = None,
     ) -> None:
-        parts = parts_of(mesh, material, damping, density_kg_m3, mass_kg, regions, prony, field)
+        parts = parts_from_regions(
+            mesh, material, damping, density_kg_m3, mass_kg, regions, prony, field
+        )
         generated: Literal["stress_free"] | None = "stress_free" if mesh.is_generated else None
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
             generated if rest_shape is None else rest_shape
@@ -197,13 +199,15 @@ class Body(Discretisation):
                 f"found {rest_shape!r}; expected 'stress_free' or UnderGravity(nodes, gravity)",
                 where="rest_shape",
             )
-        if self.scan is not None:
+        if self.scan_conditions is not None:
             require_supported(parts)
         super().__init__(parts, tuple(forces), mesh, element, evaluator, threads)
         # Lumped volume of every dof (3n,) for each part.
-        self._lumped_m3 = [np.repeat(self._lumped(part), 3) for part in self.parts]
+        self._lumped_m3 = [np.repeat(self._lumped_volume(part), 3) for part in self.parts]
         self.has_stated_mass = mass_kg is not None
-        self.node_mass: Array = self._weighed([p.density_kg_m3 for p in self.parts])[::3]
+        self.node_mass: Array = self._masses_with_densities([p.density_kg_m3 for p in self.parts])[
+            ::3
+        ]
 
     def __repr__(self) -> str:
         materials = ", ".join(f"{p.name or 'body'}: {p.material.name}" for p in self.parts)
@@ -213,7 +217,7 @@ class Body(Discretisation):
         )
 
     @property
-    def scan(self) -> UnderGravity | None:
+    def scan_conditions(self) -> UnderGravity | None:
         """Gravity and held nodes of the scan of the mesh.
 
         None if the mesh counts as stress-free.
@@ -221,25 +225,25 @@ class Body(Discretisation):
         return self.rest_shape if isinstance(self.rest_shape, UnderGravity) else None
 
     @cached_property
-    def inverse(self) -> InverseEquilibrium | None:
+    def inverse_equilibrium(self) -> InverseEquilibrium | None:
         """Solver of the stress-free shape; None if the mesh is stress-free."""
-        return None if self.scan is None else InverseEquilibrium(self)
+        return None if self.scan_conditions is None else InverseEquilibrium(self)
 
-    def unreachable(self, theta: Theta) -> str | None:
+    def rest_shape_failure(self, theta: Theta) -> str | None:
         """Return why there is no stress-free shape at θ, with a remedy; None if there is one."""
-        if self.inverse is None:
+        if self.inverse_equilibrium is None:
             return None
         try:
-            self.inverse.shape(theta)
+            self.inverse_equilibrium.solve(theta)
         except RestShapeError as error:
             return error.message
         return None
 
     def stress_free_geometry(self, theta: Theta) -> Array:
         """Return shape gradients and volumes (E, q, 3·nodes + 1) of the stress-free shape at θ."""
-        if self.inverse is None:
+        if self.inverse_equilibrium is None:
             return self.geometry
-        return self._geometry_at(self.inverse.shape(theta).positions_m)
+        return self._geometry_at(self.inverse_equilibrium.solve(theta).positions_m)
 
     def with_stress_free(self, positions_m: Array) -> Body:
         """Return this body with the same masses and another stress-free shape.
@@ -252,7 +256,7 @@ class Body(Discretisation):
         other = copy(self)
         other.geometry = self._geometry_at(positions_m)
         other.rest_shape = "stress_free"
-        for name in ("inverse", "stresses"):
+        for name in ("inverse_equilibrium", "stresses"):
             vars(other).pop(name, None)
         other._evaluators = {}
         other._framed = {}
@@ -279,31 +283,31 @@ class Body(Discretisation):
         RestShapeError
             If no stress-free shape has the mesh as its equilibrium under gravity.
         """
-        if self.inverse is None:
+        if self.inverse_equilibrium is None:
             return self.mesh
-        positions_m = self.inverse.shape(theta).positions_m[: len(self.mesh.points_m)]
+        positions_m = self.inverse_equilibrium.solve(theta).positions_m[: len(self.mesh.points_m)]
         mesh = self.mesh
         return TetMesh(
             positions_m, mesh.tetrahedra, mesh.point_arrays, mesh.cell_arrays, mesh.face_sets
         )
 
     @property
-    def density_places(self) -> list[int]:
+    def density_indices(self) -> list[int]:
         """Indices in θ of the free densities."""
-        pairs = zip(self.parts, self._gamma_places, strict=True)
-        return [place + 1 for part, place in pairs if part.free_density]
+        pairs = zip(self.parts, self._gamma_m_indices, strict=True)
+        return [place + 1 for part, place in pairs if part.has_free_density]
 
     def __getstate__(self) -> dict[str, Any]:
         # Kernels belong to this process, and cached properties are computed again.
-        state = {n: v for n, v in vars(self).items() if n not in self._following}
+        state = {n: v for n, v in vars(self).items() if n not in self._cached_names}
         return state | {"_evaluators": {}, "_framed": {}}
 
     @property
-    def _following(self) -> set[str]:
+    def _cached_names(self) -> set[str]:
         """Names of the cached properties that have been computed."""
         return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
-    def _lumped(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
+    def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
         """Return the lumped volume (n,) of a part, or of given fractions (E,) of its cells [m³]."""
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
@@ -320,22 +324,24 @@ class Body(Discretisation):
         """
         free = tuple(
             part
-            if (part.name in parts) == part.free_density
-            else replace(part, free_density=part.name in parts)
+            if (part.name in parts) == part.has_free_density
+            else replace(part, has_free_density=part.name in parts)
             for part in self.parts
         )
         return self if free == self.parts else self.with_parts(free)
 
     @property
-    def lengths_m(self) -> dict[str, float]:
+    def field_lengths_m(self) -> dict[str, float]:
         """Correlation lengths of the fields, by the names of their constants."""
         return {part.field_name: part.field.length_m for part in self.parts if part.field}
 
-    def with_lengths(self, lengths_m: Mapping[str, float]) -> Body:
+    def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
         """Return this body with other correlation lengths, by the names of the fields'
         constants.
         """
-        fields = (part.field and part.field.at(lengths_m[part.field_name]) for part in self.parts)
+        fields = (
+            part.field and part.field.with_length(lengths_m[part.field_name]) for part in self.parts
+        )
         return self.with_parts(
             tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
         )
@@ -364,43 +370,43 @@ class Body(Discretisation):
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
         """Return this body with other parts, which have the same cells as before."""
         other = copy(self)
-        for name in self._following - {"pattern", "shape_gradients", "part_of_cells"}:
+        for name in self._cached_names - {"pattern", "shape_gradients", "part_of_cells"}:
             vars(other).pop(name, None)
-        Model.__init__(other, parts, self.forces, self.frictions)
+        ConstantsModel.__init__(other, parts, self.forces, self.frictions)
         other._evaluators = {}
         other._framed = {}
         return other
 
     def with_frames(
-        self, count: int, rubs: bool = False, frictions: tuple[Constant, ...] = ()
+        self, count: int, has_skew_contact: bool = False, frictions: tuple[Constant, ...] = ()
     ) -> Body:
         """Return this body with the frames of obstacles: four further nodes each, which no cell
         has.
 
-        The nodes are at `frame_m`, after all others, and have no mass. Bodies with frames are
+        The nodes are at `frame_nodes_m`, after all others, and have no mass. Bodies with frames are
         cached.
 
         Parameters
         ----------
         count : int
             Number of obstacles.
-        rubs : bool
+        has_skew_contact : bool
             Whether derivatives of the contact forces have a skew part.
         frictions : tuple of Constant
             Friction coefficients that are parameters.
         """
-        key = count, rubs, frictions
-        if key == (len(self.frames), self.rubs, self.frictions):
+        key = count, has_skew_contact, frictions
+        if key == (len(self.frames), self.has_skew_contact, self.frictions):
             return self
         if key not in self._framed:
             other = copy(self)
-            for name in self._following - {"part_of_cells", "frame_m"}:
+            for name in self._cached_names - {"part_of_cells", "frame_nodes_m"}:
                 vars(other).pop(name, None)
-            Model.__init__(other, self.parts, self.forces, frictions)
-            other.rubs = rubs
+            ConstantsModel.__init__(other, self.parts, self.forces, frictions)
+            other.has_skew_contact = has_skew_contact
             other._evaluators = {}
             first = len(self.nodes.points_m)
-            added = np.tile(self.frame_m, (count, 1))
+            added = np.tile(self.frame_nodes_m, (count, 1))
             other.frames = first + np.arange(4 * count).reshape(count, 4)
             other.nodes_m = np.vstack([self.nodes.points_m, added])
             other._lumped_m3 = [
@@ -411,7 +417,7 @@ class Body(Discretisation):
         return self._framed[key]
 
     @cached_property
-    def frame_m(self) -> Array:
+    def frame_nodes_m(self) -> Array:
         """Undeformed positions (4, 3) of an obstacle's frame: its origin and the ends of its axes
         [m].
         """
@@ -421,15 +427,15 @@ class Body(Discretisation):
         return (low + high) / 2 + axes
 
     @cached_property
-    def stresses(self) -> Stresses:
+    def stresses(self) -> StressEvaluator:
         """Stresses at the quadrature points of the parts with memory."""
-        return Stresses(self)
+        return StressEvaluator(self)
 
     @cached_property
-    def elastic_places(self) -> list[int]:
+    def elastic_indices(self) -> list[int]:
         """Indices in θ on which the stress depends: constants of the materials, and of fields."""
         indices: list[int] = []
-        for part, start, modes in zip(self.parts, self.starts, self.mode_places, strict=False):
+        for part, start, modes in zip(self.parts, self.starts, self.field_slices, strict=False):
             indices += [*range(start, start + len(part.material.constants))]
             indices += [*range(modes.start, modes.stop)] if part.stress_field else []
         return indices
@@ -440,7 +446,7 @@ class Body(Discretisation):
         return float(self.node_mass.sum())
 
     @cached_property
-    def mass_slopes(self) -> dict[int, Array]:
+    def mass_derivatives(self) -> dict[int, Array]:
         """Derivatives of the mass of every dof (3n,), by the index in θ.
 
         These are ∂M/∂ρ [m³] for free densities, and the derivatives by the coefficients of the
@@ -452,33 +458,33 @@ class Body(Discretisation):
     def _mass_slopes(self) -> list[dict[int, Array]]:
         """Derivatives of the masses for each part."""
         slopes: list[dict[int, Array]] = []
-        places = zip(self._gamma_places, self.mode_places, strict=True)
+        places = zip(self._gamma_m_indices, self.field_slices, strict=True)
         for part, (gamma, modes), volume in zip(self.parts, places, self._lumped_m3, strict=True):
-            slopes.append({gamma + 1: volume} if part.free_density else {})
+            slopes.append({gamma + 1: volume} if part.has_free_density else {})
             if part.field is not None and part.stress_field is None:
                 shares = part.density_kg_m3 * part.field.shapes.T
-                lumped = (np.repeat(self._lumped(part, share), 3) for share in shares)
+                lumped = (np.repeat(self._lumped_volume(part, share), 3) for share in shares)
                 slopes[-1] |= dict(zip(range(modes.start, modes.stop), lumped, strict=True))
         return slopes
 
     def densities(self, theta: Theta) -> list[float]:
         """Return the density of each part at θ [kg/m³]; the mean where the density is a field."""
         return [
-            float(theta[place + 1]) if part.free_density else part.density_kg_m3
-            for part, place in zip(self.parts, self._gamma_places, strict=True)
+            float(theta[place + 1]) if part.has_free_density else part.density_kg_m3
+            for part, place in zip(self.parts, self._gamma_m_indices, strict=True)
         ]
 
     def mass_of_dofs(self, theta: Theta) -> Array:
         """Return the lumped mass (3n,) of every degree of freedom at θ [kg]."""
-        if not self.mass_slopes:
+        if not self.mass_derivatives:
             return self.dof_mass
-        return np.sum(self._masses(theta), axis=0)
+        return np.sum(self._part_masses(theta), axis=0)
 
-    def massless(self, theta: Theta) -> str | None:
+    def mass_problem(self, theta: Theta) -> str | None:
         """Return a message with a remedy if a node's mass at θ is not positive; None otherwise."""
-        if not self.mass_slopes:
+        if not self.mass_derivatives:
             return None
-        masses = np.array(self._masses(theta))[:, ::3]
+        masses = np.array(self._part_masses(theta))[:, ::3]
         # Nodes of obstacle frames have no mass.
         total = np.where(self.dof_volume_m3[::3] > 0, masses.sum(axis=0), np.inf)
         node = int(total.argmin())
@@ -494,22 +500,22 @@ class Body(Discretisation):
             f"expected masses above zero: {remedy}"
         )
 
-    def _masses(self, theta: Theta) -> list[Array]:
+    def _part_masses(self, theta: Theta) -> list[Array]:
         """Return the mass of every dof (3n,) for each part [kg]."""
         masses = []
         for part, volume, slopes in zip(
             self.parts, self._lumped_m3, self._mass_slopes, strict=True
         ):
-            density = 0.0 if part.free_density else part.density_kg_m3
+            density = 0.0 if part.has_free_density else part.density_kg_m3
             masses.append(sum((theta[k] * slope for k, slope in slopes.items()), density * volume))
         return masses
 
-    def _weighed(self, densities: Sequence[float]) -> Array:
+    def _masses_with_densities(self, densities: Sequence[float]) -> Array:
         """Return the mass of every dof (3n,) for given densities of the parts [kg]."""
         return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
 
     @cached_property
-    def placed_forces(self) -> tuple[PlacedForce, ...]:
+    def placed_forces(self) -> tuple[LocatedForce, ...]:
         """Custom forces on their nodes or faces."""
         volume = self.dof_volume_m3[::3]
         first = self.starts[-1]
@@ -519,11 +525,11 @@ class Body(Discretisation):
             first += len(columns)
             nodes = np.arange(len(self.nodes_m)) if force.nodes is None else force.nodes
             nodes = self.select(nodes) if isinstance(nodes, Selection) else np.unique(nodes)
-            placed.append(PlacedForce.on(force, self.nodes, nodes, volume, columns))
+            placed.append(LocatedForce.on_mesh(force, self.nodes, nodes, volume, columns))
         return tuple(placed)
 
     @cached_property
-    def unit_air_drag(self) -> PlacedForce:
+    def unit_air_drag(self) -> LocatedForce:
         """Drag on the surface in a fluid of density 1 kg/m³, see `air`."""
         return placed_unit_drag(self.nodes, self.dof_volume_m3[::3])
 
@@ -537,12 +543,12 @@ class Body(Discretisation):
         """Lumped mass (3n,) of every degree of freedom with the stated densities [kg]."""
         return np.repeat(self.node_mass, 3)
 
-    def joined_with(self, couplings: Sequence[SymmetricPattern]) -> Joined:
+    def joint_pattern_with(self, couplings: Sequence[SymmetricPattern]) -> JointPattern:
         """Return the union of the mesh graph, other couplings and the couplings of custom
         forces.
         """
         custom = (placed.points.couplings for placed in self.placed_forces)
-        return Joined.of((self.pattern, *couplings, *custom))
+        return JointPattern.from_patterns((self.pattern, *couplings, *custom))
 
     # One state ------------------------------------------------------------------------------
 
@@ -553,7 +559,7 @@ class Body(Discretisation):
         poisson=0.3``.
         """
         x = self._state(positions)
-        return float(self._evaluate("energy", [x], self.elastic(constants))[0, 0])
+        return float(self._evaluate("energy", [x], self.elastic_theta(constants))[0, 0])
 
     def elastic_force(self, positions: ArrayLike, **constants: float) -> Array:
         """Return the elastic force −∂Ψ/∂x, (n, 3) [N], at (n, 3) node positions [m].
@@ -561,7 +567,7 @@ class Body(Discretisation):
         See `energy` for the constants.
         """
         x = self._state(positions)
-        force = self._evaluate("force", [x, np.zeros_like(x)], self.elastic(constants))
+        force = self._evaluate("force", [x, np.zeros_like(x)], self.elastic_theta(constants))
         return force.reshape(-1, 3)
 
     def stiffness(self, positions: ArrayLike, **constants: float) -> sp.csc_array:
@@ -570,7 +576,7 @@ class Body(Discretisation):
         Row 3i + j is coordinate j of node i. See `energy` for the constants.
         """
         x = self._state(positions)
-        theta = self.elastic(constants)
+        theta = self.elastic_theta(constants)
         return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta).by_position[0])
 
     # Many states ----------------------------------------------------------------------------
@@ -581,7 +587,7 @@ class Body(Discretisation):
         velocities: ArrayLike,
         theta: Theta,
         tied_kg: Array | None = None,
-        carried: Past | None = None,
+        memory_input: MemoryInput | None = None,
     ) -> Array:
         """Return the internal force f(x, v; θ), (T, 3n) [N].
 
@@ -593,12 +599,12 @@ class Body(Discretisation):
             Constants in the order of `constants`.
         tied_kg : (3n,) or (T, 3n), optional
             Tied masses, which γ_m damps beside the mass of the body.
-        carried : Past, optional
+        memory_input : MemoryInput, optional
             Internal variables of a body with memory; zero overstress by default.
         """
         x, v = self._states(positions, velocities)
-        internal = self._evaluate("force", [x, v], theta, carried=carried)
-        return internal - self._drag(theta, tied_kg) * v
+        internal = self._evaluate("force", [x, v], theta, memory_input=memory_input)
+        return internal - self._damping_coefficients(theta, tied_kg) * v
 
     def linearise(
         self,
@@ -607,7 +613,7 @@ class Body(Discretisation):
         theta: Theta,
         out: Array | None = None,
         tied_kg: Array | None = None,
-        carried: Past | None = None,
+        memory_input: MemoryInput | None = None,
     ) -> Linearisation:
         """Return the internal force and its first derivatives at T states, see `force`.
 
@@ -623,13 +629,13 @@ class Body(Discretisation):
             Memory for the result, whose arrays are views of it.
         tied_kg : (3n,) or (T, 3n), optional
             Tied masses, which γ_m damps beside the mass of the body.
-        carried : Past, optional
+        memory_input : MemoryInput, optional
             Internal variables of a body with memory; zero overstress by default.
         """
         x, v = self._states(positions, velocities)
-        rows = self._evaluate("linearisation", [x, v], theta, out, carried)
+        rows = self._evaluate("linearisation", [x, v], theta, out, memory_input)
         size = self.pattern.size
-        entries = self.pattern.entries
+        entries = self.pattern.entry_count
         width = len(self.constants) * size
         # Slices: `numpy.split` takes as long as the elements of a small body.
         ends = list(accumulate([0, size, entries, entries, width]))
@@ -637,22 +643,22 @@ class Body(Discretisation):
         force, by_position, by_velocity, by_theta, skew = (
             rows[:, start:stop] for start, stop in zip(ends, [*ends[1:], end], strict=True)
         )
-        drag = self._drag(theta, tied_kg)
+        drag = self._damping_coefficients(theta, tied_kg)
         force -= drag * v
         by_velocity[:, self.pattern.diagonal] -= drag
         by_theta = by_theta.reshape(len(x), size, -1)
-        for number, outputs in self._of_fields("linearisation", rows):
-            columns = self.mode_places[number]
-            spread = self.spreads[number]
-            slopes = spread.field.slopes(np.asarray(theta)[columns])
-            spread.nodal(outputs["by_theta"], slopes, by_theta[:, :, columns])
-        for column, slope in self._drag_slopes(theta, tied_kg):
+        for number, outputs in self._field_outputs("linearisation", rows):
+            columns = self.field_slices[number]
+            spread = self.field_assemblies[number]
+            slopes = spread.field.jacobian(np.asarray(theta)[columns])
+            spread.assemble_nodal(outputs["by_theta"], slopes, by_theta[:, :, columns])
+        for column, slope in self._damping_derivatives(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
             by_theta[:, :, column] += -slope * v
-        self._spread_stiffening(by_theta, carried)
+        self._apply_stiffening_chain_rule(by_theta, memory_input)
         return Linearisation(force, by_position, by_velocity, by_theta, skew, skew[:, :0])
 
-    def _of_fields(self, name: str, rows: Array) -> Iterator[tuple[int, dict[str, Array]]]:
+    def _field_outputs(self, name: str, rows: Array) -> Iterator[tuple[int, dict[str, Array]]]:
         """Yield the index of each part with a field, and the outputs by the logarithm of each cell.
 
         Parameters
@@ -662,11 +668,13 @@ class Body(Discretisation):
         rows : (T, width)
             Result of the kernel.
         """
-        places = self.of_cells(name)
-        for number in self.spreads:
+        places = self.field_output_slices(name)
+        for number in self.field_assemblies:
             yield number, {out: rows[:, at] for (of, out), at in places.items() if of == number}
 
-    def _spread_stiffening(self, by_theta: Array, carried: Past | None) -> None:
+    def _apply_stiffening_chain_rule(
+        self, by_theta: Array, memory_input: MemoryInput | None
+    ) -> None:
         """Replace derivatives by the stiffening s by derivatives by the memory's constants, in
         place.
 
@@ -674,24 +682,24 @@ class Body(Discretisation):
         ----------
         by_theta : (…, k)
             Derivatives; that by s is in the column of a part's first branch.
-        carried : Past or None
+        memory_input : MemoryInput or None
             Provides ds/dθ; None for zero.
         """
         for first, columns in self._memory_columns:
-            if carried is None:
+            if memory_input is None:
                 by_theta[..., columns] = 0.0
             else:
-                slopes = carried.slopes[:, None, columns]
+                slopes = memory_input.stiffening_derivatives[:, None, columns]
                 by_theta[..., columns] = by_theta[..., first, None] * slopes
 
     @cached_property
     def _memory_columns(self) -> list[tuple[int, slice]]:
         """Index in θ of each part's first branch constant, and the slice of all of them."""
-        firsts = [s + p.of_law for p, s in zip(self.parts, self.starts, strict=False)]
+        firsts = [s + p.law_constant_count for p, s in zip(self.parts, self.starts, strict=False)]
         counts = [2 * len(part.prony) for part in self.parts]
         return [(f, slice(f, f + n)) for f, n in zip(firsts, counts, strict=True) if n]
 
-    def curvature(
+    def second_derivatives(
         self,
         positions: ArrayLike,
         velocities: ArrayLike,
@@ -699,9 +707,10 @@ class Body(Discretisation):
         theta: Theta,
         out: Array | None = None,
         tied_kg: Array | None = None,
-        carried: Past | None = None,
-    ) -> Curvature:
-        """Return the second derivatives of wᵀ f + σ·S at T states, see `Curvature` and `force`.
+        memory_input: MemoryInput | None = None,
+    ) -> SecondDerivatives:
+        """Return the second derivatives of wᵀ f + σ·S at T states, see `SecondDerivatives` and
+        `force`.
 
         The internal variables of a memory are held fixed.
 
@@ -715,22 +724,24 @@ class Body(Discretisation):
             Memory for the result, whose arrays are views of it.
         tied_kg : (3n,) or (T, 3n), optional
             Tied masses, which γ_m damps beside the mass of the body.
-        carried : Past, optional
+        memory_input : MemoryInput, optional
             Internal variables of a body with memory and the weights σ of the stress S.
         """
         x, v, w = self._states(positions, velocities, weights)
-        if self.remembers:
-            carried = carried or self.memory.nothing(len(x))
-            stress_weights = carried.stress_weights
+        if self.has_memory:
+            memory_input = memory_input or self.memory.relaxed(len(x))
+            stress_weights = memory_input.stress_weights
             if stress_weights is None:
-                stress_weights = np.zeros_like(carried.overstress)
+                stress_weights = np.zeros_like(memory_input.overstress)
             # The kernel reads H and σ as one row.
-            past = replace(carried, overstress=np.hstack([carried.overstress, stress_weights]))
+            past = replace(
+                memory_input, overstress=np.hstack([memory_input.overstress, stress_weights])
+            )
             rows = self._evaluate("curvature", [x, v, w], theta, out, past)
         else:
             rows = self._evaluate("curvature", [x, v, w], theta, out)
         size = self.pattern.size
-        entries = self.pattern.entries
+        entries = self.pattern.entry_count
         k = len(self.constants)
         xx, xv, x_theta, v_theta, theta_theta, by_theta, skew = np.split(
             rows[:, : self._width_without_fields("curvature")],
@@ -738,69 +749,69 @@ class Body(Discretisation):
             axis=1,
         )
         x_theta, v_theta = (part.reshape(len(x), size, k) for part in (x_theta, v_theta))
-        for column, slope in self._drag_slopes(theta, tied_kg):
+        for column, slope in self._damping_derivatives(theta, tied_kg):
             drag = -slope * w
             v_theta[:, :, column] += drag
             by_theta[:, column] += np.einsum("ti,ti->t", drag, v)
         theta_theta = theta_theta.reshape(len(x), k, k)
-        for number, outputs in self._of_fields("curvature", rows):
-            field_columns = self.mode_places[number]
-            spread = self.spreads[number]
+        for number, outputs in self._field_outputs("curvature", rows):
+            field_columns = self.field_slices[number]
+            spread = self.field_assemblies[number]
             coefficients = np.asarray(theta)[field_columns]
-            slopes = spread.field.slopes(coefficients)
-            spread.nodal(outputs["position_theta"], slopes, x_theta[:, :, field_columns])
-            spread.nodal(outputs["velocity_theta"], slopes, v_theta[:, :, field_columns])
+            slopes = spread.field.jacobian(coefficients)
+            spread.assemble_nodal(outputs["position_theta"], slopes, x_theta[:, :, field_columns])
+            spread.assemble_nodal(outputs["velocity_theta"], slopes, v_theta[:, :, field_columns])
             by_theta[:, field_columns] = outputs["gradient_theta"] @ slopes
             first = self.starts[number]
-            points = self.parts[number].of_points
+            points = self.parts[number].point_constant_count
             second_by_theta = outputs["theta_theta"].reshape(len(x), len(slopes), -1)
             mixed = np.einsum("tek,em->tkm", second_by_theta[:, :, :points], slopes)
             theta_theta[:, first : first + points, field_columns] = mixed
             theta_theta[:, field_columns, first : first + points] = mixed.swapaxes(1, 2)
             weighted_slopes = second_by_theta[:, :, points, None] * slopes
-            by_coefficients = spread.field.curvature(coefficients, outputs["gradient_theta"])
+            by_coefficients = spread.field.weighted_hessian(coefficients, outputs["gradient_theta"])
             theta_theta[:, field_columns, field_columns] = (
                 slopes.T @ weighted_slopes + by_coefficients
             )
         for values in (x_theta, v_theta, theta_theta, theta_theta.swapaxes(1, 2)):
-            self._spread_stiffening(values, carried)
-        if carried is not None:
+            self._apply_stiffening_chain_rule(values, memory_input)
+        if memory_input is not None:
             for first, columns in self._memory_columns:
-                bends = carried.bends[:, columns, columns]
+                bends = memory_input.stiffening_second_derivatives[:, columns, columns]
                 theta_theta[:, columns, columns] += by_theta[:, first, None, None] * bends
-        self._spread_stiffening(by_theta[:, None], carried)
-        for gamma, mass_slopes in zip(self._gamma_places, self._mass_slopes, strict=True):
+        self._apply_stiffening_chain_rule(by_theta[:, None], memory_input)
+        for gamma, mass_slopes in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
             for place, slope in mass_slopes.items():
                 mixed = -np.einsum("ti,ti,i->t", w, v, slope)
                 theta_theta[:, place, gamma] = theta_theta[:, gamma, place] = mixed
         empty = np.zeros((len(x), 0))
-        return Curvature(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew, empty)
+        return SecondDerivatives(xx, xv, x_theta, v_theta, theta_theta, by_theta, skew, empty)
 
     @cached_property
-    def _gamma_places(self) -> list[int]:
+    def _gamma_m_indices(self) -> list[int]:
         """Index in θ of each part's γ_m; the density follows where it is free."""
         starts = zip(self.parts, self.starts, strict=False)
-        return [start + part.of_gamma_m for part, start in starts]
+        return [start + part.gamma_m_index for part, start in starts]
 
     @cached_property
     def tied_shares(self) -> dict[int, Array]:
         """Index in θ of each part's γ_m, and the part's fraction (3n,) of the mass at each dof."""
-        return dict(zip(self._gamma_places, self._tied_shares, strict=True))
+        return dict(zip(self._gamma_m_indices, self._tied_shares, strict=True))
 
-    def tied_drag(self, theta: Theta) -> Array:
+    def tied_damping_rate(self, theta: Theta) -> Array:
         """Return the mass-proportional damping rate γ_m (3n,) of tied masses at every dof [1/s]."""
         return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
 
-    def _damped(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
+    def _damped_masses(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
         """Yield index in θ of each part's γ_m, and the mass (3n,) or (T, 3n) damped by it.
 
         A tied mass is damped like the node to which it is tied, in proportion to the stated masses
         of the parts that share the node.
         """
-        for k, damped in enumerate(self._masses(theta)):
+        for k, damped in enumerate(self._part_masses(theta)):
             if tied_kg is not None:
                 damped = damped + self._tied_shares[k] * tied_kg
-            yield self._gamma_places[k], damped
+            yield self._gamma_m_indices[k], damped
 
     @cached_property
     def _tied_shares(self) -> list[Array]:
@@ -809,15 +820,17 @@ class Body(Discretisation):
         total_kg = np.where(self.dof_mass == 0, 1.0, self.dof_mass)  # frames have none
         return [part.density_kg_m3 * volume / total_kg for part, volume in parts]
 
-    def _drag(self, theta: Theta, tied_kg: Array | None) -> Array:
+    def _damping_coefficients(self, theta: Theta, tied_kg: Array | None) -> Array:
         """Return the mass-proportional damping (3n,) or (T, 3n) of f = −drag v [N·s/m]."""
         # `numpy.sum` of a list takes longer than the products.
-        return reduce(np.add, (theta[k] * mass for k, mass in self._damped(theta, tied_kg)))
+        return reduce(np.add, (theta[k] * mass for k, mass in self._damped_masses(theta, tied_kg)))
 
-    def _drag_slopes(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
+    def _damping_derivatives(
+        self, theta: Theta, tied_kg: Array | None
+    ) -> Iterator[tuple[int, Array]]:
         """Yield indices in θ and the derivatives of the mass-proportional damping by these
         entries.
         """
-        yield from self._damped(theta, tied_kg)
-        for gamma, own in zip(self._gamma_places, self._mass_slopes, strict=True):
+        yield from self._damped_masses(theta, tied_kg)
+        for gamma, own in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
             yield from ((place, theta[gamma] * slope) for place, slope in own.items())

@@ -63,7 +63,7 @@ class Constant:
     at_least: float = -float("inf")
 
     @property
-    def least(self) -> float:
+    def lower_limit(self) -> float:
         """Smallest admissible value of the constant."""
         return 0.0 if self.scale == "log" else self.at_least
 
@@ -133,7 +133,7 @@ KNOWN: Mapping[str, Constant] = {
 }
 
 
-def bare(name: str) -> str:
+def without_region(name: str) -> str:
     """Return the name of a constant without its region."""
     return name.rpartition(".")[2]
 
@@ -152,31 +152,31 @@ def symbol_of(name: str) -> str:
     return f"{symbol} {region}".strip()
 
 
-def with_unit(name: str) -> str:
+def symbol_with_unit(name: str) -> str:
     """Return symbol and unit of a constant, as in the heading of a table row."""
     return f"{symbol_of(name)} {unit_of(name)}".strip()
 
 
 def constant_named(name: str) -> Constant:
     """Return the known constant of this name, or one with default properties if it is unknown."""
-    bare_name = bare(name)
+    bare_name = without_region(name)
     if bare_name not in KNOWN and bare_name.endswith(f"_{FRICTION.name}"):
         return replace(FRICTION, name=bare_name, symbol=bare_name.replace("_", " "))
     return (
         replace(MODE, name=bare_name)
-        if is_mode(bare_name)
+        if is_field_coefficient(bare_name)
         else KNOWN.get(bare_name, Constant(bare_name))
     )
 
 
-def mode(number: int) -> Constant:
+def field_coefficient(number: int) -> Constant:
     """Return the constant for the coefficient of a shape of a field, by the shape's index."""
     return replace(MODE, name=f"{MODE.name}_{number + 1}")
 
 
-def is_mode(name: str) -> bool:
+def is_field_coefficient(name: str) -> bool:
     """Return whether a constant is the coefficient of a shape of a field."""
-    word, _, number = bare(name).rpartition("_")
+    word, _, number = without_region(name).rpartition("_")
     return word == MODE.name and number.isdigit()
 
 
@@ -187,12 +187,12 @@ def is_modulus(name: str) -> bool:
 
 def is_density(name: str) -> bool:
     """Return whether a parameter of this name determines a density: a density or the total mass."""
-    return bare(name) in (DENSITY.name, MASS.name)
+    return without_region(name) in (DENSITY.name, MASS.name)
 
 
 def is_damping(name: str) -> bool:
     """Return whether a constant is γ_r or γ_m, which bodies at rest do not determine."""
-    return bare(name) in (GAMMA_R.name, GAMMA_M.name)
+    return without_region(name) in (GAMMA_R.name, GAMMA_M.name)
 
 
 def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | None:
@@ -218,7 +218,7 @@ def usual_value(name: str, young_pa: float, poisson: float = 0.3) -> float | Non
         "c20_pa": 0.0,
         "c30_pa": 0.0,
     }
-    return shear * shares.get(bare(name), 1.0)
+    return shear * shares.get(without_region(name), 1.0)
 
 
 def without_unit(name: str) -> str:

@@ -18,14 +18,14 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, Index
 from ..errors import InputError
 from .elements import Element, element_named, reference_geometry
-from .expressions import KERNELS, Law, energy_kernel
-from .field import Spread
-from .kernels import COMPILING, Batch, Evaluator, EvaluatorChoice, available_threads
-from .memory import Past, PointLayout
-from .mesh import Nodes, TetMesh
+from .expressions import KERNELS, PointLaw, energy_kernel
+from .field import FieldAssembly
+from .kernels import COMPILING, Evaluator, EvaluatorChoice, KernelBatch, available_threads
+from .memory import MemoryInput, MemoryLayout
+from .mesh import ElementNodes, TetMesh
 from .node_force import NodeForce
-from .pattern import SymmetricPattern, dofs_of, element_destinations, in_ascending_order
-from .regions import BodyPart, Model, Theta
+from .pattern import SymmetricPattern, dofs_of, element_destinations, with_ascending_nodes
+from .regions import BodyPart, ConstantsModel, Theta
 from .rest_shape import InverseEquilibrium
 from .selection import Selection
 
@@ -36,23 +36,23 @@ BY_FIELD = {
 }
 
 
-class Discretisation(Model):
+class Discretisation(ConstantsModel):
     """Mesh of elements with quadrature points, and evaluators of sums over elements.
 
     Parameters
     ----------
-    parts, forces : see `Model`
+    parts, forces : see `LiveModel`
     mesh, element, evaluator, threads : see `Body`
 
     Attributes
     ----------
-    nodes : Nodes
+    nodes : ElementNodes
         Nodes of the elements.
     nodes_m : (n, 3)
         Undeformed node positions, including obstacle frames.
     frames : (k, 4)
         Indices of the nodes of obstacle frames.
-    rubs : bool
+    has_skew_contact : bool
         Whether derivatives of contact forces have a skew part.
     cells : (E, nodes per element)
         Node indices of each element.
@@ -72,15 +72,15 @@ class Discretisation(Model):
         super().__init__(parts, forces)
         self.mesh = mesh
         self.element: Element = element_named(element)
-        if self.remembers and self.element.mean_dilatation:
+        if self.has_memory and self.element.mean_dilatation:
             raise InputError(
                 f"element '{element}' averages the dilatation and cannot have a memory (prony); "
                 "expected tet10 or tet4"
             )
-        self.nodes = Nodes.of_element(mesh, self.element)
+        self.nodes = ElementNodes.for_element(mesh, self.element)
         self.nodes_m: Array = self.nodes.points_m
         self.frames: Index = np.zeros((0, 4), dtype=np.int64)
-        self.rubs = False
+        self.has_skew_contact = False
         self._framed: dict[tuple[Any, ...], Any] = {}
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
@@ -114,9 +114,9 @@ class Discretisation(Model):
         """Reasons why the evaluator is not "simd", if the material is the cause."""
         return self._choice.notes
 
-    def make_evaluator(self, batch: Batch) -> Evaluator:
+    def make_evaluator(self, batch: KernelBatch) -> Evaluator:
         """Build the evaluator of a batch with the chosen kind of evaluator."""
-        return self._choice.make(batch)
+        return self._choice.make_evaluator(batch)
 
     @cached_property
     def part_of_cells(self) -> Index:
@@ -126,7 +126,7 @@ class Discretisation(Model):
             numbers[part.cells] = k
         return numbers
 
-    def law(self, number: int, memory: bool = False) -> Law:
+    def law(self, number: int, memory: bool = False) -> PointLaw:
         """Return the law of the quadrature points of a part.
 
         Parameters
@@ -137,12 +137,12 @@ class Discretisation(Model):
             Whether to include the memory of the material.
         """
         part = self.parts[number]
-        scaled = part.field.scaled if part.field else ()
-        rest = self.inverse.layout if self.inverse else None
-        return Law(part.material, part.damping, memory, scaled, rest)
+        scaled = part.field.scaled_indices if part.field else ()
+        rest = self.inverse_equilibrium.layout if self.inverse_equilibrium else None
+        return PointLaw(part.material, part.damping, memory, scaled, rest)
 
     @cached_property
-    def inverse(self) -> InverseEquilibrium | None:
+    def inverse_equilibrium(self) -> InverseEquilibrium | None:
         """Solver of the stress-free shape; None if the mesh is stress-free."""
         return None
 
@@ -152,14 +152,20 @@ class Discretisation(Model):
         For a stress-free shape that is not the mesh, changes of its inputs follow; they are zero,
         because the shape has been computed at this θ.
         """
-        part_constants = np.asarray(self.split(theta)[number], dtype=float)[
-            : self.parts[number].of_points
+        part_constants = np.asarray(self.split_theta(theta)[number], dtype=float)[
+            : self.parts[number].point_constant_count
         ]
-        changes = np.zeros(self.inverse.layout.inputs if self.inverse else 0)
+        changes = np.zeros(
+            self.inverse_equilibrium.layout.input_count if self.inverse_equilibrium else 0
+        )
         return np.concatenate([part_constants, changes])
 
-    def brought(
-        self, number: int, theta: Theta, carried: Array | None = None, second: bool = False
+    def point_data(
+        self,
+        number: int,
+        theta: Theta,
+        internal_variables: Array | None = None,
+        with_second_derivatives: bool = False,
     ) -> Array | None:
         """Return the data of the quadrature points of a part, or None if they have none.
 
@@ -172,32 +178,36 @@ class Discretisation(Model):
         number : int
             Index of the part.
         theta : (k,)
-        carried : (T, any), optional
+        internal_variables : (T, any), optional
             Internal variables of the points.
-        second : bool
+        with_second_derivatives : bool
             Whether to include second derivatives of the stress-free shape.
         """
-        if self.inverse is not None:
-            return self.inverse.point_data(theta, second)[number]
+        if self.inverse_equilibrium is not None:
+            return self.inverse_equilibrium.point_data(theta, with_second_derivatives)[number]
         field = self.parts[number].stress_field
         if field is None:
-            return carried
-        logs = field.logarithms(np.asarray(theta)[self.mode_places[number]])[None]
-        if carried is None:
+            return internal_variables
+        logs = field.logarithms(np.asarray(theta)[self.field_slices[number]])[None]
+        if internal_variables is None:
             return logs
-        return np.hstack([carried, np.broadcast_to(logs, (len(carried), logs.shape[1]))])
+        return np.hstack(
+            [internal_variables, np.broadcast_to(logs, (len(internal_variables), logs.shape[1]))]
+        )
 
     @cached_property
-    def spreads(self) -> dict[int, Spread]:
+    def field_assemblies(self) -> dict[int, FieldAssembly]:
         """Assembly of derivatives by fields, by the index of the part."""
         assemblies = {}
         for number, part in enumerate(self.parts):
             if part.stress_field is not None:
-                cells, _ = self.laid_out(part)
-                assemblies[number] = Spread(part.stress_field, dofs_of(cells), self.pattern.size)
+                cells, _ = self.part_elements(part)
+                assemblies[number] = FieldAssembly(
+                    part.stress_field, dofs_of(cells), self.pattern.size
+                )
         return assemblies
 
-    def laid_out(self, part: BodyPart) -> tuple[Index, Array]:
+    def part_elements(self, part: BodyPart) -> tuple[Index, Array]:
         """Return the elements of a part and their geometry, with nodes in the order of its
         kernels.
         """
@@ -207,9 +217,9 @@ class Discretisation(Model):
             return cells, geometry
         # Ascending nodes make an element's lower triangle part of the global one: in a skew
         # matrix, the other triangle has the opposite sign.
-        return in_ascending_order(cells, geometry)
+        return with_ascending_nodes(cells, geometry)
 
-    def of_cells(self, name: str) -> dict[tuple[int, str], slice]:
+    def field_output_slices(self, name: str) -> dict[tuple[int, str], slice]:
         """Return the slices of a result row that hold derivatives by the logarithm of each cell.
 
         The keys are the index of the part and the output. Each cell has d numbers of a vector, or
@@ -222,9 +232,9 @@ class Discretisation(Model):
         """
         start = self._width_without_fields(name)
         slices = {}
-        for number, spread in self.spreads.items():
+        for number, spread in self.field_assemblies.items():
             cells, dofs = spread.dofs.shape
-            theta_theta_size = 2 * self.parts[number].of_points + 1
+            theta_theta_size = 2 * self.parts[number].point_constant_count + 1
             sizes = {"theta_theta": theta_theta_size, "gradient_theta": 1}
             for output in BY_FIELD.get(name, ()):
                 size = cells * sizes.get(output, dofs)
@@ -233,26 +243,32 @@ class Discretisation(Model):
         return slices
 
     @property
-    def remembers(self) -> bool:
+    def has_memory(self) -> bool:
         """Whether any part has a memory."""
         return any(part.prony for part in self.parts)
 
     @cached_property
-    def memory(self) -> PointLayout:
+    def memory(self) -> MemoryLayout:
         """Layout of the internal variables of the parts with memory."""
-        first_indices = [s + p.of_law for p, s in zip(self.parts, self.starts, strict=False)]
-        return PointLayout(self.parts, first_indices, self.geometry.shape[1], len(self.constants))
+        first_indices = [
+            s + p.law_constant_count for p, s in zip(self.parts, self.starts, strict=False)
+        ]
+        return MemoryLayout(self.parts, first_indices, self.geometry.shape[1], len(self.constants))
 
     @cached_property
-    def unsymmetric(self) -> bool:
+    def is_unsymmetric(self) -> bool:
         """Whether derivatives of the forces have a skew part."""
         laws = any(part.damping.stress is not None for part in self.parts)
-        return laws or self.rubs or any(f.turns or f.spins for f in self.forces)
+        return (
+            laws
+            or self.has_skew_contact
+            or any(f.has_skew_stiffness or f.has_skew_damping for f in self.forces)
+        )
 
     @cached_property
     def pattern(self) -> SymmetricPattern:
         """Sparsity pattern of the stiffness matrix."""
-        return SymmetricPattern.of_cells(self.cells, len(self.nodes_m))
+        return SymmetricPattern.from_cells(self.cells, len(self.nodes_m))
 
     @cached_property
     def linearisation_width(self) -> int:
@@ -328,7 +344,7 @@ class Discretisation(Model):
         fields: Sequence[Array],
         theta: Theta,
         out: Array | None = None,
-        carried: Past | None = None,
+        memory_input: MemoryInput | None = None,
     ) -> Array:
         """Evaluate a kernel on all parts and add up the results (T, width).
 
@@ -341,7 +357,7 @@ class Discretisation(Model):
         theta : (k,)
         out : (T, width), optional
             Memory for the result; overwritten.
-        carried : Past, optional
+        memory_input : MemoryInput, optional
             Internal variables of a body with memory; zero by default.
         """
         if len(theta) != len(self.constants):
@@ -363,26 +379,26 @@ class Discretisation(Model):
         for k, evaluate in enumerate(self._evaluators[name]):
             values = self.point_constants(k, theta)
             if not self.parts[k].prony or name == "energy":
-                point_data = self.brought(k, theta, second=name == "curvature")
+                point_data = self.point_data(k, theta, with_second_derivatives=name == "curvature")
                 evaluate(fields, values, out, self.threads, k > 0, point_data)
                 continue
-            past = carried or self.memory.nothing(len(out))
-            for rows, values[-1] in past.runs(k):
+            past = memory_input or self.memory.relaxed(len(out))
+            for rows, values[-1] in past.equal_stiffening_rows(k):
                 row_fields = [field[rows] for field in fields]
-                point_data = self.brought(k, theta, past.overstress[rows])
+                point_data = self.point_data(k, theta, past.overstress[rows])
                 evaluate(row_fields, values, out[rows], self.threads, k > 0, point_data)
         return out
 
     def _width(self, name: str) -> int:
         """Return the length of a result row of a kernel."""
-        ends = (place.stop for place in self.of_cells(name).values())
+        ends = (place.stop for place in self.field_output_slices(name).values())
         return max(ends, default=self._width_without_fields(name))
 
     def _width_without_fields(self, name: str) -> int:
         """Return the length of a result row without derivatives by the logarithms of fields."""
         k = len(self.constants)
         size = self.pattern.size
-        entries = (2 + self.unsymmetric) * self.pattern.entries
+        entries = (2 + self.is_unsymmetric) * self.pattern.entry_count
         return {
             "energy": 1,
             "force": size,
@@ -390,7 +406,7 @@ class Discretisation(Model):
             "curvature": 2 * k * size + entries + k * (k + 1),
         }[name]
 
-    def _batch(self, name: str, number: int) -> Batch:
+    def _batch(self, name: str, number: int) -> KernelBatch:
         """Return the batch of a kernel and part: where each output goes in the result row.
 
         A row holds vectors, lower triangles, and columns for all of θ.
@@ -398,32 +414,32 @@ class Discretisation(Model):
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[name](self.element, self.law(number, memory))
-        cells, geometry = self.laid_out(part)
+        cells, geometry = self.part_elements(part)
         vector, lower = element_destinations(self.pattern, cells)
         total = len(self.constants)
         count = len(cells)
         # γ_m and the density come after the constants of the points and need no elements.
-        columns = self.starts[number] + np.arange(part.of_points)
-        if self.inverse is not None:
+        columns = self.starts[number] + np.arange(part.point_constant_count)
+        if self.inverse_equilibrium is not None:
             # The inputs of the stress-free shape are entries of θ.
-            columns = np.concatenate([columns, self.inverse.places])
+            columns = np.concatenate([columns, self.inverse_equilibrium.places])
         by_theta = (columns[:, None] + total * vector[:, None, :]).reshape(count, -1)
         square = (columns[:, None] + total * columns).ravel()
         first_entry = np.zeros((count, 1), dtype=np.int64)
         places = {
             "energy": (first_entry, 1),
             "force": (vector, self.pattern.size),
-            "by_position": (lower, self.pattern.entries),
-            "by_velocity": (lower, self.pattern.entries),
+            "by_position": (lower, self.pattern.entry_count),
+            "by_velocity": (lower, self.pattern.entry_count),
             "by_theta": (by_theta, total * self.pattern.size),
-            "position_position": (lower, self.pattern.entries),
-            "position_velocity": (lower, self.pattern.entries),
+            "position_position": (lower, self.pattern.entry_count),
+            "position_velocity": (lower, self.pattern.entry_count),
             "position_theta": (by_theta, total * self.pattern.size),
             "velocity_theta": (by_theta, total * self.pattern.size),
             "theta_theta": (np.broadcast_to(square, (count, len(square))), total**2),
             "gradient_theta": (np.broadcast_to(columns, (count, len(columns))), total),
-            "by_position_skew": (lower, self.pattern.entries),
-            "position_velocity_skew": (lower, self.pattern.entries),
+            "by_position_skew": (lower, self.pattern.entry_count),
+            "position_velocity_skew": (lower, self.pattern.entry_count),
         }
         used = {output: places[output] for output in kernel.contractions}
         starts = np.cumsum([0] + [length for _, length in used.values()])
@@ -431,17 +447,17 @@ class Discretisation(Model):
             output: place + start
             for (output, (place, _)), start in zip(used.items(), starts, strict=False)
         }
-        for (part_index, output), field_slice in self.of_cells(name).items():
+        for (part_index, output), field_slice in self.field_output_slices(name).items():
             if part_index == number:
                 field_positions = np.arange(field_slice.start, field_slice.stop).reshape(count, -1)
-                positions[output] = _with_own(
-                    positions[output], field_positions, output, part.of_points
+                positions[output] = _with_field_columns(
+                    positions[output], field_positions, output, part.point_constant_count
                 )
         destinations = np.hstack(list(positions.values()))
         carried = np.zeros((count, geometry.shape[1], 0), dtype=np.int64)
         width = 0
         if memory:
-            places_of = self.memory.of_part(number)
+            places_of = self.memory.part_columns(number)
             width = self.memory.width
             sets = 2 if name == "curvature" else 1
             carried = np.concatenate([places_of + k * width for k in range(sets)], axis=-1)
@@ -449,19 +465,19 @@ class Discretisation(Model):
         if part.stress_field is not None:
             logs = np.broadcast_to(width + np.arange(count)[:, None, None], (*carried.shape[:2], 1))
             carried = np.concatenate([carried, logs], axis=-1)
-        if self.inverse is not None:
-            carried = self.inverse.places_of_points(number)
-        return Batch(
+        if self.inverse_equilibrium is not None:
+            carried = self.inverse_equilibrium.point_data_columns(number)
+        return KernelBatch(
             kernel,
             cells,
             geometry,
             destinations,
             self._width(name),
-            carried=carried if carried.shape[-1] else None,
+            data_columns=carried if carried.shape[-1] else None,
         )
 
 
-def _with_own(places: Index, own: Index, output: str, constants: int) -> Index:
+def _with_field_columns(places: Index, own: Index, output: str, constants: int) -> Index:
     """Return the positions (E, …) of derivatives by θ and by the logarithm of each cell.
 
     Parameters

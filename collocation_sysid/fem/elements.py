@@ -27,8 +27,8 @@ _FROM, _TO = np.array(EDGES).T
 # material the error keeps the element's order (Ciarlet 1978, theorem 4.1.6). Four points see
 # 4 · 6 = 24 strains, as many as 30 displacements less 6 rigid motions: none is without energy.
 # Fewer points would leave some that are; more would cost in proportion and gain no order.
-_NEAR = (5 - 5**0.5) / 20
-POINTS = _NEAR + (1 - 4 * _NEAR) * np.eye(4)
+_BARYCENTRIC_OFFSET = (5 - 5**0.5) / 20
+POINTS = _BARYCENTRIC_OFFSET + (1 - 4 * _BARYCENTRIC_OFFSET) * np.eye(4)
 WEIGHTS = np.full(4, 0.25)
 
 # The row sums of the consistent mass are negative at the corners. Its diagonal is not:
@@ -84,7 +84,7 @@ class Element:
         For each node after the corners, the two corners between which it lies halfway.
     mean_dilatation : bool
         Whether the material is evaluated at the mean dilatation of the element, see
-        `mean_dilatation`.
+        `averages_dilatation`.
     """
 
     name: str

@@ -33,17 +33,17 @@ from functools import lru_cache
 import casadi as ca
 
 from .elements import Element
-from .kernel import Derivative, Outputs, Pieces, PointKernel, QuadraturePoint
-from .materials import Damping, Material
+from .kernel import Derivative, ElementKernel, Outputs, Pieces, QuadraturePoint
+from .materials import DampingLaw, Material
 from .mean_dilatation import averaging_kernel
-from .rest_point import RestPoint
+from .rest_point import RestPointLayout
 
 # Number of kernels of each kind kept in memory, shared by bodies of the same law and element.
-KEPT = 64
+CACHED_KERNELS = 64
 
 
 @dataclass(frozen=True)
-class Law:
+class PointLaw:
     """Law of a quadrature point: a material and a damping law, with or without memory.
 
     The constants θ are those of the material, those of the damping law and, with memory, the
@@ -53,31 +53,31 @@ class Law:
     Attributes
     ----------
     material : Material
-    damping : Damping
-    memory : bool
+    damping : DampingLaw
+    has_memory : bool
         Whether the point has a memory.
-    scaled : tuple of int
+    scaled_indices : tuple of int
         Indices in θ of the constants that a field multiplies.
-    rest : RestPoint or None
+    rest : RestPointLayout or None
         Layout of the data of the stress-free shape; None if the mesh is stress-free.
     """
 
     material: Material
-    damping: Damping
-    memory: bool = False
-    scaled: tuple[int, ...] = ()
-    rest: RestPoint | None = None
+    damping: DampingLaw
+    has_memory: bool = False
+    scaled_indices: tuple[int, ...] = ()
+    rest: RestPointLayout | None = None
 
     @property
-    def constants(self) -> int:
+    def constant_count(self) -> int:
         """Number of constants in θ."""
-        count = len(self.material.constants) + len(self.damping.constants) + self.memory
-        return count + (self.rest.inputs if self.rest else 0)
+        count = len(self.material.constants) + len(self.damping.constants) + self.has_memory
+        return count + (self.rest.input_count if self.rest else 0)
 
     @property
-    def carried(self) -> int:
+    def internal_variable_count(self) -> int:
         """Number of internal variables of a point."""
-        return 6 if self.memory else 0
+        return 6 if self.has_memory else 0
 
     def psi(self, F: ca.SX, theta: ca.SX) -> ca.SX:
         """Return the energy density at the deformation gradient F (3, 3)."""
@@ -95,7 +95,7 @@ class Law:
         theta : (k,) SX
         """
         potential = self.damping.potential
-        return potential(psi, F, rate, **self._of_damping(theta)) if potential else ca.SX(0)
+        return potential(psi, F, rate, **self._damping_constants(theta)) if potential else ca.SX(0)
 
     def damping_stress(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX] | None:
         """Return P_v (9,) and ∂P_v/∂F (9, 9) of the damping law.
@@ -113,39 +113,48 @@ class Law:
         F_symbol = ca.SX.sym("F", 9)
         rate_symbol = ca.SX.sym("rate", 9)
         psi = self.psi(ca.reshape(F_symbol, 3, 3), theta)
-        expressions = self.damping.stress(psi, F_symbol, rate_symbol, **self._of_damping(theta))
+        expressions = self.damping.stress(
+            psi, F_symbol, rate_symbol, **self._damping_constants(theta)
+        )
         symbols = ca.vertcat(F_symbol, rate_symbol)
         values = ca.vertcat(F, rate)
         stress, slope = ca.substitute(list(expressions), [symbols], [values])
         return stress, slope
 
-    def _of_damping(self, theta: ca.SX) -> dict[str, ca.SX]:
+    def _damping_constants(self, theta: ca.SX) -> dict[str, ca.SX]:
         """Return the constants of the damping law by name."""
         constants = theta[len(self.material.constants) :]
         return {c.name: constants[k] for k, c in enumerate(self.damping.constants)}
 
 
-def point_of(
-    element: Element, law: Law, *fields: str, carried: int | None = None
+def quadrature_point(
+    element: Element, law: PointLaw, *fields: str, internal_variable_count: int | None = None
 ) -> QuadraturePoint:
     """Return the symbols of a quadrature point of an element that obeys a law.
 
     Parameters
     ----------
     element : Element
-    law : Law
+    law : PointLaw
     *fields : str
         Node fields: "x", and if needed "v" and "w".
-    carried : int, optional
+    internal_variable_count : int, optional
         Number of internal variables; by default that of the law.
     """
-    count = law.carried if carried is None else carried
-    return QuadraturePoint.of(
-        element, law.constants, *fields, carried=count, scaled=law.scaled, rest=law.rest
+    count = (
+        law.internal_variable_count if internal_variable_count is None else internal_variable_count
+    )
+    return QuadraturePoint.from_element(
+        element,
+        law.constant_count,
+        *fields,
+        internal_variable_count=count,
+        scaled=law.scaled_indices,
+        rest=law.rest,
     )
 
 
-def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKernel:
+def kernel_from_outputs(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
     """Return the kernel whose outputs are derivatives of scalars of a quadrature point."""
     if point.stretches:
         return averaging_kernel(name, point, outputs)
@@ -154,7 +163,7 @@ def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKerne
         summands = [
             # Known derivatives are by the material's deformation gradient; with a stress-free
             # shape that differs from the gradient with respect to the mesh.
-            term.of(
+            term.select_part(
                 point.derivative(term.scalar, term.by)
                 if term.known is None or point.rest is not None
                 else term.known
@@ -162,32 +171,34 @@ def kernel_of(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKerne
             for term in terms
         ]
         pieces[key] = terms[0].contraction, sum(summands[1:], summands[0])
-    last = point.phase(name, pieces)
-    return PointKernel(last.pieces, tuple(point.fields), last.contractions)
+    last = point.make_phase(name, pieces)
+    return ElementKernel(last.pieces, tuple(point.fields), last.contractions)
 
 
-def _energy(point: QuadraturePoint, law: Law) -> ca.SX:
+def _energy(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the elastic energy V ψ of a point."""
-    return point.volume * law.psi(point.felt, point.constants)
+    return point.volume * law.psi(point.material_gradient, point.local_constants)
 
 
-def _potential(point: QuadraturePoint, law: Law) -> ca.SX:
+def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return Θ of a point, whose negative derivative by x is an internal force."""
     energy = _energy(point, law)
-    damping = law.damping_potential(energy, point.strain, point.strain_rate, point.constants)
+    damping = law.damping_potential(
+        energy, point.strain_symbols, point.strain_rate_symbols, point.local_constants
+    )
     damped = energy + damping
-    if not law.memory:
+    if not law.has_memory:
         return damped
-    return damped + point.theta[-1] * energy + carried_energy(point)
+    return damped + point.theta[-1] * energy + memory_energy(point)
 
 
-def carried_energy(point: QuadraturePoint) -> ca.SX:
+def memory_energy(point: QuadraturePoint) -> ca.SX:
     """Return ½ V H : FᵀF, the energy of the overstress, whose derivative by F is V F H."""
-    F = point.felt
-    return point.volume * ca.trace(symmetric(point.carried[:6]) @ F.T @ F) / 2
+    F = point.material_gradient
+    return point.volume * ca.trace(symmetric_matrix(point.point_data[:6]) @ F.T @ F) / 2
 
 
-def symmetric(six: ca.SX) -> ca.SX:
+def symmetric_matrix(six: ca.SX) -> ca.SX:
     """Return a symmetric matrix from its entries xx, yy, zz, xy, xz, yz."""
     xx, yy, zz, xy, xz, yz = ca.vertsplit(six)
     return ca.blockcat([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -196,24 +207,30 @@ def symmetric(six: ca.SX) -> ca.SX:
 UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
-def six_of(matrix: ca.SX) -> ca.SX:
+def six_entries(matrix: ca.SX) -> ca.SX:
     """Return the entries xx, yy, zz, xy, xz, yz of a symmetric matrix."""
     return ca.vertcat(*[matrix[a, b] for a, b in UPPER])
 
 
-def first_piola(point: QuadraturePoint, law: Law) -> ca.SX:
+def first_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the first Piola–Kirchhoff stress P = ∂ψ/∂F, stacked (9,)."""
-    return ca.gradient(law.psi(point.felt, point.constants), point.gradients["x"])
+    return ca.gradient(
+        law.psi(point.material_gradient, point.local_constants), point.gradients["x"]
+    )
 
 
-def second_piola(point: QuadraturePoint, law: Law) -> ca.SX:
+def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return the second Piola–Kirchhoff stress S = F⁻¹ P by its entries (6,)."""
-    return six_of(ca.inv_minor(point.felt) @ ca.reshape(first_piola(point, law), 3, 3))
+    return six_entries(
+        ca.inv_minor(point.material_gradient) @ ca.reshape(first_piola(point, law), 3, 3)
+    )
 
 
-def _damping(point: QuadraturePoint, law: Law) -> tuple[ca.SX, ca.SX] | None:
+def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | None:
     """Return V P_v of a point and its derivative by F; None if the damping law has a potential."""
-    stress_and_slope = law.damping_stress(ca.vec(point.felt), point.felt_rate, point.constants)
+    stress_and_slope = law.damping_stress(
+        ca.vec(point.material_gradient), point.material_gradient_rate, point.local_constants
+    )
     return (
         None
         if stress_and_slope is None
@@ -221,31 +238,33 @@ def _damping(point: QuadraturePoint, law: Law) -> tuple[ca.SX, ca.SX] | None:
     )
 
 
-@lru_cache(KEPT)
-def energy_kernel(element: Element, law: Law) -> PointKernel:
+@lru_cache(CACHED_KERNELS)
+def energy_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of the elastic energy Ψ [J]."""
-    point = point_of(element, law, "x", carried=0)
-    return kernel_of("energy", point, {"energy": (Derivative(_energy(point, law), ()),)})
+    point = quadrature_point(element, law, "x", internal_variable_count=0)
+    return kernel_from_outputs("energy", point, {"energy": (Derivative(_energy(point, law), ()),)})
 
 
-@lru_cache(KEPT)
-def force_kernel(element: Element, law: Law) -> PointKernel:
+@lru_cache(CACHED_KERNELS)
+def force_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of the elastic and damping forces on the nodes [N]."""
-    point = point_of(element, law, "x", "v")
+    point = quadrature_point(element, law, "x", "v")
     force = (Derivative(-_potential(point, law), ("x",)),)
     if damping := _damping(point, law):
         stress = -damping[0]
-        force += (Derivative(ca.dot(stress, point.felt_rate) / 2, ("v",), known=stress),)
-    return kernel_of("force", point, {"force": force})
+        force += (
+            Derivative(ca.dot(stress, point.material_gradient_rate) / 2, ("v",), known=stress),
+        )
+    return kernel_from_outputs("force", point, {"force": force})
 
 
-@lru_cache(KEPT)
-def linearisation_kernel(element: Element, law: Law) -> PointKernel:
+@lru_cache(CACHED_KERNELS)
+def linearisation_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of the force and its derivatives by position, velocity and θ.
 
     With Rayleigh damping the derivatives by position and velocity are −K − γ_r D_vK and −γ_r K.
     """
-    point = point_of(element, law, "x", "v")
+    point = quadrature_point(element, law, "x", "v")
     potential = -_potential(point, law)
     outputs: Outputs = {
         "force": (Derivative(potential, ("x",)),),
@@ -257,30 +276,32 @@ def linearisation_kernel(element: Element, law: Law) -> PointKernel:
         stress = -damping[0]
         slope = -damping[1]
         # Half the dissipated power is quadratic in the rate; its derivative by it is the stress.
-        half_power = ca.dot(stress, point.felt_rate) / 2
+        half_power = ca.dot(stress, point.material_gradient_rate) / 2
         by_rate = ca.jacobian(stress, point.gradients["v"])
-        by_theta = ca.jacobian(stress, point.varied)
+        by_theta = ca.jacobian(stress, point.differentiated_constants)
         outputs["force"] += (Derivative(half_power, ("v",), known=stress),)
         outputs["by_position"] += (Derivative(half_power, ("v", "x"), "symmetric", slope),)
         outputs["by_velocity"] += (Derivative(half_power, ("v", "v"), known=by_rate),)
         outputs["by_theta"] += (Derivative(half_power, ("v", "theta"), known=by_theta),)
         outputs["by_position_skew"] = (Derivative(half_power, ("v", "x"), "skew", slope),)
-    return kernel_of("linearisation", point, outputs)
+    return kernel_from_outputs("linearisation", point, outputs)
 
 
-@lru_cache(KEPT)
-def curvature_kernel(element: Element, law: Law) -> PointKernel:
+@lru_cache(CACHED_KERNELS)
+def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of the second derivatives of φ = wᵀ f(x, v; θ) + σ·S, and of ∂φ/∂θ.
 
     ∂²φ/∂v² vanishes. ∂²φ/∂x∂v is symmetric if the force follows from a potential (Rayleigh: −γ_r
     D_wK).
     """
-    point = point_of(element, law, "x", "v", "w", carried=2 * law.carried)
-    power = -point.along_w(_potential(point, law))
-    if law.memory:
-        power += ca.dot(point.brought[6:], second_piola(point, law))
+    point = quadrature_point(
+        element, law, "x", "v", "w", internal_variable_count=2 * law.internal_variable_count
+    )
+    power = -point.derivative_along_weights(_potential(point, law))
+    if law.has_memory:
+        power += ca.dot(point.internal_variables[6:], second_piola(point, law))
     if damping := _damping(point, law):
-        power -= ca.dot(damping[0], point.felt_weight)
+        power -= ca.dot(damping[0], point.material_gradient_along_weights)
     mixed = Derivative(power, ("x", "v"), "symmetric" if damping else "whole")
     outputs: Outputs = {
         "position_position": (Derivative(power, ("x", "x")),),
@@ -292,10 +313,10 @@ def curvature_kernel(element: Element, law: Law) -> PointKernel:
     }
     if damping:
         outputs["position_velocity_skew"] = (replace(mixed, part="skew"),)
-    return kernel_of("curvature", point, outputs)
+    return kernel_from_outputs("curvature", point, outputs)
 
 
-KERNELS: dict[str, Callable[[Element, Law], PointKernel]] = {
+KERNELS: dict[str, Callable[[Element, PointLaw], ElementKernel]] = {
     "energy": energy_kernel,
     "force": force_kernel,
     "linearisation": linearisation_kernel,

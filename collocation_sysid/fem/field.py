@@ -9,7 +9,7 @@ Lindström 2011). With the eigenpairs λ_i, v_i of the mass-weighted Laplacian, 
 
 scaled so that the prior has the same deviation, the amplitude, everywhere. The constant eigenvector
 is omitted: it is the mean. Shapes beyond the first m have a share of the variance that is included
-in the interval of every element, see `FieldModes.left_out`.
+in the interval of every element, see `FieldModes.omitted_deviation`.
 
 For a density with the stated value ρ_s the field is ρ / ρ_s instead of the logarithm: masses are
 linear in the coefficients, and densities vary little within a material.
@@ -31,7 +31,7 @@ from ..checked import AtLeastOne, Positive, Text
 from ..errors import InputError
 from ..section import ByForm
 from ..stated import key, stated
-from .constants import DENSITY, YOUNG, Constant, is_modulus, mode
+from .constants import DENSITY, YOUNG, Constant, field_coefficient, is_modulus
 from .elements import ELEMENTS, reference_geometry
 from .mesh import TetMesh
 
@@ -116,7 +116,7 @@ class Laplacian:
     basis: Array
 
     @classmethod
-    def of(cls, mesh: TetMesh, cells: Index, count: int) -> Laplacian:
+    def from_mesh(cls, mesh: TetMesh, cells: Index, count: int) -> Laplacian:
         """Return the lowest eigenpairs after the constant eigenvector.
 
         Parameters
@@ -169,7 +169,7 @@ class Laplacian:
         """
         return 1 / (1 / length_m**2 + self.values)
 
-    def share(self, length_m: float) -> float:
+    def variance_share(self, length_m: float) -> float:
         """Return the share of the prior variance of these eigenvectors, without the constant one.
 
         The trace that this needs is estimated with `PROBES` random sign vectors of a fixed seed.
@@ -186,7 +186,7 @@ class Laplacian:
 
 
 @dataclass(frozen=True)
-class FieldShapes:
+class FieldResolution:
     """Resolution of a field by its shapes.
 
     Attributes
@@ -216,7 +216,7 @@ class FieldModes:
     ----------
     field : Field
     laplacian : Laplacian
-    scaled : tuple of int
+    scaled_indices : tuple of int
         Indices of the constants of material and damping law that the field multiplies; empty for a
         density.
     length_m : float
@@ -227,12 +227,14 @@ class FieldModes:
 
     field: Field
     laplacian: Laplacian
-    scaled: tuple[int, ...]
+    scaled_indices: tuple[int, ...]
     length_m: float
     volumes_m3: Array
 
     @classmethod
-    def of(cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]) -> FieldModes:
+    def from_field(
+        cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]
+    ) -> FieldModes:
         """Return the shapes of a field on some cells.
 
         Parameters
@@ -259,18 +261,18 @@ class FieldModes:
             raise InputError(
                 f"parameter of a field is {field.parameter!r}; expected one of {', '.join(known)}"
             )
-        laplacian = Laplacian.of(mesh, cells, field.modes)
+        laplacian = Laplacian.from_mesh(mesh, cells, field.modes)
         return cls(field, laplacian, tuple(scaled), field.lengths_m[0], mesh.volumes_m3[cells])
 
     def logarithms(self, coefficients: Array) -> Array:
         """Return ln c − ln c̄ (E,) in every cell, from the coefficients (k,) of `constants`."""
         return self.shapes @ coefficients
 
-    def slopes(self, coefficients: Array) -> Array:
+    def jacobian(self, coefficients: Array) -> Array:
         """Return the derivatives (E, k) of `logarithms` by the coefficients (k,)."""
         return self.shapes
 
-    def curvature(self, coefficients: Array, weights: Array) -> Array:
+    def weighted_hessian(self, coefficients: Array, weights: Array) -> Array:
         """Return the weighted sum over cells of the second derivatives of `logarithms`, (T, k, k).
 
         It is zero here, because the logarithms are linear in the coefficients.
@@ -284,36 +286,36 @@ class FieldModes:
         return np.zeros((len(weights), len(coefficients), len(coefficients)))
 
     @cached_property
-    def share(self) -> float:
+    def variance_share(self) -> float:
         """Share of the prior variance that the shapes represent."""
-        return self.laplacian.share(self.length_m)
+        return self.laplacian.variance_share(self.length_m)
 
     @property
-    def left_out(self) -> float:
+    def omitted_deviation(self) -> float:
         """Standard deviation of the logarithm due to finer shapes, which are omitted."""
-        return self.field.deviation * float(np.sqrt(1 - self.share))
+        return self.field.deviation * float(np.sqrt(1 - self.variance_share))
 
     @cached_property
     def shapes(self) -> Array:
         """Shapes φ (E, m) in the cells."""
         unscaled = self.laplacian.weights(self.length_m)[:, None] * self.laplacian.vectors
-        deviation = self.field.deviation * np.sqrt(self.share)
+        deviation = self.field.deviation * np.sqrt(self.variance_share)
         return (deviation * unscaled / np.linalg.norm(unscaled, axis=0)).T
 
     @property
     def constants(self) -> tuple[Constant, ...]:
         """Constants of the coefficients a."""
-        return tuple(mode(k) for k in range(self.field.modes))
+        return tuple(field_coefficient(k) for k in range(self.field.modes))
 
     @property
-    def told(self) -> FieldShapes:
+    def resolution(self) -> FieldResolution:
         """Resolution of the field, for reports."""
         detail_m = float(np.pi / np.sqrt(self.laplacian.values[-1]))
-        return FieldShapes(
+        return FieldResolution(
             modes=self.field.modes,
             length_m=self.length_m,
             amplitude=self.field.deviation,
-            share=self.share,
+            share=self.variance_share,
             detail_m=detail_m,
         )
 
@@ -324,13 +326,13 @@ class FieldModes:
         laplacian = replace(self.laplacian, vectors=vectors)
         return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
 
-    def at(self, length_m: float) -> FieldModes:
+    def with_length(self, length_m: float) -> FieldModes:
         """Return this field with another correlation length [m]."""
         return replace(self, length_m=length_m)
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class FieldAssembly:
     """Assembly of derivatives by the logarithm of each cell into derivatives by the coefficients.
 
     Attributes
@@ -355,7 +357,7 @@ class Spread:
         numbers = np.arange(1, rows.size + 1)
         return sp.csr_array((numbers, (rows, columns)), shape=(self.size, cells))
 
-    def nodal(self, values: Array, slopes: Array, out: Array) -> None:
+    def assemble_nodal(self, values: Array, slopes: Array, out: Array) -> None:
         """Write derivatives of nodal values by the coefficients of the field to `out`.
 
         Parameters

@@ -19,7 +19,7 @@ from .pattern import SymmetricPattern, dofs_of
 
 # Number of cached matrices: four for each of the latest eight choices of instances, namely the
 # operator, its transpose, and the assembly of the symmetric and of the skew parts.
-MOST_KEPT = 32
+CACHED_MATRICES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,18 +30,18 @@ class ForcePoints:
     ----------
     nodes : (i, K)
         Node indices of each instance.
-    mix : (i, L, K)
+    node_weights : (i, L, K)
         Weights m of the nodes in each vector.
     node_count : int
         Number of nodes of the body.
     """
 
     nodes: Index
-    mix: Array
+    node_weights: Array
     node_count: int
 
     @classmethod
-    def of_nodes(cls, nodes: Index, node_count: int) -> ForcePoints:
+    def at_nodes(cls, nodes: Index, node_count: int) -> ForcePoints:
         """Return instances (i, K) whose vectors are the node positions."""
         count = nodes.shape[1]
         return cls(nodes, np.broadcast_to(np.eye(count), (len(nodes), count, count)), node_count)
@@ -54,12 +54,12 @@ class ForcePoints:
     @property
     def dofs(self) -> int:
         """Number 3L of coordinates of the vectors of an instance."""
-        return 3 * self.mix.shape[1]
+        return 3 * self.node_weights.shape[1]
 
     @cached_property
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs coupled by the nodes of an instance."""
-        return SymmetricPattern.of_cells(self.nodes, self.node_count)
+        return SymmetricPattern.from_cells(self.nodes, self.node_count)
 
     def vectors(self, x: Array, chosen: Index | None = None) -> Array:
         """Return the vectors y (3L, T, i) of node positions x (T, 3n).
@@ -71,10 +71,10 @@ class ForcePoints:
         chosen : array of int, optional
             Indices of the instances; all by default.
         """
-        stacked = self._some("operator", chosen) @ x.T
+        stacked = self._operator_for("operator", chosen) @ x.T
         return stacked.reshape(len(stacked) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
 
-    def summed(self, forces: Array, chosen: Index | None = None) -> Array:
+    def assemble(self, forces: Array, chosen: Index | None = None) -> Array:
         """Return the nodal forces (T, 3n) of forces (3L, T, i) on the vectors.
 
         Parameters
@@ -84,9 +84,9 @@ class ForcePoints:
             Indices of the instances; all by default.
         """
         flat = forces.transpose(2, 0, 1).reshape(len(forces) * forces.shape[2], forces.shape[1])
-        return (self._some("transposed operator", chosen) @ flat).T
+        return (self._operator_for("transposed operator", chosen) @ flat).T
 
-    def add_entries(
+    def add_matrices(
         self,
         to: Array,
         places: Index,
@@ -113,11 +113,11 @@ class ForcePoints:
         """
         columns, rows = np.triu_indices(len(blocks))
         values = blocks[rows, columns] + (-1 if skew else 1) * blocks[columns, rows]
-        assembly, nonempty = self._some("skew" if skew else "couplings", chosen)
+        assembly, nonempty = self._operator_for("skew" if skew else "couplings", chosen)
         values = np.moveaxis(values, 0, 2).reshape(values.shape[1], assembly.shape[1])
         to[:, places[nonempty]] += (assembly @ values.T).T / 2
 
-    def _some(self, what: str, chosen: Index | None) -> Any:
+    def _operator_for(self, what: str, chosen: Index | None) -> Any:
         """Return the columns or rows of a matrix that belong to chosen instances.
 
         The latest are cached.
@@ -130,44 +130,44 @@ class ForcePoints:
             Indices of the instances; None for all.
         """
         key = what, None if chosen is None else chosen.tobytes()
-        if key not in self._kept:
-            if len(self._kept) >= MOST_KEPT:
-                self._kept.pop(next(iter(self._kept)), None)
+        if key not in self._operators:
+            if len(self._operators) >= CACHED_MATRICES:
+                self._operators.pop(next(iter(self._operators)), None)
             if what == "operator":
-                rows = slice(None) if chosen is None else _each(chosen, self.dofs)
-                self._kept[key] = self._operator[rows]
+                rows = slice(None) if chosen is None else _expanded_indices(chosen, self.dofs)
+                self._operators[key] = self._operator[rows]
             elif what == "transposed operator":
-                self._kept[key] = self._some("operator", chosen).T
+                self._operators[key] = self._operator_for("operator", chosen).T
             else:
                 matrix: Any = self._onto_skew if what == "skew" else self._onto_couplings
                 if chosen is not None:
-                    matrix = matrix[:, _each(chosen, self.dofs * (self.dofs + 1) // 2)]
+                    matrix = matrix[:, _expanded_indices(chosen, self.dofs * (self.dofs + 1) // 2)]
                 # Of few instances most rows are empty.
                 is_nonempty = np.bincount(matrix.indices, minlength=matrix.shape[0]) > 0
                 number = np.cumsum(is_nonempty) - 1
                 nonempty = np.flatnonzero(is_nonempty)
                 parts = matrix.data, number[matrix.indices], matrix.indptr
                 shape = len(nonempty), matrix.shape[1]
-                self._kept[key] = sp.csc_array(parts, shape=shape), nonempty
-        return self._kept[key]
+                self._operators[key] = sp.csc_array(parts, shape=shape), nonempty
+        return self._operators[key]
 
     @cached_property
-    def _kept(self) -> dict[tuple[str, bytes | None], Any]:
+    def _operators(self) -> dict[tuple[str, bytes | None], Any]:
         """Cached matrices by kind and instances, filled on demand."""
         return {}
 
     @cached_property
     def _operator(self) -> sp.csr_array:
         """Sparse matrix (i · 3L, 3n) from node positions to vectors."""
-        instance, local, node, weight = self.pairs
+        instance, local, node, weight = self.nonzero_weights
         shape = self.count * self.dofs, 3 * self.node_count
         return sp.csr_array((weight, (instance * self.dofs + local, node)), shape=shape)
 
     @cached_property
-    def pairs(self) -> tuple[Index, Index, Index, Array]:
+    def nonzero_weights(self) -> tuple[Index, Index, Index, Array]:
         """Instance, coordinate among 3L, dof and weight of all nonzero weights, (P,) each."""
-        instance, vector, place = np.nonzero(self.mix)
-        weight = self.mix[instance, vector, place]
+        instance, vector, place = np.nonzero(self.node_weights)
+        weight = self.node_weights[instance, vector, place]
         axes = np.arange(3)
         dofs = dofs_of(self.nodes[instance, place][:, None]).ravel()
         locals_ = (3 * vector[:, None] + axes).ravel()
@@ -176,20 +176,20 @@ class ForcePoints:
     @cached_property
     def _onto_couplings(self) -> sp.csc_array:
         """Matrix that sums symmetric parts of instances into the couplings."""
-        return self._onto(skew=False)
+        return self._assembly_matrix(skew=False)
 
     @cached_property
     def _onto_skew(self) -> sp.csc_array:
         """Matrix that sums skew parts of instances into the couplings."""
-        return self._onto(skew=True)
+        return self._assembly_matrix(skew=True)
 
-    def _onto(self, skew: bool) -> sp.csc_array:
+    def _assembly_matrix(self, skew: bool) -> sp.csc_array:
         """Return the matrix that sums lower triangles (i, d(d + 1)/2) into the entries of the
         couplings.
 
         The lower triangles are stacked column after column.
         """
-        instance, local, dof, weight = self.pairs
+        instance, local, dof, weight = self.nonzero_weights
         order = np.argsort(instance, kind="stable")
         instance = instance[order]
         local = local[order]
@@ -218,13 +218,13 @@ class ForcePoints:
             low = np.minimum(r, s)
             high = np.maximum(r, s)
             lower = low * d - low * (low - 1) // 2 + high - low
-            place = self.couplings.position(row[lower_pairs], column[lower_pairs])
+            place = self.couplings.positions_of(row[lower_pairs], column[lower_pairs])
             parts.append((place, instance[first] * (d * (d + 1) // 2) + lower, value))
         places, sources, values = map(np.concatenate, zip(*parts, strict=True))
-        shape = self.couplings.entries, self.count * self.dofs * (self.dofs + 1) // 2
+        shape = self.couplings.entry_count, self.count * self.dofs * (self.dofs + 1) // 2
         return sp.csc_array((values, (places, sources)), shape=shape)
 
 
-def _each(chosen: Index, size: int) -> Index:
+def _expanded_indices(chosen: Index, size: int) -> Index:
     """Return the indices of all entries of chosen instances with `size` entries each."""
     return (chosen[:, None] * size + np.arange(size)).ravel()

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import casadi as ca
 
 from .elements import Element
-from .rest_point import RestPoint
+from .rest_point import RestPointLayout
 
 # Product of a piece with the shape gradients. "none": no product; "nodes": from (9, k), conjugate
 # to F, to (3·nodes, k); "pairs": from a symmetric (9, 9) to the lower triangle of
@@ -66,7 +66,7 @@ class Phase:
         dense = [ca.densify(ca.vec(output)) for output in outputs]
         return ca.Function(sx.name(), inputs, dense, names, sx.name_out(), {"cse": True})
 
-    def over_points(self, *inputs: Any) -> list[Any]:
+    def sum_over_points(self, *inputs: Any) -> list[Any]:
         """Return the sums over the points, each in one column.
 
         Inputs that differ between the points, see `OF_POINTS`, have one column for each point.
@@ -89,7 +89,7 @@ class Phase:
 
 
 @dataclass(frozen=True, eq=False)
-class PointKernel:
+class ElementKernel:
     """Contribution of the quadrature points of an element, summed.
 
     Attributes
@@ -100,7 +100,7 @@ class PointKernel:
         Names of the first inputs, each 3·nodes long.
     contractions : dict of str to Contraction
         Contraction of each output.
-    earlier : tuple of Phase
+    previous_phases : tuple of Phase
         Phases before the last one.
     coupled : dict of str to Contraction
         Further outputs of the last phase, which are summed for the coupling only.
@@ -112,12 +112,12 @@ class PointKernel:
     pieces: ca.Function
     fields: tuple[str, ...]
     contractions: dict[str, Contraction]
-    earlier: tuple[Phase, ...] = ()
+    previous_phases: tuple[Phase, ...] = ()
     coupled: dict[str, Contraction] = field(default_factory=dict)
     coupling: ca.Function | None = None
 
     @property
-    def carried(self) -> int:
+    def point_data_count(self) -> int:
         """Number of internal variables and other data of a point."""
         names = self.pieces.name_in()
         return self.pieces.nnz_in(names.index("carried")) if "carried" in names else 0
@@ -125,10 +125,10 @@ class PointKernel:
     @cached_property
     def phases(self) -> tuple[Phase, ...]:
         """All phases, the last one included."""
-        return (*self.earlier, Phase(self.pieces, self.contractions | self.coupled))
+        return (*self.previous_phases, Phase(self.pieces, self.contractions | self.coupled))
 
     @cached_property
-    def source(self) -> str:
+    def serialized(self) -> str:
         """Serialised expressions and contractions, which identify the kernel."""
         functions = [phase.pieces for phase in self.phases]
         functions += [self.coupling] if self.coupling else []
@@ -150,7 +150,7 @@ class PointKernel:
         vectors = ca.MX(size, 0)
         outputs: list[ca.MX] = []
         for phase in self.phases:
-            totals = phase.over_points(*inputs, *([sums] if sums.numel() else []))
+            totals = phase.sum_over_points(*inputs, *([sums] if sums.numel() else []))
             for key, total in zip(phase.contractions, totals, strict=True):
                 if key in self.contractions:
                     outputs.append(total)
@@ -173,7 +173,7 @@ def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
     return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
 
 
-def mirrored(matrix: ca.SX) -> ca.SX:
+def from_lower_triangle(matrix: ca.SX) -> ca.SX:
     """Return a matrix that is known to be symmetric from its lower triangle, to save
     computations.
     """
@@ -248,7 +248,7 @@ class Derivative:
         contractions: tuple[Contraction, ...] = ("none", "nodes", "pairs")
         return contractions[len(self.by) - self.by.count("theta")]
 
-    def of(self, piece: ca.SX) -> ca.SX:
+    def select_part(self, piece: ca.SX) -> ca.SX:
         """Return the stated part of the (9, 9) piece of a second derivative by fields.
 
         Others unchanged.
@@ -256,9 +256,9 @@ class Derivative:
         if self.contraction != "pairs":
             return piece
         if self.part == "whole":
-            return mirrored(piece)
+            return from_lower_triangle(piece)
         if self.part == "symmetric":
-            return mirrored((piece + piece.T) / 2)
+            return from_lower_triangle((piece + piece.T) / 2)
         # Contracted in pairs, a piece gives the lower triangle of its transpose.
         return (piece.T - piece) / 2
 
@@ -285,14 +285,15 @@ class QuadraturePoint:
         Gradients of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column (9,): F, Ḟ and W.
     stretches : tuple of SX
         If the element averages the dilatation: the logarithm m of the stretch that does so and,
-        with v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
-    carried : SX
+        with v, its derivative along v, and with w, those of both along w; see
+        `averages_dilatation`.
+    point_data : SX
         Internal variables of the point, see `memory`; with a field, its logarithm comes last.
-    scaled : tuple of int
+    scaled_indices : tuple of int
         Indices in θ of the constants that a field multiplies, see `field`.
-    rest : RestPoint, optional
+    rest : RestPointLayout, optional
         Layout of a stress-free shape that is not the mesh, see `rest_shape`: its data are the last
-        ones of `carried`, and the changes of its inputs the last entries of θ.
+        ones of `point_data`, and the changes of its inputs the last entries of θ.
     """
 
     nodes: int
@@ -301,19 +302,19 @@ class QuadraturePoint:
     theta: ca.SX
     gradients: dict[str, ca.SX]
     stretches: tuple[ca.SX, ...]
-    carried: ca.SX
-    scaled: tuple[int, ...] = ()
-    rest: RestPoint | None = None
+    point_data: ca.SX
+    scaled_indices: tuple[int, ...] = ()
+    rest: RestPointLayout | None = None
 
     @classmethod
-    def of(
+    def from_element(
         cls,
         element: Element,
         constants: int,
         *fields: str,
-        carried: int = 0,
+        internal_variable_count: int = 0,
         scaled: tuple[int, ...] = (),
-        rest: RestPoint | None = None,
+        rest: RestPointLayout | None = None,
     ) -> QuadraturePoint:
         """Return the symbols of a quadrature point of an element.
 
@@ -324,11 +325,11 @@ class QuadraturePoint:
             Length of θ.
         *fields : str
             Node fields: "x", and if needed "v" and "w".
-        carried : int
+        internal_variable_count : int
             Number of internal variables.
         scaled : tuple of int
             Indices in θ of the constants that a field multiplies.
-        rest : RestPoint, optional
+        rest : RestPointLayout, optional
             Layout of the data of the stress-free shape.
         """
         stretches = 2 ** (len(fields) - 1) if element.mean_dilatation else 0
@@ -339,28 +340,30 @@ class QuadraturePoint:
             ca.SX.sym("theta", constants),
             {name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
             tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
-            ca.SX.sym("carried", carried + bool(scaled) + (rest.count if rest else 0)),
+            ca.SX.sym(
+                "carried", internal_variable_count + bool(scaled) + (rest.count if rest else 0)
+            ),
             scaled,
             rest,
         )
 
     @property
-    def constants(self) -> ca.SX:
+    def local_constants(self) -> ca.SX:
         """Constants θ at this point, multiplied by the field."""
         constants = ca.SX(self.theta)
-        for place in self.scaled:
-            constants[place] *= ca.exp(self.carried[-1])
+        for place in self.scaled_indices:
+            constants[place] *= ca.exp(self.point_data[-1])
         return constants
 
     @property
-    def varied(self) -> ca.SX:
+    def differentiated_constants(self) -> ca.SX:
         """Variables of derivatives by "theta": θ, and the logarithm of the field."""
-        return ca.vertcat(self.theta, self.carried[-1]) if self.scaled else self.theta
+        return ca.vertcat(self.theta, self.point_data[-1]) if self.scaled_indices else self.theta
 
     @property
-    def brought(self) -> ca.SX:
+    def internal_variables(self) -> ca.SX:
         """Internal variables, i.e. the data of the point without the logarithm of the field."""
-        return self.carried[:-1] if self.scaled else self.carried
+        return self.point_data[:-1] if self.scaled_indices else self.point_data
 
     @property
     def mesh_volume(self) -> ca.SX:
@@ -376,14 +379,14 @@ class QuadraturePoint:
 
     @property
     def _rest_values(self) -> ca.SX:
-        """Values of the stress-free shape at this point, see `RestPoint`."""
+        """Values of the stress-free shape at this point, see `RestPointLayout`."""
         assert self.rest is not None
-        data = self.carried[self.carried.numel() - self.rest.count :]
-        changes = self.theta[self.theta.numel() - self.rest.inputs :]
+        data = self.point_data[self.point_data.numel() - self.rest.count :]
+        changes = self.theta[self.theta.numel() - self.rest.input_count :]
         return self.rest.expand(data, changes)
 
     @property
-    def felt(self) -> ca.SX:
+    def material_gradient(self) -> ca.SX:
         """Deformation gradient at which the material is evaluated (3, 3).
 
         It includes the averaged dilatation and the stress-free shape.
@@ -398,41 +401,46 @@ class QuadraturePoint:
         return F if stretch is None else ca.exp(stretch) * F
 
     @property
-    def strain(self) -> ca.SX:
+    def strain_symbols(self) -> ca.SX:
         """Symbols of an energy that depend on x: F and m."""
         return ca.vertcat(self.gradients["x"], *self.stretches[:1])
 
     @property
-    def strain_rate(self) -> ca.SX:
-        """Symbols of the derivative of `strain` along v."""
+    def strain_rate_symbols(self) -> ca.SX:
+        """Symbols of the derivative of `strain_symbols` along v."""
         return ca.vertcat(self.gradients["v"], *self.stretches[1:2])
 
     @property
-    def felt_rate(self) -> ca.SX:
-        """Derivative of `felt` along v, stacked (9,)."""
-        return ca.jtimes(ca.vec(self.felt), self.strain, self.strain_rate)
+    def material_gradient_rate(self) -> ca.SX:
+        """Derivative of `material_gradient` along v, stacked (9,)."""
+        return ca.jtimes(
+            ca.vec(self.material_gradient), self.strain_symbols, self.strain_rate_symbols
+        )
 
     @property
-    def felt_weight(self) -> ca.SX:
-        """Derivative of `felt` along w, stacked (9,)."""
+    def material_gradient_along_weights(self) -> ca.SX:
+        """Derivative of `material_gradient` along w, stacked (9,)."""
         weights = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
-        return ca.jtimes(ca.vec(self.felt), self.strain, weights)
+        return ca.jtimes(ca.vec(self.material_gradient), self.strain_symbols, weights)
 
-    def along_w(self, scalar: ca.SX) -> ca.SX:
+    def derivative_along_weights(self, scalar: ca.SX) -> ca.SX:
         """Return the derivative of a scalar of x and v by x along w."""
         inputs = ca.vertcat(self.gradients["x"], *self.stretches[:2])
         return ca.jtimes(scalar, inputs, ca.vertcat(self.gradients["w"], *self.stretches[2:]))
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
         """Return a derivative of a scalar, where fields stand for their gradients."""
-        inputs = [self.varied if name == "theta" else self.gradients[name] for name in by]
+        inputs = [
+            self.differentiated_constants if name == "theta" else self.gradients[name]
+            for name in by
+        ]
         if not inputs:
             return scalar
         if len(inputs) < 2:
             return ca.jacobian(scalar, inputs[0]).T
         return ca.jacobian(ca.gradient(scalar, inputs[0]), inputs[1])
 
-    def phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
+    def make_phase(self, name: str, pieces: Pieces, sums: ca.SX | None = None) -> Phase:
         """Return a phase with these pieces.
 
         Parameters
@@ -445,8 +453,8 @@ class QuadraturePoint:
             Symbols of the sums of earlier phases on which the pieces depend.
         """
         inputs = {**self.fields, "geometry": self.geometry, "theta": self.theta}
-        if self.carried.numel():
-            inputs["carried"] = self.carried
+        if self.point_data.numel():
+            inputs["carried"] = self.point_data
         if sums is not None:
             inputs["sums"] = sums
         shape_gradients = node_gradients(self.geometry, self.nodes)

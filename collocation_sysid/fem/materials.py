@@ -9,7 +9,8 @@ Energies in the isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3)
 (J − 1)². Ogden's is omitted: its derivatives by principal stretches are not exact where stretches
 coincide.
 
-A `Damping` law is a potential or a stress that depends on the rate of deformation. "kelvin-voigt"
+A `DampingLaw` law is a potential or a stress that depends on the rate of deformation.
+"kelvin-voigt"
 and "material" are objective and dissipate at any strain, with viscosities proportional to the
 small-strain Lamé constants: the former is a viscous fluid in the current shape, the latter is
 viscous in the rate of the Green strain. Rayleigh's law agrees with both at small strain, but it
@@ -33,13 +34,13 @@ import numpy as np
 from ..errors import InputError, hint_at
 from ..files import reason
 from .constants import GAMMA_R, SHARE, TAU, Constant, constant_named
-from .kernel import mirrored
+from .kernel import from_lower_triangle
 
 T = TypeVar("T")
 Energy = Callable[..., ca.SX]
 
 # Largest energy and stress of an undeformed material, as a fraction of its stiffness: rounding.
-AT_REST = 1e-9
+REST_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class Material:
     constants: tuple[Constant, ...]
 
     @classmethod
-    def of(cls, energy: Energy, name: str = "", *constants: Constant) -> Material:
+    def from_energy(cls, energy: Energy, name: str = "", *constants: Constant) -> Material:
         """Return a material from an energy function; its arguments after F are the constants.
 
         Parameters
@@ -130,13 +131,13 @@ class Material:
         scale = np.abs(stiffness).max()
         for what, unit, residual in (("energy", "J/m³", energy), ("stress", "Pa", force)):
             worst = np.abs(residual).max()
-            if not worst <= AT_REST * scale:
+            if not worst <= REST_TOLERANCE * scale:
                 raise InputError(
                     f"material {self.name!r} has the {what} {worst:.3g} {unit} undeformed, with "
-                    f"{self._said(sample_values)}; expected none at F = I: subtract it"
+                    f"{self._describe_values(sample_values)}; expected none at F = I: subtract it"
                 )
 
-    def _said(self, values: list[float]) -> str:
+    def _describe_values(self, values: list[float]) -> str:
         """Return the constants with given values as text."""
         return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
 
@@ -251,7 +252,8 @@ def _arguments(energy: Energy) -> list[str]:
     return list(inspect.signature(energy).parameters)[1:]
 
 
-# Built without `Material.of`, whose check would slow down every start; the tests check them.
+# Built without `Material.from_energy`, whose check would slow down every start; the tests check
+# them.
 MATERIALS: dict[str, Material] = {
     name: Material(name, energy, tuple(map(constant_named, _arguments(energy))))
     for name, energy in {
@@ -267,21 +269,25 @@ MATERIALS: dict[str, Material] = {
 }
 
 
-def as_material(given: str | Energy | Material) -> Material:
+def as_material(material: str | Energy | Material) -> Material:
     """Return a material from its name in `MATERIALS`, from an energy function, or the given
     material.
 
     Raises
     ------
     InputError
-        If there is no material of that name; for a function see `Material.of`.
+        If there is no material of that name; for a function see `Material.from_energy`.
     """
-    if isinstance(given, Material):
-        return given
-    return _named("material", given, MATERIALS) if isinstance(given, str) else Material.of(given)
+    if isinstance(material, Material):
+        return material
+    return (
+        _look_up("material", material, MATERIALS)
+        if isinstance(material, str)
+        else Material.from_energy(material)
+    )
 
 
-def _named(kind: str, name: str, table: Mapping[str, T]) -> T:
+def _look_up(kind: str, name: str, table: Mapping[str, T]) -> T:
     """Return the entry of a table by name, or raise an `InputError` that lists the known names.
 
     Parameters
@@ -303,7 +309,7 @@ TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
 
 
 @dataclass(frozen=True, eq=False)
-class Damping:
+class DampingLaw:
     """Damping law: a potential, or a stress.
 
     Attributes
@@ -338,7 +344,7 @@ def kelvin_voigt(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[c
     stiffness, _ = ca.hessian(psi, F)
     # A linear material does not distinguish the deformed from the undeformed shape.
     if not ca.depends_on(stiffness, F):
-        return gamma_r_s * mirrored(stiffness) @ rate, ca.SX(9, 9)
+        return gamma_r_s * from_lower_triangle(stiffness) @ rate, ca.SX(9, 9)
     lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
     one = ca.SX.eye(3)
     inverse = ca.inv_minor(ca.reshape(F, 3, 3))
@@ -361,7 +367,7 @@ def material_form(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> tuple[
     """
     stiffness, _ = ca.hessian(psi, F)
     if not ca.depends_on(stiffness, F):  # a linear material does not distinguish the shapes
-        return gamma_r_s * mirrored(stiffness) @ rate, ca.SX(9, 9)
+        return gamma_r_s * from_lower_triangle(stiffness) @ rate, ca.SX(9, 9)
     lame, shear = ca.vertsplit(gamma_r_s * lame_constants(psi, F))
     deformation = ca.reshape(F, 3, 3)
     product = deformation.T @ ca.reshape(rate, 3, 3)
@@ -376,14 +382,14 @@ def rayleigh(psi: ca.SX, F: ca.SX, rate: ca.SX, gamma_r_s: ca.SX) -> ca.SX:
     return gamma_r_s * ca.jtimes(psi, F, rate)
 
 
-DAMPINGS: dict[str, Damping] = {
-    "kelvin-voigt": Damping("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
-    "material": Damping("material", (GAMMA_R,), stress=material_form),
-    "rayleigh": Damping("rayleigh", (GAMMA_R,), rayleigh),
+DAMPINGS: dict[str, DampingLaw] = {
+    "kelvin-voigt": DampingLaw("kelvin-voigt", (GAMMA_R,), stress=kelvin_voigt),
+    "material": DampingLaw("material", (GAMMA_R,), stress=material_form),
+    "rayleigh": DampingLaw("rayleigh", (GAMMA_R,), rayleigh),
 }
 
 
-def as_damping(given: str | Damping) -> Damping:
+def as_damping(damping: str | DampingLaw) -> DampingLaw:
     """Return a damping law from its name in `DAMPINGS`, or the given law.
 
     Raises
@@ -391,7 +397,7 @@ def as_damping(given: str | Damping) -> Damping:
     InputError
         If there is no damping law of that name.
     """
-    return given if isinstance(given, Damping) else _named("damping", given, DAMPINGS)
+    return damping if isinstance(damping, DampingLaw) else _look_up("damping", damping, DAMPINGS)
 
 
 @dataclass(frozen=True)
@@ -420,7 +426,7 @@ class Prony:
         return share, tau
 
 
-def as_branches(given: Sequence[str | Prony]) -> tuple[Prony, ...]:
+def as_branches(branches_or_names: Sequence[str | Prony]) -> tuple[Prony, ...]:
     """Return Prony branches from their names, or the given branches.
 
     Raises
@@ -428,9 +434,9 @@ def as_branches(given: Sequence[str | Prony]) -> tuple[Prony, ...]:
     InputError
         For an invalid name, or a name that occurs twice.
     """
-    if isinstance(given, str):
-        raise InputError(f"prony is {given!r}; expected a sequence of names")
-    branches = tuple(b if isinstance(b, Prony) else Prony(b) for b in given)
+    if isinstance(branches_or_names, str):
+        raise InputError(f"prony is {branches_or_names!r}; expected a sequence of names")
+    branches = tuple(b if isinstance(b, Prony) else Prony(b) for b in branches_or_names)
     names = [branch.name for branch in branches]
     for name in names:
         if names.count(name) > 1:

@@ -35,10 +35,18 @@ from functools import cached_property
 
 import casadi as ca
 
-from .kernel import By, Derivative, Outputs, Pieces, PointKernel, QuadraturePoint, mirrored
+from .kernel import (
+    By,
+    Derivative,
+    ElementKernel,
+    Outputs,
+    Pieces,
+    QuadraturePoint,
+    from_lower_triangle,
+)
 
 
-def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> PointKernel:
+def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> ElementKernel:
     """Return the kernel of derivatives of scalars that depend on `QuadraturePoint.stretches`.
 
     Parameters
@@ -49,25 +57,29 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Poi
     outputs : dict
         Derivatives that are summed in each output.
     """
-    shape = _Shape.of(point)
-    chains = _chains(shape, outputs)
+    shape = _VolumeSums.from_point(point)
+    chains = _scalar_derivatives(shape, outputs)
     order = max(len(term.by) for terms in outputs.values() for term in terms)
     output_pieces: Pieces = {}
     for key, terms in outputs.items():
-        summands = [term.of(chains[id(term.scalar)].piece(term.by)) for term in terms]
+        summands = [term.select_part(chains[id(term.scalar)].piece(term.by)) for term in terms]
         output_pieces[key] = terms[0].contraction, sum(summands[1:], summands[0])
     slopes: Pieces = {}
     if order:
-        slopes = {chain.key("slopes"): ("none", chain.by_stretch) for chain in chains.values()}
+        slopes = {chain.sum_name("slopes"): ("none", chain.by_stretch) for chain in chains.values()}
     sums = ca.vertcat(shape.volume, shape.volumes)
-    earlier = [point.phase("volumes", shape.first(order))]
+    earlier = [point.make_phase("volumes", shape.volume_pieces(order))]
     coupled = slopes
     if order > 1:
-        earlier.append(point.phase("slopes", shape.at_sums(slopes), sums))
+        earlier.append(point.make_phase("slopes", shape.with_stretches(slopes), sums))
         sums = ca.vertcat(sums, *(chain.slopes for chain in chains.values()))
-        coupled = {key: p for chain in chains.values() for key, p in chain.second().items()}
-    last = point.phase(name, shape.at_sums(output_pieces | coupled), sums)
-    return PointKernel(
+        coupled = {
+            key: p
+            for chain in chains.values()
+            for key, p in chain.second_derivative_pieces().items()
+        }
+    last = point.make_phase(name, shape.with_stretches(output_pieces | coupled), sums)
+    return ElementKernel(
         last.pieces,
         tuple(point.fields),
         {key: last.contractions[key] for key in output_pieces},
@@ -78,7 +90,7 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Poi
 
 
 @dataclass(frozen=True, eq=False)
-class _Shape:
+class _VolumeSums:
     """Volumes that determine the stretch of a point.
 
     Attributes
@@ -98,7 +110,7 @@ class _Shape:
     own_volumes: ca.SX
 
     @classmethod
-    def of(cls, point: QuadraturePoint) -> _Shape:
+    def from_point(cls, point: QuadraturePoint) -> _VolumeSums:
         """Return the volumes of a quadrature point and symbols of their sums."""
         F, *rates = point.gradients.values()
         volumes = point.mesh_volume * ca.det(ca.reshape(F, 3, 3))
@@ -116,16 +128,16 @@ class _Shape:
         """Number of the sums s."""
         return self.volumes.numel()
 
-    def at_sums(self, pieces: Pieces) -> Pieces:
+    def with_stretches(self, pieces: Pieces) -> Pieces:
         """Return pieces with m replaced by its expression in the sums."""
-        m = _stretches(self.volumes, self.volume)
-        m -= _stretches(self.own_volumes, self.point.mesh_volume)
+        m = _volume_logarithms(self.volumes, self.volume)
+        m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
         return {
             key: (how, ca.substitute(piece, self.stretches, m))
             for key, (how, piece) in pieces.items()
         }
 
-    def first(self, order: int) -> Pieces:
+    def volume_pieces(self, order: int) -> Pieces:
         """Return the pieces V, s and, for derivatives, ∂s/∂x of the first phase.
 
         Parameters
@@ -138,14 +150,14 @@ class _Shape:
             "volumes": ("none", self.own_volumes),
         }
         if order:
-            sums["volumes_by_x"] = "nodes", self.own_by("x").T
+            sums["volumes_by_x"] = "nodes", self.volume_derivative("x").T
         return sums
 
-    def own_by(self, field: str) -> ca.SX:
+    def volume_derivative(self, field: str) -> ca.SX:
         """Return ∂σ by the gradient of a field."""
         return ca.jacobian(self.own_volumes, self.point.gradients[field])
 
-    def as_by_x(self, field: str) -> ca.SX:
+    def relation_to_x(self, field: str) -> ca.SX:
         """Return the matrix B with ∂s/∂field = B ∂s/∂x."""
         if field == "x":
             return ca.SX.eye(self.count)
@@ -155,12 +167,12 @@ class _Shape:
 
 
 @dataclass(frozen=True, eq=False)
-class _Chain:
+class _ScalarDerivatives:
     """Scalar g in the symbols of a point, with the chain rule through the stretches.
 
     Attributes
     ----------
-    shape : _Shape
+    shape : _VolumeSums
     scalar : SX
         Scalar g.
     number : int
@@ -171,13 +183,13 @@ class _Chain:
         Fields whose Σ_q ∂²g/∂field∂m are coupled node vectors.
     """
 
-    shape: _Shape
+    shape: _VolumeSums
     scalar: ca.SX
     number: int
     slopes: ca.SX
     fields: tuple[str, ...]
 
-    def key(self, name: str) -> str:
+    def sum_name(self, name: str) -> str:
         """Return the name of a sum of this scalar."""
         return f"{name}_{self.number}"
 
@@ -186,21 +198,21 @@ class _Chain:
         """Derivatives ∂g/∂m by the stretches."""
         return ca.gradient(self.scalar, self.shape.stretches)
 
-    def second(self) -> Pieces:
+    def second_derivative_pieces(self) -> Pieces:
         """Return the pieces whose sums couple in second derivatives: ∂²g by (m, m), (m, θ), (field,
         m).
         """
         by_m = ca.jacobian(self.by_stretch, self.shape.stretches)
         pieces: Pieces = {
-            self.key("second"): ("none", ca.vec(mirrored(by_m))),
-            self.key("slopes_by_theta"): (
+            self.sum_name("second"): ("none", ca.vec(from_lower_triangle(by_m))),
+            self.sum_name("slopes_by_theta"): (
                 "none",
-                ca.vec(ca.jacobian(self.by_stretch, self.shape.point.varied)),
+                ca.vec(ca.jacobian(self.by_stretch, self.shape.point.differentiated_constants)),
             ),
         }
         for field in self.fields:
-            slopes = (self._lifted(field).T @ self._hessian(field, "x"))[:, 9:]
-            pieces[self.key(f"slopes_by_{field}")] = "nodes", slopes
+            slopes = (self._with_stretch(field).T @ self._hessian(field, "x"))[:, 9:]
+            pieces[self.sum_name(f"slopes_by_{field}")] = "nodes", slopes
         return pieces
 
     def piece(self, by: By) -> ca.SX:
@@ -212,40 +224,46 @@ class _Chain:
             return point.derivative(self.scalar, by)
         if len(nodal) == 1:
             gradient = ca.gradient(self.scalar, point.gradients[nodal[0]])
-            gradient += (self._lifted(nodal[0])[9:, :]).T @ self.by_stretch
-            return gradient if len(by) == 1 else ca.jacobian(gradient, point.varied)
+            gradient += (self._with_stretch(nodal[0])[9:, :]).T @ self.by_stretch
+            return (
+                gradient if len(by) == 1 else ca.jacobian(gradient, point.differentiated_constants)
+            )
         alpha, beta = nodal
         weights = ca.SX.sym("weights", shape.count)
-        by_s, _ = _slopes(shape.volumes, shape.volume, self.slopes)
-        by_own, second_by_own = _slopes(shape.own_volumes, point.mesh_volume, self.by_stretch)
+        by_s, _ = _logarithm_derivatives(shape.volumes, shape.volume, self.slopes)
+        by_own, second_by_own = _logarithm_derivatives(
+            shape.own_volumes, point.mesh_volume, self.by_stretch
+        )
         second_volumes = ca.jacobian(
             ca.gradient(ca.dot(weights, shape.own_volumes), point.gradients[alpha]),
             point.gradients[beta],
         )
         weight_values = by_s.T @ self.slopes - by_own.T @ self.by_stretch
         return (
-            self._lifted(alpha).T @ self._hessian(alpha, beta) @ self._lifted(beta)
-            - shape.own_by(alpha).T @ second_by_own @ shape.own_by(beta)
+            self._with_stretch(alpha).T @ self._hessian(alpha, beta) @ self._with_stretch(beta)
+            - shape.volume_derivative(alpha).T @ second_by_own @ shape.volume_derivative(beta)
             + ca.substitute(second_volumes, weights, weight_values)
         )
 
-    def _lifted(self, field: str) -> ca.SX:
+    def _with_stretch(self, field: str) -> ca.SX:
         """Return ∂(F, m)/∂F at fixed s, or the same for the gradient of another field."""
-        by_own, _ = _slopes(self.shape.own_volumes, self.shape.point.mesh_volume, self.by_stretch)
-        return ca.vertcat(ca.SX.eye(9), -by_own @ self.shape.own_by(field))
+        by_own, _ = _logarithm_derivatives(
+            self.shape.own_volumes, self.shape.point.mesh_volume, self.by_stretch
+        )
+        return ca.vertcat(ca.SX.eye(9), -by_own @ self.shape.volume_derivative(field))
 
     def _hessian(self, alpha: str, beta: str) -> ca.SX:
         """Return the second derivatives of g by (gradient, m) of two fields."""
         gradients = self.shape.point.gradients
         first, second = (ca.vertcat(gradients[f], self.shape.stretches) for f in (alpha, beta))
         hessian = ca.jacobian(ca.gradient(self.scalar, first), second)
-        return mirrored(hessian) if alpha == beta else hessian
+        return from_lower_triangle(hessian) if alpha == beta else hessian
 
 
-def _chains(shape: _Shape, outputs: Outputs) -> dict[int, _Chain]:
+def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _ScalarDerivatives]:
     """Return the chain rule of each scalar in the outputs, by the identity of the scalar."""
     terms = [term for those in outputs.values() for term in those]
-    chains: dict[int, _Chain] = {}
+    chains: dict[int, _ScalarDerivatives] = {}
     for term in terms:
         if id(term.scalar) not in chains:
             number = len(chains)
@@ -253,16 +271,16 @@ def _chains(shape: _Shape, outputs: Outputs) -> dict[int, _Chain]:
             # Where all is symmetric, what is by v is among what is by x.
             fields = ("x",) if parts == {"whole"} else ("x", "v")
             slopes = ca.SX.sym(f"slopes_{number}", shape.count)
-            chains[id(term.scalar)] = _Chain(shape, term.scalar, number, slopes, fields)
+            chains[id(term.scalar)] = _ScalarDerivatives(shape, term.scalar, number, slopes, fields)
     return chains
 
 
 def _coupling(
-    shape: _Shape, chains: dict[int, _Chain], outputs: Outputs, order: int
+    shape: _VolumeSums, chains: dict[int, _ScalarDerivatives], outputs: Outputs, order: int
 ) -> ca.Function:
     """Return C or D of each output as a function of all sums, see `kernel`."""
     count = shape.count
-    constants = shape.point.varied.numel()
+    constants = shape.point.differentiated_constants.numel()
     sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
     blocks = {"volumes": slice(0, count)}
     seconds = {}
@@ -274,7 +292,7 @@ def _coupling(
             sums += [ca.vec(seconds[key]), ca.vec(by_thetas[key])]
             for field in chain.fields:
                 start = count * len(blocks)
-                blocks[chain.key(field)] = slice(start, start + count)
+                blocks[chain.sum_name(field)] = slice(start, start + count)
     size = count * len(blocks)
     couplings = []
     for terms in outputs.values():
@@ -284,21 +302,23 @@ def _coupling(
             total = ca.SX(size, size if terms[0].contraction == "pairs" else width)
         for term in terms:
             chain = chains[id(term.scalar)]
-            by_s, second_of_logarithm = _slopes(shape.volumes, shape.volume, chain.slopes)
+            by_s, second_of_logarithm = _logarithm_derivatives(
+                shape.volumes, shape.volume, chain.slopes
+            )
             if term.contraction == "nodes":
-                relation = shape.as_by_x(term.by[0])
+                relation = shape.relation_to_x(term.by[0])
                 slopes = by_thetas[id(term.scalar)] if "theta" in term.by else chain.slopes
                 total[:count, :] += (by_s @ relation).T @ slopes
             elif term.contraction == "pairs":
                 second = by_s.T @ seconds[id(term.scalar)] @ by_s + second_of_logarithm
-                total += _of_pair(shape, chain, blocks, size, term, by_s, second)
+                total += _pair_coupling(shape, chain, blocks, size, term, by_s, second)
         couplings.append(total)
     return ca.Function("coupling", [ca.vertcat(*sums)], couplings, ["sums"], list(outputs))
 
 
-def _of_pair(
-    shape: _Shape,
-    chain: _Chain,
+def _pair_coupling(
+    shape: _VolumeSums,
+    chain: _ScalarDerivatives,
     blocks: dict[str, slice],
     size: int,
     term: Derivative,
@@ -309,8 +329,8 @@ def _of_pair(
 
     Parameters
     ----------
-    shape : _Shape
-    chain : _Chain
+    shape : _VolumeSums
+    chain : _ScalarDerivatives
     blocks : dict
         Slices of the coupled node vectors, by their names.
     size : int
@@ -322,22 +342,22 @@ def _of_pair(
         Coupling of ∂s/∂α with ∂s/∂β.
     """
     alpha, beta = term.by
-    of_alpha = shape.as_by_x(alpha)
-    of_beta = shape.as_by_x(beta)
+    of_alpha = shape.relation_to_x(alpha)
+    of_beta = shape.relation_to_x(beta)
     volume_block = blocks["volumes"]
     coupling = ca.SX(size, size)
     coupling[volume_block, volume_block] = of_alpha.T @ second @ of_beta
-    coupling[blocks[chain.key(alpha)], volume_block] = by_s @ of_beta
+    coupling[blocks[chain.sum_name(alpha)], volume_block] = by_s @ of_beta
     if beta in chain.fields:
-        coupling[volume_block, blocks[chain.key(beta)]] = of_alpha.T @ by_s.T
+        coupling[volume_block, blocks[chain.sum_name(beta)]] = of_alpha.T @ by_s.T
     else:
-        coupling[volume_block, blocks[chain.key(alpha)]] = of_beta.T @ by_s.T
+        coupling[volume_block, blocks[chain.sum_name(alpha)]] = of_beta.T @ by_s.T
     if term.part == "whole":
         return coupling
     return (coupling + coupling.T if term.part == "symmetric" else coupling - coupling.T) / 2
 
 
-def _stretches(volumes: ca.SX, volume: ca.SX) -> ca.SX:
+def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
     """Return n: ⅓ ln(v/V), its derivative along the velocities, and the derivatives along w."""
     s = ca.SX.sym("s", volumes.numel())
     n = ca.log(s[0] / volume) / 3
@@ -347,11 +367,11 @@ def _stretches(volumes: ca.SX, volume: ca.SX) -> ca.SX:
     return ca.substitute(n, s, volumes)
 
 
-def _slopes(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
+def _logarithm_derivatives(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return ∂n/∂s, and Σ_k weights_k ∂²n_k/∂s²."""
     s = ca.SX.sym("s", volumes.numel())
     c = ca.SX.sym("c", volumes.numel())
-    n = _stretches(s, volume)
+    n = _volume_logarithms(s, volume)
     expressions = [ca.jacobian(n, s), ca.hessian(ca.dot(c, n), s)[0]]
     first, second = ca.substitute(expressions, [s, c], [volumes, weights])
     return first, second

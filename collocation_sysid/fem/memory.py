@@ -14,7 +14,7 @@ Q_k = m_{k−1} + c_k S_k. With the sums over branches H = Σ m_{k−1} and s = 
 step (1 + s) S + H has the energy (1 + s) ψ + ½ H : FᵀF (Simo & Hughes 1998, ch. 10).
 
 The internal variables of all points of a body are one row: part after part, and for each part the
-entries xx, yy, zz, xy, xz, yz of all its points. `PointLayout` describes this row;
+entries xx, yy, zz, xy, xz, yz of all its points. `MemoryLayout` describes this row;
 `model.viscoelasticity` advances the memory in time.
 """
 
@@ -33,7 +33,7 @@ from .regions import BodyPart
 
 
 @dataclass(frozen=True, eq=False)
-class Past:
+class MemoryInput:
     """Contribution of the memory to the forces at T states.
 
     Attributes
@@ -42,9 +42,9 @@ class Past:
         Sum H of the internal variables [Pa].
     stiffening : (T, parts)
         Stiffening s of each part.
-    slopes : (T, k)
+    stiffening_derivatives : (T, k)
         Derivative of the part's s by each entry of θ.
-    bends : (T, k, k)
+    stiffening_second_derivatives : (T, k, k)
         Second derivatives of s; those by constants of different parts are zero.
     stress_weights : (T, width), optional
         Weights σ of S in second derivatives; None for zero.
@@ -52,11 +52,11 @@ class Past:
 
     overstress: Array
     stiffening: Array
-    slopes: Array
-    bends: Array
+    stiffening_derivatives: Array
+    stiffening_second_derivatives: Array
     stress_weights: Array | None = None
 
-    def runs(self, part: int) -> Iterator[tuple[slice, float]]:
+    def equal_stiffening_rows(self, part: int) -> Iterator[tuple[slice, float]]:
         """Yield slices of consecutive states with equal stiffening s of a part, and s.
 
         Parameters
@@ -72,7 +72,7 @@ class Past:
 
 
 @dataclass(frozen=True)
-class Branch:
+class BranchIndices:
     """Positions of a Prony branch in the arrays of a body.
 
     Attributes
@@ -81,7 +81,7 @@ class Branch:
         Index of its part.
     points : slice
         Columns in the row of the body, (…, width).
-    own : slice
+    columns : slice
         Columns in the row of all branches, (…, all branches).
     share, tau : int
         Indices of g and τ in θ.
@@ -89,35 +89,35 @@ class Branch:
 
     part: int
     points: slice
-    own: slice
+    columns: slice
     share: int
     tau: int
 
 
 @dataclass(frozen=True, eq=False)
-class PointLayout:
+class MemoryLayout:
     """Layout of the internal variables of a body in one row: the parts with memory in turn.
 
     Attributes
     ----------
     parts : tuple of BodyPart
-    first : (parts,)
+    first_constants : (parts,)
         Index in θ of the first memory constant of each part.
-    points : int
+    points_per_element : int
         Quadrature points of an element.
-    constants : int
+    constant_count : int
         Length of θ.
     """
 
     parts: tuple[BodyPart, ...]
-    first: Sequence[int]
-    points: int
-    constants: int
+    first_constants: Sequence[int]
+    points_per_element: int
+    constant_count: int
 
     @cached_property
     def starts(self) -> list[int]:
         """First column of each part in the row, and the length of the row."""
-        sizes = [6 * self.points * len(p.cells) if p.prony else 0 for p in self.parts]
+        sizes = [6 * self.points_per_element * len(p.cells) if p.prony else 0 for p in self.parts]
         return [0, *np.cumsum(sizes).tolist()]
 
     @property
@@ -125,7 +125,7 @@ class PointLayout:
         """Length of the row of a body."""
         return self.starts[-1]
 
-    def of_part(self, number: int) -> NDArray[np.int64]:
+    def part_columns(self, number: int) -> NDArray[np.int64]:
         """Return the columns (E, q, 6) of the points of a part.
 
         Parameters
@@ -134,30 +134,35 @@ class PointLayout:
             Index of the part.
         """
         cells = len(self.parts[number].cells)
-        indices = np.arange(cells * self.points).reshape(cells, self.points, 1)
-        return self.starts[number] + indices + cells * self.points * np.arange(6)
+        indices = np.arange(cells * self.points_per_element).reshape(
+            cells, self.points_per_element, 1
+        )
+        return self.starts[number] + indices + cells * self.points_per_element * np.arange(6)
 
     @cached_property
-    def branches(self) -> list[Branch]:
+    def branches(self) -> list[BranchIndices]:
         """Branches of all parts, in the order of the parts."""
-        branches: list[Branch] = []
+        branches: list[BranchIndices] = []
         start = 0
         for number, part in enumerate(self.parts):
             points = slice(self.starts[number], self.starts[number + 1])
             for k in range(len(part.prony)):
                 columns = slice(start, start + points.stop - points.start)
-                first_constant = self.first[number] + 2 * k
-                branches.append(Branch(number, points, columns, first_constant, first_constant + 1))
+                first_constant = self.first_constants[number] + 2 * k
+                branches.append(
+                    BranchIndices(number, points, columns, first_constant, first_constant + 1)
+                )
                 start = columns.stop
         return branches
 
-    def borne(self, values: Array) -> Array:
+    def to_branches(self, values: Array) -> Array:
         """Return values (…, all branches) for each branch from values (…, width) for each point."""
         parts = [values[..., branch.points] for branch in self.branches]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
 
-    def summed(self, values: Array) -> Array:
-        """Return the sums (…, width) over the branches of each point: the transpose of `borne`.
+    def sum_over_branches(self, values: Array) -> Array:
+        """Return the sums (…, width) over the branches of each point: the transpose of
+        `to_branches`.
 
         Parameters
         ----------
@@ -167,31 +172,31 @@ class PointLayout:
             return values
         sums = np.zeros((*values.shape[:-1], self.width))
         for branch in self.branches:
-            sums[..., branch.points] += values[..., branch.own]
+            sums[..., branch.points] += values[..., branch.columns]
         return sums
 
-    def spread(self, values: Array) -> Array:
+    def repeat_over_points(self, values: Array) -> Array:
         """Return values (…, all branches) from one value for each branch (branches, …).
 
         With a single branch the result has one column and is broadcast.
         """
         if len(self.branches) == 1:
             return values[0][..., None]
-        sizes = [branch.own.stop - branch.own.start for branch in self.branches]
+        sizes = [branch.columns.stop - branch.columns.start for branch in self.branches]
         return np.moveaxis(np.repeat(values, sizes, axis=0), 0, -1)
 
-    def totals(self, values: Array) -> Array:
+    def sum_over_points(self, values: Array) -> Array:
         """Return the sums (branches, …) over all values (…, all branches) of each branch."""
-        return np.stack([values[..., branch.own].sum(axis=-1) for branch in self.branches])
+        return np.stack([values[..., branch.columns].sum(axis=-1) for branch in self.branches])
 
-    def nothing(self, states: int) -> Past:
+    def relaxed(self, states: int) -> MemoryInput:
         """Return the contribution of a memory that has relaxed to this many states: all zero."""
-        count = self.constants
+        count = self.constant_count
         sizes = (self.width,), (len(self.parts),), (count,), (count, count)
-        return Past(*(np.zeros((states, *size)) for size in sizes))
+        return MemoryInput(*(np.zeros((states, *size)) for size in sizes))
 
 
-def fading(share: Array, tau_s: Array, spacing_s: float) -> tuple[Array, Array]:
+def fading_coefficients(share: Array, tau_s: Array, spacing_s: float) -> tuple[Array, Array]:
     """Return e and c of branches over an interval [s] in which S changes linearly.
 
     Parameters

@@ -1,6 +1,7 @@
 """Tetrahedral mesh of a body: generated or read, cleaned and checked once, then immutable.
 
-`TetMesh` holds the mesh. `Nodes` are the nodes of a body's elements: those of the mesh, then, for
+`TetMesh` holds the mesh. `ElementNodes` are the nodes of a body's elements: those of the mesh,
+then, for
 quadratic elements, one in the middle of each edge.
 """
 
@@ -25,7 +26,7 @@ from .mesh_checks import (
     checked_faces,
     checked_points,
     checked_tetrahedra,
-    cleaned,
+    clean_mesh,
     mean_ratios,
     signed_volumes,
     unique_edges,
@@ -35,9 +36,9 @@ from .surface import tetrahedralize_surface
 
 
 class NodeSelection(Protocol):
-    """Selection of nodes, see `selection`."""
+    """Selection of nodes, see `selection_from_section`."""
 
-    def resolve(self, nodes: Nodes) -> np.ndarray:
+    def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the indices of the selected nodes, sorted."""
         ...
 
@@ -107,7 +108,7 @@ class TetMesh:
         elements = checked_tetrahedra(tetrahedra, len(raw_points))
         arrays = checked_arrays(point_arrays or {}, len(raw_points), "point", "nodes")
         element_arrays = checked_arrays(cell_arrays or {}, len(elements), "cell", "elements")
-        points, elements, used, notes = cleaned(raw_points, elements)
+        points, elements, used, notes = clean_mesh(raw_points, elements)
         new_index = np.full(len(raw_points), -1)
         new_index[used] = np.arange(len(used))
         faces = {
@@ -217,7 +218,7 @@ class TetMesh:
 
         For nodes on edges, which quadratic elements have, see `Body.select`.
         """
-        return selection.resolve(Nodes.corners(self))
+        return selection.resolve(ElementNodes.corners(self))
 
     @cached_property
     def volumes_m3(self) -> np.ndarray:
@@ -260,7 +261,7 @@ class TetMesh:
         """Pairs of nodes that share an element, (m, 2) int64, each once, sorted."""
         return _read_only(unique_edges(self.tetrahedra))
 
-    def middles(self, pairs: np.ndarray) -> np.ndarray:
+    def mid_node_indices(self, pairs: np.ndarray) -> np.ndarray:
         """Return the indices (…) of the mid nodes between pairs (…, 2) of corners.
 
         Mid nodes follow the corners, in the order of `edges`.
@@ -311,7 +312,7 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Nodes:
+class ElementNodes:
     """Nodes of the elements of a body.
 
     Attributes
@@ -332,17 +333,17 @@ class Nodes:
     ends: Index
 
     @classmethod
-    def corners(cls, mesh: TetMesh) -> Nodes:
+    def corners(cls, mesh: TetMesh) -> ElementNodes:
         """Return the nodes of the mesh only."""
         return cls(mesh, mesh.points_m, mesh.tetrahedra, np.empty((0, 2), dtype=np.int64))
 
     @classmethod
-    def of_element(cls, mesh: TetMesh, element: Element) -> Nodes:
+    def for_element(cls, mesh: TetMesh, element: Element) -> ElementNodes:
         """Return the nodes of a kind of element: corners, and mid nodes if it has any."""
         if not element.edges:
             return cls.corners(mesh)
         points = _read_only(np.vstack([mesh.points_m, mesh.points_m[mesh.edges].mean(axis=1)]))
-        middles = mesh.middles(mesh.tetrahedra[:, element.edges])
+        middles = mesh.mid_node_indices(mesh.tetrahedra[:, element.edges])
         return cls(mesh, points, np.hstack([mesh.tetrahedra, middles]), mesh.edges)
 
     def with_mid_nodes(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -351,11 +352,11 @@ class Nodes:
         """
         return np.concatenate([chosen, chosen[self.ends].all(axis=1)])
 
-    def on_faces(self, triangles: Index) -> Index:
+    def nodes_of_faces(self, triangles: Index) -> Index:
         """Return the nodes (F, 3) or (F, 6) of triangles of corners, then those on the edges ab,
         bc, ca.
         """
         if not len(self.ends):
             return triangles
         pairs = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)
-        return np.hstack([triangles, self.mesh.middles(pairs)])
+        return np.hstack([triangles, self.mesh.mid_node_indices(pairs)])

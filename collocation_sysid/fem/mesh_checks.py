@@ -27,7 +27,7 @@ LARGEST_M = 1e50
 # file in single precision.
 ROUND_OFF = 1e-5
 # Largest offset, in edge lengths, of sides that are straightened with a note.
-SLIGHTLY_CURVED = 0.05
+LARGEST_SIDE_CURVATURE = 0.05
 
 
 def checked_points(points_m: ArrayLike) -> np.ndarray:
@@ -56,7 +56,7 @@ def checked_tetrahedra(tetrahedra: ArrayLike, node_count: int) -> np.ndarray:
         raise InputError(f"tetrahedra must have shape (E, 4) with E > 0, not {array.shape}")
     if array.dtype.kind not in "iu":
         raise InputError(f"tetrahedra must hold integer node numbers, not {array.dtype}")
-    refuse_unknown_nodes(array, node_count)
+    require_known_nodes(array, node_count)
     return array.astype(np.int64)
 
 
@@ -67,11 +67,11 @@ def checked_faces(faces: ArrayLike, node_count: int) -> np.ndarray:
         raise InputError(
             f"a face set must be a (k, 3) array of node numbers, not {array.dtype} {array.shape}"
         )
-    refuse_unknown_nodes(array, node_count)
+    require_known_nodes(array, node_count)
     return array.astype(np.int64)
 
 
-def refuse_unknown_nodes(cells: np.ndarray, node_count: int) -> None:
+def require_known_nodes(cells: np.ndarray, node_count: int) -> None:
     """Raise an `InputError` if cells (E, k) have node indices outside 0 … `node_count` − 1."""
     bad = np.flatnonzero(((cells < 0) | (cells >= node_count)).any(axis=1))
     if len(bad):
@@ -109,7 +109,7 @@ def checked_arrays(
     return checked
 
 
-def cleaned(
+def clean_mesh(
     points_m: np.ndarray, tetrahedra: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
     """Drop nodes that are no element's corner and reverse negatively oriented elements.
@@ -131,11 +131,11 @@ def cleaned(
         For coordinates that are not finite, and elements that are degenerate or given twice.
     """
     used, renumbered = np.unique(tetrahedra, return_inverse=True)
-    _refuse_non_finite(points_m, used)
-    _refuse_duplicates(tetrahedra)
-    _refuse_degenerate(points_m, tetrahedra)
+    _require_finite(points_m, used)
+    _require_no_duplicates(tetrahedra)
+    _require_not_degenerate(points_m, tetrahedra)
     used_points = points_m[used]
-    oriented, reversed_elements = orient(used_points, renumbered.reshape(-1, 4))
+    oriented, reversed_elements = orient_elements(used_points, renumbered.reshape(-1, 4))
     notes = []
     dropped = np.setdiff1d(np.arange(len(points_m)), used)
     if len(dropped):
@@ -151,7 +151,7 @@ def cleaned(
     return used_points, oriented, used, (*notes, *_note_parts(used_points, oriented))
 
 
-def orient(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def orient_elements(points_m: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the tetrahedra with positive volumes, and the indices of those that were reversed."""
     reversed_elements = np.flatnonzero(signed_volumes(points_m, tetrahedra) < 0)
     oriented = tetrahedra.copy()
@@ -208,7 +208,7 @@ def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
 
 
-def _refuse_non_finite(points: np.ndarray, used: np.ndarray) -> None:
+def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
     """Raise an `InputError` if a used node has coordinates that are not finite."""
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
@@ -218,7 +218,7 @@ def _refuse_non_finite(points: np.ndarray, used: np.ndarray) -> None:
         )
 
 
-def _refuse_duplicates(tetrahedra: np.ndarray) -> None:
+def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
     """Raise an `InputError` if two elements have the same nodes."""
     _, first, inverse = np.unique(
         np.sort(tetrahedra, axis=1), axis=0, return_index=True, return_inverse=True
@@ -232,7 +232,7 @@ def _refuse_duplicates(tetrahedra: np.ndarray) -> None:
         )
 
 
-def _refuse_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
+def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
     """Raise an `InputError` if an element has almost no volume."""
     volumes = np.abs(signed_volumes(points, tetrahedra))
     cubes = edge_lengths(points, tetrahedra).mean(axis=1) ** 3
@@ -259,7 +259,7 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
     return (f"The mesh is in {parts} unconnected parts (the largest have {sizes} nodes){hint}.",)
 
 
-def straightened(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
+def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
     """Return notes on curved sides that are lost when quadratic tetrahedra are reduced to corners.
 
     Parameters
@@ -275,15 +275,15 @@ def straightened(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        If a node does not exist, or sides are curved by more than `SLIGHTLY_CURVED`.
+        If a node does not exist, or sides are curved by more than `LARGEST_SIDE_CURVATURE`.
     """
-    refuse_unknown_nodes(cells, len(points_m))
+    require_known_nodes(cells, len(points_m))
     start_of, end_of = np.array(EDGES).T
     start = points_m[cells[:, start_of]]
     stop = points_m[cells[:, end_of]]
     length = np.linalg.norm(stop - start, axis=2)
     offset = np.linalg.norm(points_m[cells[:, 4:]] - (start + stop) / 2, axis=2)
-    bad = np.argwhere(~(offset <= SLIGHTLY_CURVED * length))
+    bad = np.argwhere(~(offset <= LARGEST_SIDE_CURVATURE * length))
     if len(bad):
         e, k = bad[0]
         a = cells[e, start_of[k]]
@@ -292,7 +292,7 @@ def straightened(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, ...]:
         raise InputError(
             f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of "
             f"the edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at "
-            f"most {SLIGHTLY_CURVED:.0%} of that ({len(bad)} such in all), since sides are taken "
+            f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), since sides are taken "
             "as straight: refine the mesh, or save it with linear tetrahedra"
         )
     curved = offset > ROUND_OFF * length

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import require_regular
-from .mesh_checks import straightened
+from .mesh_checks import straightening_notes
 from .meshio_reader import MeshContent, read_content
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
@@ -71,7 +71,7 @@ def read_tetrahedra(
         If the file cannot be read, contains no tetrahedra, or their sides are strongly curved.
     """
     metres = length_in_metres(length_unit)
-    with _reading(path) as data:
+    with _read_with_meshio(path) as data:
         return _tetrahedra(data, metres)
 
 
@@ -86,10 +86,10 @@ def _tetrahedra(
         filled = "; a closed surface can be filled by TetMesh.from_surface"
         hint = filled if "triangle" in counts else ""
         raise InputError(f"no tetrahedra in this file, found {_listed(counts)}{hint}")
-    notes = _note_left_out(counts)
+    notes = _note_omitted_cells(counts)
     quadratic = [block.data for block in blocks if block.type == "tetra10"]
     if quadratic:
-        notes += straightened(points_m, np.concatenate(quadratic))
+        notes += straightening_notes(points_m, np.concatenate(quadratic))
     # Where a cell is in several groups, the sets of a .msh file tell all, its tags only the first.
     groups = {**_physical_groups(data), **_cell_sets(data)}
     nodes = {name: _nodes_of(data, per_block) for name, per_block in groups.items()}
@@ -114,7 +114,7 @@ def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray
         If the file cannot be read or contains no triangles.
     """
     metres = length_in_metres(length_unit)
-    with _reading(path) as data:
+    with _read_with_meshio(path) as data:
         faces = [
             np.asarray(block.data, dtype=np.int64)
             for block in data.cells
@@ -141,20 +141,20 @@ def write_tetrahedra(
     """Write a mesh, in metres, to any format that meshio knows by the file's extension."""
     import meshio  # slow to import
 
-    point_data: dict[str, Any] = {n: _numbers(v) for n, v in (point_arrays or {}).items()}
-    cell_data: dict[str, Any] = {n: [_numbers(v)] for n, v in (cell_arrays or {}).items()}
+    point_data: dict[str, Any] = {n: _without_booleans(v) for n, v in (point_arrays or {}).items()}
+    cell_data: dict[str, Any] = {n: [_without_booleans(v)] for n, v in (cell_arrays or {}).items()}
     mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data, cell_data)
-    with _one_error(path, "written"):
+    with _as_input_error(path, "written"):
         meshio.write(path, mesh)
 
 
-def _numbers(values: np.ndarray) -> np.ndarray:
+def _without_booleans(values: np.ndarray) -> np.ndarray:
     """Return booleans as uint8, because few formats have a boolean type; other arrays unchanged."""
     return values.astype(np.uint8) if values.dtype == bool else values
 
 
 @contextlib.contextmanager
-def _reading(path: str | Path) -> Iterator[MeshContent]:
+def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
     """Context that gives the content of a file.
 
     Errors in the body of the context are reported as damage of the file.
@@ -170,13 +170,13 @@ def _reading(path: str | Path) -> Iterator[MeshContent]:
     try:
         content = read_content(path)
     except InputError as error:
-        raise _refusal("read", error.message, path) from error
-    with _one_error(path, "read"):
+        raise _unreadable_error("read", error.message, path) from error
+    with _as_input_error(path, "read"):
         yield content
 
 
 @contextlib.contextmanager
-def _one_error(path: str | Path, done: str) -> Iterator[None]:
+def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
     """Context that turns any failure on an invalid file into one `InputError`, and prints nothing.
 
     Parameters
@@ -200,10 +200,10 @@ def _one_error(path: str | Path, done: str) -> Iterator[None]:
         if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise
         reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise _refusal(done, reason, path) from error
+        raise _unreadable_error(done, reason, path) from error
 
 
-def _refusal(done: str, reason: str, path: str | Path) -> InputError:
+def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
     """Return the error for a file that cannot be read or written as a mesh.
 
     Parameters
@@ -261,10 +261,12 @@ def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
             if tag > 0:
                 masks[int(tag), dimension] = [block == tag for block in tags_of_dimension]
     nameless = Counter(tag for tag, dimension in masks if (tag, dimension) not in names)
-    return {names.get(key) or _called(*key, nameless[key[0]] > 1): m for key, m in masks.items()}
+    return {
+        names.get(key) or _group_name(*key, nameless[key[0]] > 1): m for key, m in masks.items()
+    }
 
 
-def _called(tag: int, dimension: int, ambiguous: bool) -> str:
+def _group_name(tag: int, dimension: int, ambiguous: bool) -> str:
     """Return the name of a physical group without a name."""
     kind = ("points", "lines", "surface", "volume")[dimension]
     return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
@@ -323,7 +325,7 @@ def _listed(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 
-def _note_left_out(counts: Mapping[str, int]) -> tuple[str, ...]:
+def _note_omitted_cells(counts: Mapping[str, int]) -> tuple[str, ...]:
     """Return a note on cells other than tetrahedra, which are omitted; empty if there are none."""
     others = {name: count for name, count in counts.items() if name not in _TETRAHEDRA and count}
     if not others:

@@ -114,8 +114,8 @@ def read_content(path: str | Path) -> MeshContent:
         With the reason, without the path, if meshio cannot read the file or exceeds the limits of
         time or memory.
     """
-    if _is_harmless(Path(path)):
-        return _read_here(path)
+    if _is_small_and_safe(Path(path)):
+        return _read_in_process(path)
     try:
         absolute = str(Path(path).resolve())
         arrays = computed_apart(_WORKER, absolute, limits=ProcessLimits.for_file(path))
@@ -136,7 +136,7 @@ def read_content(path: str | Path) -> MeshContent:
     )
 
 
-def _is_harmless(path: Path) -> bool:
+def _is_small_and_safe(path: Path) -> bool:
     """Return whether a file is a small .vtu without parts that could exceed its size when
     decoded.
     """
@@ -147,7 +147,7 @@ def _is_harmless(path: Path) -> bool:
     return b"<VTKFile" in content and b"LZMA" not in content and not has_entities
 
 
-def _read_here(path: str | Path) -> MeshContent:
+def _read_in_process(path: str | Path) -> MeshContent:
     """Return the content of a file read in this process."""
     import meshio  # slow to import
 

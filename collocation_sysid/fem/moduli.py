@@ -21,11 +21,11 @@ ELASTIC = ("lambda_pa", "mu_pa", "kappa_pa", "young_pa", "poisson")
 LAME = ("lambda_pa", "mu_pa")
 ENGINEERING = ("young_pa", "poisson")
 _PAIRS = (LAME, ENGINEERING, ("kappa_pa", "mu_pa"), ("mu_pa", "poisson"))
-_BESIDE_SHEAR = (("kappa_pa",), ("lambda_pa",), ("poisson",))
+_VOLUMETRIC_CHOICES = (("kappa_pa",), ("lambda_pa",), ("poisson",))
 
 
 @dataclass(frozen=True)
-class Source:
+class ConstantSource:
     """Names of the parameters that determine the constants of a region.
 
     Attributes
@@ -39,7 +39,7 @@ class Source:
     material: Material
     names: Mapping[str, str]
 
-    def constants(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def evaluate(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return every constant by its name without region.
 
         Parameters
@@ -69,9 +69,9 @@ class Source:
         return {**by_constant, "mu_pa": mu, "lambda_pa": lame, "kappa_pa": lame + 2 / 3 * mu}
 
 
-def source_of(
+def find_source(
     region: str, material: Material, others: Iterable[Constant], known: Sequence[str]
-) -> Source:
+) -> ConstantSource:
     """Find the constants of a region among the names of the given parameters.
 
     Parameters
@@ -130,7 +130,7 @@ def source_of(
             f"{_listed(lacking)} missing: {subject} with its damping expects "
             f"{_expected(elastic, plain)}"
         )
-    return Source(material, names)
+    return ConstantSource(material, names)
 
 
 def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
@@ -138,7 +138,7 @@ def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
     volumetric = {"lambda_pa", "kappa_pa"} & set(owns)
     if not volumetric:
         return ()
-    return _PAIRS if "mu_pa" in owns else _BESIDE_SHEAR
+    return _PAIRS if "mu_pa" in owns else _VOLUMETRIC_CHOICES
 
 
 def elastic_names(material: Material) -> tuple[str, ...]:
@@ -163,7 +163,7 @@ def _listed(names: Sequence[str]) -> str:
     return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
-def engineering(lambda_pa: Any, mu_pa: Any) -> tuple[Any, Any]:
+def engineering_constants(lambda_pa: Any, mu_pa: Any) -> tuple[Any, Any]:
     """Return (E, ν) from (λ, μ), as numbers or expressions."""
     return (
         mu_pa * (3 * lambda_pa + 2 * mu_pa) / (lambda_pa + mu_pa),

@@ -1,6 +1,7 @@
 """Custom forces on nodes or faces of a body: laws f(x, v, at, constants) in CasADi.
 
-Use `NodeForce.of` for a force that depends on position, velocity and time of a node, such as air
+Use `NodeForce.from_law` for a force that depends on position, velocity and time of a node, such as
+air
 drag, a foundation or a magnet; or, on faces of the surface, on their current area and normal, such
 as a pressure. Its constants follow those of the body's parts in θ and are estimated like them.
 """
@@ -23,16 +24,16 @@ from ..errors import InputError, hint_at
 from ..files import reason
 from .constants import Constant, constant_named
 from .force_points import ForcePoints
-from .mesh import Nodes
+from .mesh import ElementNodes
 from .selection import Indices, Selection
 
 Law = Callable[..., Any]
 On = Literal["nodes", "faces"]
 # A derivative counts as symmetric if its skew part is at most this fraction of its largest entry.
-SYMMETRIC = 1e-9
+SYMMETRY_TOLERANCE = 1e-9
 
 
-class AtNode(NamedTuple):
+class ForceContext(NamedTuple):
     """Further quantities on which a law may depend, beside position and velocity.
 
     Attributes
@@ -47,9 +48,9 @@ class AtNode(NamedTuple):
     normal : (3,) SX
         Outward unit normal: of a node that of the undeformed surface, zero inside; of a face the
         current one.
-    since_s : SX
+    interval_s : SX
         Time since the previous evaluation.
-    began : SX
+    is_start : SX
         1 at the start, where there is no previous evaluation, else 0.
     """
 
@@ -58,13 +59,13 @@ class AtNode(NamedTuple):
     area_m2: ca.SX
     volume_m3: ca.SX
     normal: ca.SX
-    since_s: ca.SX
-    began: ca.SX
+    interval_s: ca.SX
+    is_start: ca.SX
 
 
-# Offsets of the attributes of an `AtNode` in the data of a law, in their order.
-ENDS = (0, 1, 4, 5, 6, 9, 10, 11)
-DATA = ENDS[-1]
+# Offsets of the attributes of an `ForceContext` in the data of a law, in their order.
+CONTEXT_OFFSETS = (0, 1, 4, 5, 6, 9, 10, 11)
+CONTEXT_SIZE = CONTEXT_OFFSETS[-1]
 # Corners of a triangle on which laws are tested.
 TRIANGLE_M = (0.1, 0.2, 0.3, 0.2, 0.2, 0.3, 0.1, 0.3, 0.3)
 
@@ -79,18 +80,18 @@ class NodeForce:
         Name for messages.
     law : callable
         ``law(x, v, at, **constants) -> (3,)`` force [N] on a node at x [m] with velocity v [m/s],
-        where ``at`` is an `AtNode`; or on a face whose middle is at x.
+        where ``at`` is an `ForceContext`; or on a face whose middle is at x.
     constants : tuple of Constant
     nodes : Selection, (k,) int array or None
         Nodes on which the force acts; None for all.
     on : {"nodes", "faces"}
         "faces": on faces of the surface whose nodes are all selected; quadratic faces are treated
         as folded along their mid nodes.
-    carries : int
+    internal_variable_count : int
         Number of internal variables of a node or face, such as the creep of a dashpot. If it is
         nonzero: ``law(x, v, before, at, **constants) -> (force, after)``, where `before` (carries,)
         are the variables of the previous evaluation, zero at the start.
-    compiled : bool
+    is_compiled : bool
         Whether the law is compiled to native code, which must support all of its operations;
         worthwhile for laws that are evaluated in every step of most problems.
     """
@@ -100,11 +101,11 @@ class NodeForce:
     constants: tuple[Constant, ...]
     nodes: Selection | Index | None = None
     on: On = "nodes"
-    carries: int = 0
-    compiled: bool = False
+    internal_variable_count: int = 0
+    is_compiled: bool = False
 
     @classmethod
-    def of(
+    def from_law(
         cls,
         law: Law,
         *constants: Constant,
@@ -166,72 +167,72 @@ class NodeForce:
         u : SX
             Stacked (x, v, constants, before).
         data : SX
-            Entries of an `AtNode`.
+            Entries of an `ForceContext`.
         """
-        dofs = (u.numel() - len(self.constants) - self.carries) // 2
-        ends = [0, dofs, 2 * dofs, u.numel() - self.carries, u.numel()]
+        dofs = (u.numel() - len(self.constants) - self.internal_variable_count) // 2
+        ends = [0, dofs, 2 * dofs, u.numel() - self.internal_variable_count, u.numel()]
         x, v, values, before = ca.vertsplit(u, ends)
-        at = AtNode(*ca.vertsplit(data, [*ENDS]))
+        at = ForceContext(*ca.vertsplit(data, [*CONTEXT_OFFSETS]))
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
         if self.on == "nodes":
-            return ca.vertcat(*self._valued(x, v, before, at, named))
+            return ca.vertcat(*self._evaluate_law(x, v, before, at, named))
         places = ca.horzsplit(ca.reshape(x, 3, dofs // 3))
         area = area_vector(places)
         size = ca.norm_2(area)
         at = at._replace(area_m2=size, normal=area / size)
-        force, after = self._valued(middle(x), middle(v), before, at, named)
+        force, after = self._evaluate_law(face_middle(x), face_middle(v), before, at, named)
         return ca.vertcat(*[ca.SX.zeros(3)] * (len(places) - 3), *[force / 3] * 3, after)
 
-    def _valued(
-        self, x: ca.SX, v: ca.SX, before: ca.SX, at: AtNode, named: dict[str, ca.SX]
+    def _evaluate_law(
+        self, x: ca.SX, v: ca.SX, before: ca.SX, at: ForceContext, named: dict[str, ca.SX]
     ) -> tuple[ca.SX, ca.SX]:
         """Return the force (3,) and the internal variables after the evaluation."""
-        if not self.carries:
-            return _column(self.law(x, v, at, **named)), ca.SX.zeros(0)
+        if not self.internal_variable_count:
+            return _as_column(self.law(x, v, at, **named)), ca.SX.zeros(0)
         force, after = self.law(x, v, before, at, **named)
-        return _column(force), _column(after)
+        return _as_column(force), _as_column(after)
 
-    def inputs(self, dofs: int) -> int:
+    def input_size(self, dofs: int) -> int:
         """Return the length of u for this number of dofs."""
-        return 2 * dofs + len(self.constants) + self.carries
+        return 2 * dofs + len(self.constants) + self.internal_variable_count
 
     @property
-    def _dofs(self) -> int:
+    def _smallest_dofs(self) -> int:
         """Number of dofs of a node, or of the simplest face."""
         return 3 if self.on == "nodes" else 9
 
     @cached_property
-    def turns(self) -> bool:
+    def has_skew_stiffness(self) -> bool:
         """Whether the derivative by x is not symmetric."""
-        return self._skew[0] > SYMMETRIC
+        return self._relative_skew_parts[0] > SYMMETRY_TOLERANCE
 
     @cached_property
-    def spins(self) -> bool:
+    def has_skew_damping(self) -> bool:
         """Whether the derivative by v is not symmetric, as for gyroscopic forces."""
-        return self._skew[1] > SYMMETRIC
+        return self._relative_skew_parts[1] > SYMMETRY_TOLERANCE
 
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Symbols u and data, and the expression of the force."""
-        u = ca.SX.sym("u", self.inputs(self._dofs))
-        data = ca.SX.sym("data", DATA)
+        u = ca.SX.sym("u", self.input_size(self._smallest_dofs))
+        data = ca.SX.sym("data", CONTEXT_SIZE)
         return u, data, self.expression(u, data)
 
     @cached_property
-    def _slopes(self) -> ca.Function:
+    def _force_and_jacobian(self) -> ca.Function:
         """Function of the force and its derivative by u."""
         u, data, y = self._symbols
         return ca.Function("slopes", [u, data], [y, ca.jacobian(y, u)])
 
     @cached_property
-    def _skew(self) -> tuple[float, float]:
+    def _relative_skew_parts(self) -> tuple[float, float]:
         """Largest relative skew parts of the derivatives by x and by v, at three random points."""
         rng = np.random.default_rng(0)
         largest = np.zeros(2)
-        dofs = self._dofs
+        dofs = self._smallest_dofs
         for _ in range(3):
-            sample = [rng.uniform(0.5, 1.0, size) for size in (self.inputs(dofs), DATA)]
-            values = self._slopes(*sample)[1].full()
+            sample = [rng.uniform(0.5, 1.0, size) for size in (self.input_size(dofs), CONTEXT_SIZE)]
+            values = self._force_and_jacobian(*sample)[1].full()
             values = values[:dofs]
             for k, part in enumerate((values[:, :dofs], values[:, dofs : 2 * dofs])):
                 size = np.abs(part).max() or 1.0
@@ -242,15 +243,15 @@ class NodeForce:
         """Raise an `InputError` if the law cannot be evaluated, has the wrong shape or is not
         finite.
         """
-        dofs = self._dofs
+        dofs = self._smallest_dofs
         named = {c.name: ca.SX.sym(c.name) for c in self.constants}
-        x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.carries))
-        at = AtNode(*ca.vertsplit(ca.SX.sym("data", DATA), [*ENDS]))
+        x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.internal_variable_count))
+        at = ForceContext(*ca.vertsplit(ca.SX.sym("data", CONTEXT_SIZE), [*CONTEXT_OFFSETS]))
         try:
-            force, after = self._valued(x, v, before, at, named)
+            force, after = self._evaluate_law(x, v, before, at, named)
             _ = self._symbols
         except (Exception, SystemExit) as error:
-            carried = " and what is carried" if self.carries else ""
+            carried = " and what is carried" if self.internal_variable_count else ""
             raise InputError(
                 f"force {self.name!r} cannot be evaluated ({reason(error)}); expected a function "
                 "of x, v, at and named constants in CasADi operations that returns three forces"
@@ -258,21 +259,24 @@ class NodeForce:
             ) from error
         if force.shape != (3, 1):
             raise InputError(f"force {self.name!r} has the shape {force.shape}; expected (3, 1)")
-        if after.shape != (self.carries, 1):
+        if after.shape != (self.internal_variable_count, 1):
             raise InputError(
                 f"force {self.name!r} returns {after.numel()} numbers to carry; expected "
-                f"{self.carries}, as carries says"
+                f"{self.internal_variable_count}, as carries says"
             )
-        at_rest = np.zeros(self.inputs(dofs))
+        at_rest = np.zeros(self.input_size(dofs))
         at_rest[:dofs] = TRIANGLE_M[:dofs]
         at_rest[2 * dofs : 2 * dofs + len(self.constants)] = 1.0
-        if not all(np.isfinite(e.full()).all() for e in self._slopes(at_rest, np.ones(DATA))):
+        if not all(
+            np.isfinite(e.full()).all()
+            for e in self._force_and_jacobian(at_rest, np.ones(CONTEXT_SIZE))
+        ):
             raise InputError(
                 f"force {self.name!r} or its slope is not finite where the node is at rest; "
                 "expected a smooth law, such as sqrt(v·v + 1e-12) in place of |v|"
             )
 
-    def on_finer(self, nodes: Index | None) -> NodeForce:
+    def on_refined_body(self, nodes: Index | None) -> NodeForce:
         """Return this force for a refined body.
 
         Parameters
@@ -287,7 +291,7 @@ class NodeForce:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedForce:
+class LocatedForce:
     """Custom force on the nodes or faces of a body.
 
     Attributes
@@ -296,7 +300,7 @@ class PlacedForce:
     points : ForcePoints
         The nodes, or those of each face.
     data : (8, i)
-        Entries of an `AtNode` between `t_s` and `since_s`, for each instance.
+        Entries of an `ForceContext` between `t_s` and `interval_s`, for each instance.
     columns : (c,)
         Indices in θ of its constants.
     """
@@ -307,15 +311,15 @@ class PlacedForce:
     columns: Index
 
     @classmethod
-    def on(
-        cls, force: NodeForce, mesh: Nodes, chosen: Index, volume_m3: Array, columns: Index
-    ) -> PlacedForce:
+    def on_mesh(
+        cls, force: NodeForce, mesh: ElementNodes, chosen: Index, volume_m3: Array, columns: Index
+    ) -> LocatedForce:
         """Place a force on selected nodes of a mesh.
 
         Parameters
         ----------
         force : NodeForce
-        mesh : Nodes
+        mesh : ElementNodes
         chosen : (k,) int
             Indices of the selected nodes.
         volume_m3 : (n,)
@@ -328,13 +332,13 @@ class PlacedForce:
         InputError
             If the force is on faces and no face has all of its nodes selected.
         """
-        area, normal = surface_of(mesh)
+        area, normal = surface_shares(mesh)
         data = np.vstack([mesh.points_m.T, area, volume_m3[: len(area)], normal.T])
         if force.on == "nodes":
             nodes = chosen[:, None]
             data = data[:, chosen]
         else:
-            faces = mesh.on_faces(mesh.mesh.surface)
+            faces = mesh.nodes_of_faces(mesh.mesh.surface)
             nodes = faces[np.isin(faces, chosen).all(axis=1)]
             if not len(nodes):
                 raise InputError(
@@ -343,15 +347,15 @@ class PlacedForce:
                 )
             data = data[:, nodes[:, -3:]].mean(axis=2)
             data[3:] = 0.0
-        return cls(force, ForcePoints.of_nodes(nodes, len(volume_m3)), data, columns)
+        return cls(force, ForcePoints.at_nodes(nodes, len(volume_m3)), data, columns)
 
 
-def _column(values: Any) -> ca.SX:
+def _as_column(values: Any) -> ca.SX:
     """Return a list or a single expression as a column vector."""
     return ca.SX(ca.vertcat(*values) if isinstance(values, (list, tuple)) else values)
 
 
-def middle(values: ca.SX) -> ca.SX:
+def face_middle(values: ca.SX) -> ca.SX:
     """Return the mean over the last three nodes of a face of a nodal quantity (3k,).
 
     These nodes share the force on the face: the corners, or the mid nodes of a quadratic face.
@@ -375,12 +379,12 @@ def area_vector(places: Sequence[ca.SX]) -> ca.SX:
     return sum((ca.cross(a, b) for a, b in neighbours), start=ca.SX.zeros(3)) / 2
 
 
-def surface_of(mesh: Nodes) -> tuple[Array, Array]:
+def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
     """Return the surface area (n,) and outward normal (n, 3) of every node; zero inside.
 
     The area belongs to the corners, or to the mid nodes of quadratic faces.
     """
-    faces = mesh.on_faces(mesh.mesh.surface)
+    faces = mesh.nodes_of_faces(mesh.mesh.surface)
     a, b, c = np.moveaxis(mesh.points_m[faces[:, :3]], 1, 0)
     share = np.cross(b - a, c - a) / 6
     normal = np.zeros((len(mesh.points_m), 3))

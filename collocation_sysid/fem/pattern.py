@@ -32,23 +32,23 @@ class SymmetricPattern:
     columns: Index
 
     @classmethod
-    def of_cells(cls, cells: Index, nodes: int) -> SymmetricPattern:
+    def from_cells(cls, cells: Index, nodes: int) -> SymmetricPattern:
         """Return the pattern of a stiffness matrix on cells (E, k) of a mesh with `nodes` nodes."""
         dofs = dofs_of(cells)
         row = np.repeat(dofs, dofs.shape[1], axis=1).ravel()
         column = np.tile(dofs, dofs.shape[1]).ravel()
         lower = row >= column
-        return cls.of_entries(row[lower], column[lower], nodes)
+        return cls.from_entries(row[lower], column[lower], nodes)
 
     @classmethod
-    def of_entries(cls, rows: Index, columns: Index, nodes: int) -> SymmetricPattern:
+    def from_entries(cls, rows: Index, columns: Index, nodes: int) -> SymmetricPattern:
         """Return the pattern with these entries, rows >= columns, and the diagonal."""
         size = 3 * nodes
         codes = np.unique(np.append(columns * size + rows, np.arange(size) * (size + 1)))
         return cls(size, codes % size, codes // size)
 
     @property
-    def entries(self) -> int:
+    def entry_count(self) -> int:
         """Number m of entries in the lower triangle."""
         return len(self.rows)
 
@@ -57,7 +57,7 @@ class SymmetricPattern:
         """Position of each diagonal entry (3n,)."""
         return np.flatnonzero(self.rows == self.columns)
 
-    def position(self, row: Index, column: Index) -> Index:
+    def positions_of(self, row: Index, column: Index) -> Index:
         """Return the positions of entries given in either triangle.
 
         Raises
@@ -80,7 +80,7 @@ class SymmetricPattern:
         strict = self.rows != self.columns
         rows = np.concatenate([self.rows, self.columns[strict]])
         columns = np.concatenate([self.columns, self.rows[strict]])
-        source = np.concatenate([np.arange(self.entries), np.flatnonzero(strict)])
+        source = np.concatenate([np.arange(self.entry_count), np.flatnonzero(strict)])
         order = np.lexsort((rows, columns))
         return rows[order], columns[order], source[order]
 
@@ -96,7 +96,7 @@ class SymmetricPattern:
 
 
 @dataclass(frozen=True, eq=False)
-class Joined:
+class JointPattern:
     """Union of several patterns.
 
     Attributes
@@ -112,22 +112,22 @@ class Joined:
 
     @staticmethod
     @lru_cache(maxsize=16)
-    def of(patterns: tuple[SymmetricPattern, ...]) -> Joined:
+    def from_patterns(patterns: tuple[SymmetricPattern, ...]) -> JointPattern:
         """Return the union of patterns of one size; the latest 16 are cached."""
         rows = np.concatenate([pattern.rows for pattern in patterns])
         columns = np.concatenate([pattern.columns for pattern in patterns])
-        union = SymmetricPattern.of_entries(rows, columns, patterns[0].size // 3)
-        union = patterns[0] if union.entries == patterns[0].entries else union
-        return Joined(union, tuple(union.position(p.rows, p.columns) for p in patterns))
+        union = SymmetricPattern.from_entries(rows, columns, patterns[0].size // 3)
+        union = patterns[0] if union.entry_count == patterns[0].entry_count else union
+        return JointPattern(union, tuple(union.positions_of(p.rows, p.columns) for p in patterns))
 
-    def spread(self, values: Array) -> Array:
+    def expand(self, values: Array) -> Array:
         """Return values (T, m) of the first pattern as values of the union.
 
         Unchanged if they are equal.
         """
-        if not values.size or values.shape[1] == self.pattern.entries:
+        if not values.size or values.shape[1] == self.pattern.entry_count:
             return values
-        expanded = np.zeros((len(values), self.pattern.entries))
+        expanded = np.zeros((len(values), self.pattern.entry_count))
         expanded[:, self.places[0]] = values
         return expanded
 
@@ -150,10 +150,10 @@ def element_destinations(pattern: SymmetricPattern, cells: Index) -> tuple[Index
     dofs = dofs_of(cells)
     size = dofs.shape[1]
     local_columns, local_rows = np.triu_indices(size)
-    return dofs, pattern.position(dofs[:, local_rows], dofs[:, local_columns])
+    return dofs, pattern.positions_of(dofs[:, local_rows], dofs[:, local_columns])
 
 
-def in_ascending_order(cells: Index, geometry: Array) -> tuple[Index, Array]:
+def with_ascending_nodes(cells: Index, geometry: Array) -> tuple[Index, Array]:
     """Return elements (E, nodes) and their geometry (E, q, 3·nodes + 1) with ascending node
     indices.
     """

@@ -1,6 +1,6 @@
 """Refinement of a body: every tetrahedron is split into eight.
 
-Use `refined` for the body, and `refined_nodes` for nodes that are selected on it.
+Use `refine_body` for the body, and `refine_nodes` for nodes that are selected on it.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ..arrays import Index
 from .elements import ELEMENTS
-from .mesh import Nodes, TetMesh
-from .mesh_checks import orient
-from .node_force import NodeForce, PlacedForce
+from .mesh import ElementNodes, TetMesh
+from .mesh_checks import orient_elements
+from .node_force import LocatedForce, NodeForce
 from .regions import Region
 from .rest_shape import UnderGravity
 from .selection import Ball, Box, Indices, Selection
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _AT_CORNERS = ((0, 4, 6, 7), (1, 4, 5, 8), (2, 5, 6, 9), (3, 7, 8, 9))
 # Octahedron in the middle: each of its diagonals, and the ring of the other mid nodes.
 _DIAGONALS = np.array([(4, 9), (5, 7), (6, 8)])
-_AROUND = np.array([(5, 6, 7, 8), (4, 6, 9, 8), (4, 5, 9, 7)])
+_RINGS = np.array([(5, 6, 7, 8), (4, 6, 9, 8), (4, 5, 9, 7)])
 
 
 def split_in_eight(mesh: TetMesh) -> TetMesh:
@@ -38,13 +38,13 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
     `TetMesh.edges`; the eight parts of an element follow one another. Masks of nodes are true in
     the middle of an edge if they are at both ends; other arrays of nodes are omitted.
     """
-    finer = Nodes.of_element(mesh, ELEMENTS["tet10"])
+    finer = ElementNodes.for_element(mesh, ELEMENTS["tet10"])
     ends = mesh.edges
     points = finer.points_m
     nodes = finer.cells
     across = points[nodes[:, _DIAGONALS]]  # (E, 3, 2, 3)
     shortest = np.linalg.norm(across[:, :, 1] - across[:, :, 0], axis=2).round(12).argmin(axis=1)
-    ring = _AROUND[shortest]
+    ring = _RINGS[shortest]
     axis = _DIAGONALS[shortest]  # (E, 4), (E, 2)
     middle = [np.column_stack([axis, ring[:, k], ring[:, k - 1]]) for k in range(4)]
     local = [np.broadcast_to(corner, (len(nodes), 4)) for corner in _AT_CORNERS] + middle
@@ -52,21 +52,21 @@ def split_in_eight(mesh: TetMesh) -> TetMesh:
     masks = {n: a for n, a in mesh.point_arrays.items() if a.ndim == 1 and np.isin(a, (0, 1)).all()}
     return TetMesh(
         points,
-        orient(points, children.reshape(-1, 4))[0],
+        orient_elements(points, children.reshape(-1, 4))[0],
         {name: np.concatenate([a, a[ends].min(axis=1)]) for name, a in masks.items()},
         {name: np.repeat(a, 8, axis=0) for name, a in mesh.cell_arrays.items()},
-        {name: faces_in_four(faces, mesh) for name, faces in mesh.face_sets.items()},
+        {name: split_faces_in_four(faces, mesh) for name, faces in mesh.face_sets.items()},
         is_generated=mesh.is_generated,
     )
 
 
-def faces_in_four(faces: Index, mesh: TetMesh) -> Index:
+def split_faces_in_four(faces: Index, mesh: TetMesh) -> Index:
     """Return faces (k, 3) of a mesh split into four each, with the nodes of `split_in_eight`."""
-    nodes = Nodes.of_element(mesh, ELEMENTS["tet10"]).on_faces(faces)
+    nodes = ElementNodes.for_element(mesh, ELEMENTS["tet10"]).nodes_of_faces(faces)
     return nodes[:, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]].reshape(-1, 3)
 
 
-def refined(body: Body) -> Body:
+def refine_body(body: Body) -> Body:
     """Return the body on a mesh with half the element size.
 
     Its regions consist of the split cells.
@@ -77,7 +77,7 @@ def refined(body: Body) -> Body:
             part.name,
             inside.ravel(),
             part.material,
-            part.density_kg_m3 if part.own_density else None,
+            part.density_kg_m3 if part.has_own_density else None,
             part.damping,
             part.prony,
         )
@@ -85,7 +85,7 @@ def refined(body: Body) -> Body:
         if part.name
     ]
     # A region without a density has that of the body, even if regions claim all cells.
-    rest = next((part for part in body.parts if not part.own_density), body.parts[0])
+    rest = next((part for part in body.parts if not part.has_own_density), body.parts[0])
     mesh = split_in_eight(body.mesh)
     finer = type(body)(
         mesh,
@@ -95,32 +95,32 @@ def refined(body: Body) -> Body:
         damping=rest.damping,
         regions=regions,
         prony=rest.prony,
-        forces=[_finer(placed, mesh, body) for placed in body.placed_forces],
-        rest_shape=_finer_rest_shape(body, mesh),
+        forces=[_refined_force(placed, mesh, body) for placed in body.placed_forces],
+        rest_shape=_refined_rest_shape(body, mesh),
         evaluator=body.evaluator,
         threads=body.threads,
     )
-    finer = finer.with_free_densities([part.name for part in body.parts if part.free_density])
-    if not body.lengths_m:
+    finer = finer.with_free_densities([part.name for part in body.parts if part.has_free_density])
+    if not body.field_lengths_m:
         return finer
     fields = [part.field and part.field.split_in_eight() for part in body.parts]
     parts = zip(finer.parts, fields, strict=True)
     return finer.with_parts(tuple(replace(part, field=field) for part, field in parts))
 
 
-def _finer_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
+def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
     """Return the rest-shape statement of a body, with the held nodes of the refined mesh."""
-    if body.scan is None:
+    if body.scan_conditions is None:
         return None if body.rest_shape is None else "stress_free"
-    if isinstance(body.scan.nodes, (Box, Ball)):
-        return body.scan
+    if isinstance(body.scan_conditions.nodes, (Box, Ball)):
+        return body.scan_conditions
     corners = len(body.mesh.points_m)
-    is_held = np.isin(np.arange(corners), body.scan.held_nodes(body.nodes))
+    is_held = np.isin(np.arange(corners), body.scan_conditions.held_nodes(body.nodes))
     chosen = np.concatenate([is_held, is_held[body.mesh.edges].all(axis=1)])
-    return replace(body.scan, nodes=Indices(np.flatnonzero(chosen).tolist()))
+    return replace(body.scan_conditions, nodes=Indices(np.flatnonzero(chosen).tolist()))
 
 
-def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:
+def _refined_force(placed: LocatedForce, mesh: TetMesh, body: Body) -> NodeForce:
     """Return a force for the refined mesh.
 
     It acts in the middle of an edge if it does at both ends.
@@ -130,10 +130,10 @@ def _finer(placed: PlacedForce, mesh: TetMesh, body: Body) -> NodeForce:
     chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])
     if body.element.edges:
         chosen = np.concatenate([chosen, chosen[mesh.edges].all(axis=1)])
-    return placed.force.on_finer(np.flatnonzero(chosen))
+    return placed.force.on_refined_body(np.flatnonzero(chosen))
 
 
-def refined_nodes(nodes: Index, selection: Selection | None, body: Body, finer: Body) -> Index:
+def refine_nodes(nodes: Index, selection: Selection | None, body: Body, finer: Body) -> Index:
     """Return the nodes of the refined body that correspond to nodes of the original one.
 
     Boxes and balls select anew. Otherwise the middle of an edge is selected if both ends are.

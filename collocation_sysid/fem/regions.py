@@ -1,6 +1,6 @@
 """Regions of a body with their own material, damping law and density, and the vector θ.
 
-Use `Region` to declare a region. `Model` maps parameters by the names that users know to the
+Use `Region` to declare a region. `LiveModel` maps parameters by the names that users know to the
 constants θ of all parts of a body.
 """
 
@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError, hint_at
-from .constants import CONTRAST, DENSITY, GAMMA_M, MASS, Constant, is_mode
+from .constants import CONTRAST, DENSITY, GAMMA_M, MASS, Constant, is_field_coefficient
 from .field import TWO_PHASE, Field, FieldModes
-from .materials import Damping, Energy, Material, Prony, as_branches, as_damping, as_material
+from .materials import DampingLaw, Energy, Material, Prony, as_branches, as_damping, as_material
 from .mesh import TetMesh
-from .moduli import Source, elastic_names, source_of
+from .moduli import ConstantSource, elastic_names, find_source
 from .node_force import NodeForce
 from .selection import Selection
 from .two_phase import TwoPhaseModes
@@ -47,7 +47,7 @@ class Region:
     cells: Selection | ArrayLike
     material: str | Energy | Material | None = None
     density_kg_m3: float | None = None
-    damping: str | Damping | None = None
+    damping: str | DampingLaw | None = None
     prony: Sequence[str | Prony] | None = None
     field: Field | None = None
 
@@ -70,16 +70,16 @@ class BodyPart:
     cells : (k,)
         Cell indices, ascending.
     material : Material
-    damping : Damping
+    damping : DampingLaw
     density_kg_m3 : float
         Stated density; not used where the density is free.
     prony : tuple of Prony
         Branches of its memory.
     per_mass_1_m3 : float
         Density divided by the mass of the body.
-    own_density : bool
+    has_own_density : bool
         Whether the density is stated for this part, not for the body.
-    free_density : bool
+    has_free_density : bool
         Whether the density is an entry of θ.
     field : FieldModes or None
         Constant that varies in space within the part.
@@ -88,12 +88,12 @@ class BodyPart:
     name: str
     cells: Index
     material: Material
-    damping: Damping
+    damping: DampingLaw
     density_kg_m3: float
     prony: tuple[Prony, ...] = ()
     per_mass_1_m3: float = 0.0
-    own_density: bool = False
-    free_density: bool = False
+    has_own_density: bool = False
+    has_free_density: bool = False
     field: FieldModes | None = None
 
     @cached_property
@@ -101,7 +101,7 @@ class BodyPart:
         """Constants of material, damping law, memory, mass and field, in the order of θ."""
         memory = [constant for branch in self.prony for constant in branch.constants]
         law = (*self.material.constants, *self.damping.constants, *memory, GAMMA_M)
-        law = (*law, DENSITY) if self.free_density else law
+        law = (*law, DENSITY) if self.has_free_density else law
         return (*law, *self.field_constants)
 
     @property
@@ -110,26 +110,26 @@ class BodyPart:
         return () if self.field is None else self.field.constants
 
     @property
-    def of_law(self) -> int:
+    def law_constant_count(self) -> int:
         """Number of constants of the material and the damping law."""
         return len(self.material.constants) + len(self.damping.constants)
 
     @property
-    def of_gamma_m(self) -> int:
+    def gamma_m_index(self) -> int:
         """Index of γ_m among the constants of the part; the density follows where it is free."""
-        return self.of_law + 2 * len(self.prony)
+        return self.law_constant_count + 2 * len(self.prony)
 
     @property
-    def of_points(self) -> int:
+    def point_constant_count(self) -> int:
         """Number of constants of the quadrature points: of the law, and the stiffening by
         memory.
         """
-        return self.of_law + bool(self.prony)
+        return self.law_constant_count + bool(self.prony)
 
     @property
     def stress_field(self) -> FieldModes | None:
         """Field of a constant on which the stress depends; None without one, or for a density."""
-        return self.field if self.field and self.field.scaled else None
+        return self.field if self.field and self.field.scaled_indices else None
 
     @property
     def field_name(self) -> str:
@@ -141,10 +141,10 @@ class BodyPart:
         return f"{self.name}.{own}" if self.name else own
 
 
-def parts_of(
+def parts_from_regions(
     mesh: TetMesh,
     material: str | Energy | Material,
-    damping: str | Damping,
+    damping: str | DampingLaw,
     density_kg_m3: float | None,
     mass_kg: float | None,
     regions: Sequence[Region],
@@ -167,7 +167,7 @@ def parts_of(
     InputError
         If regions overlap, share a name, are empty, or leave no mass for the rest.
     """
-    claimed = _claimed(mesh, regions)
+    claimed = _cells_of_regions(mesh, regions)
     densities = _densities(mesh, regions, claimed, density_kg_m3, mass_kg)
     rest = np.setdiff1d(
         np.arange(len(mesh.tetrahedra)), np.concatenate([np.zeros(0, int), *claimed])
@@ -190,7 +190,7 @@ def parts_of(
             memory = branches if region.prony is None else as_branches(region.prony)
             has_own = region.density_kg_m3 is not None
             part = BodyPart(
-                region.name, cells, law, region_damping, density, memory, own_density=has_own
+                region.name, cells, law, region_damping, density, memory, has_own_density=has_own
             )
             parts.append(_with_field(part, region.field, mesh))
         except InputError as error:
@@ -205,7 +205,7 @@ def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
         return part
     law = (*part.material.constants, *part.damping.constants)
     kind = TwoPhaseModes if field.prior == TWO_PHASE else FieldModes
-    return replace(part, field=kind.of(field, mesh, part.cells, law))
+    return replace(part, field=kind.from_field(field, mesh, part.cells, law))
 
 
 def _densities(
@@ -247,7 +247,7 @@ def _densities(
     return [default_density, *region_densities]
 
 
-def _claimed(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
+def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
     """Return the cells of each region, ascending; raise an `InputError` if regions overlap."""
     owner = np.full(len(mesh.tetrahedra), -1)
     claimed: list[Index] = []
@@ -255,7 +255,7 @@ def _claimed(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
         if region.name in [other.name for other in regions[:k]]:
             raise InputError(f"two regions are named {region.name!r}; names must differ")
         try:
-            cells = _cells(mesh, region.cells)
+            cells = _resolve_cells(mesh, region.cells)
         except InputError as error:
             raise error.located(None, f"region '{region.name}'") from error
         if (overlap := cells[owner[cells] >= 0]).size:
@@ -269,11 +269,11 @@ def _claimed(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
     return claimed
 
 
-def _cells(mesh: TetMesh, given: Selection | ArrayLike) -> Index:
+def _resolve_cells(mesh: TetMesh, cells: Selection | ArrayLike) -> Index:
     """Return cell indices, ascending, from a selection, a mask or indices."""
-    if isinstance(given, Selection):
-        return given.resolve_cells(mesh)
-    array = np.asarray(given)
+    if isinstance(cells, Selection):
+        return cells.resolve_cells(mesh)
+    array = np.asarray(cells)
     count = len(mesh.tetrahedra)
     if array.dtype == bool and array.shape == (count,):
         array = np.flatnonzero(array)
@@ -291,7 +291,7 @@ def _cells(mesh: TetMesh, given: Selection | ArrayLike) -> Index:
 Theta = Sequence[float] | Array
 
 
-class Model:
+class ConstantsModel:
     """Sum of terms, part by part, with the vector θ of their constants.
 
     Parameters
@@ -341,7 +341,7 @@ class Model:
                 )
             self.constants[constant.name] = constant
 
-    def sources(self, known: Sequence[str]) -> list[Source]:
+    def constant_sources(self, known: Sequence[str]) -> list[ConstantSource]:
         """Return for each part the parameters that determine its constants.
 
         Parameters
@@ -355,7 +355,7 @@ class Model:
             If a constant is missing or given twice.
         """
         return [
-            source_of(
+            find_source(
                 part.name,
                 part.material,
                 part.constants[
@@ -368,8 +368,8 @@ class Model:
 
     def used_names(self, known: Sequence[str]) -> set[str]:
         """Return those of the given parameters' names on which θ depends."""
-        used = {name for source in self.sources(known) for name in source.names.values()}
-        used.update(self.mode_names, self.contrasts)
+        used = {name for source in self.constant_sources(known) for name in source.names.values()}
+        used.update(self.field_coefficient_names, self.contrast_deviations)
         further = (force.constants for force in self.forces)
         return used.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
@@ -385,7 +385,7 @@ class Model:
             names += [part.full_name(part_name) for part_name in part_names] + part_names
         return tuple(dict.fromkeys([*names, MASS.name, *self.constants]))
 
-    def assembled(self, values: Mapping[str, Any]) -> list[Any]:
+    def assemble_theta(self, values: Mapping[str, Any]) -> list[Any]:
         """Return θ as a list from parameters by name: numbers, or CasADi expressions.
 
         Raises
@@ -394,8 +394,8 @@ class Model:
             If a constant is missing or given twice.
         """
         theta = []
-        for part, source in zip(self.parts, self.sources(list(values)), strict=True):
-            constants = source.constants(values)
+        for part, source in zip(self.parts, self.constant_sources(list(values)), strict=True):
+            constants = source.evaluate(values)
             if source.names.get(DENSITY.name) == MASS.name:
                 constants[DENSITY.name] *= part.per_mass_1_m3
             # A field that nothing is said of is as its mean everywhere.
@@ -410,7 +410,7 @@ class Model:
             theta.append(values[name])
         return theta
 
-    def theta(self, values: Mapping[str, float]) -> Array:
+    def theta_from_values(self, values: Mapping[str, float]) -> Array:
         """Return the constants θ (k,) from parameters by name; names of other bodies are ignored.
 
         Raises
@@ -418,13 +418,13 @@ class Model:
         InputError
             If a constant is missing or given twice.
         """
-        return np.array([float(value) for value in self.assembled(values)])
+        return np.array([float(value) for value in self.assemble_theta(values)])
 
     def lame(self, theta: Theta) -> dict[str, tuple[float, float]]:
         """Return the small-strain (λ, μ) [Pa] of each part at θ, by the name of the part."""
         by_part = {}
         for part, part_constants in zip(
-            self.parts, self.split(np.asarray(theta, dtype=float)), strict=True
+            self.parts, self.split_theta(np.asarray(theta, dtype=float)), strict=True
         ):
             values = (
                 part.material.lame(part_constants[: len(part.material.constants)]).full().ravel()
@@ -432,7 +432,7 @@ class Model:
             by_part[part.name] = (float(values[0]), float(values[1]))
         return by_part
 
-    def weighed_by(self, names: Collection[str]) -> list[str]:
+    def parts_with_free_density(self, names: Collection[str]) -> list[str]:
         """Return the names of the parts whose densities are given by parameters of these names.
 
         A density that is stated for a region alone is not a parameter, unless
@@ -443,20 +443,20 @@ class Model:
             for part in self.parts
             if MASS.name in names
             or part.full_name(DENSITY.name) in names
-            or (DENSITY.name in names and not part.own_density)
+            or (DENSITY.name in names and not part.has_own_density)
         ]
 
-    def split(self, theta: Any) -> list[Any]:
+    def split_theta(self, theta: Any) -> list[Any]:
         """Return θ, numbers or a CasADi expression, part by part."""
         return [theta[a:b] for a, b in pairwise(self.starts)]
 
     @property
-    def mode_names(self) -> tuple[str, ...]:
+    def field_coefficient_names(self) -> tuple[str, ...]:
         """Names of the coefficients of the shapes of fields."""
-        return tuple(name for name in self.constants if is_mode(name))
+        return tuple(name for name in self.constants if is_field_coefficient(name))
 
     @property
-    def contrasts(self) -> dict[str, float]:
+    def contrast_deviations(self) -> dict[str, float]:
         """Prior deviations of the logarithms of the contrasts of two-phase fields, by name."""
         return {
             part.full_name(CONTRAST.name): part.field.field.deviation
@@ -465,7 +465,7 @@ class Model:
         }
 
     @cached_property
-    def mode_places(self) -> list[slice]:
+    def field_slices(self) -> list[slice]:
         """Slice in θ of the coefficients of each part's field."""
         counts = (len(part.field_constants) for part in self.parts)
         ends = self.starts[1:]
@@ -476,7 +476,7 @@ class Model:
         """Index in θ of the first constant of each part, and that after the last part."""
         return [0, *np.cumsum([len(part.constants) for part in self.parts]).tolist()]
 
-    def elastic(self, constants: Mapping[str, float]) -> Array:
+    def elastic_theta(self, constants: Mapping[str, float]) -> Array:
         """Return θ from elastic constants, with all other constants zero.
 
         Raises
@@ -491,4 +491,6 @@ class Model:
                     f"no constant {name!r}; expected {', '.join(self.constants)}{hint}"
                 )
         stored = {p.full_name(c.name) for p in self.parts for c in p.material.constants}
-        return self.theta({**dict.fromkeys(set(self.constants) - stored, 0.0), **constants})
+        return self.theta_from_values(
+            {**dict.fromkeys(set(self.constants) - stored, 0.0), **constants}
+        )

@@ -8,7 +8,7 @@ import casadi as ca
 
 
 @dataclass(frozen=True)
-class RestPoint:
+class RestPointLayout:
     """Layout of the data of the stress-free shape at a quadrature point.
 
     A point has D values: the 9 entries of G = ∂X/∂Y, column after column, and, for elements that
@@ -17,37 +17,37 @@ class RestPoint:
 
     Attributes
     ----------
-    inputs : int
+    input_count : int
         Number k of entries of θ on which X depends.
-    mean_dilatation : bool
+    averages_dilatation : bool
         Whether the element averages the dilatation.
     """
 
-    inputs: int
-    mean_dilatation: bool
+    input_count: int
+    averages_dilatation: bool
 
     @property
-    def values(self) -> int:
+    def value_count(self) -> int:
         """Number D of values of a point."""
-        return 10 if self.mean_dilatation else 9
+        return 10 if self.averages_dilatation else 9
 
     @property
-    def pairs(self) -> list[tuple[int, int]]:
+    def input_pairs(self) -> list[tuple[int, int]]:
         """Pairs of inputs (i, j), i ≤ j, in the order of the second derivatives."""
-        return [(i, j) for j in range(self.inputs) for i in range(j + 1)]
+        return [(i, j) for j in range(self.input_count) for i in range(j + 1)]
 
     @property
     def count(self) -> int:
         """Number of data of a point."""
-        return self.values * (1 + self.inputs + len(self.pairs))
+        return self.value_count * (1 + self.input_count + len(self.input_pairs))
 
     def expand(self, data: ca.SX, changes: ca.SX) -> ca.SX:
         """Return the D values after changes (k,) of the inputs, to second order."""
-        columns = ca.reshape(data, self.values, 1 + self.inputs + len(self.pairs))
+        columns = ca.reshape(data, self.value_count, 1 + self.input_count + len(self.input_pairs))
         values = columns[:, 0]
-        for i in range(self.inputs):
+        for i in range(self.input_count):
             values += columns[:, 1 + i] * changes[i]
-        for number, (i, j) in enumerate(self.pairs):
+        for number, (i, j) in enumerate(self.input_pairs):
             factor = 0.5 if i == j else 1.0
-            values += factor * changes[i] * changes[j] * columns[:, 1 + self.inputs + number]
+            values += factor * changes[i] * changes[j] * columns[:, 1 + self.input_count + number]
         return values

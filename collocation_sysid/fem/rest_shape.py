@@ -12,7 +12,8 @@ function theorem, with the residual r, ∂X/∂θ = −(∂r/∂X)⁻¹ ∂r/∂
 
 The kernels keep Y as the reference configuration of the computation. With G = ∂X/∂Y at a quadrature
 point, the deformation gradient of the material is F = (∂x/∂Y) G⁻¹ and the volume of the point V det
-G, see `RestPoint`. G and its derivatives by θ are data of the points, so that forces and all their
+G, see `RestPointLayout`. G and its derivatives by θ are data of the points, so that forces and all
+their
 derivatives are those of the complete model in every method.
 """
 
@@ -32,19 +33,19 @@ from scipy.sparse.linalg import splu
 from ..arrays import Array, Index
 from ..errors import InputError, SimulationError
 from .materials import Material
-from .mesh import Nodes
+from .mesh import ElementNodes
 from .regions import BodyPart
-from .rest_point import RestPoint
+from .rest_point import RestPointLayout
 from .selection import Selection
 
 # Number of cached stress-free shapes: of an iterate, of its neighbours for difference quotients,
 # and of the previous iterate.
-SHAPES_KEPT = 16
+CACHED_SHAPES = 16
 # Relative step of the differences of ∂X/∂θ that give ∂²X/∂θ²: the cube root of the rounding error.
-DIFFERENCE = 1e-5
+RELATIVE_DIFFERENCE_STEP = 1e-5
 LARGEST_GRAVITY_M_S2 = 1e4
 # Largest relative change of a constant for which Newton's method starts from the latest solution.
-NEAR = 0.2
+LARGEST_EXTRAPOLATION = 0.2
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class UnderGravity:
         gravity.setflags(write=False)
         object.__setattr__(self, "gravity_m_s2", gravity)
 
-    def held_nodes(self, nodes: Nodes) -> Index:
+    def held_nodes(self, nodes: ElementNodes) -> Index:
         """Return the indices of the held nodes, sorted.
 
         Raises
@@ -312,7 +313,7 @@ def _average_pressure(stress: Array, shares: Array) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Assembled:
+class _AssembledForces:
     """Elastic forces at the mesh, assembled, with derivatives.
 
     Attributes
@@ -335,7 +336,7 @@ class InverseEquilibrium:
     Parameters
     ----------
     body : Body
-        Body with a `scan`. (`body` imports this module, hence no annotation.)
+        Body with a `scan_stiffness`. (`body` imports this module, hence no annotation.)
 
     Attributes
     ----------
@@ -347,7 +348,7 @@ class InverseEquilibrium:
         Dofs of the nodes that were not held.
     places : (k,)
         Indices in θ of the inputs on which the stress-free shape depends.
-    layout : RestPoint
+    layout : RestPointLayout
         Layout of the data of the points.
     """
 
@@ -361,13 +362,15 @@ class InverseEquilibrium:
         self.free: Index = np.setdiff1d(
             np.arange(size), (3 * held_nodes[:, None] + np.arange(3)).ravel()
         )
-        self.places: Index = np.array([*body.elastic_places, *body.density_places], dtype=np.int64)
-        self.layout = RestPoint(len(self.places), body.element.mean_dilatation)
+        self.places: Index = np.array(
+            [*body.elastic_indices, *body.density_indices], dtype=np.int64
+        )
+        self.layout = RestPointLayout(len(self.places), body.element.mean_dilatation)
         self._shapes: dict[bytes, RestShape] = {}
         self._data: dict[tuple[bytes, bool], list[Array]] = {}
         self._size_m = float(np.linalg.norm(np.ptp(self.points_m, axis=0)))
 
-    def shape(self, theta: ArrayLike) -> RestShape:
+    def solve(self, theta: ArrayLike) -> RestShape:
         """Return the stress-free shape at θ (k,), with its derivatives; the latest 16 are cached.
 
         Raises
@@ -378,8 +381,8 @@ class InverseEquilibrium:
         constants = np.asarray(theta, dtype=float)
         key = constants[self.places].tobytes()
         if key not in self._shapes:
-            solution = self._solved(constants)
-            while len(self._shapes) >= SHAPES_KEPT:
+            solution = self._solve(constants)
+            while len(self._shapes) >= CACHED_SHAPES:
                 self._shapes.pop(next(iter(self._shapes)), None)
             self._shapes[key] = solution
         return self._shapes[key]
@@ -392,39 +395,39 @@ class InverseEquilibrium:
         constants = np.asarray(theta, dtype=float)
         columns = []
         for place in self.places:
-            step = DIFFERENCE * max(abs(float(constants[place])), 1e-12)
+            step = RELATIVE_DIFFERENCE_STEP * max(abs(float(constants[place])), 1e-12)
             ends = []
             for offset in (step, -step):
                 shifted = constants.copy()
                 shifted[place] += offset
-                ends.append(self.shape(shifted).by_input)
+                ends.append(self.solve(shifted).by_input)
             columns.append((ends[0] - ends[1]) / (2 * step))
-        pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.pairs]
+        pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.input_pairs]
         return np.array(pairs).reshape(-1, *self.points_m.shape)
 
-    def point_data(self, theta: ArrayLike, second: bool = False) -> list[Array]:
+    def point_data(self, theta: ArrayLike, with_second_derivatives: bool = False) -> list[Array]:
         """Return the data of the points of each part of the body, (1, cells · q · count) each.
 
         Parameters
         ----------
         theta : (k,)
-        second : bool
+        with_second_derivatives : bool
             Whether to include second derivatives; they are zero otherwise.
         """
-        key = np.asarray(theta, dtype=float)[self.places].tobytes(), second
+        key = np.asarray(theta, dtype=float)[self.places].tobytes(), with_second_derivatives
         if key not in self._data:
-            shape = self.shape(theta)
+            shape = self.solve(theta)
             fields = [shape.positions_m, *shape.by_input]
-            if second:
+            if with_second_derivatives:
                 fields += [*self.second_derivatives(theta)]
             else:
-                fields += [np.zeros_like(self.points_m)] * len(self.layout.pairs)
+                fields += [np.zeros_like(self.points_m)] * len(self.layout.input_pairs)
             while len(self._data) >= 2:
                 self._data.pop(next(iter(self._data)), None)
-            self._data[key] = self._of_points(fields)
+            self._data[key] = self._fields_at_points(fields)
         return self._data[key]
 
-    def places_of_points(self, part: int) -> Index:
+    def point_data_columns(self, part: int) -> Index:
         """Return the columns (E, q, any) of each point in the data of a part, given by its
         index.
         """
@@ -432,23 +435,23 @@ class InverseEquilibrium:
         size = self.layout.count
         return np.arange(count * points * size).reshape(count, points, size)
 
-    def weight_slope(self, theta: ArrayLike) -> Array:
+    def weight_sensitivity(self, theta: ArrayLike) -> Array:
         """Return the change (n, 3) of X for a relative change of gravity, to first order."""
         constants = np.asarray(theta, dtype=float)
-        at = self._assembled(self.shape(constants).positions_m, constants, slopes=True)
-        factor = self._factor(at.by_position)
+        at = self._assemble_forces(self.solve(constants).positions_m, constants, slopes=True)
+        factor = self._factorise(at.by_position)
         if factor is None:
-            raise RestShapeError(self._failure(constants, 1.0))
-        return self._step(factor, self._weight_n(constants))
+            raise RestShapeError(self._failure_message(constants, 1.0))
+        return self._newton_step(factor, self._weight_n(constants))
 
-    def data_of(self, positions_m: Array) -> list[Array]:
+    def point_data_at(self, positions_m: Array) -> list[Array]:
         """Return the data of the points for given X (n, 3), independent of θ: derivatives are
         zero.
         """
-        others = self.layout.inputs + len(self.layout.pairs)
-        return self._of_points([positions_m, *[np.zeros_like(positions_m)] * others])
+        others = self.layout.input_count + len(self.layout.input_pairs)
+        return self._fields_at_points([positions_m, *[np.zeros_like(positions_m)] * others])
 
-    def _of_points(self, fields: Sequence[Array]) -> list[Array]:
+    def _fields_at_points(self, fields: Sequence[Array]) -> list[Array]:
         """Return G and its derivatives at the points of each part.
 
         Parameters
@@ -463,12 +466,12 @@ class InverseEquilibrium:
             # (cells, q, columns of G, rows of G): column after column.
             columns = [np.einsum("ean,eqai->eqin", f[cells], slopes) for f in fields]
             values = np.stack([c.reshape(*c.shape[:2], 9) for c in columns], axis=2)
-            if layout.mean_dilatation:
-                values = np.concatenate([values, self._stretches(values, geometry)], axis=3)
+            if layout.averages_dilatation:
+                values = np.concatenate([values, self._volume_logarithms(values, geometry)], axis=3)
             data.append(np.ascontiguousarray(values).reshape(1, -1))
         return data
 
-    def _stretches(self, values: Array, geometry: Array) -> Array:
+    def _volume_logarithms(self, values: Array, geometry: Array) -> Array:
         """Return ρ with its derivatives (E, q, 1 + k + pairs, 1), from those of G (E, q, …, 9)."""
         layout = self.layout
         shares = geometry[..., -1] / geometry[..., -1].sum(axis=1)[:, None]
@@ -479,7 +482,7 @@ class InverseEquilibrium:
         # + tr A_ij), with A = G⁻¹ ∂G.
         relative = np.einsum("eqab,eqkbc->eqkac", inverse, matrices[:, :, 1:])
         traces = np.trace(relative, axis1=3, axis2=4)
-        k = layout.inputs
+        k = layout.input_count
         first = ratios[..., None] * traces[..., :k]
         second = [
             ratios
@@ -488,7 +491,7 @@ class InverseEquilibrium:
                 - np.einsum("eqab,eqba->eq", relative[:, :, i], relative[:, :, j])
                 + traces[..., k + number]
             )
-            for number, (i, j) in enumerate(layout.pairs)
+            for number, (i, j) in enumerate(layout.input_pairs)
         ]
         determinants = np.concatenate(
             [ratios[..., None], first, np.stack(second, axis=-1)], axis=-1
@@ -500,11 +503,11 @@ class InverseEquilibrium:
 
     def _logarithm(self, values: Array) -> Array:
         """Return ln of a number with its derivatives (…, 1 + k + pairs)."""
-        k = self.layout.inputs
+        k = self.layout.input_count
         logarithm = np.empty_like(values)
         logarithm[..., 0] = np.log(values[..., 0])
         logarithm[..., 1 : k + 1] = values[..., 1 : k + 1] / values[..., :1]
-        for number, (i, j) in enumerate(self.layout.pairs):
+        for number, (i, j) in enumerate(self.layout.input_pairs):
             column = k + 1 + number
             product = logarithm[..., 1 + i] * logarithm[..., 1 + j]
             logarithm[..., column] = values[..., column] / values[..., 0] - product
@@ -513,33 +516,33 @@ class InverseEquilibrium:
     @cached_property
     def _parts(self) -> list[tuple[Index, Array]]:
         """Cells and geometry of each part, with nodes in the order of its kernels."""
-        return [self.body.laid_out(part) for part in self.body.parts]
+        return [self.body.part_elements(part) for part in self.body.parts]
 
     # Newton's method ------------------------------------------------------------------------
 
-    def _solved(self, theta: Array) -> RestShape:
+    def _solve(self, theta: Array) -> RestShape:
         """Return the stress-free shape at θ with derivatives, from the latest solution or from the
         mesh.
         """
         weight = self._weight_n(theta)
-        start = self._predicted(theta)
+        start = self._predict(theta)
         x = None if start is None else self._newton(start, theta, weight)
         if x is None:
-            x = self._under_growing_weight(theta, weight)
-        force = self._assembled(x, theta, slopes=True)
+            x = self._solve_with_load_steps(theta, weight)
+        force = self._assemble_forces(x, theta, slopes=True)
         by_theta = force.by_theta
-        for column, slope in self.body.mass_slopes.items():
+        for column, slope in self.body.mass_derivatives.items():
             place = self.places.tolist().index(column)
             gravity = np.tile(self.gravity_m_s2, len(self.points_m))
             by_theta[:, place] += slope[: self.points_m.size] * gravity
-        factor = self._factor(force.by_position)
+        factor = self._factorise(force.by_position)
         if factor is None:
-            raise RestShapeError(self._failure(theta, 1.0))
+            raise RestShapeError(self._failure_message(theta, 1.0))
         by_input = np.zeros((len(self.places), self.points_m.size))
         by_input[:, self.free] = -factor.solve(by_theta[self.free]).T
         return RestShape(x, by_input.reshape(-1, *self.points_m.shape))
 
-    def _predicted(self, theta: Array) -> Array | None:
+    def _predict(self, theta: Array) -> Array | None:
         """Return X at θ to first order from the latest solution; None if θ differs too much."""
         if not self._shapes:
             return None
@@ -547,12 +550,12 @@ class InverseEquilibrium:
         known = np.frombuffer(key)
         target = theta[self.places]
         change = target - known
-        if (np.abs(change) > NEAR * np.abs(known)).any():
+        if (np.abs(change) > LARGEST_EXTRAPOLATION * np.abs(known)).any():
             return None
         predicted = shape.positions_m + np.tensordot(change, shape.by_input, axes=1)
         return predicted if self._is_admissible(predicted) else None
 
-    def _under_growing_weight(self, theta: Array, weight_n: Array) -> Array:
+    def _solve_with_load_steps(self, theta: Array, weight_n: Array) -> Array:
         """Return X, solved from the mesh under shares of the weight that grow to one.
 
         Raises
@@ -575,7 +578,7 @@ class InverseEquilibrium:
             share_reached = share
             if share_reached == 1.0:
                 return x
-        raise RestShapeError(self._failure(theta, share_reached))
+        raise RestShapeError(self._failure_message(theta, share_reached))
 
     def _weight_n(self, theta: Array) -> Array:
         """Return the weight (3n,) of every dof [N]."""
@@ -592,11 +595,11 @@ class InverseEquilibrium:
         """
         x = start.copy()
         for _ in range(OPTIONS.iterations):
-            at = self._assembled(x, theta, slopes=True)
-            factor = self._factor(at.by_position)
+            at = self._assemble_forces(x, theta, slopes=True)
+            factor = self._factorise(at.by_position)
             if factor is None:
                 return None
-            step = self._step(factor, at.force_n + weight_n)
+            step = self._newton_step(factor, at.force_n + weight_n)
             length = float(np.linalg.norm(step))
             if not np.isfinite(length):
                 return None
@@ -608,8 +611,8 @@ class InverseEquilibrium:
             for _ in range(OPTIONS.halvings):
                 trial = x + share * step
                 if self._is_admissible(trial):
-                    after = self._assembled(trial, theta, slopes=False).force_n
-                    next_step = self._step(factor, after + weight_n)
+                    after = self._assemble_forces(trial, theta, slopes=False).force_n
+                    next_step = self._newton_step(factor, after + weight_n)
                     if np.linalg.norm(next_step) <= (1 - share / 4) * length:
                         break
                 share /= 2
@@ -618,13 +621,13 @@ class InverseEquilibrium:
             x = trial
         return None
 
-    def _step(self, factor: Any, residual_n: Array) -> Array:
+    def _newton_step(self, factor: Any, residual_n: Array) -> Array:
         """Return the Newton step (n, 3) of a residual, by factors of ∂r/∂X."""
         step = np.zeros(self.points_m.size)
         step[self.free] = -factor.solve(residual_n[self.free])
         return step.reshape(self.points_m.shape)
 
-    def _factor(self, by_position: sp.csc_array) -> Any:
+    def _factorise(self, by_position: sp.csc_array) -> Any:
         """Return the LU factors of ∂r/∂X at the free dofs; None if it is singular."""
         matrix = sp.csc_array(by_position[self.free][:, self.free])
         try:
@@ -641,7 +644,7 @@ class InverseEquilibrium:
                 return False
         return True
 
-    def _assembled(self, positions_m: Array, theta: Array, slopes: bool) -> _Assembled:
+    def _assemble_forces(self, positions_m: Array, theta: Array, slopes: bool) -> _AssembledForces:
         """Return the elastic forces at the mesh for X `positions_m` (n, 3), with derivatives if
         `slopes`.
         """
@@ -676,9 +679,9 @@ class InverseEquilibrium:
             for number in range(elastic):
                 values = part_forces.by_theta[..., number].ravel()
                 by_theta[:, places[start + number]] += np.bincount(dofs.ravel(), values, size)
-        return _Assembled(force, by_position, by_theta)
+        return _AssembledForces(force, by_position, by_theta)
 
-    def _failure(self, theta: Array, reached: float) -> str:
+    def _failure_message(self, theta: Array, reached: float) -> str:
         """Return the message for a solve that reached only a share of the weight."""
         moduli = ", ".join(
             f"{name + ': ' if name else ''}λ {lam:.4g} Pa, μ {mu:.4g} Pa"

@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..errors import InputError, hint_at, require_among
-from .mesh import Nodes, TetMesh
+from .mesh import ElementNodes, TetMesh
 
 # Tolerance in diagonals of the body: nodes on a box's face must not be lost by rounding.
 ROUND_OFF = 1e-9
@@ -25,33 +25,35 @@ FACE_TOLERANCE = 1e-6
 FaceName = Literal["top", "bottom", "side_x", "side_y"]
 
 
-class _Within:
+class _PositionSelection:
     """Base class of selections by position."""
 
-    def resolve(self, nodes: Nodes) -> np.ndarray:
+    def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
-        hint = self._nearest(nodes.points_m)
-        return _chosen(self._holds(nodes.points_m), nodes.mesh, str(self), "nodes" + hint)
+        hint = self._nearest_hint(nodes.points_m)
+        return _indices_or_error(
+            self._contains(nodes.points_m), nodes.mesh, str(self), "nodes" + hint
+        )
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the selected cells, sorted."""
-        return _chosen(self._holds(mesh.centres_m), mesh, str(self), OF_CELLS)
+        return _indices_or_error(self._contains(mesh.centres_m), mesh, str(self), OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted."""
-        return _chosen_faces(self._holds(mesh.points_m), mesh, str(self))
+        return _select_faces(self._contains(mesh.points_m), mesh, str(self))
 
-    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+    def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask of the points inside."""
         raise NotImplementedError
 
-    def _nearest(self, points_m: np.ndarray) -> str:
+    def _nearest_hint(self, points_m: np.ndarray) -> str:
         """Return a hint for the message if no point is inside."""
         return ""
 
 
 @dataclass(frozen=True)
-class Box(_Within):
+class Box(_PositionSelection):
     """Selection of an axis-aligned box, including its faces; bounds may be infinite.
 
     Parameters
@@ -64,8 +66,8 @@ class Box(_Within):
     high_m: Sequence[float]
 
     def __post_init__(self) -> None:
-        low = _triple(self.low_m, "box: low_m")
-        high = _triple(self.high_m, "box: high_m")
+        low = _three_numbers(self.low_m, "box: low_m")
+        high = _three_numbers(self.high_m, "box: high_m")
         for axis, below, above in zip("xyz", low, high, strict=True):
             if below > above:
                 raise InputError(
@@ -75,9 +77,9 @@ class Box(_Within):
         object.__setattr__(self, "low_m", low)
         object.__setattr__(self, "high_m", high)
 
-    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+    def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask of the points inside, with a tolerance for rounding."""
-        slack = _round_off_m(points_m)
+        slack = _tolerance_m(points_m)
         above = points_m >= np.subtract(self.low_m, slack)
         below = points_m <= np.add(self.high_m, slack)
         return np.all(above & below, axis=1)
@@ -88,7 +90,7 @@ class Box(_Within):
 
 
 @dataclass(frozen=True)
-class Ball(_Within):
+class Ball(_PositionSelection):
     """Selection of a ball.
 
     Parameters
@@ -103,11 +105,11 @@ class Ball(_Within):
     radius_m: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center_m", _triple(self.center_m, "ball: center_m"))
+        object.__setattr__(self, "center_m", _three_numbers(self.center_m, "ball: center_m"))
         if not _is_number(self.radius_m) or not self.radius_m > 0:
             raise InputError(f"ball: radius_m must be a positive number, not {self.radius_m!r}")
 
-    def _nearest(self, points_m: np.ndarray) -> str:
+    def _nearest_hint(self, points_m: np.ndarray) -> str:
         """Return the distance of the nearest node as a hint."""
         least_m = self._distance_m(points_m).min()
         return f"; the nearest node is {least_m:.4g} m from its centre"
@@ -116,9 +118,9 @@ class Ball(_Within):
         """Return the distances of points from the centre [m]."""
         return np.linalg.norm(points_m - np.array(self.center_m), axis=1)
 
-    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+    def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask of the points inside, with a tolerance for rounding."""
-        return self._distance_m(points_m) <= self.radius_m + _round_off_m(points_m)
+        return self._distance_m(points_m) <= self.radius_m + _tolerance_m(points_m)
 
     def __str__(self) -> str:
         center = ", ".join(f"{x:g}" for x in self.center_m)
@@ -126,7 +128,7 @@ class Ball(_Within):
 
 
 @dataclass(frozen=True)
-class Face(_Within):
+class Face(_PositionSelection):
     """Selection of the nodes on an end or a plane side of the body, without stating a length.
 
     Parameters
@@ -143,13 +145,13 @@ class Face(_Within):
     def __post_init__(self) -> None:
         require_among(self.name, get_args(FaceName), None, "face")
 
-    def resolve(self, nodes: Nodes) -> np.ndarray:
+    def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         points_m = nodes.points_m
         mask = self._holds(points_m)
         if self.name.startswith("side"):
             mask &= ~(Face("top")._holds(points_m) | Face("bottom")._holds(points_m))
-        return _chosen(mask, nodes.mesh, str(self))
+        return _indices_or_error(mask, nodes.mesh, str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Raise an `InputError`: a face of the body contains no cells."""
@@ -190,7 +192,7 @@ class Indices:
             raise InputError(f"indices must be a list of whole node numbers, not {self.indices!r}")
         object.__setattr__(self, "indices", tuple(indices.tolist()))
 
-    def resolve(self, nodes: Nodes) -> np.ndarray:
+    def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         mesh = nodes.mesh
         requested = np.unique(np.array(self.indices, dtype=np.int64))
@@ -207,7 +209,7 @@ class Indices:
                 "corner; leave it out (a node on an edge is selected when both of its ends are)"
             )
         chosen = nodes.with_mid_nodes(np.isin(mesh.file_index, requested))
-        return _chosen(chosen, mesh, "an empty list of indices")
+        return _indices_or_error(chosen, mesh, "an empty list of indices")
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the selected cells, sorted."""
@@ -219,13 +221,13 @@ class Indices:
                 f"numbered 0 to {count - 1}"
             )
         chosen = np.isin(np.arange(count), self.indices)
-        return _chosen(chosen, mesh, "an empty list of indices", OF_CELLS)
+        return _indices_or_error(chosen, mesh, "an empty list of indices", OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the rows of `mesh.surface` whose corners are all selected."""
-        nodes = self.resolve(Nodes.corners(mesh))
+        nodes = self.resolve(ElementNodes.corners(mesh))
         chosen = np.isin(np.arange(len(mesh.points_m)), nodes)
-        return _chosen_faces(chosen, mesh, "the list of indices")
+        return _select_faces(chosen, mesh, "the list of indices")
 
 
 @dataclass(frozen=True)
@@ -244,17 +246,17 @@ class Named:
 
     name: str
 
-    def resolve(self, nodes: Nodes) -> np.ndarray:
+    def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         what = f'point array "{self.name}"'
         mask = self._mask(nodes.mesh.point_arrays, len(nodes.mesh.points_m), what)
-        return _chosen(nodes.with_mid_nodes(mask), nodes.mesh, what)
+        return _indices_or_error(nodes.with_mid_nodes(mask), nodes.mesh, what)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the selected cells, sorted."""
         what = f'cell array "{self.name}"'
         mask = self._mask(mesh.cell_arrays, len(mesh.tetrahedra), what)
-        return _chosen(mask, mesh, what, OF_CELLS)
+        return _indices_or_error(mask, mesh, what, OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the selected rows of `mesh.surface`, sorted.
@@ -265,7 +267,7 @@ class Named:
             what = f'point array "{self.name}"'
             count = len(mesh.points_m)
             mask = self._mask(mesh.point_arrays, count, what, "group of faces")
-            return _chosen_faces(mask, mesh, what)
+            return _select_faces(mask, mesh, what)
         faces = np.unique(np.sort(mesh.face_sets[self.name], axis=1), axis=0)
         rows = rows_of_faces(faces, mesh.surface)
         if inner := int((rows < 0).sum()):
@@ -326,13 +328,15 @@ def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:
     return np.array([row_of_face.get(tuple(face), -1) for face in sorted_faces], dtype=np.int64)
 
 
-def _chosen_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
+def _select_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndarray:
     """Return the boundary faces whose corners are all selected, or raise an `InputError`."""
     mask = np.asarray(chosen_nodes[mesh.surface].all(axis=1))
-    return _chosen(mask, mesh, what, missed="holds no face of the boundary with all its corners")
+    return _indices_or_error(
+        mask, mesh, what, missed="holds no face of the boundary with all its corners"
+    )
 
 
-def _chosen(
+def _indices_or_error(
     mask: np.ndarray, mesh: TetMesh, what: str, of: str = "nodes", missed: str = ""
 ) -> np.ndarray:
     """Return the indices of a mask, or raise an `InputError` if it is false everywhere.
@@ -350,17 +354,17 @@ def _chosen(
     """
     if not mask.any():  # no mid node lies beyond the corners
         missed = missed or f"selects none of the {len(mask)} {of}"
-        raise InputError(f"{what} {missed}; the body spans {_span(mesh.bounds_m)}")
+        raise InputError(f"{what} {missed}; the body spans {_describe_bounds(mesh.bounds_m)}")
     return np.flatnonzero(mask).astype(np.int64)
 
 
-def _span(bounds_m: np.ndarray) -> str:
+def _describe_bounds(bounds_m: np.ndarray) -> str:
     """Return the bounds of a body as text."""
     axes = zip("xyz", *bounds_m, strict=True)
     return ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes)
 
 
-def _round_off_m(points_m: np.ndarray) -> float:
+def _tolerance_m(points_m: np.ndarray) -> float:
     """Return the tolerance of positions for rounding [m]."""
     return ROUND_OFF * float(np.linalg.norm(np.ptp(points_m, axis=0)))
 
@@ -370,7 +374,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
 
 
-def _triple(values: Iterable[float], what: str) -> tuple[float, float, float]:
+def _three_numbers(values: Iterable[float], what: str) -> tuple[float, float, float]:
     """Return three numbers as floats, or raise an `InputError` that begins with `what`."""
     numbers = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
     if len(numbers) != 3 or not all(_is_number(x) and not np.isnan(x) for x in numbers):

@@ -31,7 +31,7 @@ _COLUMNS = np.array([0, 0, 0, 1, 1, 2])
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
-class Length:
+class PolylineLength:
     """Length L(x) [m] of the polyline through points with fixed weights of nodes.
 
     Parameters
@@ -57,7 +57,7 @@ class Length:
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         rows, columns, *_ = self._pairs
-        return SymmetricPattern.of_entries(rows, columns, self.node_count)
+        return SymmetricPattern.from_entries(rows, columns, self.node_count)
 
     @cached_property
     def _pairs(self) -> tuple[Index, Index, Array, Index]:
@@ -79,40 +79,40 @@ class Length:
         return rows, columns, weights, places
 
     @cached_property
-    def _spread(self) -> sp.csr_array:
+    def _assembly_matrix(self) -> sp.csr_array:
         """Matrix (6 J, entries) from second derivatives by d to those by x."""
         rows, columns, weights, places = self._pairs
-        entries = self.couplings.position(rows, columns)
-        shape = (6 * self._segments, self.couplings.entries)
+        entries = self.couplings.positions_of(rows, columns)
+        shape = (6 * self._segments, self.couplings.entry_count)
         return sp.csr_array((weights, (places, entries)), shape=shape)
 
-    def value(self, x: Array) -> Array:
+    def evaluate(self, x: Array) -> Array:
         """Return the lengths L (T,) at positions (T, 3n)."""
         return np.linalg.norm(self._vectors(x), axis=2).sum(axis=1)
 
     def gradient(self, x: Array) -> Array:
         """Return ∂L/∂x (T, 3n) at positions (T, 3n)."""
-        directions = _unit(self._vectors(x))[0].transpose(1, 0, 2)  # (J, T, 3)
+        directions = _directions_and_lengths(self._vectors(x))[0].transpose(1, 0, 2)  # (J, T, 3)
         nodal = self._differences.T @ directions.reshape(len(directions), -1)
         return nodal.reshape(-1, len(x), 3).transpose(1, 0, 2).reshape(len(x), -1)
 
     def hessian(self, x: Array) -> Array:
         """Return ∂²L/∂x² (T, entries) on `couplings`, at positions (T, 3n)."""
-        e, length = _unit(self._vectors(x))
+        e, length = _directions_and_lengths(self._vectors(x))
         across = np.eye(3) - e[..., :, None] * e[..., None, :]
-        return self._assembled(across / length[..., None])
+        return self._assemble(across / length[..., None])
 
-    def hessian_along(self, x: Array, w: Array) -> Array:
+    def hessian_derivative(self, x: Array, w: Array) -> Array:
         """Return Σ w_i ∂³L/∂x_i∂x² (T, entries) at positions x, in the directions w, (T, 3n)
         each.
         """
-        e, length = _unit(self._vectors(x))
+        e, length = _directions_and_lengths(self._vectors(x))
         delta = self._vectors(w)
         projection = (e * delta).sum(axis=2, keepdims=True)
         mixed = (delta - projection * e)[..., :, None] * e[..., None, :]
         across = np.eye(3) - e[..., :, None] * e[..., None, :]
         derivative = projection[..., None] * across + mixed + np.swapaxes(mixed, 2, 3)
-        return self._assembled(-derivative / length[..., None] ** 2)
+        return self._assemble(-derivative / length[..., None] ** 2)
 
     def _vectors(self, x: Array) -> Array:
         """Return the vectors (T, J, 3) from each point to the next."""
@@ -120,13 +120,13 @@ class Length:
         differences = self._differences @ by_node.reshape(len(by_node), -1)
         return differences.reshape(-1, len(x), 3).transpose(1, 0, 2)
 
-    def _assembled(self, by_vector: Array) -> Array:
+    def _assemble(self, by_vector: Array) -> Array:
         """Return values (T, entries) on `couplings` from second derivatives by d (T, J, 3, 3)."""
         lower = by_vector[..., _ROWS, _COLUMNS]
-        return np.asarray(lower.reshape(len(lower), -1) @ self._spread)
+        return np.asarray(lower.reshape(len(lower), -1) @ self._assembly_matrix)
 
 
-def _unit(vectors: Array) -> tuple[Array, Array]:
+def _directions_and_lengths(vectors: Array) -> tuple[Array, Array]:
     """Return directions (T, J, 3) and lengths (T, J, 1) of vectors."""
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     return vectors / length, length
@@ -137,7 +137,7 @@ _PERMUTATIONS = [
 ]
 
 
-class Volume:
+class EnclosedVolume:
     """Volume V(x) [m³] of the cones from an apex over faces.
 
     For a closed surface the enclosed volume.
@@ -159,17 +159,17 @@ class Volume:
         self.apex_m = np.zeros(3) if apex_m is None else apex_m
         self._apex = np.tile(self.apex_m, node_count)
 
-    def from_apex(self, apex_m: Array) -> Volume:
+    def with_apex(self, apex_m: Array) -> EnclosedVolume:
         """Return this volume with cones from another apex; self if it is the same."""
         is_same = (apex_m == self.apex_m).all()
-        return self if is_same else Volume(self.faces, self.node_count, apex_m)
+        return self if is_same else EnclosedVolume(self.faces, self.node_count, apex_m)
 
     @cached_property
     def _terms(self) -> tuple[Index, Index, Index, Array]:
         """Rows and columns (lower triangle) of H, the dof on which each term depends, and its
         factor.
         """
-        form = _form(self.faces.shape[1])
+        form = _cubic_form(self.faces.shape[1])
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
         term_parts = []
         for (a, b, c), sign in _PERMUTATIONS:
@@ -188,14 +188,14 @@ class Volume:
     def couplings(self) -> SymmetricPattern:
         """Pairs of dofs with a nonzero second derivative, and the diagonal."""
         rows, columns, *_ = self._terms
-        return SymmetricPattern.of_entries(rows, columns, self.node_count)
+        return SymmetricPattern.from_entries(rows, columns, self.node_count)
 
     @cached_property
-    def _slopes(self) -> sp.csr_array:
+    def _hessian_matrix(self) -> sp.csr_array:
         """Matrix (3n, entries) from x to H."""
         rows, columns, by, factor = self._terms
-        entries = self.couplings.position(rows, columns)
-        shape = (self.couplings.size, self.couplings.entries)
+        entries = self.couplings.positions_of(rows, columns)
+        shape = (self.couplings.size, self.couplings.entry_count)
         return sp.csr_array((factor, (by, entries)), shape=shape)
 
     @cached_property
@@ -214,31 +214,31 @@ class Volume:
         mid = self.faces[:, 3:].reshape(len(edges), -1)
         return np.hstack([edges, mid])[is_rim]
 
-    def value(self, x: Array) -> Array:
+    def evaluate(self, x: Array) -> Array:
         """Return the volumes V (T,) at positions (T, 3n)."""
         relative = x - self._apex
-        return (self._pulled(relative) * relative).sum(axis=1) / 3
+        return (self._gradient_from_apex(relative) * relative).sum(axis=1) / 3
 
     def gradient(self, x: Array) -> Array:
         """Return ∂V/∂x (T, 3n) at positions (T, 3n)."""
-        return self._pulled(x - self._apex)
+        return self._gradient_from_apex(x - self._apex)
 
     def hessian(self, x: Array) -> Array:
         """Return ∂²V/∂x² (T, entries) on `couplings`, at positions (T, 3n)."""
-        return np.asarray((x - self._apex) @ self._slopes)
+        return np.asarray((x - self._apex) @ self._hessian_matrix)
 
-    def hessian_along(self, x: Array, w: Array) -> Array:
+    def hessian_derivative(self, x: Array, w: Array) -> Array:
         """Return Σ w_i ∂³V/∂x_i∂x² (T, entries) at positions x, in the directions w, (T, 3n)
         each.
         """
-        return np.asarray(w @ self._slopes)
+        return np.asarray(w @ self._hessian_matrix)
 
-    def _pulled(self, away: Array) -> Array:
+    def _gradient_from_apex(self, away: Array) -> Array:
         """Return H x / 2 = 3 Σ A_ijk x_j × x_k of every node i, for positions (T, 3n) relative to
         the apex.
         """
         corners = away.reshape(len(away), -1, 3)[:, self.faces]  # (T, F, k, 3)
-        weighted = np.einsum("ijk,tfkc->tfijc", 3 * _form(self.faces.shape[1]), corners)
+        weighted = np.einsum("ijk,tfkc->tfijc", 3 * _cubic_form(self.faces.shape[1]), corners)
         of_faces = np.cross(corners[:, :, None], weighted).sum(axis=3)
         nodal = np.zeros((self.node_count, len(away), 3))
         np.add.at(nodal, self.faces, of_faces.transpose(1, 2, 0, 3))
@@ -246,10 +246,10 @@ class Volume:
 
 
 @cache
-def _form(nodes: int) -> Array:
+def _cubic_form(nodes: int) -> Array:
     """Return A (k, k, k) of a triangle with 3 or 6 nodes."""
     points, weights = _triangle_rule()
-    values, slopes = _shape(points, nodes)
+    values, slopes = _triangle_shape_functions(points, nodes)
     form = np.einsum("q,qi,qj,qk->ijk", weights / 3, values, slopes[..., 0], slopes[..., 1])
     permuted = [sign * form.transpose(p) for p, sign in _PERMUTATIONS]
     return np.asarray(np.mean(permuted, axis=0))
@@ -265,7 +265,7 @@ def _triangle_rule() -> tuple[Array, Array]:
     return np.column_stack([u.ravel(), ((1 - u) * v).ravel()]), area.ravel()
 
 
-def _shape(points: Array, nodes: int) -> tuple[Array, Array]:
+def _triangle_shape_functions(points: Array, nodes: int) -> tuple[Array, Array]:
     """Return shape functions (q, k) of a triangle with 3 or 6 nodes, and their derivatives (q, k,
     2).
     """

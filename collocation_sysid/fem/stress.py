@@ -20,85 +20,94 @@ import numpy as np
 from ..arrays import Array, Index
 from .discretisation import Discretisation
 from .elements import Element
-from .expressions import Law, carried_energy, first_piola, point_of, second_piola, six_of
-from .kernel import Contraction, PointKernel, QuadraturePoint
-from .kernels import COMPILING, Batch, Evaluator
+from .expressions import (
+    PointLaw,
+    first_piola,
+    memory_energy,
+    quadrature_point,
+    second_piola,
+    six_entries,
+)
+from .kernel import Contraction, ElementKernel, QuadraturePoint
+from .kernels import COMPILING, Evaluator, KernelBatch
 from .pattern import dofs_of
 
-Expression = Callable[[QuadraturePoint, Law], ca.SX]
+Expression = Callable[[QuadraturePoint, PointLaw], ca.SX]
 
 
-def _stress_by_theta(point: QuadraturePoint, law: Law) -> ca.SX:
+def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂S by the material's constants and the logarithm of a field, column after column."""
-    slope = ca.jacobian(second_piola(point, law), point.varied)
-    of_field = slope[:, law.constants :]
+    slope = ca.jacobian(second_piola(point, law), point.differentiated_constants)
+    of_field = slope[:, law.constant_count :]
     return ca.vec(ca.horzcat(slope[:, : len(law.material.constants)], of_field))
 
 
-def _stress_along(point: QuadraturePoint, law: Law) -> ca.SX:
+def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂S/∂x v, from dS = F⁻¹ (dP − dF S)."""
     F = point.gradients["x"]
     piola = first_piola(point, law)
     rate = point.gradients["v"]
-    inverse = ca.inv_minor(point.felt)
+    inverse = ca.inv_minor(point.material_gradient)
     stress = inverse @ ca.reshape(piola, 3, 3)
     change = ca.reshape(ca.jtimes(piola, F, rate), 3, 3) - ca.reshape(rate, 3, 3) @ stress
-    return six_of(inverse @ change)
+    return six_entries(inverse @ change)
 
 
-def _pulled(point: QuadraturePoint, law: Law) -> ca.SX:
+def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂S/∂x)ᵀ σ, with the weights σ as data of the points."""
-    return ca.gradient(ca.dot(point.brought, second_piola(point, law)), point.gradients["x"])
+    return ca.gradient(
+        ca.dot(point.internal_variables, second_piola(point, law)), point.gradients["x"]
+    )
 
 
-def _carried_force(point: QuadraturePoint, law: Law) -> ca.SX:
+def _memory_force(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return f_H, with H as data of the points."""
-    return -ca.gradient(carried_energy(point), point.gradients["x"])
+    return -ca.gradient(memory_energy(point), point.gradients["x"])
 
 
-def _against(point: QuadraturePoint, law: Law) -> ca.SX:
+def _memory_force_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂f_H/∂H)ᵀ v, with velocities v."""
-    power = ca.jtimes(-carried_energy(point), point.gradients["x"], point.gradients["v"])
-    return ca.gradient(power, point.brought)
+    power = ca.jtimes(-memory_energy(point), point.gradients["x"], point.gradients["v"])
+    return ca.gradient(power, point.internal_variables)
 
 
-def _stress_slope(point: QuadraturePoint, law: Law) -> ca.SX:
+def _stress_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return (∂S/∂x)ᵀ, column after column."""
     return ca.jacobian(second_piola(point, law), point.gradients["x"]).T
 
 
-def _force_slope(point: QuadraturePoint, law: Law) -> ca.SX:
+def _memory_force_jacobian(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂f_H/∂H, column after column."""
-    return ca.jacobian(_carried_force(point, law), point.brought)
+    return ca.jacobian(_memory_force(point, law), point.internal_variables)
 
 
 # Expression, node fields, number of data of a point, and contraction of each kernel.
 KERNELS: dict[str, tuple[Expression, tuple[str, ...], int, Contraction]] = {
     "stress": (second_piola, ("x",), 0, "none"),
     "stress_by_theta": (_stress_by_theta, ("x",), 0, "none"),
-    "stress_along": (_stress_along, ("x", "v"), 0, "none"),
-    "pulled": (_pulled, ("x",), 6, "nodes"),
-    "carried_force": (_carried_force, ("x",), 6, "nodes"),
-    "against": (_against, ("x", "v"), 6, "none"),
-    "stress_slope": (_stress_slope, ("x",), 0, "nodes"),
-    "force_slope": (_force_slope, ("x",), 6, "nodes"),
+    "stress_along": (_stress_derivative, ("x", "v"), 0, "none"),
+    "pulled": (_stress_pullback, ("x",), 6, "nodes"),
+    "carried_force": (_memory_force, ("x",), 6, "nodes"),
+    "against": (_memory_force_pullback, ("x", "v"), 6, "none"),
+    "stress_slope": (_stress_jacobian, ("x",), 0, "nodes"),
+    "force_slope": (_memory_force_jacobian, ("x",), 6, "nodes"),
 }
 
 
-def stress_kernel(name: str, element: Element, law: Law) -> PointKernel:
+def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
     """Return the kernel of a line of `KERNELS` for an element and a law."""
     expression, fields, carried, contraction = KERNELS[name]
-    point = point_of(element, law, *fields, carried=carried)
+    point = quadrature_point(element, law, *fields, internal_variable_count=carried)
     piece = expression(point, law)
-    if not ca.depends_on(piece, point.carried):  # H has gone from what is linear in it
-        point = replace(point, stretches=(), carried=ca.SX(0, 1), scaled=())
-    phase = point.phase(name, {name: (contraction, piece)})
-    return PointKernel(phase.pieces, fields, phase.contractions)
+    if not ca.depends_on(piece, point.point_data):  # H has gone from what is linear in it
+        point = replace(point, stretches=(), point_data=ca.SX(0, 1), scaled_indices=())
+    phase = point.make_phase(name, {name: (contraction, piece)})
+    return ElementKernel(phase.pieces, fields, phase.contractions)
 
 
 @dataclass(frozen=True, eq=False)
-class SlopeEntries:
-    """Row and column of each entry of the derivatives `stress_slopes` and `force_slopes`.
+class JacobianEntries:
+    """Row and column of each entry of the derivatives `stress_jacobian` and `force_slopes`.
 
     Attributes
     ----------
@@ -112,7 +121,7 @@ class SlopeEntries:
     dofs: Index
 
 
-class Stresses:
+class StressEvaluator:
     """Stresses of a body with memory, and their derivatives and transposed derivatives.
 
     Kernels are compiled when they are first needed.
@@ -129,102 +138,111 @@ class Stresses:
 
     def stress(self, x: Array, theta: Array) -> Array:
         """Return S (T, width) [Pa] at positions x (T, 3n) and constants θ."""
-        return self._of_points("stress", [x], theta)
+        return self._evaluate_at_points("stress", [x], theta)
 
-    def stress_by(self, x: Array, theta: Array, theta_q: Array) -> Array:
+    def stress_theta_derivatives(self, x: Array, theta: Array, theta_q: Array) -> Array:
         """Return ∂S/∂θ θ_q (T, q, width), for directions θ_q (k, q)."""
         body = self.body
         derivatives = np.zeros((len(x), theta_q.shape[1], self.width))
         for number, part in enumerate(body.parts):
             if part.prony:
                 count = len(part.material.constants)
-                places = body.memory.of_part(number)
+                places = body.memory.part_columns(number)
                 field = part.stress_field
                 out = np.zeros((len(x), (count + bool(field)) * places.size))
-                self._run("stress_by_theta", number, [x], theta, out, add=False)
+                self._evaluate_part("stress_by_theta", number, [x], theta, out, add=False)
                 first = body.starts[number]
                 part_columns = slice(places[0, 0, 0], places[0, 0, 0] + places.size)
                 by_constant = out.reshape(len(x), -1, places.size)
                 for k, j in zip(*np.nonzero(theta_q[first : first + count]), strict=True):
                     derivatives[:, j, part_columns] += theta_q[first + k, j] * by_constant[:, k]
                 if field:
-                    field_columns = body.mode_places[number]
-                    logs = field.slopes(theta[field_columns]) @ theta_q[field_columns]
+                    field_columns = body.field_slices[number]
+                    logs = field.jacobian(theta[field_columns]) @ theta_q[field_columns]
                     for j in np.flatnonzero(logs.any(axis=0)):
                         point_values = np.tile(np.repeat(logs[:, j], body.geometry.shape[1]), 6)
                         derivatives[:, j, part_columns] += point_values * by_constant[:, count]
         return derivatives
 
-    def along(self, x: Array, direction: Array, theta: Array, out: Array | None = None) -> Array:
+    def stress_jvp(
+        self, x: Array, direction: Array, theta: Array, out: Array | None = None
+    ) -> Array:
         """Return ∂S/∂x along a direction (T, 3n) as (T, width), added to `out` in place if it is
         given.
         """
-        return self._of_points("stress_along", [x, direction], theta, out)
+        return self._evaluate_at_points("stress_along", [x, direction], theta, out)
 
-    def pulled(self, x: Array, weights: Array, theta: Array) -> Array:
+    def stress_vjp(self, x: Array, weights: Array, theta: Array) -> Array:
         """Return (∂S/∂x)ᵀ weights (T, 3n), for weights (T, width)."""
-        return self._of_nodes("pulled", [x], theta, weights)
+        return self._evaluate_at_nodes("pulled", [x], theta, weights)
 
-    def force(self, x: Array, overstress: Array, theta: Array) -> Array:
+    def memory_force(self, x: Array, overstress: Array, theta: Array) -> Array:
         """Return f_H (T, 3n) [N], which is linear in H (`overstress`, (T, width))."""
-        return self._of_nodes("carried_force", [x], theta, overstress)
+        return self._evaluate_at_nodes("carried_force", [x], theta, overstress)
 
-    def against(self, x: Array, direction: Array, theta: Array) -> Array:
+    def memory_force_vjp(self, x: Array, direction: Array, theta: Array) -> Array:
         """Return (∂f_H/∂H)ᵀ direction (T, width), for a direction (T, 3n)."""
-        return self._of_points("against", [x, direction], theta)
+        return self._evaluate_at_points("against", [x, direction], theta)
 
     @cached_property
-    def slope_entries(self) -> SlopeEntries:
-        """Row and column of each entry of `stress_slopes` and `force_slopes`."""
+    def jacobian_entries(self) -> JacobianEntries:
+        """Row and column of each entry of `stress_jacobian` and `memory_force_jacobian`."""
         points = []
         dofs = []
         for number, part in enumerate(self.body.parts):
             if part.prony:
-                part_columns = self.body.memory.of_part(number)
+                part_columns = self.body.memory.part_columns(number)
                 of_cells = dofs_of(self.body.cells[part.cells])
                 shape = (*part_columns.shape, of_cells.shape[1])
                 points.append(np.broadcast_to(part_columns[..., None], shape).ravel())
                 dofs.append(np.broadcast_to(of_cells[:, None, None], shape).ravel())
-        return SlopeEntries(np.concatenate(points), np.concatenate(dofs))
+        return JacobianEntries(np.concatenate(points), np.concatenate(dofs))
 
-    def stress_slopes(self, x: Array, theta: Array) -> Array:
+    def stress_jacobian(self, x: Array, theta: Array) -> Array:
         """Return the entries (T, K) of ∂S/∂x."""
         return self._slopes("stress_slope", x, theta)
 
-    def force_slopes(self, x: Array, theta: Array) -> Array:
+    def memory_force_jacobian(self, x: Array, theta: Array) -> Array:
         """Return the entries (T, K) of ∂f_H/∂H, which is linear in x."""
         return self._slopes("force_slope", x, theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
         """Return the entries (T, K) of a derivative."""
-        out = np.zeros((len(x), len(self.slope_entries.points)))
-        return self._summed(name, [x], theta, out)
+        out = np.zeros((len(x), len(self.jacobian_entries.points)))
+        return self._evaluate_all_parts(name, [x], theta, out)
 
-    def _of_points(
+    def _evaluate_at_points(
         self, name: str, fields: list[Array], theta: Array, out: Array | None = None
     ) -> Array:
         """Return values at points (T, width) of a kernel, added to `out` in place if it is
         given.
         """
         out = np.zeros((len(fields[0]), self.width)) if out is None else out
-        return self._summed(name, fields, theta, out)
+        return self._evaluate_all_parts(name, fields, theta, out)
 
-    def _of_nodes(self, name: str, fields: list[Array], theta: Array, carried: Array) -> Array:
+    def _evaluate_at_nodes(
+        self, name: str, fields: list[Array], theta: Array, point_data: Array
+    ) -> Array:
         """Return node values (T, 3n) of a kernel."""
-        return self._summed(name, fields, theta, np.zeros_like(fields[0]), carried)
+        return self._evaluate_all_parts(name, fields, theta, np.zeros_like(fields[0]), point_data)
 
-    def _summed(
-        self, name: str, fields: list[Array], theta: Array, out: Array, carried: Array | None = None
+    def _evaluate_all_parts(
+        self,
+        name: str,
+        fields: list[Array],
+        theta: Array,
+        out: Array,
+        point_data: Array | None = None,
     ) -> Array:
         """Add the results of a kernel for all parts with memory to `out`, in place, and return
         it.
         """
         for number, part in enumerate(self.body.parts):
             if part.prony:
-                self._run(name, number, fields, theta, out, True, carried)
+                self._evaluate_part(name, number, fields, theta, out, True, point_data)
         return out
 
-    def _run(
+    def _evaluate_part(
         self,
         name: str,
         number: int,
@@ -232,7 +250,7 @@ class Stresses:
         theta: Array,
         out: Array,
         add: bool,
-        carried: Array | None = None,
+        point_data: Array | None = None,
     ) -> None:
         """Evaluate a kernel for one part.
 
@@ -248,7 +266,7 @@ class Stresses:
         out : array
             Result; overwritten, or added to if `add`.
         add : bool
-        carried : (T, width), optional
+        point_data : (T, width), optional
             Data of the points: H or weights.
         """
         body = self.body
@@ -257,9 +275,9 @@ class Stresses:
             if key not in self._evaluators:
                 self._evaluators[key] = body.make_evaluator(self._batch(name, number))
         first = body.starts[number]
-        values = np.array(theta[first : first + body.parts[number].of_law], dtype=float)
-        brought = body.brought(number, theta, carried)
-        threads = body.threads if len(out) > FEW else 1
+        values = np.array(theta[first : first + body.parts[number].law_constant_count], dtype=float)
+        brought = body.point_data(number, theta, point_data)
+        threads = body.threads if len(out) > SINGLE_THREAD_STATES else 1
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],
             values,
@@ -269,11 +287,11 @@ class Stresses:
             None if brought is None else np.ascontiguousarray(brought),
         )
 
-    def _batch(self, name: str, number: int) -> Batch:
+    def _batch(self, name: str, number: int) -> KernelBatch:
         """Return the batch of a kernel and part, in which every point is an element."""
         body = self.body
         part = body.parts[number]
-        places = body.memory.of_part(number)
+        places = body.memory.part_columns(number)
         kernel = stress_kernel(name, body.element, body.law(number))
         points = body.geometry.shape[1]
         cells = np.repeat(body.cells[part.cells], points, axis=0)
@@ -282,7 +300,7 @@ class Stresses:
         if name.endswith("_slope"):
             # 3n for each of what the points carry, part after part.
             per_number = dofs_of(cells).shape[1]
-            length = len(self.slope_entries.points)
+            length = len(self.jacobian_entries.points)
             numbers = np.arange(per_number * places.size).reshape(len(cells), -1)
             destinations = per_number * places[0, 0, 0] + numbers
         elif "nodes" in kernel.contractions.values():
@@ -303,9 +321,9 @@ class Stresses:
             width = self.width if KERNELS[name][2] else 0
             logs = width + np.repeat(np.arange(len(part.cells)), points)
             carried = np.concatenate([carried, logs[:, None, None]], axis=-1)
-        carried = carried[..., : kernel.carried] if kernel.carried else None
-        return Batch(kernel, cells, geometry, destinations, length, carried)
+        carried = carried[..., : kernel.point_data_count] if kernel.point_data_count else None
+        return KernelBatch(kernel, cells, geometry, destinations, length, carried)
 
 
 # Number of states up to which one thread is faster than several.
-FEW = 16
+SINGLE_THREAD_STATES = 16

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from .mesh import TetMesh
-from .mesh_checks import orient
+from .mesh_checks import orient_elements
 
 # Sectors of a cylinder by edge length: a multiple of four, which a quarter of a cylinder needs.
 _SECTORS = 8
@@ -28,8 +28,8 @@ def box_of_edge(size_m: ArrayLike, edge_length_m: float) -> TetMesh:
     InputError
         If this takes more than a million elements.
     """
-    divisions = _divided(np.asarray(size_m, dtype=float), edge_length_m)
-    _refuse_many(6 * float(np.prod(divisions)))
+    divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
+    _require_element_limit(6 * float(np.prod(divisions)))
     return box_mesh(size_m, divisions.astype(int))
 
 
@@ -49,8 +49,8 @@ def cylinder_of_edge(
     InputError
         If this takes more than a million elements.
     """
-    rings, layers = _divided(np.array([diameter_m / 2, height_m]), edge_length_m)
-    _refuse_many(3 * _SECTORS * float(rings**2 * layers))
+    rings, layers = _divisions(np.array([diameter_m / 2, height_m]), edge_length_m)
+    _require_element_limit(3 * _SECTORS * float(rings**2 * layers))
     corners = _SECTORS * rings
     radius_m = diameter_m / 2 * sqrt(2 * pi / corners / sin(2 * pi / corners))
     whole = cylinder_mesh(radius_m, height_m, int(rings), int(layers), _SECTORS)
@@ -62,7 +62,7 @@ def cylinder_of_edge(
     return TetMesh(points_m[corners_kept], tetrahedra.reshape(-1, 4), is_generated=True)
 
 
-def counts_of_box(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
+def count_box_elements(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
     """Return the numbers of nodes and elements of `box_of_edge` without creating the mesh.
 
     Raises
@@ -70,13 +70,13 @@ def counts_of_box(size_m: ArrayLike, edge_length_m: float) -> tuple[int, int]:
     InputError
         For more than a million elements.
     """
-    divisions = _divided(np.asarray(size_m, dtype=float), edge_length_m)
-    elements = 6 * np.prod(divisions)
-    _refuse_many(elements)
+    divisions = _divisions(np.asarray(size_m, dtype=float), edge_length_m)
+    elements = float(6 * np.prod(divisions))
+    _require_element_limit(elements)
     return int(np.prod(divisions + 1)), int(elements)
 
 
-def counts_of_cylinder(
+def count_cylinder_elements(
     diameter_m: float, height_m: float, edge_length_m: float, quarter: bool = False
 ) -> tuple[int, int]:
     """Return the approximate numbers of nodes and elements of `cylinder_of_edge`, without the mesh.
@@ -86,20 +86,20 @@ def counts_of_cylinder(
     InputError
         For more than a million elements.
     """
-    rings, layers = _divided(np.array([diameter_m / 2, height_m]), edge_length_m)
+    rings, layers = _divisions(np.array([diameter_m / 2, height_m]), edge_length_m)
     sectors = _SECTORS / 4 if quarter else _SECTORS
     nodes = (1 + sectors * rings * (rings + 1) / 2) * (layers + 1)
     elements = 3 * sectors * rings**2 * layers
-    _refuse_many(elements)
+    _require_element_limit(elements)
     return int(nodes), int(elements)
 
 
-def _divided(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
+def _divisions(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
     """Return the numbers of elements along lengths, rounded, at least 1."""
     return np.maximum(np.round(size_m / edge_length_m), 1)
 
 
-def _refuse_many(elements: float) -> None:
+def _require_element_limit(elements: float) -> None:
     """Raise an `InputError` for more than a million elements."""
     if elements > _MOST_ELEMENTS:
         raise InputError(
@@ -149,7 +149,7 @@ def box_mesh(
     orders = [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)]
     paths = np.array([[0, *np.cumsum(stride[list(order)])] for order in orders])
     tetrahedra = (corner.reshape(-1, 1, 1) + paths).reshape(-1, 4)
-    return TetMesh(points, orient(points, tetrahedra)[0], is_generated=True)
+    return TetMesh(points, orient_elements(points, tetrahedra)[0], is_generated=True)
 
 
 def cylinder_mesh(
@@ -203,7 +203,7 @@ def cylinder_mesh(
         for a, b, c in [(up if layer % 2 == 0 else up[:, ::-1]).T + layer * len(disc)]
         for a_, b_, c_ in [(a + len(disc), b + len(disc), c + len(disc))]
     ]
-    cells = orient(points, np.concatenate(tetrahedra))[0]
+    cells = orient_elements(points, np.concatenate(tetrahedra))[0]
     return TetMesh(points, cells, is_generated=True)
 
 

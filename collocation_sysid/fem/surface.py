@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from ..apart import Failed, computed_apart
 from ..errors import InputError
 from ..files import whole_file
-from .mesh_checks import cleaned
+from .mesh_checks import clean_mesh
 from .mesh_files import read_tetrahedra, write_tetrahedra
 
 # Edge length passed to fTetWild, as a fraction of the desired one. fTetWild stops as soon as its
@@ -77,8 +77,8 @@ def tetrahedralize_surface(
         If the surface is not closed, the edge length does not suit it, or pytetwild is missing.
     """
     points, faces = merge_coincident(*_checked_surface(points_m, triangles))
-    _refuse_open(faces)
-    _refuse_edge_length(points, faces, edge_length_m)
+    _require_closed(faces)
+    _require_suitable_edge_length(points, faces, edge_length_m)
     mesher = _pytetwild_version()
     if cache_dir is None:
         return _run_ftetwild(points, faces, edge_length_m)
@@ -88,7 +88,7 @@ def tetrahedralize_surface(
     if not cached.exists():
         with whole_file(cached) as draft:
             # A mesh that is refused must not be kept.
-            nodes, tetrahedra, *_ = cleaned(*_run_ftetwild(points, faces, edge_length_m))
+            nodes, tetrahedra, *_ = clean_mesh(*_run_ftetwild(points, faces, edge_length_m))
             write_tetrahedra(draft, nodes, tetrahedra)
     nodes, tetrahedra, *_ = read_tetrahedra(cached)
     return nodes, tetrahedra
@@ -124,7 +124,7 @@ def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndar
     return points, faces
 
 
-def _refuse_open(triangles: np.ndarray) -> None:
+def _require_closed(triangles: np.ndarray) -> None:
     """Raise an `InputError` unless every edge belongs to exactly two triangles."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, count = np.unique(edges, axis=0, return_counts=True)
@@ -138,7 +138,9 @@ def _refuse_open(triangles: np.ndarray) -> None:
         )
 
 
-def _refuse_edge_length(points: np.ndarray, triangles: np.ndarray, edge_length_m: float) -> None:
+def _require_suitable_edge_length(
+    points: np.ndarray, triangles: np.ndarray, edge_length_m: float
+) -> None:
     """Raise an `InputError` if the edge length is not positive, too large or too small for the
     body.
     """

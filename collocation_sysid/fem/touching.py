@@ -12,23 +12,23 @@ from .force_points import ForcePoints
 from .selection import Selection
 
 # Number of vectors of a contact point: from the frame's origin to it and to the ends of three axes.
-VECTORS = 4
+VECTORS_PER_POINT = 4
 
 # Barycentric points and weights of a triangle, exact to order 2 and 4 (Dunavant 1985).
 _A = (0.445948490915965, 0.223381589678011)
 _B = (0.091576213509771, 0.109951743655322)
-_TURNS = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]])
+_ROTATIONS = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]])
 RULES = {
-    3: (np.where(_TURNS, 1 / 6, 2 / 3), np.full(3, 1 / 3)),
+    3: (np.where(_ROTATIONS, 1 / 6, 2 / 3), np.full(3, 1 / 3)),
     6: (
-        np.vstack([np.where(_TURNS, a, 1 - 2 * a) for a, _ in (_A, _B)]),
+        np.vstack([np.where(_ROTATIONS, a, 1 - 2 * a) for a, _ in (_A, _B)]),
         np.repeat([w for _, w in (_A, _B)], 3),
     ),
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Touching:
+class ContactSurface:
     """Surface points of a body that may touch an obstacle.
 
     Attributes
@@ -44,7 +44,7 @@ class Touching:
         Mean edge length of each face.
     part : int
         Index of the part of the body with most of the area.
-    a_face : int
+    points_per_face : int
         Number of points of each face.
     faces : (f,)
         Rows of the mesh's surface.
@@ -55,11 +55,11 @@ class Touching:
     edge_m: float
     edges_m: Array
     part: int
-    a_face: int
+    points_per_face: int
     faces: Index
 
     @classmethod
-    def of(cls, body: Body, frame: Index, chosen: Selection | None) -> Touching:
+    def from_body(cls, body: Body, frame: Index, chosen: Selection | None) -> ContactSurface:
         """Return the contact points of a body and the frame of an obstacle.
 
         Parameters
@@ -74,15 +74,15 @@ class Touching:
         if chosen is not None:
             rows = chosen.resolve_faces(body.mesh)
         triangles = body.mesh.surface[rows]
-        faces = body.nodes.on_faces(triangles)
+        faces = body.nodes.nodes_of_faces(triangles)
         corners = body.mesh.points_m[triangles]
         sides = np.roll(corners, -1, axis=1) - corners
         area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
         places, weights = RULES[faces.shape[1]]
-        shape, _ = on_faces(places, faces.shape[1])
+        shape, _ = face_shape_functions(places, faces.shape[1])
         count = len(weights)
         nodes = np.hstack([faces, np.broadcast_to(frame, (len(faces), 4))])
-        mix = np.zeros((count, VECTORS, nodes.shape[1]))
+        mix = np.zeros((count, VECTORS_PER_POINT, nodes.shape[1]))
         mix[:, 0, : faces.shape[1]] = shape
         mix[:, 1:, faces.shape[1] + 1 :] = np.eye(3)
         mix[:, :, faces.shape[1]] = -1
@@ -100,12 +100,12 @@ class Touching:
             edge_m=float(edges_m.mean()),
             edges_m=edges_m,
             part=part,
-            a_face=count,
+            points_per_face=count,
             faces=rows,
         )
 
 
-def on_faces(places: Array, nodes: int) -> tuple[Array, Array]:
+def face_shape_functions(places: Array, nodes: int) -> tuple[Array, Array]:
     """Return the shape functions (q, v) of faces with v nodes, and derivatives (q, v, 3).
 
     Nodes are the corners and, for six of them, the middles of ab, bc and ca.

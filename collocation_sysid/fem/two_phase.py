@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .constants import CONTRAST, DENSITY, Constant, mode
+from .constants import CONTRAST, DENSITY, Constant, field_coefficient
 from .field import SMOOTH, Field, FieldModes
 from .mesh import TetMesh
 
@@ -54,7 +54,7 @@ class PhaseSamples:
 
 
 @dataclass(frozen=True)
-class PhaseFinding:
+class PhaseSummary:
     """Summary of the phases of a two-phase field.
 
     Attributes
@@ -96,10 +96,10 @@ class TwoPhaseModes(FieldModes):
     samples: PhaseSamples | None = None
 
     @classmethod
-    def of(
+    def from_field(
         cls, field: Field, mesh: TetMesh, cells: Index, law: tuple[Constant, ...]
     ) -> TwoPhaseModes:
-        """Return the two-phase field of some cells, see `FieldModes.of`.
+        """Return the two-phase field of some cells, see `FieldModes.from_field`.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class TwoPhaseModes(FieldModes):
                 f"length_m of a two-phase field has {len(field.lengths_m)} values; expected one: "
                 "lengths to choose from are for prior = 'smooth'"
             )
-        modes = super().of(field, mesh, cells, law)
+        modes = super().from_field(field, mesh, cells, law)
         assert isinstance(modes, cls)
         return replace(modes, phase=np.zeros(len(cells)))
 
@@ -127,15 +127,17 @@ class TwoPhaseModes(FieldModes):
         return bool(self.phase.any())
 
     @property
-    def smooth(self) -> FieldModes:
+    def smooth_field(self) -> FieldModes:
         """Smooth field with which the search for the phases starts."""
         field = replace(self.field, prior=SMOOTH, amplitude=None)
-        return FieldModes(field, self.laplacian, self.scaled, self.length_m, self.volumes_m3)
+        return FieldModes(
+            field, self.laplacian, self.scaled_indices, self.length_m, self.volumes_m3
+        )
 
     @property
-    def share(self) -> float:
+    def variance_share(self) -> float:
         """Share of the prior variance that the shapes of the smooth field represent."""
-        return self.smooth.share
+        return self.smooth_field.variance_share
 
     @property
     def shapes(self) -> Array:
@@ -160,11 +162,11 @@ class TwoPhaseModes(FieldModes):
         """Return ln r · h (E,) in every cell, from the contrast (1,)."""
         return np.log(coefficients[0]) * self.phase
 
-    def slopes(self, coefficients: Array) -> Array:
+    def jacobian(self, coefficients: Array) -> Array:
         """Return the derivatives (E, 1) of `logarithms` by the contrast."""
         return self.phase[:, None] / coefficients[0]
 
-    def curvature(self, coefficients: Array, weights: Array) -> Array:
+    def weighted_hessian(self, coefficients: Array, weights: Array) -> Array:
         """Return Σ weights (T, E) · ∂² of `logarithms` by the contrast, (T, 1, 1)."""
         return -(weights @ self.phase)[:, None, None] / coefficients[0] ** 2
 
@@ -183,7 +185,7 @@ class ElementLogarithms(FieldModes):
     base: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def about(cls, modes: FieldModes, base: Array) -> ElementLogarithms:
+    def relative_to(cls, modes: FieldModes, base: Array) -> ElementLogarithms:
         """Return such a field on the cells of another field.
 
         Parameters
@@ -194,7 +196,7 @@ class ElementLogarithms(FieldModes):
         """
         field = replace(modes.field, prior=SMOOTH, modes=len(base))
         volumes_m3 = modes.volumes_m3
-        return cls(field, modes.laplacian, modes.scaled, modes.length_m, volumes_m3, base)
+        return cls(field, modes.laplacian, modes.scaled_indices, modes.length_m, volumes_m3, base)
 
     @cached_property
     def shapes(self) -> Array:
@@ -204,13 +206,13 @@ class ElementLogarithms(FieldModes):
     @property
     def constants(self) -> tuple[Constant, ...]:
         """Constants of the coefficients, one per element."""
-        return tuple(mode(k) for k in range(len(self.base)))
+        return tuple(field_coefficient(k) for k in range(len(self.base)))
 
     def logarithms(self, coefficients: Array) -> Array:
         """Return the base plus the coefficients, (E,)."""
         return self.base + coefficients
 
 
-def inclusion(phase: Array) -> NDArray[np.bool_]:
+def is_inclusion(phase: Array) -> NDArray[np.bool_]:
     """Return a mask (E,) of the elements of inclusions, from phases (E,) between 0 and 1."""
     return phase > 0.5

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 # Decay per frame of the longest observed delay: time steps that might exceed the budget are not
 # started, and an occasional long one is forgotten.
-FADING = 0.85
+DELAY_DECAY = 0.85
 # Decay per frame of the time after the time steps, which contains work that only some frames need.
-SELDOM = 0.97
+REMAINDER_DECAY = 0.97
 
 
 @dataclass
-class Budget:
+class TimeBudget:
     """Computing times of time steps that are computed together [s].
 
     Attributes
@@ -41,37 +41,37 @@ class Budget:
     after_s: float = 0.0
 
     @classmethod
-    def of(cls, one_s: float, many_s: float, many: int) -> Budget:
+    def from_times(cls, one_s: float, many_s: float, many: int) -> TimeBudget:
         """Return the budget from the time of one time step and the time of `many`."""
         more_s = (many_s - one_s) / (many - 1) if many > 1 else one_s
         return cls(one_s, min(max(more_s, 0.0), one_s))
 
-    def rows(self, left_s: float) -> int:
+    def affordable_steps(self, remaining_s: float) -> int:
         """Return how many time steps fit into the remaining time [s]."""
-        left_s -= self.after_s
-        spare_s = left_s / self.delay - self.first_s
-        if left_s <= 0 or spare_s < 0:
+        remaining_s -= self.after_s
+        spare_s = remaining_s / self.delay - self.first_s
+        if remaining_s <= 0 or spare_s < 0:
             return 0
         return 1 + int(min(spare_s / self.more_s, 1e6)) if self.more_s else 1
 
-    def took(self, rows: int, took_s: float) -> None:
+    def record_steps(self, rows: int, took_s: float) -> None:
         """Record how long some time steps took [s]."""
         expected_s = self.first_s + (rows - 1) * self.more_s
         if expected_s:
             self.delay = max(self.delay, took_s / expected_s)
 
-    def turned(self, took_s: float) -> None:
+    def record_relinearisation(self, took_s: float) -> None:
         """Record how long a change of the linearisation point took [s]."""
         self.turn_s = max(self.turn_s, took_s)
 
-    def ended(self, took_s: float) -> None:
+    def record_remainder(self, took_s: float) -> None:
         """Record how long the work after the time steps took [s].
 
         Not every frame needs all of it.
         """
-        self.after_s = max(SELDOM * self.after_s, took_s)
+        self.after_s = max(REMAINDER_DECAY * self.after_s, took_s)
 
-    def forget(self) -> None:
+    def start_frame(self) -> None:
         """Start another frame: let the recorded delays decay."""
-        self.delay = max(1.0, FADING * self.delay)
-        self.turn_s *= FADING
+        self.delay = max(1.0, DELAY_DECAY * self.delay)
+        self.turn_s *= DELAY_DECAY

@@ -25,61 +25,75 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array
 from ..checked import AtLeastOne, Options, Positive
 from ..errors import InputError, SimulationError
-from ..fem.constants import is_mode
+from ..fem.constants import is_field_coefficient
 from ..pipeline import Run
 from ..problem import Problem
 from ..program.lapack import one_blas_thread
-from ..program.least_squares import LeastSquares
-from ..statistics.concern import concerned
+from ..program.least_squares import SquareRootInformation
+from ..statistics.concern import concern_if
 from ..statistics.estimates import Estimate, user_estimates
 from ..statistics.linearised import AT_BOUND
-from ..statistics.trust import GROSS_MISFIT, Trust
-from .budget import Budget
-from .frames import Frame, Pose, as_pose, as_readings, as_time, as_tracks, as_wrenches
-from .intake import LONGEST, Intake
-from .model import TOGETHER, Model, Poses
-from .search import SEEN, Search
+from ..statistics.trust import GROSS_MISFIT, Assessment
+from .budget import TimeBudget
+from .frames import (
+    Frame,
+    Pose,
+    parse_custom_readings,
+    parse_markers,
+    parse_pose,
+    parse_time,
+    parse_wrenches,
+)
+from .intake import LARGEST_GAP, FrameBuffer
+from .model import ROWS_PER_CHUNK, LiveModel, Poses
+from .search import TRIAL_SAMPLES, StiffnessSearch
 from .sweep import LoggedRow, Sample
-from .track import JoinedPasses, Track
-from .trust import UNSETTLED, Scatter, data_concerns, estimate_concerns, widened
-from .whole import recording_of, solved
+from .track import CombinedPasses, WindowPass
+from .trust import (
+    LARGEST_SETTLED_DISTANCE,
+    ResidualScatter,
+    data_concerns,
+    estimate_concerns,
+    variance_factor,
+)
+from .whole import recording_from_log, solve_recording
 
 # Standard deviation, in steps of the trust region, of a prior that keeps the next linearisation
 # point near the last one until many samples are available.
-STAY = 0.5
+POINT_PRIOR_DEVIATION = 0.5
 # Distance of the estimate from the linearisation point, in standard errors, that starts a new pass.
-MOVED = 0.1
+REPEAT_DISTANCE = 0.1
 # Distance, in standard errors, at which a pass that is catching up changes its linearisation point.
-TURN = 1.0
+RELINEARISE_DISTANCE = 1.0
 # The same distance for the first pass, which receives the frames.
-TURN_FIRST = 3.0
-# Initial radius of the trust region, see `methods.search`.
-TRUST = 1.0
+RELINEARISE_DISTANCE_FIRST = 3.0
+# Initial radius of the trust region, see `methods.minimise`.
+INITIAL_RADIUS = 1.0
 # Largest radius of the trust region.
-WIDEST = 2.0
+LARGEST_RADIUS = 2.0
 # Factor of the radius after a rejected step.
-SHRINK = 0.25
+RADIUS_REDUCTION = 0.25
 # A pass is accepted if its sum of squares is at most TIMES · expected + SLACK: rows that arrived in
 # the meantime are fitted by the next pass.
-TIMES = 1.25
-SLACK = 1.0
+ACCEPTED_RATIO = 1.25
+ACCEPTED_EXCESS = 1.0
 # Default of the computing time of a frame, as a fraction of the time between samples.
-SHARE = 0.8
+BUDGET_FRACTION = 0.8
 # Number of blocks of a window.
-BLOCKS = 12
+WINDOW_BLOCKS = 12
 # Number of consecutively rejected passes after which other initial values are searched for.
-REJECTED = 3
+LARGEST_REJECTIONS = 3
 # Largest number of passes over the window after the last frame.
-PASSES = 50
+FINAL_PASSES = 50
 # Number of timing measurements before the first frame.
-TIMED = 3
+TIMING_REPETITIONS = 3
 # Ratio of a residual to the usual one above which a sample is an outlier.
-JUMP = 6.0
+OUTLIER_RATIO = 6.0
 # Distance, in body sizes, from the grasp beyond which no marker can be, and beyond which no grasp
 # moves between two samples.
-FAR = 5.0
+REACH_BODY_SIZES = 5.0
 # Number of frames between two evaluations of all residuals.
-LOOK_EVERY = 5
+SCATTER_INTERVAL_FRAMES = 5
 
 
 @dataclass(frozen=True)
@@ -106,7 +120,7 @@ class LiveOptions(Options):
 
 
 @dataclass(frozen=True, eq=False)
-class Update:
+class LiveUpdate:
     """Result after a frame.
 
     Attributes
@@ -115,7 +129,7 @@ class Update:
         Time of the frame.
     estimates : mapping of name to Estimate
         Value, standard error and 95 % interval of each parameter.
-    trust : Trust
+    trust : Assessment
         Verdict with its reasons.
     marker_rms_m : float
         Root mean square distance of this frame's markers from the estimate's; NaN without markers.
@@ -129,7 +143,7 @@ class Update:
 
     t_s: float
     estimates: Mapping[str, Estimate]
-    trust: Trust
+    trust: Assessment
     marker_rms_m: float
     notes: tuple[str, ...]
     latency_s: float
@@ -152,7 +166,7 @@ def _require_phases(problem: Problem) -> None:
             )
 
 
-class Estimator:
+class LiveEstimator:
     """Estimator of a problem's parameters from frames, one after another.
 
     Parameters
@@ -170,7 +184,7 @@ class Estimator:
         Current estimate of the parameters, in the solver's coordinates.
     counts : Counter
         Numbers of irregularities of frames, by kind.
-    last : Update or None
+    last : LiveUpdate or None
         Result after the last frame; None before the first one.
 
     Raises
@@ -189,36 +203,36 @@ class Estimator:
         self.options = options
         self.clock = clock
         _require_phases(problem)
-        self.model = Model.of(problem)
+        self.model = LiveModel.from_problem(problem)
         model = self.model
         self.names = self.model.experiment.markers.names
-        far_m = FAR * model.size_m
-        neighbours = model.samples_around
+        far_m = REACH_BODY_SIZES * model.body_size_m
+        neighbours = model.neighbouring_samples
         self._reach_m = far_m + float(np.linalg.norm(model.segment.body.nodes_m.mean(axis=0)))
-        stencils = [each.around for each in model.instruments]
-        self.intake = Intake(model.interval_s, model.substeps, neighbours, far_m, stencils)
+        stencils = [each.stencil for each in model.instruments]
+        self.intake = FrameBuffer(model.interval_s, model.substeps, neighbours, far_m, stencils)
         self.counts = self.intake.counts
         self.samples = 0
-        self.budget_s = options.budget_s or SHARE * model.interval_s
+        self.budget_s = options.budget_s or BUDGET_FRACTION * model.interval_s
         self.rows = options.rows
-        samples = max(LONGEST, round(options.window_s / model.interval_s / BLOCKS))
+        samples = max(LARGEST_GAP, round(options.window_s / model.interval_s / WINDOW_BLOCKS))
         self._block_rows = samples * model.substeps
         self._blocks = max(2, round(options.window_s / model.interval_s / samples))
-        self._bounds()
+        self._set_bounds()
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
-        self.prior = LeastSquares.none(model.size)
-        self.track: Track | None = None
-        self._joined = JoinedPasses(self.prior, [], [])
+        self.prior = SquareRootInformation.empty(model.parameter_count)
+        self.first_pass: WindowPass | None = None
+        self._joined = CombinedPasses(self.prior, [], [])
         self._held_m = np.full((1, 3), np.nan)
-        self.again: Track | None = None
+        self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
-        self.search = self._search() if problem.parameters.unguessed else None
-        self.scatter = Scatter()
-        self._trust = TRUST
+        self.search = self._new_search() if problem.parameters.names_without_guess else None
+        self.scatter = ResidualScatter()
+        self._trust = INITIAL_RADIUS
         self._rejected = 0
-        self.budget = Budget()
-        self.last: Update | None = None
-        self._rest = self._warmed_up()
+        self.budget = TimeBudget()
+        self.last: LiveUpdate | None = None
+        self._rest = self._warm_up()
 
     # Frames -----------------------------------------------------------------------------------
 
@@ -229,7 +243,7 @@ class Estimator:
         markers: ArrayLike | Mapping[str, ArrayLike],
         wrench: Any = None,
         readings: Mapping[str, Any] | None = None,
-    ) -> Update:
+    ) -> LiveUpdate:
         """Process a frame and return the result.
 
         Parameters
@@ -254,54 +268,60 @@ class Estimator:
         InputError
             If the values are not a valid frame; the estimator is then unchanged.
         """
-        poses = as_pose(pose, self.model.moved_grasps + 1)
-        tracks = as_tracks(markers, self.names)
+        poses = parse_pose(pose, self.model.moving_grasps + 1)
+        tracks = parse_markers(markers, self.names)
         gauges = self.model.experiment.readings
-        instrument_samples = as_readings(readings, gauges, as_time(t_s))
-        instrument_samples += as_wrenches(wrench, self.model.wrenches, len(gauges), as_time(t_s))
-        return self.take(Frame(as_time(t_s), poses, tracks, wrench is not None, instrument_samples))
+        instrument_samples = parse_custom_readings(readings, gauges, parse_time(t_s))
+        instrument_samples += parse_wrenches(
+            wrench, self.model.wrenches, len(gauges), parse_time(t_s)
+        )
+        return self.process_frame(
+            Frame(parse_time(t_s), poses, tracks, wrench is not None, instrument_samples)
+        )
 
     @one_blas_thread()
-    def take(self, frame: Frame) -> Update:
+    def process_frame(self, frame: Frame) -> LiveUpdate:
         """Process a validated frame and return the result."""
         began = self.clock()
-        frame, notes = self._of_frame(frame)
-        if self.intake.is_lost(frame.t_s):
+        frame, notes = self._checked_frame(frame)
+        if self.intake.is_motion_unknown(frame.t_s):
             if frame.pose is None:
                 notes.append("the grasp is lost: nothing is read until its pose is back")
             else:
-                self._begin_anew()
+                self._restart()
                 notes.append("begun anew after a gap: the body is assumed to be at rest here")
-        rows, readings, new_notes = self.intake.take(
-            frame.t_s, frame.pose, frame.tracks_m, frame.told
+        rows, readings, new_notes = self.intake.add_frame(
+            frame.t_s, frame.pose, frame.tracks_m, frame.instrument_samples
         )
         notes += new_notes
-        self.budget.forget()
+        self.budget.start_frame()
         caught_up = self._catch_up(began, notes)
         squares = []
         before = self.clock()
         while rows:
-            done, new_notes = self._go_on(rows, squares)
+            done, new_notes = self._compute_rows(rows, squares)
             notes = notes + new_notes
             rows = rows[done:]
-        notes += self._read(readings, squares)
-        self._estimate()
-        if self.track is not None and not self.track.failed and self.search is None:
-            self._turn(self.track, self.track, began, TURN_FIRST)
+        notes += self._add_samples(readings, squares)
+        self._update_estimate()
+        if self.first_pass is not None and not self.first_pass.has_failed and self.search is None:
+            self._relinearise_if_far(
+                self.first_pass, self.first_pass, began, RELINEARISE_DISTANCE_FIRST
+            )
         self.budget.frame_s = self.clock() - before
-        done = self._pass_again(began, notes, caught_up)
+        done = self._repeat_rows(began, notes, caught_up)
         before = self.clock()
-        self._shorten()
+        self._drop_old_rows()
         squared_distances = np.concatenate([*squares, np.zeros(0)])
         rms_m = float(np.sqrt(squared_distances.mean())) if len(squared_distances) else float("nan")
-        estimates, trust = self._known(frame.t_s)
-        self.budget.ended(self.clock() - before)
+        estimates, trust = self._estimates_and_trust(frame.t_s)
+        self.budget.record_remainder(self.clock() - before)
         latency_s = self.clock() - began
-        self.last = Update(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
+        self.last = LiveUpdate(frame.t_s, estimates, trust, rms_m, tuple(notes), latency_s, done)
         return self.last
 
     @one_blas_thread()
-    def settle(self) -> Update | None:
+    def finish(self) -> LiveUpdate | None:
         """Return the final result of all frames, however long that takes.
 
         Call it after the last frame.
@@ -318,18 +338,20 @@ class Estimator:
         """
         began = self.clock()
         notes = ["settled after the last frame"]
-        if self.last is None or self.track is None:
+        if self.last is None or self.first_pass is None:
             return self.last
         last = self.last
-        batch_run = self._run_of_all(self.track, notes)
+        batch_run = self._solve_batch(self.first_pass, notes)
         if batch_run is None:
-            rows = self._pass_to_the_end(began, notes)
-            estimates, trust = self._known(last.t_s)
+            rows = self._repeat_until_settled(began, notes)
+            estimates, trust = self._estimates_and_trust(last.t_s)
         else:
             rows = len(batch_run.solution.history) * len(self.log)
             estimates = {name: batch_run.estimates[name] for name in last.estimates}
-            left_out = Trust.of(data_concerns(Scatter(), self.counts, self.samples))
-            trust = batch_run.trust.joined(left_out)
+            left_out = Assessment.from_concerns(
+                data_concerns(ResidualScatter(), self.counts, self.samples)
+            )
+            trust = batch_run.trust.combined_with(left_out)
             last = replace(last, marker_rms_m=batch_run.solution.rms_m)
         return replace(
             last,
@@ -340,27 +362,29 @@ class Estimator:
             relinearised=rows,
         )
 
-    def _run_of_all(self, track: Track, notes: list[str]) -> Run | None:
+    def _solve_batch(self, track: WindowPass, notes: list[str]) -> Run | None:
         """Return the run of the batch; None if the window does not hold the whole recording."""
-        recording = None if track.prior.rows else recording_of(self.model, self.intake, self.log)
+        recording = (
+            None if track.prior.row_count else recording_from_log(self.model, self.intake, self.log)
+        )
         try:
-            return None if recording is None else solved(self.problem, recording)
+            return None if recording is None else solve_recording(self.problem, recording)
         except InputError as error:
             notes.append(f"the recording cannot be solved as a whole: {error.message}")
             return None
 
-    def _pass_to_the_end(self, began: float, notes: list[str]) -> int:
+    def _repeat_until_settled(self, began: float, notes: list[str]) -> int:
         """Compute the rows in the window again until the estimate stays.
 
         Return the number of rows.
         """
-        rows_per_frame, self.rows = self.rows, PASSES * len(self.log)
+        rows_per_frame, self.rows = self.rows, FINAL_PASSES * len(self.log)
         try:
-            return self._pass_again(began, notes)
+            return self._repeat_rows(began, notes)
         finally:
             self.rows = rows_per_frame
 
-    def _of_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
+    def _checked_frame(self, frame: Frame) -> tuple[Frame, list[str]]:
         """Return the frame without implausible markers, and notes."""
         notes = []
         if frame.has_wrench and not self.model.wrenches:
@@ -373,40 +397,44 @@ class Estimator:
         self.samples += int(np.isfinite(frame.tracks_m[:, 0]).sum())
         is_implausible = (distances_m > self._reach_m).all(axis=1)
         if is_implausible.any():
-            notes.append(self._left_out(is_implausible))
+            notes.append(self._note_outliers(is_implausible))
             frame = replace(
                 frame, tracks_m=np.where(is_implausible[:, None], np.nan, frame.tracks_m)
             )
         return frame, notes
 
-    def _left_out(self, wild: NDArray[np.bool_]) -> str:
+    def _note_outliers(self, wild: NDArray[np.bool_]) -> str:
         """Count outliers given by a mask (M,) of the markers; return a note."""
         self.counts["wild"] += int(wild.sum())
         names = ", ".join(self.names[m] for m in np.flatnonzero(wild))
         return f"left out, far from where they can be: {names}"
 
-    def _go_on(self, rows: Sequence[LoggedRow], squares: list[Array]) -> tuple[int, list[str]]:
+    def _compute_rows(
+        self, rows: Sequence[LoggedRow], squares: list[Array]
+    ) -> tuple[int, list[str]]:
         """Compute and log new rows, as many as possible at once; return their number and notes."""
         done = 1
         notes = []
-        track = self.track
+        track = self.first_pass
         try:
             if track is None:
-                self._begin(rows[0])
-            elif not track.failed:
-                done = track.advance([row.poses for row in rows[: track.together]])
+                self._start_pass(rows[0])
+            elif not track.has_failed:
+                done = track.add_rows([row.poses for row in rows[: track.rows_left_in_block]])
         except SimulationError as error:
             if track is None:
-                self.intake.begin_anew()
+                self.intake.reset()
                 return 1, [f"the start of the motion cannot be computed: {error}"]
-            track.failed = True
+            track.has_failed = True
             notes = [f"the body cannot be simulated with these parameters: {error}"]
         for k, row in enumerate(rows[:done], 1):
             self.log.append(LoggedRow(row.poses, []))
-            notes += self._read(row.readings, squares, done - k)
+            notes += self._add_samples(row.samples, squares, done - k)
         return done, notes
 
-    def _read(self, readings: Sequence[Sample], squares: list[Array], rows: int = 0) -> list[str]:
+    def _add_samples(
+        self, readings: Sequence[Sample], squares: list[Array], rows: int = 0
+    ) -> list[str]:
         """Add samples without outliers to the pass and to the log; return notes.
 
         Parameters
@@ -417,53 +445,56 @@ class Estimator:
         rows : int
             Number of rows computed since the row after which the samples are evaluated.
         """
-        track = self.track
+        track = self.first_pass
         if track is None:
             return []
         notes = []
         sigma_m = self.model.segment.experiment.markers.sigma_m[:, None]
-        if track.failed:
-            self.log[-1].readings.extend(readings)
+        if track.has_failed:
+            self.log[-1].samples.extend(readings)
             return notes
-        all_linearised = track.sweep.linearised([(reading, rows) for reading in readings])
+        all_linearised = track.sweep.linearise_samples([(reading, rows) for reading in readings])
         for reading, linearised in zip(readings, all_linearised, strict=True):
-            if not reading.of:
-                residual = linearised.at(self.model.flat(self.p))
-                outliers = self._wild(residual)
+            if not reading.instrument:
+                residual = linearised.evaluate_at(self.model.transformed(self.p))
+                outliers = self._outliers(residual)
                 if outliers.any():
-                    notes.append(self._left_out(outliers))
+                    notes.append(self._note_outliers(outliers))
                     remaining = np.where(outliers[:, None], np.nan, reading.values)
                     reading = reading._replace(values=remaining)
                     linearised.at_zero[outliers] = residual[outliers] = np.nan
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
                 squares.append(squared[np.isfinite(squared)])
-            self.log[-1].readings.append(reading)
-        track.read(all_linearised)
+            self.log[-1].samples.append(reading)
+        track.add_residuals(all_linearised)
         return notes
 
-    def _wild(self, residual: Array) -> NDArray[np.bool_]:
+    def _outliers(self, residual: Array) -> NDArray[np.bool_]:
         """Return a mask (M,) of samples that the estimate does not explain while it explains the
         others.
         """
-        if self.moved > UNSETTLED or not 0 < self.scatter.rms < GROSS_MISFIT:
+        if (
+            self.linearisation_distance > LARGEST_SETTLED_DISTANCE
+            or not 0 < self.scatter.rms < GROSS_MISFIT
+        ):
             return np.zeros(len(residual), dtype=bool)
         length = np.sqrt(np.sum(residual**2, axis=1) / 3)
-        outliers = length > JUMP * max(1.0, self.scatter.rms)
+        outliers = length > OUTLIER_RATIO * max(1.0, self.scatter.rms)
         if outliers.sum() > np.isfinite(length).sum() / 2:
             return np.zeros_like(outliers)
         return outliers
 
     # Beginnings -------------------------------------------------------------------------------
 
-    def _bounds(self) -> None:
+    def _set_bounds(self) -> None:
         """Set the bounds of p from the model."""
-        self.lower, self.upper = self.model.collocation.bounds_p
+        self.lower, self.upper = self.model.collocation.parameter_bounds
 
-    def _search(self) -> Search:
+    def _new_search(self) -> StiffnessSearch:
         """Return a new search for initial values."""
-        return Search(self.model, self.p[self.model.collocation.nq :])
+        return StiffnessSearch(self.model, self.p[self.model.collocation.nq :])
 
-    def _warmed_up(self) -> tuple[Poses, Array] | None:
+    def _warm_up(self) -> tuple[Poses, Array] | None:
         """Compile the kernels before the first frame.
 
         Return poses and positions (3n,) of the start.
@@ -471,39 +502,39 @@ class Estimator:
         None if the start cannot be computed.
         """
         poses = self.model.first_poses
-        moving_poses = tuple(poses[k] for k in self.model.moved_grasps)
+        moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
         no_markers = np.full((len(self.names), 3), np.nan)
         no_markers[0] = 0.0
         try:
-            trial = Track(self.model, self.p, self.prior, self._block_rows)
+            trial = WindowPass(self.model, self.p, self.prior, self._block_rows)
             row = LoggedRow(moving_poses, [Sample(0.0, no_markers)])
-            for _ in range(self.model.rows + 2):
-                trial.again([row])
+            for _ in range(self.model.template_rows + 2):
+                trial.repeat_rows([row])
         except SimulationError:
             return None
         self._estimates_at(trial.information, self.p)
-        self.budget = self._timed(trial, row)
-        return poses, trial.blocks[0].kept[0].x
+        self.budget = self._measure_times(trial, row)
+        return poses, trial.blocks[0].stored_rows[0].x
 
-    def _timed(self, trial: Track, row: LoggedRow) -> Budget:
+    def _measure_times(self, trial: WindowPass, row: LoggedRow) -> TimeBudget:
         """Return the computing times of repeated rows, the shortest of several measurements."""
         took_s: dict[int, float] = {}
-        most = min(trial.rows - 1, TOGETHER, self._block_rows - 1)
-        for count in (1, most) * TIMED:
-            again = Track(self.model, self.p, self.prior, self._block_rows, trial)
-            again.again([row])
+        most = min(trial.rows - 1, ROWS_PER_CHUNK, self._block_rows - 1)
+        for count in (1, most) * TIMING_REPETITIONS:
+            again = WindowPass(self.model, self.p, self.prior, self._block_rows, trial)
+            again.repeat_rows([row])
             began = self.clock()
-            again.again([row] * count)
+            again.repeat_rows([row] * count)
             took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
-        return Budget.of(took_s[1], took_s[most], most)
+        return TimeBudget.from_times(took_s[1], took_s[most], most)
 
-    def _begin(self, row: LoggedRow) -> None:
+    def _start_pass(self, row: LoggedRow) -> None:
         """Start the first pass with the first row, and set unknown marker places from its
         markers.
         """
         model = self.model
         guesses = []
-        poses = model.poses_of(row.poses)
+        poses = model.all_poses(row.poses)
         if self._rest is not None and len(poses) == 1:
             old_rotation, old_position = self._rest[0][0]
             x = self._rest[1]
@@ -511,108 +542,112 @@ class Estimator:
             guesses = [
                 ((x.reshape(-1, 3) - old_position) @ old_rotation @ rotation.T + position).ravel()
             ]
-        track = Track(model, self.p, self.prior, self._block_rows)
-        track.advance([row.poses], guesses)
-        marker_samples = [reading.values for reading in row.readings if not reading.of]
+        track = WindowPass(model, self.p, self.prior, self._block_rows)
+        track.add_rows([row.poses], guesses)
+        marker_samples = [reading.values for reading in row.samples if not reading.instrument]
         first = marker_samples[0] if marker_samples else np.full((len(self.names), 3), np.nan)
-        self.model = model.placed(first, track.blocks[0].kept[0].x)
+        self.model = model.with_marker_places(first, track.blocks[0].stored_rows[0].x)
         if self.model is not model:
-            self._bounds()
+            self._set_bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
-            self.prior = LeastSquares.none(self.model.size)
-            track = Track(self.model, self.p, self.prior, self._block_rows)
-            track.advance([row.poses], guesses)
-        self.track = track
-        self._joined = JoinedPasses.of(track, None)
+            self.prior = SquareRootInformation.empty(self.model.parameter_count)
+            track = WindowPass(self.model, self.p, self.prior, self._block_rows)
+            track.add_rows([row.poses], guesses)
+        self.first_pass = track
+        self._joined = CombinedPasses.from_passes(track, None)
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         """Keep the information so far as a prior, and wait for a new start."""
-        if self.track is not None:
-            self.prior = self.track.measured
-        self.track = self.again = None
+        if self.first_pass is not None:
+            self.prior = self.first_pass.measured_information
+        self.first_pass = self.second_pass = None
         self.log.clear()
-        self.intake.begin_anew()
+        self.intake.reset()
         self.counts["begun anew"] += 1
 
     # Estimates --------------------------------------------------------------------------------
 
     @property
-    def moved(self) -> float:
+    def linearisation_distance(self) -> float:
         """Largest distance of the estimate from the linearisation points, in standard errors.
 
         Infinite if there is no pass, or if it failed.
         """
-        if self.track is None or self.track.failed:
+        if self.first_pass is None or self.first_pass.has_failed:
             return np.inf
-        return self._apart(self.track, self.p, self._joined.points)
+        return self._largest_distance(self.first_pass, self.p, self._joined.points)
 
-    def _apart(self, track: Track, p: Array, points: Sequence[Array]) -> float:
+    def _largest_distance(self, track: WindowPass, p: Array, points: Sequence[Array]) -> float:
         """Return the largest distance of p from some points, in the standard errors of a pass."""
         nq = self.model.collocation.nq
-        distances = np.abs(np.array(points) - self.model.flat(p))[:, :nq]
-        return float(np.max(distances / track.information.errors[:nq], initial=0.0))
+        distances = np.abs(np.array(points) - self.model.transformed(p))[:, :nq]
+        return float(np.max(distances / track.information.standard_errors[:nq], initial=0.0))
 
-    def _estimate(self) -> None:
+    def _update_estimate(self) -> None:
         """Update the estimate p from the joint information of both passes."""
-        if self.track is not None and not self.track.failed:
-            self._joined = JoinedPasses.of(self.track, self.again)
-            self.p = self._best(self.track, self._joined.information)
+        if self.first_pass is not None and not self.first_pass.has_failed:
+            self._joined = CombinedPasses.from_passes(self.first_pass, self.second_pass)
+            self.p = self._constrained_minimum(self.first_pass, self._joined.information)
 
-    def _best(self, track: Track, known: LeastSquares) -> Array:
+    def _constrained_minimum(self, track: WindowPass, known: SquareRootInformation) -> Array:
         """Return the minimum of a quadratic loss within bounds and the trust region about a
         pass.
         """
         reach = self._trust * self.model.collocation.reach_p
-        low = np.maximum(self.lower, track.p - reach)
-        high = np.minimum(self.upper, track.p + reach)
-        best = known.best(self.model.flat(low), self.model.flat(high))
-        return np.clip(self.model.curved(best), low, high)
+        low = np.maximum(self.lower, track.linearisation_point - reach)
+        high = np.minimum(self.upper, track.linearisation_point + reach)
+        best = known.minimiser(self.model.transformed(low), self.model.transformed(high))
+        return np.clip(self.model.physical(best), low, high)
 
-    def _next(self, track: Track) -> Array:
+    def _next_linearisation_point(self, track: WindowPass) -> Array:
         """Return the next linearisation point.
 
         Poorly determined parameters stay near their last value.
         """
-        size = self.model.size
+        size = self.model.parameter_count
         samples = len(self.log) / self.model.substeps
-        deviation = STAY * max(1.0, samples / SEEN)
+        deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
         slopes = np.diag(1 / (deviation * self.model.collocation.reach_p * track.sweep.rates))
-        information = self._joined.information.add(np.zeros(size), slopes, track.sweep.flat)
-        return self._best(track, information)
+        information = self._joined.information.with_rows(
+            np.zeros(size), slopes, track.sweep.transformed
+        )
+        return self._constrained_minimum(track, information)
 
-    def _known(self, t_s: float) -> tuple[Mapping[str, Estimate], Trust]:
+    def _estimates_and_trust(self, t_s: float) -> tuple[Mapping[str, Estimate], Assessment]:
         """Return estimates and verdict at a time."""
         code = ""
-        if self.track is None:
+        if self.first_pass is None:
             code = "solve/no-start"
-        elif self.track.failed:
+        elif self.first_pass.has_failed:
             code = "solve/not-simulable"
-        elif self.intake.is_lost(t_s):
+        elif self.intake.is_motion_unknown(t_s):
             code = "solve/grasp-lost"
         elif self.search is not None:
             code = "solve/seeking"
-        grave = concerned(bool(code), True, code)
-        if self.track is None or self.track.failed:
+        grave = concern_if(bool(code), True, code)
+        if self.first_pass is None or self.first_pass.has_failed:
             values = self.model.collocation.parameters.values(self.p[: self.model.collocation.nq])
-            estimates_only = {name: Estimate(v) for name, v in values.items() if not is_mode(name)}
-            return estimates_only, Trust.of(grave)
-        if self.counts["looked"] % LOOK_EVERY == 0:
-            self.scatter = self._joined.scatter(self.model.flat(self.p))
+            estimates_only = {
+                name: Estimate(v) for name, v in values.items() if not is_field_coefficient(name)
+            }
+            return estimates_only, Assessment.from_concerns(grave)
+        if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
+            self.scatter = self._joined.scatter(self.model.transformed(self.p))
         self.counts["looked"] += 1
         estimates = self._estimates_at(self._joined.information, self.p)
         grave += data_concerns(self.scatter, self.counts, self.samples)
-        grave += estimate_concerns(estimates, self.moved)
-        return estimates, Trust.of(grave)
+        grave += estimate_concerns(estimates, self.linearisation_distance)
+        return estimates, Assessment.from_concerns(grave)
 
-    def _estimates_at(self, known: LeastSquares, p: Array) -> dict[str, Estimate]:
+    def _estimates_at(self, known: SquareRootInformation, p: Array) -> dict[str, Estimate]:
         """Return the estimates with intervals from given information, at p."""
         collocation = self.model.collocation
         nq = self.model.collocation.nq
-        transformed = self.model.flat(p)
-        parameter_count = self.model.size
-        factor, quantile = widened(known, transformed, parameter_count, self.scatter)
-        rates = self.model.rates(transformed)[:nq]
+        transformed = self.model.transformed(p)
+        parameter_count = self.model.parameter_count
+        factor, quantile = variance_factor(known, transformed, parameter_count, self.scatter)
+        rates = self.model.transformation_derivatives(transformed)[:nq]
         of_q = factor * known.covariance()[:nq, :nq] / np.outer(rates, rates)
         bounded = ((p - self.lower < AT_BOUND) | (self.upper - p < AT_BOUND))[:nq]
         quantiles = np.full(nq, quantile)
@@ -620,7 +655,7 @@ class Estimator:
 
     # Passing again ----------------------------------------------------------------------------
 
-    def _pass_again(self, began: float, notes: list[str], done: int = 0) -> int:
+    def _repeat_rows(self, began: float, notes: list[str], done: int = 0) -> int:
         """Continue or start a second pass within the rest of the budget.
 
         Parameters
@@ -637,20 +672,24 @@ class Estimator:
         int
             Number of rows computed again in this frame.
         """
-        while self.track is not None:
+        while self.first_pass is not None:
             pass_began = self.clock()
-            if self.again is None and self._left(done, pass_began - began + self.budget.turn_s):
-                self.again = self._wanted(self.track, notes)
-                self.budget.turned(self.clock() - pass_began)
-            again = self.again
+            if self.second_pass is None and self._affordable_rows(
+                done, pass_began - began + self.budget.turn_s
+            ):
+                self.second_pass = self._start_second_pass(self.first_pass, notes)
+                self.budget.record_relinearisation(self.clock() - pass_began)
+            again = self.second_pass
             if again is None:
                 break
             if not done and again.base is not None:
-                self._turn(self.track, again, began, TURN)
-            affordable = min(self._left(done, self.clock() - began), again.left)
+                self._relinearise_if_far(self.first_pass, again, began, RELINEARISE_DISTANCE)
+            affordable = min(
+                self._affordable_rows(done, self.clock() - began), again.repeatable_rows
+            )
             if not affordable:
                 break
-            done += self._advance(again, affordable, notes)
+            done += self._advance_second_pass(again, affordable, notes)
         return done
 
     def _catch_up(self, began: float, notes: list[str]) -> int:
@@ -658,16 +697,18 @@ class Estimator:
 
         Return the number of rows.
         """
-        again = self.again
+        again = self.second_pass
         if again is None or again.base is None:
             return 0
         lag = len(self.log) - again.rows
         elapsed_s = self.clock() - began
-        if lag > min(again.left, self._left(0, elapsed_s + self.budget.frame_s)):
+        if lag > min(
+            again.repeatable_rows, self._affordable_rows(0, elapsed_s + self.budget.frame_s)
+        ):
             return 0
-        return self._advance(again, lag, notes)
+        return self._advance_second_pass(again, lag, notes)
 
-    def _advance(self, again: Track, count: int, notes: list[str]) -> int:
+    def _advance_second_pass(self, again: WindowPass, count: int, notes: list[str]) -> int:
         """Continue a second pass by some rows and judge it if it has caught up.
 
         Return the number of rows.
@@ -675,102 +716,115 @@ class Estimator:
         before = self.clock()
         first_row = again.rows
         try:
-            again.again(self.log[first_row : first_row + count])
+            again.repeat_rows(self.log[first_row : first_row + count])
         except SimulationError:
-            again.failed = True
-        self.budget.took(count, self.clock() - before)
-        if self.search is not None and not self.search.done:
-            if again.failed or again.rows >= min(self.search.rows, len(self.log)):
-                self.search.compare(again)
-                self.again = None
-        elif (again.failed or again.rows == len(self.log)) and self.track is not None:
-            self._judge(self.track, again, notes)
+            again.has_failed = True
+        self.budget.record_steps(count, self.clock() - before)
+        if self.search is not None and not self.search.is_done:
+            if again.has_failed or again.rows >= min(self.search.rows, len(self.log)):
+                self.search.record_trial(again)
+                self.second_pass = None
+        elif (again.has_failed or again.rows == len(self.log)) and self.first_pass is not None:
+            self._accept_or_reject(self.first_pass, again, notes)
         return again.rows - first_row
 
-    def _left(self, done: int, elapsed_s: float) -> int:
+    def _affordable_rows(self, done: int, elapsed_s: float) -> int:
         """Return the number of rows that fit into the rest of the budget."""
         if self.rows is not None:
             return self.rows - done
-        return self.budget.rows(self.budget_s - elapsed_s)
+        return self.budget.affordable_steps(self.budget_s - elapsed_s)
 
-    def _wanted(self, track: Track, notes: list[str]) -> Track | None:
+    def _start_second_pass(self, track: WindowPass, notes: list[str]) -> WindowPass | None:
         """Return a new second pass if one is needed, otherwise None."""
         search = self.search
         at_start = track.start[0] is None
-        if search is None and track.failed and at_start:
-            search = self.search = self._search()
+        if search is None and track.has_failed and at_start:
+            search = self.search = self._new_search()
             notes.append("searching for initial values over a range of stiffness")
         p = self.p
         base = track
         if search is not None:
-            if not search.done and (len(self.log) < search.rows or not at_start):
+            if not search.is_done and (len(self.log) < search.rows or not at_start):
                 return None
-            p = search.best if search.done else search.next()
+            p = search.best if search.is_done else search.next_trial()
             base = None
             if p is None:
                 self.search = None
                 notes.append("found no initial values over a range of stiffness")
                 return None
-        elif track.failed:
+        elif track.has_failed:
             return None
         else:
-            p = self._next(track)
-            if self._apart(track, p, track.points) <= MOVED and not track.sweep.is_rough:
+            p = self._next_linearisation_point(track)
+            if (
+                self._largest_distance(track, p, track.linearisation_points) <= REPEAT_DISTANCE
+                and not track.sweep.needs_another_pass
+            ):
                 return None
-        return Track(self.model, p, track.prior, self._block_rows, base)
+        return WindowPass(self.model, p, track.prior, self._block_rows, base)
 
-    def _turn(self, track: Track, turned: Track, began: float, far: float) -> None:
+    def _relinearise_if_far(
+        self, track: WindowPass, pass_to_move: WindowPass, began: float, distance: float
+    ) -> None:
         """Move the linearisation point of a pass to the estimate if it is far and there is time.
 
         Parameters
         ----------
-        track : Track
+        track : WindowPass
             First pass, which gives the standard errors.
-        turned : Track
+        pass_to_move : WindowPass
             Pass to change.
         began : float
             Time at which the frame began.
-        far : float
+        distance : float
             Distance in standard errors.
         """
-        current_point = [turned.sweep.flat]
+        current_point = [pass_to_move.sweep.transformed]
         if (
-            turned.rows < turned.turned + TOGETHER
-            or self._apart(track, self.p, current_point) <= far
+            pass_to_move.rows < pass_to_move.last_relinearised_row + ROWS_PER_CHUNK
+            or self._largest_distance(track, self.p, current_point) <= distance
         ):
             return
         before = self.clock()
-        if self.rows is None and not self._left(0, before - began + self.budget.turn_s):
+        if self.rows is None and not self._affordable_rows(0, before - began + self.budget.turn_s):
             return
-        p = self._next(track)
-        if self._apart(track, p, current_point) > far:
-            turned.turn(p)
-            self.budget.turned(self.clock() - before)
+        p = self._next_linearisation_point(track)
+        if self._largest_distance(track, p, current_point) > distance:
+            pass_to_move.relinearise_at(p)
+            self.budget.record_relinearisation(self.clock() - before)
 
-    def _judge(self, track: Track, again: Track, notes: list[str]) -> None:
+    def _accept_or_reject(self, track: WindowPass, again: WindowPass, notes: list[str]) -> None:
         """Replace the first pass by a second one that has caught up, or reject it."""
-        self.again = None
+        self.second_pass = None
         was_search = self.search is not None
         self.search = None
-        points = [*track.points, again.points[0]]
+        points = [*track.linearisation_points, again.linearisation_points[0]]
         expected = max(track.information.loss(point) for point in points)
         # Of a pass that turned the sum of squares is not that of a simulation.
-        is_near = track.turned and self._apart(track, track.p, again.points) <= MOVED
-        fits = track.failed or is_near or again.loss <= TIMES * expected + SLACK
-        if not again.failed and fits:
+        is_near = (
+            track.last_relinearised_row
+            and self._largest_distance(track, track.linearisation_point, again.linearisation_points)
+            <= REPEAT_DISTANCE
+        )
+        fits = (
+            track.has_failed or is_near or again.loss <= ACCEPTED_RATIO * expected + ACCEPTED_EXCESS
+        )
+        if not again.has_failed and fits:
             again.base = None
-            self.track = again
-            self._trust = TRUST if was_search else min(2 * self._trust, WIDEST)
+            self.first_pass = again
+            self._trust = INITIAL_RADIUS if was_search else min(2 * self._trust, LARGEST_RADIUS)
             self._rejected = 0
             if was_search:
                 notes.append("restarted from another stiffness")
-            self.scatter = JoinedPasses.of(again, None).scatter(again.sweep.flat)
+            self.scatter = CombinedPasses.from_passes(again, None).scatter(again.sweep.transformed)
         else:
             reach = self.model.collocation.reach_p
-            length = float(np.abs((again.p - track.p) / reach).max())
-            self._trust = max(SHRINK * length, 1e-6)
+            length = float(
+                np.abs((again.linearisation_point - track.linearisation_point) / reach).max()
+            )
+            self._trust = max(RADIUS_REDUCTION * length, 1e-6)
             self._rejected += 1
-            is_stuck = self._rejected >= REJECTED and self.scatter.rms > GROSS_MISFIT
+            is_stuck = self._rejected >= LARGEST_REJECTIONS and self.scatter.rms > GROSS_MISFIT
             if (
                 is_stuck
                 and not was_search
@@ -778,23 +832,27 @@ class Estimator:
                 and track.start[0] is None
             ):
                 self.counts["searched"] += 1
-                self.search = self._search()
+                self.search = self._new_search()
                 notes.append(
                     "the estimation does not converge: searching for other initial values over a "
                     "range of stiffness"
                 )
-        self._estimate()
+        self._update_estimate()
 
-    def _shorten(self) -> None:
+    def _drop_old_rows(self) -> None:
         """Remove the oldest rows if the window is full."""
-        if self.track is None:
+        if self.first_pass is None:
             return
         most = self._blocks * self._block_rows
-        if self.again is not None and len(self.log) > 2 * most:
-            self.again = None
-        if self.track.failed and len(self.log) > 2 * most:
-            self._begin_anew()
-        while self.again is None and self.track is not None and not self.track.failed:
+        if self.second_pass is not None and len(self.log) > 2 * most:
+            self.second_pass = None
+        if self.first_pass.has_failed and len(self.log) > 2 * most:
+            self._restart()
+        while (
+            self.second_pass is None
+            and self.first_pass is not None
+            and not self.first_pass.has_failed
+        ):
             if len(self.log) <= most:
                 break
-            del self.log[: self.track.drop_oldest()]
+            del self.log[: self.first_pass.drop_oldest_block()]

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Array, Index
-from ..model.setting import Setting
-from ..program.channel import Forced
-from ..program.reaction import HeldForces
-from ..program.wrench_channel import GraspWrench, Grid
+from ..model.setting import EquationsAtParameters
+from ..program.channel import ReactionForces
+from ..program.reaction import GraspForces
+from ..program.wrench_channel import GraspWrench, ReactionGrid
 
 # Number of time steps after which the wrench of a time is available.
-LATE = 1
+DELAY_STEPS = 1
 
 # Rotation (3, 3) and translation (3,) of each grasp.
 Poses = tuple[tuple[Array, Array], ...]
@@ -30,12 +30,12 @@ Weights = tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
-class WrenchOfRows(GraspWrench):
+class StreamedWrench(GraspWrench):
     """Wrench of a grasp at consecutive time steps.
 
     Attributes
     ----------
-    turns : (n + 2, 3, 3)
+    rotations : (n + 2, 3, 3)
         Rotations of the poses, with one more time step on either side.
     shifts : (n + 2, 3)
         Translations of the poses.
@@ -43,46 +43,48 @@ class WrenchOfRows(GraspWrench):
         Time step.
     """
 
-    turns: Array
+    rotations: Array
     shifts: Array
     step_s: float
 
     @classmethod
-    def of_rows(
-        cls, channel: GraspWrench, turns: Array, shifts: Array, step_s: float
-    ) -> WrenchOfRows:
+    def from_poses(
+        cls, channel: GraspWrench, rotations: Array, shifts: Array, step_s: float
+    ) -> StreamedWrench:
         """Return the wrench of a grasp at consecutive time steps.
 
         Parameters
         ----------
         channel : GraspWrench
             Wrench in the still recording, whose other properties are copied.
-        turns : (n + 2, 3, 3)
+        rotations : (n + 2, 3, 3)
         shifts : (n + 2, 3)
         step_s : float
         """
         properties = {name: getattr(channel, name) for name in GraspWrench.__dataclass_fields__}
-        properties["on"] = Grid.at(step_s * np.arange(len(turns) - 2, dtype=np.float64))
-        wrench = cls(**properties, turns=turns, shifts=shifts, step_s=step_s)
-        if len(channel.tool_phi):
+        properties["reaction_grid"] = ReactionGrid.from_times(
+            step_s * np.arange(len(rotations) - 2, dtype=np.float64)
+        )
+        wrench = cls(**properties, rotations=rotations, shifts=shifts, step_s=step_s)
+        if len(channel.tool_parameters):
             vars(wrench)["tool"] = channel.tool
         return wrench
 
     def poses_at(self, rows: Index) -> tuple[Array, Array]:
         """Return rotations and translations at time steps, given by index."""
-        return self.turns[1 + rows], self.shifts[1 + rows]
+        return self.rotations[1 + rows], self.shifts[1 + rows]
 
-    def pose_rates(self, count: int) -> tuple[Array, Array]:
+    def pose_accelerations(self, count: int) -> tuple[Array, Array]:
         """Return the second time derivatives of the first `count` poses, by differences."""
         turn, shift = (
             (each[2:] - 2 * each[1:-1] + each[:-2])[:count] / self.step_s**2
-            for each in (self.turns, self.shifts)
+            for each in (self.rotations, self.shifts)
         )
         return turn, shift
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class GraspReactions:
     """Forces and columns at the sensed dofs g in the rows of a template, and the poses of all G
     grasps.
 
@@ -90,45 +92,51 @@ class Felt:
 
     Attributes
     ----------
-    held : HeldForces
+    forces : GraspForces
         Forces at the sensed dofs, with derivatives.
-    moved : (rows, g, 1 + m)
+    position_columns : (rows, g, 1 + m)
         Columns of the positions of these dofs: Newton correction and sensitivities.
-    turns : (rows, G, 3, 3)
+    rotations : (rows, G, 3, 3)
         Rotations of the grasps.
     shifts : (rows, G, 3)
         Translations of the grasps.
     """
 
-    held: HeldForces
-    moved: Array
-    turns: Array
+    forces: GraspForces
+    position_columns: Array
+    rotations: Array
     shifts: Array
 
     @classmethod
-    def nothing(cls, rows: int, dofs: int, columns: int, grasps: int) -> Felt:
+    def zeros(cls, rows: int, dofs: int, columns: int, grasps: int) -> GraspReactions:
         """Return zero arrays for a number of rows, dofs, columns and grasps."""
         moved = np.zeros((rows, dofs, columns))
         turns = np.zeros((rows, grasps, 3, 3))
-        return cls(HeldForces.nothing(rows, dofs, columns), moved, turns, turns[..., 0].copy())
+        return cls(GraspForces.zeros(rows, dofs, columns), moved, turns, turns[..., 0].copy())
 
     @property
     def arrays(self) -> tuple[Array, ...]:
         """All arrays whose first axis is the row."""
-        return self.held.force, self.held.slopes, self.moved, self.turns, self.shifts
+        return (
+            self.forces.force,
+            self.forces.changes,
+            self.position_columns,
+            self.rotations,
+            self.shifts,
+        )
 
-    def copy(self) -> Felt:
+    def copy(self) -> GraspReactions:
         """Return a copy that can be modified."""
         force, slopes, *others = (each.copy() for each in self.arrays)
-        return Felt(HeldForces(force, slopes), *others)
+        return GraspReactions(GraspForces(force, slopes), *others)
 
-    def place(self, first: int, poses: Sequence[Poses]) -> None:
+    def set_poses(self, first: int, poses: Sequence[Poses]) -> None:
         """Store the poses of consecutive rows from the index `first` on, in place."""
         rows = slice(first, first + len(poses))
-        self.turns[rows] = [[turn for turn, _ in each] for each in poses]
+        self.rotations[rows] = [[turn for turn, _ in each] for each in poses]
         self.shifts[rows] = [[shift for _, shift in each] for each in poses]
 
-    def corrected(self, here: slice, moved: Array) -> None:
+    def apply_correction(self, here: slice, moved: Array) -> None:
         """Add the Newton correction to the forces of `here` and store the sensitivities, in place.
 
         Parameters
@@ -138,11 +146,11 @@ class Felt:
         moved : (rows, g, 1 + m)
             Newton correction (column 0) and sensitivities of the sensed dofs.
         """
-        self.held.force[here] += self.held.slopes[here, :, 0]
-        self.held.slopes[here, :, 0] = 0.0
-        self.moved[here, :, 1:] = moved[..., 1:]
+        self.forces.force[here] += self.forces.changes[here, :, 0]
+        self.forces.changes[here, :, 0] = 0.0
+        self.position_columns[here, :, 1:] = moved[..., 1:]
 
-    def at(self, step: Array, grown: Array) -> Felt:
+    def moved_to(self, step: Array, grown: Array) -> GraspReactions:
         """Return the forces at another linearisation point, to first order.
 
         Parameters
@@ -152,20 +160,27 @@ class Felt:
         grown : (1 + m,)
             Factors of the columns, whose parameters change their scale.
         """
-        force = self.held.force + self.held.slopes[..., 1:] @ step
-        held = HeldForces(force, self.held.slopes * grown)
-        return Felt(held, self.moved * grown, self.turns.copy(), self.shifts.copy())
+        force = self.forces.force + self.forces.changes[..., 1:] @ step
+        held = GraspForces(force, self.forces.changes * grown)
+        return GraspReactions(
+            held, self.position_columns * grown, self.rotations.copy(), self.shifts.copy()
+        )
 
     def wrenches(
-        self, sensors: Sequence[Sensor], setting: Setting, x: Array, weights: Weights, rows: Index
-    ) -> tuple[Forced, list[WrenchOfRows]]:
+        self,
+        sensors: Sequence[Sensor],
+        setting: EquationsAtParameters,
+        x: Array,
+        weights: Weights,
+        rows: Index,
+    ) -> tuple[ReactionForces, list[StreamedWrench]]:
         """Return the reactions at some time steps with derivatives, and the wrenches of the
         sensors.
 
         Parameters
         ----------
         sensors : sequence of Sensor
-        setting : Setting
+        setting : EquationsAtParameters
             Equations of motion at the linearisation point.
         x : (known, g)
             Positions of the sensed dofs in the first rows of the template [m].
@@ -177,26 +192,26 @@ class Felt:
         dynamics = setting.dynamics
         channel, _ = sensors[0]
         known = slice(len(x))
-        at = rows - LATE
-        dofs = channel.sensed
-        of_force, of_x = (each[at + channel.on.late, known] for each in weights)
-        mass_kg = dynamics.mass.kg[0, dofs]
+        at = rows - DELAY_STEPS
+        dofs = channel.sensed_dofs
+        of_force, of_x = (each[at + channel.reaction_grid.delay_steps, known] for each in weights)
+        mass_kg = dynamics.mass.inertia_kg[0, dofs]
         acceleration = of_x @ x
-        reaction = mass_kg * acceleration - of_force @ self.held.force[known]
-        position_slopes = self.moved[known, :, 1:]
-        slopes = self.held.slopes[known, :, 1:]
+        reaction = mass_kg * acceleration - of_force @ self.forces.force[known]
+        position_slopes = self.position_columns[known, :, 1:]
+        slopes = self.forces.changes[known, :, 1:]
         by = mass_kg[:, None] * np.tensordot(of_x, position_slopes, 1) - np.tensordot(
             of_force, slopes, 1
         )
-        by += setting.inertia_slopes(0, acceleration, dofs)
+        by += setting.inertia_derivatives(0, acceleration, dofs)
         pose_rows = slice(at[0] - 1, at[-1] + 2)
         channels = [
-            WrenchOfRows.of_rows(
+            StreamedWrench.from_poses(
                 channel,
-                self.turns[pose_rows, grasp],
+                self.rotations[pose_rows, grasp],
                 self.shifts[pose_rows, grasp],
                 dynamics.step_s,
             )
             for channel, grasp in sensors
         ]
-        return Forced(reaction, x[at], by, position_slopes[at]), channels
+        return ReactionForces(reaction, x[at], by, position_slopes[at]), channels

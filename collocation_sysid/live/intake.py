@@ -20,21 +20,21 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array
 from ..program.reading import lagrange_weights
 from ..recording.clock import TIME_TOLERANCE_S
-from .frames import Told
-from .model import Around
-from .sweep import LATEST, LoggedRow, Sample
+from .frames import InstrumentSample
+from .model import RowStencil
+from .sweep import LARGEST_SAMPLE_DELAY, LoggedRow, Sample
 
 # Largest difference, in samples, of two times that count as equal.
-TOLERANCE = 0.1
+TIME_TOLERANCE_SAMPLES = 0.1
 # Largest gap between frames, in samples, over which poses are interpolated by a cubic polynomial;
 # over a larger gap they are interpolated linearly.
-FEW = 3
+LARGEST_CUBIC_GAP = 3
 # Largest gap between poses, in samples, after which the motion counts as unknown.
-LONGEST = 10
+LARGEST_GAP = 10
 
 
 @dataclass(eq=False)
-class Intake:
+class FrameBuffer:
     """Buffer of the frames that have arrived.
 
     Attributes
@@ -43,11 +43,11 @@ class Intake:
         Time between samples.
     substeps : int
         Time steps between samples.
-    around : int
+    neighbouring_samples : int
         Number of samples before and after one that its evaluation needs.
-    leap_m : float
+    largest_jump_m : float
         Largest distance that a grasp can move between two samples.
-    instruments : sequence of Around
+    instruments : sequence of RowStencil
         Rows that a sample of each instrument needs.
     counts : Counter
         Numbers of irregularities of frames, by kind.
@@ -55,22 +55,22 @@ class Intake:
 
     interval_s: float
     substeps: int
-    around: int
-    leap_m: float = np.inf
-    instruments: Sequence[Around] = ()
+    neighbouring_samples: int
+    largest_jump_m: float = np.inf
+    instruments: Sequence[RowStencil] = ()
     counts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
-        self.begin_anew()
+        self.reset()
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Discard all frames and wait for a new start."""
         self.start_s: float | None = None
         self.rows = 0
         self.last_s = -np.inf
-        self._times: deque[float] = deque(maxlen=8 * LATEST)
+        self._times: deque[float] = deque(maxlen=8 * LARGEST_SAMPLE_DELAY)
         self._poses: deque[tuple[float, Array, Array]] = deque(maxlen=4)
-        self._waiting: list[Told] = []
+        self._waiting: list[InstrumentSample] = []
         self._too_late = 0
 
     @property
@@ -78,16 +78,16 @@ class Intake:
         """Time of the last pose; None if there is none."""
         return self._poses[-1][0] if self._poses else None
 
-    def seen(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
+    def marker_samples(self, log: Sequence[LoggedRow]) -> Iterator[tuple[float, Array]]:
         """Yield time and positions (M, 3) of all marker samples.
 
         Times in samples from the first row on.
         """
-        for of, when, tracks_m in self.told(log):
+        for of, when, tracks_m in self.all_samples(log):
             if not of:
                 yield when, tracks_m
 
-    def told(self, log: Sequence[LoggedRow]) -> Iterator[Told]:
+    def all_samples(self, log: Sequence[LoggedRow]) -> Iterator[InstrumentSample]:
         """Yield instrument number, time and values of all samples; markers have the number 0.
 
         Times are in samples from the first row on. Samples that still wait for rows come last.
@@ -98,28 +98,28 @@ class Intake:
             Rows so far, with their samples.
         """
         for number, row in enumerate(log):
-            for back, values, of in row.readings:
+            for back, values, of in row.samples:
                 yield of, (number - back) / self.substeps, values
         for of, t_s, values in self._waiting:
             yield of, (t_s - (self.start_s or 0.0)) / self.interval_s, values
 
-    def is_lost(self, t_s: float) -> bool:
+    def is_motion_unknown(self, t_s: float) -> bool:
         """Return whether a time is too long after the last pose for the motion to be known.
 
         This is also the case after many frames in turn that were too late, because their clock was
         set back.
         """
-        if self._too_late >= LONGEST:
+        if self._too_late >= LARGEST_GAP:
             return True
         gone_s = t_s - (t_s if self.last_pose_s is None else self.last_pose_s)
-        return gone_s > (LONGEST + TOLERANCE) * self.interval_s
+        return gone_s > (LARGEST_GAP + TIME_TOLERANCE_SAMPLES) * self.interval_s
 
-    def take(
+    def add_frame(
         self,
         t_s: float,
         pose: tuple[Array, Array] | None,
         tracks_m: Array,
-        told: Sequence[Told] = (),
+        instrument_samples: Sequence[InstrumentSample] = (),
     ) -> tuple[list[LoggedRow], list[Sample], list[str]]:
         """Add a frame; return the completed rows, the samples after the last row, and notes.
 
@@ -134,17 +134,17 @@ class Intake:
             Positions (G, 3) and quaternions (G, 4) of the grasps that move; None if missing.
         tracks_m : (M, 3)
             Marker positions, NaN where missing.
-        told : sequence of Told
+        instrument_samples : sequence of Told
             Samples of instruments.
         """
         sample_s = self.interval_s
         notes = []
-        if any(abs(t_s - other) <= TOLERANCE * sample_s for other in self._times):
+        if any(abs(t_s - other) <= TIME_TOLERANCE_SAMPLES * sample_s for other in self._times):
             self.counts["doubled"] += 1
             return [], [], [f"a frame at {t_s:.6g} s was received before: ignored"]
         late = t_s < self.last_s
         if late:
-            if self.last_s - t_s > LATEST * sample_s:
+            if self.last_s - t_s > LARGEST_SAMPLE_DELAY * sample_s:
                 self.counts["late"] += 1
                 self._too_late += 1
                 return [], [], [f"the frame at {t_s:.6g} s is too late: ignored"]
@@ -153,34 +153,38 @@ class Intake:
         self._too_late = 0
         self._times.append(t_s)
         has_started = self.start_s is not None or pose is not None
-        if has_started and not self.is_lost(t_s):
+        if has_started and not self.is_motion_unknown(t_s):
             if np.isfinite(tracks_m).any():
                 self._waiting.append((0, t_s, tracks_m))
-            on_time = [each for each in told if abs(each[1] - t_s) <= LATEST * sample_s]
-            self.counts["late"] += len(told) - len(on_time)
+            on_time = [
+                each
+                for each in instrument_samples
+                if abs(each[1] - t_s) <= LARGEST_SAMPLE_DELAY * sample_s
+            ]
+            self.counts["late"] += len(instrument_samples) - len(on_time)
             self._waiting += on_time
         if not late:
-            if pose is not None and self._leaps(t_s, pose[0]):
+            if pose is not None and self._is_jump(t_s, pose[0]):
                 pose = None
                 notes.append(f"the pose at {t_s:.6g} s is too far from the last one: ignored")
-            notes += self._gap(t_s)
+            notes += self._note_gaps(t_s)
             self.last_s = t_s
             if pose is not None:
                 self._add_pose(t_s, *pose)
             else:
                 self.counts["without a pose"] += 1
-        rows = self._due()
-        return rows, self._ready() if not rows else [], notes
+        rows = self._completed_rows()
+        return rows, self._available_samples() if not rows else [], notes
 
-    def _leaps(self, t_s: float, positions_m: Array) -> bool:
+    def _is_jump(self, t_s: float, positions_m: Array) -> bool:
         """Return whether a grasp is farther from its last position than it can have moved."""
         if not self._poses:
             return False
         before_s, before_m, _ = self._poses[-1]
         samples = max(1.0, (t_s - before_s) / self.interval_s)
-        return bool(np.abs(positions_m - before_m).max() > samples * self.leap_m)
+        return bool(np.abs(positions_m - before_m).max() > samples * self.largest_jump_m)
 
-    def _gap(self, t_s: float) -> list[str]:
+    def _note_gaps(self, t_s: float) -> list[str]:
         """Count missing frames and frames between samples, and return notes about them."""
         if not np.isfinite(self.last_s):
             return []
@@ -192,7 +196,7 @@ class Intake:
             notes.append(
                 f"{missing} frames before {t_s:.6g} s are missing: bridged by interpolation"
             )
-        if abs(offset - round(offset)) > TOLERANCE:
+        if abs(offset - round(offset)) > TIME_TOLERANCE_SAMPLES:
             if not self.counts["off the grid"]:
                 notes.append(
                     f"the frame at {t_s:.6g} s lies between samples: markers are evaluated at the "
@@ -216,18 +220,18 @@ class Intake:
         assert self.start_s is not None
         return self.start_s + row * self.interval_s / self.substeps
 
-    def _due(self) -> list[LoggedRow]:
+    def _completed_rows(self) -> list[LoggedRow]:
         """Return the rows for which poses are available now, with the samples that are read after
         them.
         """
         rows: list[tuple[Array, Array, list[Sample]]] = []
         if self.start_s is None:
             return []
-        until_s = self._poses[-1][0] + TOLERANCE * self.interval_s
+        until_s = self._poses[-1][0] + TIME_TOLERANCE_SAMPLES * self.interval_s
         while self._time_s(self.rows) <= until_s:
             pose = self._pose_at(self._time_s(self.rows))
             self.rows += 1
-            rows.append((*pose, self._ready()))
+            rows.append((*pose, self._available_samples()))
         if not rows:
             return []
         places, quaternions, readings = zip(*rows, strict=True)
@@ -244,7 +248,10 @@ class Intake:
             if abs(at_s - t_s) <= TIME_TOLERANCE_S:
                 return positions_m, quaternions
         times, places, quaternions = (list(each) for each in zip(*self._poses, strict=True))
-        has_large_gap = any(b - a > (FEW + TOLERANCE) * self.interval_s for a, b in pairwise(times))
+        has_large_gap = any(
+            b - a > (LARGEST_CUBIC_GAP + TIME_TOLERANCE_SAMPLES) * self.interval_s
+            for a, b in pairwise(times)
+        )
         used = slice(-2, None) if has_large_gap else slice(None)
         weights = lagrange_weights(t_s, times[used])
         position_m, quaternion = (
@@ -252,22 +259,22 @@ class Intake:
         )
         return position_m, quaternion
 
-    def _ready(self) -> list[Sample]:
+    def _available_samples(self) -> list[Sample]:
         """Return and remove the waiting samples that can be evaluated after the rows so far."""
         if self.start_s is None or not self.rows:
             return []
         now_s = self._time_s(self.rows - 1)
         step_s = self.interval_s / self.substeps
-        room_s = TOLERANCE * self.interval_s
-        latest_s = now_s - self.around * self.interval_s + room_s
+        room_s = TIME_TOLERANCE_SAMPLES * self.interval_s
+        latest_s = now_s - self.neighbouring_samples * self.interval_s + room_s
 
         def ready(of: int, t_s: float) -> bool:
             """Return whether the rows that a sample needs are available."""
             if not of:
                 return t_s <= latest_s
             instrument = self.instruments[of - 1]
-            rows = instrument.rows(self.rows - 1 - (now_s - t_s) / step_s)
-            return rows.stop + instrument.late <= self.rows
+            rows = instrument.rows_of_sample(self.rows - 1 - (now_s - t_s) / step_s)
+            return rows.stop + instrument.delay <= self.rows
 
         available = [each for each in self._waiting if ready(*each[:2])]
         self._waiting = [each for each in self._waiting if not ready(*each[:2])]

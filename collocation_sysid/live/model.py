@@ -1,7 +1,8 @@
 """Problem of a live recording, prepared for time marching without an end.
 
 A short still recording with the same body, grasps and markers represents recordings of any length:
-its first rows have the stencils of the start, and its last row has those of all later rows. `Model`
+its first rows have the stencils of the start, and its last row has those of all later rows.
+`LiveModel`
 holds this recording and everything that does not depend on the parameters.
 """
 
@@ -17,69 +18,69 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from ..fem.constants import GAMMA_M, bare
-from ..methods.scan import usual_parameters
+from ..fem.constants import GAMMA_M, without_region
+from ..methods.scan import typical_parameters
 from ..model.dynamics import StencilRow
-from ..model.point_forces import generated
+from ..model.point_forces import law_function
 from ..problem import Problem
-from ..program.channel import Points
+from ..program.channel import PointPositions
 from ..program.collocation import Collocation
 from ..program.gauge import NEIGHBOURS as GAUGE_NEIGHBOURS
-from ..program.gauge import points_of
-from ..program.least_squares import LeastSquares
-from ..program.markers import NEIGHBOURS, MarkerReading
-from ..program.newton import NewtonOptions, Solver
-from ..program.reading import Reading
-from ..program.segment import Segment
+from ..program.gauge import observed_points
+from ..program.least_squares import SquareRootInformation
+from ..program.markers import NEIGHBOURS, MarkerResidual
+from ..program.newton import NewtonOptions, NewtonSolver
+from ..program.reading import MeasurementResidual
+from ..program.segment import Transcription
 from ..program.sweep import Sweep
 from ..program.wrench import NEIGHBOURS as WRENCH_NEIGHBOURS
 from ..program.wrench_channel import GraspWrench
 from ..recording.experiment import Experiment
 from ..recording.poses import PoseSequence
 from ..recording.wrench import Wrench
-from .felt import LATE, Poses, Sensor
+from .felt import DELAY_STEPS, Poses, Sensor
 
 if TYPE_CHECKING:
-    from ..fem.kernels.skyline import Room
+    from ..fem.kernels.skyline import FactorMemory
 
 # Largest number of rows that are linearised together; limits memory.
-TOGETHER = 8
+ROWS_PER_CHUNK = 8
 # Standard deviation of a weak prior on the logarithm of each parameter, a factor of 10: it keeps
 # parameters finite that the first frames do not determine, and is negligible later.
-WEAK = 2.3
+WEAK_PRIOR_DEVIATION = 2.3
 # Accuracy of rows whose grasp displacement has to be applied in parts.
-CAREFUL = NewtonOptions(tolerance=1e-6)
+CAREFUL_OPTIONS = NewtonOptions(tolerance=1e-6)
 # Young's modulus at which a search without a guess starts [Pa].
 MIDDLE_PA = 1e4
 # Largest distance of a sample from a row, in rows, at which no interpolation is needed.
-NEAR = 1e-3
+ROW_TOLERANCE = 1e-3
 
 
-class Around(NamedTuple):
+class RowStencil(NamedTuple):
     """Rows that samples of an instrument need, in a recording that continues.
 
     Attributes
     ----------
     neighbours : int
         Number of rows around a sample if its clock is right.
-    off : float
+    clock_error : float
         Largest error of its clock, in rows.
     first : int
         Index of the first row at which the observed quantity exists.
-    late : int
+    delay : int
         Number of rows after which it is available.
     """
 
     neighbours: int
-    off: float = 0.0
+    clock_error: float = 0.0
     first: int = 0
-    late: int = 0
+    delay: int = 0
 
-    def rows(self, at: float) -> range:
+    def rows_of_sample(self, at: float) -> range:
         """Return the rows that a sample at a position `at`, in rows, needs."""
         begins, ends = (
-            max(int(np.floor(at + off + NEAR)) - (self.neighbours - 1) // 2, self.first)
-            for off in (-self.off, self.off)
+            max(int(np.floor(at + off + ROW_TOLERANCE)) - (self.neighbours - 1) // 2, self.first)
+            for off in (-self.clock_error, self.clock_error)
         )
         return range(begins, ends + self.neighbours)
 
@@ -89,21 +90,21 @@ class LiveInstrument(NamedTuple):
 
     Attributes
     ----------
-    reading : Reading
+    reading : MeasurementResidual
         Sensor model.
-    around : Around
+    stencil : RowStencil
         Rows that its samples need.
-    looked : slice or int
+    observable : slice or int
         Slice of its points among all observed points, or the index of the grasp sensor.
     """
 
-    reading: Reading
-    around: Around
-    looked: slice | int
+    reading: MeasurementResidual
+    stencil: RowStencil
+    observable: slice | int
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class LiveModel:
     """Problem whose recording arrives frame by frame.
 
     Attributes
@@ -118,7 +119,7 @@ class Model:
     collocation: Collocation
 
     @classmethod
-    def of(cls, problem: Problem) -> Model:
+    def from_problem(cls, problem: Problem) -> LiveModel:
         """Return the model of a problem.
 
         Raises
@@ -128,18 +129,18 @@ class Model:
         """
         experiment = _only_experiment(problem)
         collocation = problem.collocation()
-        if collocation.parameters.unguessed:
-            usual = usual_parameters(collocation.parameters, MIDDLE_PA)
+        if collocation.parameters.names_without_guess:
+            usual = typical_parameters(collocation.parameters, MIDDLE_PA)
             collocation = replace(collocation, parameters=usual)
-        still = replace(collocation, experiments=[_still(experiment, collocation)])
+        still = replace(collocation, experiments=[_still_experiment(experiment, collocation)])
         return cls(experiment, still)
 
     def at_start(self, poses: Poses) -> Experiment:
         """Return the experiment that begins with its grasps at these poses."""
         still = self.segment.experiment
-        return replace(still, grasps=_held_at(still, poses))
+        return replace(still, grasps=_grasps_at(still, poses))
 
-    def placed(self, tracks_m: Array, x: Array) -> Model:
+    def with_marker_places(self, tracks_m: Array, x: Array) -> LiveModel:
         """Return the model with unknown marker places set from the first frame.
 
         Self if all are known.
@@ -154,37 +155,37 @@ class Model:
         unknown = ~self.segment.experiment.markers.located & np.isfinite(tracks_m).all(axis=1)
         if not unknown.any():
             return self
-        places_m = self.segment.places_m(self.segment.guess_phi)
+        places_m = self.segment.marker_places_m(self.segment.guess_phi)
         nodes_m = x.reshape(-1, 3)
-        places_m[unknown] = self.segment.chart.at_markers(nodes_m, tracks_m[unknown])
-        return replace(self, collocation=self.collocation.placed_at([places_m]))
+        places_m[unknown] = self.segment.association.places_of_points(nodes_m, tracks_m[unknown])
+        return replace(self, collocation=self.collocation.with_marker_places([places_m]))
 
     @cached_property
-    def segment(self) -> Segment:
+    def segment(self) -> Transcription:
         """Transcription of the still recording."""
-        return self.collocation.segments[0]
+        return self.collocation.transcriptions[0]
 
     @cached_property
     def solver(self) -> Sweep:
         """Solver of the rows of the template."""
-        return Sweep(self.segment, self.rows)
+        return Sweep(self.segment, self.template_rows)
 
     @cached_property
-    def newton(self) -> Solver:
+    def newton(self) -> NewtonSolver:
         """Newton solver for the start, and for rows whose grasp displacement is applied in
         parts.
         """
-        return Solver(self.segment.experiment, CAREFUL)
+        return NewtonSolver(self.segment.experiment, CAREFUL_OPTIONS)
 
     @cached_property
-    def rows(self) -> int:
+    def template_rows(self) -> int:
         """Number of rows of the template: those of the start, and those that are linearised
         together.
         """
-        return 2 * self.segment.dynamics.reach + 2 + TOGETHER
+        return 2 * self.segment.dynamics.largest_lag + 2 + ROWS_PER_CHUNK
 
     @cached_property
-    def size(self) -> int:
+    def parameter_count(self) -> int:
         """Number P of parameters p."""
         return self.collocation.nq + self.collocation.nphi
 
@@ -199,72 +200,76 @@ class Model:
         return self.experiment.timestep_s
 
     @cached_property
-    def _drags(self) -> tuple[Index, Array]:
+    def _mass_damping(self) -> tuple[Index, Array]:
         """Indices in p of the logarithms of mass-proportional dampings, and their values at the
         guess.
         """
         free = self.collocation.parameters.free
-        places = np.flatnonzero([bare(item.name) == GAMMA_M.name for item in free])
+        places = np.flatnonzero([without_region(item.name) == GAMMA_M.name for item in free])
         return places, self.collocation.guess_p[places]
 
-    def flat(self, p: Array) -> Array:
+    def transformed(self, p: Array) -> Array:
         """Return the variables in which residuals are nearly linear.
 
         For mass-proportional damping γ_m this is its value divided by the guess, otherwise p
         itself.
         """
-        places, guesses = self._drags
+        places, guesses = self._mass_damping
         flat = p.copy()
         flat[places] = np.exp(p[places] - guesses)
         return flat
 
-    def curved(self, flat: Array) -> Array:
-        """Return the parameters p of transformed variables: the inverse of `flat`."""
-        places, guesses = self._drags
-        p = flat.copy()
-        p[places] = guesses + np.log(flat[places])
+    def physical(self, transformed: Array) -> Array:
+        """Return the parameters p of transformed variables: the inverse of `transformed`."""
+        places, guesses = self._mass_damping
+        p = transformed.copy()
+        p[places] = guesses + np.log(transformed[places])
         return p
 
-    def rates(self, flat: Array) -> Array:
+    def transformation_derivatives(self, transformed: Array) -> Array:
         """Return the derivatives (P,) of the transformed variables by p."""
-        places, _ = self._drags
-        rates = np.ones(len(flat))
-        rates[places] = flat[places]
+        places, _ = self._mass_damping
+        rates = np.ones(len(transformed))
+        rates[places] = transformed[places]
         return rates
 
-    def stated(self, p: Array) -> LeastSquares:
+    def prior_information(self, p: Array) -> SquareRootInformation:
         """Return the information before the first frame, linearised about p: priors and a weak
         prior.
         """
-        residual, slopes = self.collocation.prior(p)
+        residual, slopes = self.collocation.prior_residuals(p)
         nq = self.collocation.nq
-        flat = self.flat(p)
-        from_guess = (p[:nq] - self.collocation.parameters.guess_q) / WEAK
-        rows = np.vstack([np.diag(slopes), np.eye(nq, self.size) / WEAK]) / self.rates(flat)
-        empty = LeastSquares.none(self.size)
-        return empty.add(np.concatenate([residual, from_guess]), rows, flat)
+        flat = self.transformed(p)
+        from_guess = (p[:nq] - self.collocation.parameters.guess_q) / WEAK_PRIOR_DEVIATION
+        rows = np.vstack(
+            [np.diag(slopes), np.eye(nq, self.parameter_count) / WEAK_PRIOR_DEVIATION]
+        ) / self.transformation_derivatives(flat)
+        empty = SquareRootInformation.empty(self.parameter_count)
+        return empty.with_rows(np.concatenate([residual, from_guess]), rows, flat)
 
     @cached_property
-    def samples_around(self) -> int:
+    def neighbouring_samples(self) -> int:
         """Number of samples before and after one that its evaluation needs.
 
         0 if no clock is estimated.
         """
-        return NEIGHBOURS // 2 if len(self.segment.nuisance.of_clock) else 0
+        return NEIGHBOURS // 2 if len(self.segment.nuisance.clock_indices) else 0
 
     @cached_property
-    def markers(self) -> MarkerReading:
+    def marker_model(self) -> MarkerResidual:
         """Sensor model of one marker sample, in the middle of its neighbours, measured at the
         origin.
         """
-        neighbours = self.samples_around
+        neighbours = self.neighbouring_samples
         markers = self.segment.experiment.markers
         origin = replace(
             markers, t_s=markers.t_s[:1], positions_m=np.zeros((1, len(markers.names), 3))
         )
         rows = np.arange(2 * neighbours + 1)
         segment = self.segment
-        return MarkerReading.of(origin, rows, segment.nuisance, segment.chart, earlier=neighbours)
+        return MarkerResidual.from_markers(
+            origin, rows, segment.nuisance, segment.association, earlier_times=neighbours
+        )
 
     @cached_property
     def instruments(self) -> tuple[LiveInstrument, ...]:
@@ -272,42 +277,42 @@ class Model:
         instruments = []
         place = len(self.experiment.markers.names)
         step_s = self.segment.dynamics.step_s
-        points = iter(self.looked)
-        for reading in (*self.segment.gauges, *self.segment.sensors):
-            channel = reading.channel
-            is_custom = reading in self.segment.gauges
-            stencil = Around(GAUGE_NEIGHBOURS)
+        points = iter(self.observed_points)
+        for reading in (*self.segment.custom_sensors, *self.segment.sensors):
+            channel = reading.observable
+            is_custom = reading in self.segment.custom_sensors
+            stencil = RowStencil(GAUGE_NEIGHBOURS)
             if isinstance(channel, GraspWrench):
-                observable = [other for other, _ in self.sensors].index(channel)
-                stencil = stencil._replace(first=int(channel.grid[0]), late=LATE)
+                observable = [other for other, _ in self.wrench_sensors].index(channel)
+                stencil = stencil._replace(first=int(channel.known_rows[0]), late=DELAY_STEPS)
                 if not is_custom:
                     clock_error = channel.clock_limit_s / step_s
                     stencil = stencil._replace(neighbours=WRENCH_NEIGHBOURS, off=clock_error)
             else:
                 points_of_sensor = next(points)
-                reading = replace(reading, channel=points_of_sensor)
-                observable = slice(place, place + points_of_sensor.each)
-                place += points_of_sensor.each
+                reading = replace(reading, observable=points_of_sensor)
+                observable = slice(place, place + points_of_sensor.vector_count)
+                place += points_of_sensor.vector_count
             instruments.append(LiveInstrument(reading, stencil, observable))
         return tuple(instruments)
 
     @cached_property
-    def late(self) -> int:
+    def largest_delay_rows(self) -> int:
         """Largest number of rows that instruments need in addition to those of the markers."""
-        spans = (2 * each.around.off + each.around.late for each in self.instruments)
+        spans = (2 * each.stencil.clock_error + each.stencil.delay for each in self.instruments)
         return int(np.ceil(max(spans, default=0.0)))
 
     @cached_property
-    def looked(self) -> tuple[Points, ...]:
+    def observed_points(self) -> tuple[PointPositions, ...]:
         """Points that custom sensors of points observe."""
         still = self.segment.experiment
         gauges = [gauge for gauge in still.readings if gauge.grasp is None]
-        return tuple(points_of(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges)
+        return tuple(observed_points(still, gauge, GAUGE_NEIGHBOURS) for gauge in gauges)
 
     @cached_property
-    def sensors(self) -> tuple[Sensor, ...]:
+    def wrench_sensors(self) -> tuple[Sensor, ...]:
         """Wrenches of grasps that are observed, and the index of the grasp, from 0."""
-        channels = [reading.channel for reading in self.segment.readings]
+        channels = [reading.observable for reading in self.segment.residuals]
         grasps = [id(grasp) for grasp in self.segment.experiment.grasps]
         wrenches = (channel for channel in channels if isinstance(channel, GraspWrench))
         return tuple((channel, grasps.index(id(channel.grasp))) for channel in wrenches)
@@ -319,7 +324,7 @@ class Model:
         return {number: grasp.wrench for number, grasp in pairs if grasp.wrench is not None}
 
     @cached_property
-    def moved_grasps(self) -> Index:
+    def moving_grasps(self) -> Index:
         """Indices, from 0, of the grasps whose poses come with the frames; others never move."""
         grasps = self.experiment.grasps
         return np.flatnonzero([len(grasp.poses.t_s) > 1 for grasp in grasps])
@@ -329,59 +334,61 @@ class Model:
         """Poses of all grasps at the start of the problem's recording."""
         return _first_poses(self.experiment)
 
-    def poses_of(self, moved: Poses) -> Poses:
+    def all_poses(self, moved: Poses) -> Poses:
         """Return the poses of all grasps from those of the moving ones."""
         still = list(self.first_poses)
-        for number, pose in zip(self.moved_grasps, moved, strict=True):
+        for number, pose in zip(self.moving_grasps, moved, strict=True):
             still[number] = pose
         return tuple(still)
 
     @cached_property
-    def known_rows(self) -> dict[int, StencilRow]:
+    def cached_rows(self) -> dict[int, StencilRow]:
         """Cached coefficients of rows with constant masses, by index; filled on demand."""
         return {}
 
     @cached_property
-    def room(self) -> Room | None:
+    def factor_memory(self) -> FactorMemory | None:
         """Memory for the factor of a row, shared by all passes; None without native code."""
-        return self.solver.factoriser.room(1 + self.segment.body.unsymmetric)
+        return self.solver.factoriser.allocate(1 + self.segment.body.is_unsymmetric)
 
     @cached_property
-    def out(self) -> Array:
+    def linearisation_memory(self) -> Array:
         """Memory for rows that are linearised together."""
-        return np.empty((TOGETHER, self.segment.dynamics.forces.linearisation_width))
+        return np.empty((ROWS_PER_CHUNK, self.segment.dynamics.forces.linearisation_width))
 
     @cached_property
-    def size_m(self) -> float:
+    def body_size_m(self) -> float:
         """Diagonal of the body [m]."""
         return float(np.linalg.norm(np.ptp(self.segment.body.nodes_m, axis=0)))
 
-    def carried(self, phi: Array) -> tuple[Array, Array]:
+    def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
         """Return H X (g, 3) of the node of each grasped dof, and its derivatives (g, 3, m) by φ."""
-        return self.segment.grasping.places(phi)
+        return self.segment.prescribed_motion.displaced_nodes(phi)
 
-    def goals(self, carried: tuple[Array, Array], poses: Sequence[Poses]) -> tuple[Array, Array]:
+    def prescribed_positions(
+        self, displaced_nodes: tuple[Array, Array], poses: Sequence[Poses]
+    ) -> tuple[Array, Array]:
         """Return the prescribed positions (K, g) at K poses, and their derivatives by φ (K, g, m).
 
         Parameters
         ----------
-        carried : tuple
-            Result of `carried`.
+        displaced_nodes : tuple
+            Result of `displaced_nodes`.
         poses : sequence of Poses
             K poses of all grasps.
         """
         turns = np.array([[turn for turn, _ in each] for each in poses])[:, *self._axes]
         shifts = np.array([[shift for _, shift in each] for each in poses])[:, *self._axes]
-        goal = np.einsum("kgj,gj->kg", turns, carried[0]) + shifts
-        return goal, np.einsum("kgj,gjm->kgm", turns, carried[1])
+        goal = np.einsum("kgj,gj->kg", turns, displaced_nodes[0]) + shifts
+        return goal, np.einsum("kgj,gjm->kgm", turns, displaced_nodes[1])
 
     @cached_property
     def _axes(self) -> tuple[Index, Index]:
         """Index of the grasp and axis of each grasped dof, (g,) each."""
-        dofs = self.segment.grasping.dofs
+        dofs = self.segment.prescribed_motion.dofs
         grasp = np.zeros_like(dofs)
         for k, each in enumerate(self.experiment.grasps):
-            grasp[np.searchsorted(dofs, each.dofs)] = k
+            grasp[np.searchsorted(dofs, each.prescribed_dofs)] = k
         return grasp, dofs % 3
 
     @cached_property
@@ -390,7 +397,7 @@ class Model:
 
         q and s include the time step.
         """
-        dynamics = self.segment.dynamics.first_rows(self.rows)
+        dynamics = self.segment.dynamics.truncated_to(self.template_rows)
         tables = dynamics.tables
         step_s = dynamics.step_s
         p, q, w, s = (
@@ -414,7 +421,7 @@ def _only_experiment(problem: Problem) -> Experiment:
             "experiment",
         )
     (experiment,) = fitted
-    for feature, is_present, expected in _not_live(experiment):
+    for feature, is_present, expected in _unsupported_features(experiment):
         if is_present:
             where = f"experiment '{experiment.name}'"
             message = f"{feature} cannot be live"
@@ -422,17 +429,19 @@ def _only_experiment(problem: Problem) -> Experiment:
     return experiment
 
 
-def _not_live(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
+def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
     """Yield description, presence and alternative of each feature that live estimation lacks."""
     body = experiment.body
     grasps = experiment.grasps
     nuisance = experiment.nuisance
-    yield "a static experiment", experiment.static, "a motion"
+    yield "a static experiment", experiment.is_static, "a motion"
     has_given_start = experiment.start == "given"
     yield "a start that is given", has_given_start, "one in equilibrium, or undeformed"
-    yield "a material with memory", body.remembers, "one without Prony branches"
-    yield "a mesh made under gravity", body.scan is not None, "a stress-free one"
-    has_internal_variables = any(placed.force.carries for placed in body.placed_forces)
+    yield "a material with memory", body.has_memory, "one without Prony branches"
+    yield "a mesh made under gravity", body.scan_conditions is not None, "a stress-free one"
+    has_internal_variables = any(
+        placed.force.internal_variable_count for placed in body.placed_forces
+    )
     yield "a force that carries something from step to step", has_internal_variables, "none"
     yield "tensions and pressures, which frames do not bring,", experiment.actuators, "none"
     yield "depth cameras, which frames do not bring,", experiment.depths, "none"
@@ -440,8 +449,8 @@ def _not_live(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
     yield "an obstacle whose delay is estimated", delayed, "one whose clock is known"
     filtered = nuisance.sensor_lag_s and experiment.wrenches
     yield "a sensor with a low-pass (sensor_lag)", filtered, "one without"
-    laws = (generated(each.force, each.points.dofs) for each in body.placed_forces)
-    depends_on_time = any(law.takes(0) for law in laws)
+    laws = (law_function(each.force, each.points.dofs) for each in body.placed_forces)
+    depends_on_time = any(law.depends_on_datum(0) for law in laws)
     yield "a force that depends on time", depends_on_time, "one that does not"
     yield "an experiment without markers", not experiment.markers.names, "markers"
     is_temporary = any(np.isfinite([g.from_s, g.until_s]).any() for g in grasps)
@@ -450,22 +459,25 @@ def _not_live(experiment: Experiment) -> Iterator[tuple[str, object, str]]:
     yield "a grasp whose zero is estimated", has_zero, "one whose zero is known"
     moves = any(len(grasp.poses.t_s) > 1 for grasp in grasps)
     yield "an experiment whose grasps never move", not moves, "a pose that moves"
-    loads = (each(experiment.t_s) for each in (experiment.tied_mass_kg, experiment.node_forces_n))
+    loads = (
+        each(experiment.t_s)
+        for each in (experiment.point_mass_at_nodes_kg, experiment.stated_node_forces_n)
+    )
     changing = not all(np.allclose(each, each[:1]) for each in loads)
     yield "a load that joins, leaves or changes", changing, "loads that are always there"
 
 
-def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
+def _still_experiment(experiment: Experiment, collocation: Collocation) -> Experiment:
     """Return the experiment as a few samples in which nothing moves."""
-    reach = collocation.segments[0].dynamics.reach
+    reach = collocation.transcriptions[0].dynamics.largest_lag
     # The rows of the start, and room for a reading.
-    count = max(2 * reach + 2 + TOGETHER, NEIGHBOURS, 3)
+    count = max(2 * reach + 2 + ROWS_PER_CHUNK, NEIGHBOURS, 3)
     t_s = experiment.timestep_s * np.arange(count)
     markers = experiment.markers
     first, _ = markers.first_samples
     tracks = np.tile(np.nan_to_num(first), (count, 1, 1))
     gauges = [
-        replace(g, t_s=t_s, values=np.zeros((count, g.measured.shape[1])))
+        replace(g, t_s=t_s, values=np.zeros((count, g.measured_values.shape[1])))
         for g in experiment.readings
     ]
     return replace(
@@ -473,7 +485,7 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
         t_s=t_s,
         grasps=[
             replace(grasp, wrench=grasp.wrench and _still_wrench(grasp.wrench, t_s))
-            for grasp in _held_at(experiment, _first_poses(experiment))
+            for grasp in _grasps_at(experiment, _first_poses(experiment))
         ],
         markers=replace(markers, t_s=t_s, positions_m=tracks),
         readings=gauges,
@@ -482,7 +494,7 @@ def _still(experiment: Experiment, collocation: Collocation) -> Experiment:
 
 def _still_wrench(wrench: Wrench, t_s: NDArray) -> Wrench:
     """Return a wrench sensor with zero measurements at these times."""
-    values = np.where(wrench.measured, np.zeros((len(t_s), 1)), np.nan)
+    values = np.where(wrench.measured_components, np.zeros((len(t_s), 1)), np.nan)
     return replace(wrench, t_s=t_s, values=values)
 
 
@@ -492,7 +504,7 @@ def _first_poses(experiment: Experiment) -> Poses:
     return tuple((turns[0], shifts[0]) for turns, shifts in poses)
 
 
-def _held_at(experiment: Experiment, poses: Poses) -> list:
+def _grasps_at(experiment: Experiment, poses: Poses) -> list:
     """Return the grasps of an experiment, at rest at given poses."""
     grasps = []
     for grasp, (turn, shift) in zip(experiment.grasps, poses, strict=True):

@@ -17,17 +17,17 @@ from ..problem import Problem
 from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.experiment import Experiment
 from ..runs.result import Result
-from .estimator import Update
+from .estimator import LiveUpdate
 from .frames import Frame
-from .model import Model
+from .model import LiveModel
 
 # Largest accepted datagram [bytes].
 DATAGRAM_BYTES = 65536
 # Address of this machine; datagrams from others are not received.
-HERE = "127.0.0.1"
+LOCALHOST = "127.0.0.1"
 
 
-def as_text(lines: Iterable[bytes]) -> Iterator[str]:
+def decode_lines(lines: Iterable[bytes]) -> Iterator[str]:
     """Decode lines of UTF-8.
 
     Invalid bytes are replaced by a character that no number or name contains.
@@ -35,7 +35,7 @@ def as_text(lines: Iterable[bytes]) -> Iterator[str]:
     return (line.decode("utf-8", errors="replace") for line in lines)
 
 
-def datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
+def receive_datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
     """Yield lines that arrive as UDP datagrams at a port of this machine, until an empty datagram.
 
     Parameters
@@ -51,14 +51,14 @@ def datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterato
         If the port is in use.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind((HERE, port))
+        receiver.bind((LOCALHOST, port))
         if opened is not None:
             opened(receiver.getsockname()[1])
         while datagram := receiver.recv(DATAGRAM_BYTES):
-            yield from as_text(datagram.splitlines())
+            yield from decode_lines(datagram.splitlines())
 
 
-def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
+def read_problem(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
     """Return the problem of a file, or that of the folder of a run.
 
     Raises
@@ -68,15 +68,15 @@ def problem_in(recording: Path, overrides: Sequence[str], allow_code: bool) -> P
     """
     if not recording.is_dir():
         return Problem.read(recording, overrides, allow_code)
-    home = Result.read(recording).home(recording, "which a replay needs")
+    home = Result.read(recording).problem_folder(recording, "which a replay needs")
     return Problem.read(recording / "problem.toml", overrides, allow_code, folder=home)
 
 
-def recorded(experiment: Experiment, model: Model) -> Iterator[Frame]:
+def frames_of_recording(experiment: Experiment, model: LiveModel) -> Iterator[Frame]:
     """Yield the frames of an experiment's recording."""
-    poses = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moved_grasps]
+    poses = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moving_grasps]
     quaternion_series = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses]
-    series = [(gauge.times, gauge.measured) for gauge in experiment.readings]
+    series = [(gauge.sample_times_s, gauge.measured_values) for gauge in experiment.readings]
     series += [(wrench.t_s, wrench.values) for wrench in model.wrenches.values()]
     samples = [
         (number, float(at_s), values)
@@ -91,10 +91,12 @@ def recorded(experiment: Experiment, model: Model) -> Iterator[Frame]:
             each for each, frame in zip(samples, frame_of, strict=True) if frame == k
         )
         tracks_m = experiment.markers.positions_m[k]
-        yield Frame(float(t_s), (positions_m, quaternions), tracks_m, told=frame_samples)
+        yield Frame(
+            float(t_s), (positions_m, quaternions), tracks_m, instrument_samples=frame_samples
+        )
 
 
-def paced(
+def paced_frames(
     frames: Iterator[Frame],
     rate_hz: float,
     clock: Callable[[], float] = time.monotonic,
@@ -118,7 +120,7 @@ def paced(
 
 
 @contextmanager
-def collected_before() -> Iterator[None]:
+def without_garbage_of_startup() -> Iterator[None]:
     """Exclude all existing objects from garbage collection within this context.
 
     A collection of all objects takes longer than some frames.
@@ -131,7 +133,7 @@ def collected_before() -> Iterator[None]:
         gc.unfreeze()
 
 
-def as_json(update: Update) -> str:
+def update_as_json(update: LiveUpdate) -> str:
     """Return an update as a line of JSON; unknown values are null."""
     parameters = {
         name: {

@@ -21,23 +21,29 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..fem.body import Linearisation
 from ..model.dynamics import StencilRow
-from ..program.channel import Motion, Slopes
-from ..program.least_squares import LeastSquares
-from ..program.marching import RowEquations, extrapolated, solve_row
+from ..program.channel import ObservableDerivatives, ObservedMotion
+from ..program.least_squares import SquareRootInformation
+from ..program.marching import RowEquations, extrapolate, solve_row
 from ..program.newton import NewtonFailure, simulation_error
-from ..program.reading import as_squares, lagrange_weights
-from ..program.rest import start_state
-from ..program.sweep import Columns, Forward, GraspMotion, LastRows, Step
-from .felt import LATE, Felt, Poses
-from .model import NEAR, TOGETHER, Model
+from ..program.reading import huber_as_least_squares, lagrange_weights
+from ..program.rest import initial_state
+from ..program.sweep import (
+    FactorisedStep,
+    ForwardState,
+    ForwardSubstitution,
+    PrescribedColumns,
+    SweepColumns,
+)
+from .felt import DELAY_STEPS, GraspReactions, Poses
+from .model import ROW_TOLERANCE, ROWS_PER_CHUNK, LiveModel
 
 # Largest correction of a row, divided by the size of the body, after which the row is not
 # linearised again: the next correction would be about its square.
-LAST_STEP = 3e-4
+LARGEST_CORRECTION = 3e-4
 # Factor of this limit for rows that are solved together; beyond the limit another pass follows.
-ROUGH = 10
+CHUNK_CORRECTION_FACTOR = 10
 # Largest delay of samples that are still used, in samples.
-LATEST = 5
+LARGEST_SAMPLE_DELAY = 5
 
 
 class Sample(NamedTuple):
@@ -45,17 +51,17 @@ class Sample(NamedTuple):
 
     Attributes
     ----------
-    back : float
+    rows_back : float
         Time of the sample, in rows before the row after which it is evaluated.
     values : (M, 3) or (m,)
         Marker positions, or values of an instrument; NaN where missing.
-    of : int
+    instrument : int
         0 for markers, or the number of the instrument, from 1 on.
     """
 
-    back: float
+    rows_back: float
     values: Array
-    of: int = 0
+    instrument: int = 0
 
 
 class LoggedRow(NamedTuple):
@@ -65,34 +71,34 @@ class LoggedRow(NamedTuple):
     ----------
     poses : Poses
         Poses of the grasps that move.
-    readings : list of Sample
+    samples : list of Sample
         Samples that are evaluated after this row.
     """
 
     poses: Poses
-    readings: list[Sample]
+    samples: list[Sample]
 
 
-class Kept(NamedTuple):
+class StoredRow(NamedTuple):
     """Initial guess of a row for a later pass.
 
     Attributes
     ----------
-    flat : (P,)
-        Transformed parameters of the pass, see `Model.flat`.
+    transformed : (P,)
+        Transformed parameters of the pass, see `LiveModel.transformed`.
     x : (3n,)
         Positions [m].
     columns : (3n, m) float32
         Derivatives Z of the positions by these transformed parameters.
     """
 
-    flat: Array
+    transformed: Array
     x: Array
     columns: NDArray[np.float32]
 
 
-class Said(NamedTuple):
-    """Residuals of a sample, linear in the transformed parameters, see `Model.flat`.
+class LinearisedResidual(NamedTuple):
+    """Residuals of a sample, linear in the transformed parameters, see `LiveModel.transformed`.
 
     Attributes
     ----------
@@ -100,26 +106,26 @@ class Said(NamedTuple):
         Residuals extrapolated to transformed parameters of zero; NaN where missing.
     slope : (…, P)
         Derivatives by the transformed parameters.
-    of : int
+    instrument : int
         Instrument, see `Sample`.
     """
 
     at_zero: Array
     slope: Array
-    of: int = 0
+    instrument: int = 0
 
-    def at(self, flat: Array) -> Array:
+    def evaluate_at(self, transformed: Array) -> Array:
         """Return the residuals at transformed parameters, to first order."""
-        return self.at_zero + self.slope @ flat
+        return self.at_zero + self.slope @ transformed
 
 
-# A row as `Kept`; positions and columns of markers and of the points of custom sensors,
+# A row as `StoredRow`; positions and columns of markers and of the points of custom sensors,
 # (3M + …, 1 + m); and wrenches with their derivatives by all parameters, (sensors, 6, 1 + P).
-Read = tuple[Kept, Array, Array]
+ObservedRow = tuple[StoredRow, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class SweepState:
     """State on which the next row depends.
 
     Attributes
@@ -130,13 +136,13 @@ class State:
         Index of the next row in the template.
     x, force : (rows, 3n)
         Positions and forces of the rows of the template.
-    given : (rows, g, 1 + m)
+    prescribed_columns : (rows, g, 1 + m)
         Columns of the prescribed positions of the grasped dofs.
-    felt : Felt
+    reactions : GraspReactions
         Reaction forces of grasps with a sensor.
-    memory : LastRows or None
+    last_rows : ForwardState or None
         Columns of the last rows; None at the start.
-    read : tuple of Read
+    observed_rows : tuple of Read
         Observed quantities of the last rows, the latest one last.
     """
 
@@ -144,23 +150,23 @@ class State:
     end: int
     x: Array
     force: Array
-    given: Array
-    felt: Felt
-    memory: LastRows | None
-    read: tuple[Read, ...]
+    prescribed_columns: Array
+    reactions: GraspReactions
+    last_rows: ForwardState | None
+    observed_rows: tuple[ObservedRow, ...]
 
 
-class LiveSweep:
+class StreamingSweep:
     """Forward pass at parameters p, row after row.
 
     Parameters
     ----------
-    model : Model
+    model : LiveModel
     p : (P,)
         Linearisation point.
-    known : LeastSquares
+    known : SquareRootInformation
         Information from before its first row.
-    start : State, optional
+    start : SweepState, optional
         State at which the pass begins; the start of the recording by default.
     at : (P,), optional
         Linearisation point of that state, which is moved to p along its columns. Columns by
@@ -168,7 +174,7 @@ class LiveSweep:
 
     Attributes
     ----------
-    information : LeastSquares
+    information : SquareRootInformation
         Information at p in the transformed parameters, from `known` and all samples so far.
     longest_m : float
         Longest correction so far [m].
@@ -181,70 +187,72 @@ class LiveSweep:
 
     def __init__(
         self,
-        model: Model,
+        model: LiveModel,
         p: Array,
-        known: LeastSquares,
-        start: State | None = None,
+        prior_information: SquareRootInformation,
+        start: SweepState | None = None,
         at: Array | None = None,
     ) -> None:
         self.model = model
         self.p = p
         self.solver = model.solver
-        self.flat = model.flat(p)
-        self.rates = model.rates(self.flat)
+        self.transformed = model.transformed(p)
+        self.rates = model.transformation_derivatives(self.transformed)
         collocation = model.collocation
         segment = model.segment
         self.segment = segment
         self.phi = p[collocation.nq :]
-        self.setting = segment.setting(p[: collocation.nq], self.phi)
+        self.setting = segment.equations_at(p[: collocation.nq], self.phi)
         self.dynamics = self.setting.dynamics
-        self.carried = model.carried(self.phi)
-        self.shape_functions = segment.markers.channel.shape(self.phi)
+        self.displaced_nodes = model.displaced_nodes(self.phi)
+        self.shape_functions = segment.markers.observable.shape_functions(self.phi)
         points_and_weights = [
             self.shape_functions,
-            *(points.shape(self.phi) for points in model.looked),
+            *(points.shape_functions(self.phi) for points in model.observed_points),
         ]
         self._looked = tuple(
             np.concatenate(part)
             for part in zip(*((nodes, at.weights) for nodes, at in points_and_weights), strict=True)
         )
         self.longest_m = 0.0
-        self.grasped = segment.grasping.dofs
-        self.moving = segment.moving
+        self.grasped = segment.prescribed_motion.dofs
+        self.moving = segment.dynamic_parameters
         self.sensed = segment.sensed_dofs
         self.count = 1 + len(self.moving)
-        self.mass_kg = self.dynamics.mass.kg[0]
+        self.mass_kg = self.dynamics.mass.inertia_kg[0]
         # Loads are always there: what acts on one row acts on every one.
-        self.forces = self.dynamics.forces.rows(slice(1))
-        self._rows = {} if self.setting.mass_moves else model.known_rows
-        self.information = known
-        state = self._begin() if start is None or at is None else self._moved(start, at)
+        self.forces = self.dynamics.forces.at_times(slice(1))
+        self._rows = {} if self.setting.mass_depends_on_parameters else model.cached_rows
+        self.information = prior_information
+        state = (
+            self._initial_state() if start is None or at is None else self._moved_state(start, at)
+        )
         self._resume(state)
 
     # State ------------------------------------------------------------------------------------
 
-    def _begin(self) -> State:
+    def _initial_state(self) -> SweepState:
         """Return the state before the first row."""
-        rows = self.model.rows
-        dofs = self.segment.dofs
+        rows = self.model.template_rows
+        dofs = self.segment.dof_count
         empty = np.zeros((rows, dofs))
         given = np.zeros((rows, len(self.grasped), self.count))
-        felt = Felt.nothing(rows, len(self.sensed), self.count, len(self.model.first_poses))
-        return State(0, 0, empty, empty, given, felt, None, ())
+        felt = GraspReactions.zeros(rows, len(self.sensed), self.count, len(self.model.first_poses))
+        return SweepState(0, 0, empty, empty, given, felt, None, ())
 
-    def _moved(self, state: State, at: Array) -> State:
+    def _moved_state(self, state: SweepState, at: Array) -> SweepState:
         """Return a state moved from the linearisation point `at` to p, to first order."""
-        if state.memory is None or (at == self.p).all():
+        if state.last_rows is None or (at == self.p).all():
             return state
         moving = self.moving
-        flat = self.model.flat(at)
-        old_rates = self.model.rates(flat)
-        change = (self.flat - flat)[moving]
+        flat = self.model.transformed(at)
+        old_rates = self.model.transformation_derivatives(flat)
+        change = (self.transformed - flat)[moving]
         step = change / old_rates[moving]
         factors = np.ones(self.count)
         factors[1:] = (self.rates / old_rates)[moving]
         force = state.force.copy()
-        memory = state.memory
+        memory = state.last_rows
         last = state.end - 1
         for k, columns in enumerate(memory.increments[: last + 1]):
             force[last - k, self.solver.free] += columns[:, 1:] @ step
@@ -253,65 +261,73 @@ class LiveSweep:
             for each in (memory.solutions, memory.increments)
         )
         memory = replace(memory, solutions=solutions, increments=increments)
-        stored = [each for each, *_ in state.read]
-        columns_of_rows = np.empty((len(stored), self.segment.dofs, self.count))
+        stored = [each for each, *_ in state.observed_rows]
+        columns_of_rows = np.empty((len(stored), self.segment.dof_count, self.count))
         columns_of_rows[..., 1:] = [each.columns for each in stored]
         columns_of_rows[..., 0] = columns_of_rows[..., 1:] @ change + [each.x for each in stored]
         x = state.x.copy()
         known_rows = min(len(stored), state.end)
         x[state.end - known_rows : state.end] = columns_of_rows[len(stored) - known_rows :, :, 0]
-        point_columns = self._seen(columns_of_rows)
+        point_columns = self._at_points(columns_of_rows)
         point_columns[..., 1:] *= self.rates[moving]
         stored_rows = [
-            Kept(self.flat, w[:, 0], k.columns)
+            StoredRow(self.transformed, w[:, 0], k.columns)
             for w, k in zip(columns_of_rows, stored, strict=True)
         ]
-        all_wrenches = np.array([wrenches for *_, wrenches in state.read])
-        all_wrenches[..., 0] += all_wrenches[..., 1:] @ ((self.flat - flat) / old_rates)
+        all_wrenches = np.array([wrenches for *_, wrenches in state.observed_rows])
+        all_wrenches[..., 0] += all_wrenches[..., 1:] @ ((self.transformed - flat) / old_rates)
         all_wrenches[..., 1:] *= self.rates / old_rates
         read = tuple(zip(stored_rows, point_columns, all_wrenches, strict=True))
-        felt = state.felt.at(step, factors)
-        return replace(state, x=x, force=force, felt=felt, memory=memory, read=read)
+        felt = state.reactions.moved_to(step, factors)
+        return replace(
+            state, x=x, force=force, reactions=felt, last_rows=memory, observed_rows=read
+        )
 
-    def _resume(self, state: State) -> None:
+    def _resume(self, state: SweepState) -> None:
         """Continue from a state, whose arrays are copied."""
         self.row = state.row
         self.end = state.end
         self.x = state.x.copy()
         self.force = state.force.copy()
-        self.given = state.given.copy()
+        self.given = state.prescribed_columns.copy()
         grasped = None
-        if self.segment.nuisance.moves_grasps:
-            grasped = GraspMotion.along(self.solver, self.grasped, self.given)
-        self.columns = Columns(self.setting, self.count, step=True, grasped=grasped)
-        self.felt = state.felt.copy()
-        self.forward = Forward(self.solver, self.columns, state.memory, self.felt.held)
-        most = (2 * self.model.samples_around + LATEST + 2) * self.model.substeps + 4 + TOGETHER
-        most += self.model.late
-        self.read: deque[Read] = deque(state.read, maxlen=most)
+        if self.segment.nuisance.affects_grasps:
+            grasped = PrescribedColumns.from_columns(self.solver, self.grasped, self.given)
+        self.columns = SweepColumns(self.setting, self.count, has_step=True, prescribed=grasped)
+        self.felt = state.reactions.copy()
+        self.forward = ForwardSubstitution(
+            self.solver, self.columns, state.last_rows, self.felt.forces
+        )
+        most = (
+            (2 * self.model.neighbouring_samples + LARGEST_SAMPLE_DELAY + 2) * self.model.substeps
+            + 4
+            + ROWS_PER_CHUNK
+        )
+        most += self.model.largest_delay_rows
+        self.read: deque[ObservedRow] = deque(state.observed_rows, maxlen=most)
 
     @property
-    def is_rough(self) -> bool:
+    def needs_another_pass(self) -> bool:
         """Whether a correction was so long that its square is not negligible."""
-        return self.longest_m > LAST_STEP * self.model.size_m
+        return self.longest_m > LARGEST_CORRECTION * self.model.body_size_m
 
     @property
-    def state(self) -> State:
+    def state(self) -> SweepState:
         """Copy of the state on which the next row depends."""
-        return State(
+        return SweepState(
             row=self.row,
             end=self.end,
             x=self.x.copy(),
             force=self.force.copy(),
-            given=self.given.copy(),
-            felt=self.felt.copy(),
-            memory=self.forward.last,
-            read=tuple(self.read),
+            prescribed_columns=self.given.copy(),
+            reactions=self.felt.copy(),
+            last_rows=self.forward.state,
+            observed_rows=tuple(self.read),
         )
 
     # Rows -------------------------------------------------------------------------------------
 
-    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> list[Kept]:
+    def advance(self, poses: Sequence[Poses], guesses: Sequence[Array] = ()) -> list[StoredRow]:
         """Compute further rows with given poses; return them for later passes.
 
         Fewer rows than given are computed if one is far from its initial guess: later guesses are
@@ -320,7 +336,7 @@ class LiveSweep:
         Parameters
         ----------
         poses : sequence of Poses
-            Poses of the moving grasps, for at most `TOGETHER` rows.
+            Poses of the moving grasps, for at most `ROWS_PER_CHUNK` rows.
         guesses : sequence of (3n,), optional
             Initial guesses of the positions; extrapolated by default.
 
@@ -334,29 +350,33 @@ class LiveSweep:
         SimulationError
             If a row cannot be solved.
         """
-        poses = [self.model.poses_of(each) for each in poses]
+        poses = [self.model.all_poses(each) for each in poses]
         first = self._make_room(len(poses))
         count = len(poses)
-        goals, slopes = self.model.goals(self.carried, poses)
-        self.felt.place(first, poses)
+        goals, slopes = self.model.prescribed_positions(self.displaced_nodes, poses)
+        self.felt.set_poses(first, poses)
         self.given[first : first + count, :, 1 + self.segment.nq :] = slopes
         if first < self.dynamics.first_row:
-            self.x[first] = self._start(poses[0])
-            self._done(1)
-            return self._kept([np.zeros(self.forward.shape)])
+            self.x[first] = self._start_positions(poses[0])
+            self._count_rows(1)
+            return self._store_rows([np.zeros(self.forward.shape)])
         for k, t in enumerate(range(first, first + count)):
-            self.x[t] = guesses[k] if guesses else self._guess(t, poses[k])
+            self.x[t] = guesses[k] if guesses else self._extrapolate(t, poses[k])
             self.x[t, self.grasped] = goals[k]
         remaining = range(first, first + count)
         computed = []
         last_length = np.inf
         is_careful = False
         while remaining:
-            limit = LAST_STEP * self.model.size_m * (1 if len(remaining) == 1 else ROUGH)
-            rows, length = self._advanced(remaining, limit)
+            limit = (
+                LARGEST_CORRECTION
+                * self.model.body_size_m
+                * (1 if len(remaining) == 1 else CHUNK_CORRECTION_FACTOR)
+            )
+            rows, length = self._solve_rows(remaining, limit)
             accepted = len(remaining) if length is None else len(rows) - 1
             computed += rows[:accepted]
-            self._done(accepted)
+            self._count_rows(accepted)
             if length is None:
                 break
             t = remaining[accepted]
@@ -364,46 +384,46 @@ class LiveSweep:
                 self.x[t] += rows[accepted][:, 0]
                 last_length = length
             elif not is_careful:
-                self.x[t] = self._carefully(t, poses[t - first])
+                self.x[t] = self._solve_carefully(t, poses[t - first])
                 is_careful = True
                 last_length = np.inf
             else:
                 self._fail(NewtonFailure(self.x[t], "Newton's steps do not get shorter"))
             remaining = range(t, t + 1)
-        return self._kept(computed)
+        return self._store_rows(computed)
 
-    def _done(self, count: int) -> None:
+    def _count_rows(self, count: int) -> None:
         """Record that rows are done."""
         self.row = self.row + count
         self.end = self.end + count
 
     def _make_room(self, count: int) -> int:
         """Shift the template if necessary for more rows; return the index of the next row in it."""
-        surplus = self.end + count - self.model.rows
+        surplus = self.end + count - self.model.template_rows
         if surplus > 0:
             for each in (self.x, self.force, self.given, *self.felt.arrays):
                 each[:-surplus] = each[surplus:]
             self.end -= surplus
         return self.end
 
-    def _guess(self, t: int, poses: Poses) -> Array:
+    def _extrapolate(self, t: int, poses: Poses) -> Array:
         """Return x_t on a cubic polynomial through the last four rows, or through fewer at the
         start.
         """
         if t == 0:
-            return self._start(poses)
+            return self._start_positions(poses)
         if t < 4:
-            return extrapolated(self.x[:t], np.zeros(self.segment.dofs))
+            return extrapolate(self.x[:t], np.zeros(self.segment.dof_count))
         return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
-    def _start(self, poses: Poses) -> Array:
+    def _start_positions(self, poses: Poses) -> Array:
         """Return the positions of the start (3n,) with grasps at given poses."""
-        goals_m = np.full(self.segment.dofs, np.nan)
-        goals_m[self.grasped] = self.model.goals(self.carried, [poses])[0][0]
+        goals_m = np.full(self.segment.dof_count, np.nan)
+        goals_m[self.grasped] = self.model.prescribed_positions(self.displaced_nodes, [poses])[0][0]
         experiment = self.model.at_start(poses)
-        return start_state(experiment, self.forces, self.model.newton, goals_m=goals_m)[0]
+        return initial_state(experiment, self.forces, self.model.newton, prescribed_m=goals_m)[0]
 
-    def _linearised(self, here: range) -> tuple[Linearisation, tuple[Array, Array]]:
+    def _linearise(self, here: range) -> tuple[Linearisation, tuple[Array, Array]]:
         """Return forces with derivatives at guessed rows, and the right-hand sides of their
         columns.
 
@@ -419,18 +439,18 @@ class LiveSweep:
         free = self.solver.free
         nu = q @ x
         acceleration = s @ x
-        at = self.forces.linearise(p @ x, nu, self.model.out[: len(here)])
+        at = self.forces.linearise(p @ x, nu, self.model.linearisation_memory[: len(here)])
         force[rows] = at.force
         residual = (w @ force - self.mass_kg * acceleration)[:, free]
-        return at, self.columns.sides(rows, at, acceleration, residual, free)
+        return at, self.columns.right_hand_sides(rows, at, acceleration, residual, free)
 
-    def _row(self, t: int) -> StencilRow:
+    def _stencil_row(self, t: int) -> StencilRow:
         """Return the coefficients of a row, cached while the masses do not depend on parameters."""
         if t not in self._rows:
-            self._rows[t] = StencilRow.of(self.dynamics, t)
+            self._rows[t] = StencilRow.from_dynamics(self.dynamics, t)
         return self._rows[t]
 
-    def _advanced(self, here: range, limit: float) -> tuple[list[Array], float | None]:
+    def _solve_rows(self, here: range, limit: float) -> tuple[list[Array], float | None]:
         """Solve rows once; return their columns (3n, 1 + m), and None if all are accepted.
 
         Otherwise the last columns are those of the first row that is not accepted, because its
@@ -446,11 +466,11 @@ class LiveSweep:
         """
         solver = self.solver
         forward = self.forward
-        at, sides = self._linearised(here)
+        at, sides = self._linearise(here)
         solved: list[Array] = []
         for k, (t, right, force) in enumerate(zip(here, *sides, strict=True)):
-            row = self._row(t)
-            before = forward.last
+            row = self._stencil_row(t)
+            before = forward.state
             row_columns = np.zeros(forward.shape)
             by_position = at.by_position[k]
             by_velocity = at.by_velocity[k]
@@ -460,8 +480,8 @@ class LiveSweep:
             skew_block = row.skew_block(by_position_skew, by_velocity_skew)
             solved.append(row_columns)
             try:
-                factor = solver.factoriser.factorise(block, skew_block, self.model.room)
-                step = Step(
+                factor = solver.factoriser.factorise(block, skew_block, self.model.factor_memory)
+                step = FactorisedStep(
                     t,
                     row,
                     at.force[k],
@@ -471,12 +491,12 @@ class LiveSweep:
                     by_position_skew,
                     by_velocity_skew,
                 )
-                forward.advance(step, right, force, row_columns)
+                forward.solve_step(step, right, force, row_columns)
             except np.linalg.LinAlgError:
                 return solved, np.nan
             length = float(np.abs(row_columns[:, 0]).max(initial=0.0))
             if not length <= limit:
-                self.forward = Forward(solver, self.columns, before, self.felt.held)
+                self.forward = ForwardSubstitution(solver, self.columns, before, self.felt.forces)
                 return solved, length
             self.longest_m = max(self.longest_m, length)
             self.x[t] += row_columns[:, 0]
@@ -485,7 +505,7 @@ class LiveSweep:
                 self.force[t, solver.free] += forward.past_increments[0][:, 0]
         return solved, None
 
-    def _kept(self, columns: Sequence[Array]) -> list[Kept]:
+    def _store_rows(self, columns: Sequence[Array]) -> list[StoredRow]:
         """Return the last rows for later passes, from their columns (3n, 1 + m).
 
         Observed quantities of these rows are stored, too.
@@ -495,47 +515,54 @@ class LiveSweep:
         all_columns[:, :, 0] = self.x[rows]
         by_flat = (all_columns[:, :, 1:] / self.rates[self.moving]).astype(np.float32)
         pairs = zip(self.x[rows].copy(), by_flat, strict=True)
-        stored_rows = [Kept(self.flat, *pair) for pair in pairs]
-        self.felt.corrected(rows, all_columns[:, self.sensed])
-        self.read.extend(zip(stored_rows, self._seen(all_columns), self._told(rows), strict=True))
+        stored_rows = [StoredRow(self.transformed, *pair) for pair in pairs]
+        self.felt.apply_correction(rows, all_columns[:, self.sensed])
+        self.read.extend(
+            zip(
+                stored_rows,
+                self._at_points(all_columns),
+                self._observed_wrenches(rows),
+                strict=True,
+            )
+        )
         return stored_rows
 
-    def _told(self, here: slice) -> Array:
+    def _observed_wrenches(self, here: slice) -> Array:
         """Return wrenches and their derivatives available at rows, (rows, sensors, 6, 1 + P).
 
         They are zero in the first rows, where they are not known.
         """
-        sensors = self.model.sensors
-        size = self.model.size
+        sensors = self.model.wrench_sensors
+        size = self.model.parameter_count
         wrenches = np.zeros((here.stop - here.start, len(sensors), 6, 1 + size))
         if not sensors:
             return wrenches
-        first = max(here.start, int(sensors[0][0].grid[0]) + LATE)
+        first = max(here.start, int(sensors[0][0].known_rows[0]) + DELAY_STEPS)
         if first >= here.stop:
             return wrenches
         *_, w, s = self.model.stencils
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
         reactions, channels = self.felt.wrenches(sensors, self.setting, x, (w, s), rows)
-        motion = Motion(x, lambda: reactions)
+        motion = ObservedMotion(x, lambda: reactions)
         for k, channel in enumerate(channels):
-            value, slopes = channel.linearised(motion, self.phi, self.moving, size)
+            value, slopes = channel.linearise(motion, self.phi, self.moving, size)
             sensor_wrenches = wrenches[first - here.start :, k]
             sensor_wrenches[..., 0] = value.reshape(-1, 6)
-            sensor_wrenches[..., 1:] = slopes.by.reshape(-1, 6, size)
+            sensor_wrenches[..., 1:] = slopes.by_common.reshape(-1, 6, size)
         return wrenches
 
-    def _seen(self, whole: Array) -> Array:
+    def _at_points(self, columns: Array) -> Array:
         """Return the values at observed points (…, 3M + …, k) of columns (…, 3n, k) of the body."""
         nodes, weights = self._looked
-        *rows, dofs, count = whole.shape
-        at = whole.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
+        *rows, dofs, count = columns.shape
+        at = columns.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
         return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)
 
-    def _carefully(self, t: int, poses: Poses) -> Array:
+    def _solve_carefully(self, t: int, poses: Poses) -> Array:
         """Return x_t, with the displacement of the grasp applied in parts if necessary."""
         if t == 0:
-            return self._start(poses)
+            return self._start_positions(poses)
         equations = RowEquations(self.dynamics, self.x, self.force, t)
         goal = self.x[t, self.grasped]
         try:
@@ -552,7 +579,7 @@ class LiveSweep:
 
     # Readings ---------------------------------------------------------------------------------
 
-    def linearised(self, pairs: Sequence[tuple[Sample, int]]) -> list[Said]:
+    def linearise_samples(self, pairs: Sequence[tuple[Sample, int]]) -> list[LinearisedResidual]:
         """Return the linearised residuals of samples.
 
         Parameters
@@ -560,21 +587,21 @@ class LiveSweep:
         pairs : sequence of (Sample, int)
             Samples, and the number of rows computed since the row after which each is evaluated.
         """
-        residuals: list[Said | None] = [None] * len(pairs)
-        for of in {sample.of for sample, _ in pairs}:
-            positions = [k for k, (sample, _) in enumerate(pairs) if sample.of == of]
+        residuals: list[LinearisedResidual | None] = [None] * len(pairs)
+        for of in {sample.instrument for sample, _ in pairs}:
+            positions = [k for k, (sample, _) in enumerate(pairs) if sample.instrument == of]
             samples = [pairs[k] for k in positions]
             pairs_of_instrument = (
-                self._of_instrument(of, samples)
+                self._instrument_residuals(of, samples)
                 if of
-                else (self._of_markers(*pair) for pair in samples)
+                else (self._marker_residuals(*pair) for pair in samples)
             )
             for k, (residual, slope) in zip(positions, pairs_of_instrument, strict=True):
                 slope /= self.rates
-                residuals[k] = Said(residual - slope @ self.flat, slope, of)
+                residuals[k] = LinearisedResidual(residual - slope @ self.transformed, slope, of)
         return [each for each in residuals if each is not None]
 
-    def _of_instrument(
+    def _instrument_residuals(
         self, of: int, pairs: Sequence[tuple[Sample, int]]
     ) -> Iterator[tuple[Array, Array]]:
         """Yield residuals and derivatives by p of samples of an instrument.
@@ -583,28 +610,34 @@ class LiveSweep:
         """
         model = self.model
         reading, stencil, observable = self.model.instruments[of - 1]
-        at = [self.row - 1 - sample.back - rows for sample, rows in pairs]
-        needed_rows = range(stencil.rows(min(at)).start, stencil.rows(max(at)).stop)
+        at = [self.row - 1 - sample.rows_back - rows for sample, rows in pairs]
+        needed_rows = range(
+            stencil.rows_of_sample(min(at)).start, stencil.rows_of_sample(max(at)).stop
+        )
         _, point_columns, wrenches = zip(
-            *(self.read[k + stencil.late - self.row] for k in needed_rows), strict=True
+            *(self.read[k + stencil.delay - self.row] for k in needed_rows), strict=True
         )
         step_s = model.interval_s / model.substeps
         begins_s = float(model.experiment.t_s[0])
         known_s, t_s = (begins_s + step_s * np.array(rows) for rows in (needed_rows, at))
-        sensor = reading.of_some(known_s, t_s, np.array([sample.values for sample, _ in pairs]))
+        sensor = reading.with_samples(
+            known_s, t_s, np.array([sample.values for sample, _ in pairs])
+        )
         if isinstance(observable, slice):
             columns = self.moving
             place = slice(3 * observable.start, 3 * observable.stop)
             values = np.array(point_columns)[:, place]
         else:
-            columns = np.arange(model.size)
+            columns = np.arange(model.parameter_count)
             values = np.array(wrenches)[:, observable]
         values = values.reshape(len(needed_rows), -1, 3, 1 + len(columns))
-        slopes = Slopes.along(columns, values[..., 1:])
-        residual, slope = sensor.linearised(values[..., 0], slopes, self.phi, model.size)
-        return zip(np.where(sensor.there(len(needed_rows)), residual, np.nan), slope, strict=True)
+        slopes = ObservableDerivatives.without_own(columns, values[..., 1:])
+        residual, slope = sensor.linearise(values[..., 0], slopes, self.phi, model.parameter_count)
+        return zip(
+            np.where(sensor.compared_with(len(needed_rows)), residual, np.nan), slope, strict=True
+        )
 
-    def _of_markers(self, reading: Sample, rows: int) -> tuple[Array, Array]:
+    def _marker_residuals(self, reading: Sample, rows: int) -> tuple[Array, Array]:
         """Return residuals (M, 3) of a marker sample and their derivatives (M, 3, P) by p.
 
         Residuals of missing markers are NaN.
@@ -616,29 +649,31 @@ class LiveSweep:
             Number of rows computed since the row after which the sample is evaluated.
         """
         model = self.model
-        neighbours = self.model.samples_around
-        markers = self.model.markers
-        back = reading.back + rows
+        neighbours = self.model.neighbouring_samples
+        markers = self.model.marker_model
+        back = reading.rows_back + rows
         backs = [back - k * model.substeps for k in range(-neighbours, neighbours + 1)]
-        x, point_columns = (np.array(part) for part in zip(*map(self._at, backs), strict=True))
+        x, point_columns = (
+            np.array(part) for part in zip(*map(self._interpolated_row, backs), strict=True)
+        )
         point_columns = point_columns[:, : 3 * len(self.shape_functions[0])]
         values = point_columns[..., 0].reshape(len(point_columns), -1, 3)
-        slopes = markers.channel.slopes_of(
+        slopes = markers.observable.derivatives_from(
             x, self.shape_functions, self.moving, point_columns[..., 1:]
         )
         since_s = (self.row - 1 - back) / model.substeps * model.interval_s
-        markers = markers.later(since_s)
-        residual, slope = markers.linearised(values, slopes, self.phi, model.size)
+        markers = markers.shifted(since_s)
+        residual, slope = markers.linearise(values, slopes, self.phi, model.parameter_count)
         return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
 
-    def _at(self, back: float) -> tuple[Array, Array]:
+    def _interpolated_row(self, back: float) -> tuple[Array, Array]:
         """Return positions and observed points at a time, in rows before the last one.
 
         Times before the start give the start.
         """
         nearest = round(back)
         last = len(self.read) - 1
-        if abs(back - nearest) <= NEAR or not last:
+        if abs(back - nearest) <= ROW_TOLERANCE or not last:
             stored, point_columns, _ = self.read[min(max(last - nearest, 0), last)]
             return stored.x, point_columns
         first = int(np.clip(np.floor(back) - 1, 0, max(0, last - 3)))
@@ -649,19 +684,21 @@ class LiveSweep:
             weights, point_columns, 1
         )
 
-    def take(self, said: Sequence[Said]) -> None:
+    def add_residuals(self, residuals: Sequence[LinearisedResidual]) -> None:
         """Add linearised residuals to the information; missing ones are skipped."""
-        self.information = self.added(self.information, said)
+        self.information = self.with_residuals(self.information, residuals)
 
-    def added(self, known: LeastSquares, said: Sequence[Said]) -> LeastSquares:
+    def with_residuals(
+        self, known: SquareRootInformation, residuals: Sequence[LinearisedResidual]
+    ) -> SquareRootInformation:
         """Return information with linearised residuals added, with the weights of the loss at p."""
-        if not said:
+        if not residuals:
             return known
-        at_zero = np.concatenate([each.at_zero for each in said])
+        at_zero = np.concatenate([each.at_zero for each in residuals])
         is_present = np.isfinite(at_zero)
         rows_present = is_present.any(axis=1)
-        slopes = np.concatenate([each.slope for each in said])[rows_present]
+        slopes = np.concatenate([each.slope for each in residuals])[rows_present]
         is_present = is_present[rows_present]
-        residual = np.where(is_present, at_zero[rows_present] + slopes @ self.flat, 0.0)
-        rows, slopes = as_squares(residual, slopes, self.model.collocation.huber)
-        return known.add(rows[is_present], slopes[is_present], self.flat)
+        residual = np.where(is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0)
+        rows, slopes = huber_as_least_squares(residual, slopes, self.model.collocation.huber)
+        return known.with_rows(rows[is_present], slopes[is_present], self.transformed)

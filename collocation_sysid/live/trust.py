@@ -9,28 +9,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Array
-from ..program.least_squares import LeastSquares
-from ..statistics.concern import Concern, concerned
+from ..program.least_squares import SquareRootInformation
+from ..statistics.concern import Concern, concern_if
 from ..statistics.distributions import chi2_sf, student_ppf
 from ..statistics.estimates import Estimate
 from ..statistics.trust import GROSS_MISFIT, HARDLY_TAME, MISFIT, PERSISTENT, WILD
 
 # Distance from the linearisation point, in standard errors, above which estimates may still change.
-UNSETTLED = 0.5
+LARGEST_SETTLED_DISTANCE = 0.5
 # Probability, at each test, that noise of the stated σ is taken for larger noise.
-RARE = 1e-3
+TEST_LEVEL = 1e-3
 # Smallest autocorrelation that is taken into account.
 CORRELATED = 0.1
 # Smallest ratio of an autocorrelation to its standard deviation to be taken into account.
 DEVIATIONS = 3.3
 # Largest autocorrelation used, to keep the variance finite.
-MOST = 0.98
+LARGEST_AUTOCORRELATION = 0.98
 # Smallest number of samples for an estimate of the autocorrelation.
-FEWEST = 10
+FEWEST_SAMPLES = 10
 
 
 @dataclass(frozen=True)
-class Scatter:
+class ResidualScatter:
     """Size and autocorrelation of residuals.
 
     Attributes
@@ -45,7 +45,7 @@ class Scatter:
     lag1: float = 0.0
 
     @classmethod
-    def of(cls, residuals: Sequence[Array]) -> Scatter:
+    def from_residuals(cls, residuals: Sequence[Array]) -> ResidualScatter:
         """Return the scatter of residuals (M, 3) of consecutive samples, NaN where missing."""
         if not residuals:
             return cls()
@@ -53,43 +53,47 @@ class Scatter:
         square = np.nanmean(values**2) if np.isfinite(values).any() else 0.0
         products = values[1:] * values[:-1]
         count = int(np.isfinite(products).sum())
-        if len(values) < FEWEST or not count or not square:
+        if len(values) < FEWEST_SAMPLES or not count or not square:
             return cls(float(np.sqrt(square)))
         lag1 = float(np.nanmean(products) / square)
         is_significant = lag1 > max(CORRELATED, DEVIATIONS / np.sqrt(count))
-        return cls(float(np.sqrt(square)), min(lag1, MOST) if is_significant else 0.0)
+        return cls(
+            float(np.sqrt(square)), min(lag1, LARGEST_AUTOCORRELATION) if is_significant else 0.0
+        )
 
 
-def widened(known: LeastSquares, p: Array, fitted: float, scatter: Scatter) -> tuple[float, float]:
+def variance_factor(
+    known: SquareRootInformation, p: Array, parameter_count: float, scatter: ResidualScatter
+) -> tuple[float, float]:
     """Return the factor of all variances, and the half width of 95 % intervals in standard
     deviations.
 
     Parameters
     ----------
-    known : LeastSquares
+    known : SquareRootInformation
         Information, including the priors.
     p : (P,)
         Estimate.
-    fitted : float
+    parameter_count : float
         Number of fitted parameters.
-    scatter : Scatter
+    scatter : RecordingComparison
     """
-    freedom = max(1.0, known.rows - fitted)
+    freedom = max(1.0, known.row_count - parameter_count)
     loss = known.loss(p)
     factor = 1.0
     quantile = 1.96
-    if chi2_sf(loss, freedom) < RARE:
+    if chi2_sf(loss, freedom) < TEST_LEVEL:
         factor = loss / freedom
         quantile = float(student_ppf(0.975, freedom))
     return factor * (1 + scatter.lag1) / (1 - scatter.lag1), quantile
 
 
-def data_concerns(scatter: Scatter, counts: Counter[str], samples: int) -> list[Concern]:
+def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) -> list[Concern]:
     """Return the concerns due to residuals, and to samples that were left out.
 
     Parameters
     ----------
-    scatter : Scatter
+    scatter : RecordingComparison
     counts : Counter
         Numbers of irregularities, by kind.
     samples : int
@@ -100,34 +104,34 @@ def data_concerns(scatter: Scatter, counts: Counter[str], samples: int) -> list[
     size = {"factor": scatter.rms, "stated": "sigma_m"}
     times = "once" if restarts == 1 else f"{restarts} times"
     return [
-        *concerned(scatter.rms > MISFIT, scatter.rms > GROSS_MISFIT, "noise/larger", **size),
-        *concerned(
+        *concern_if(scatter.rms > MISFIT, scatter.rms > GROSS_MISFIT, "noise/larger", **size),
+        *concern_if(
             scatter.lag1 > PERSISTENT, False, "residuals/persist", autocorrelation=scatter.lag1
         ),
-        *concerned(
+        *concern_if(
             outlier_share > WILD,
             outlier_share > HARDLY_TAME,
             "residuals/far",
             percent=100 * outlier_share,
         ),
-        *concerned(restarts > 0, False, "solve/anew", times=times),
+        *concern_if(restarts > 0, False, "solve/anew", times=times),
     ]
 
 
-def estimate_concerns(estimates: Mapping[str, Estimate], moved: float) -> list[Concern]:
+def estimate_concerns(estimates: Mapping[str, Estimate], distance: float) -> list[Concern]:
     """Return the concerns due to the estimates themselves.
 
     Parameters
     ----------
     estimates : mapping of name to Estimate
-    moved : float
+    distance : float
         Distance of the estimate from the linearisation point, in standard errors.
     """
-    concerns = concerned(moved > UNSETTLED, False, "solve/moves")
+    concerns = concern_if(distance > LARGEST_SETTLED_DISTANCE, False, "solve/moves")
     for name, estimate in estimates.items():
-        if estimate.at_bound:
-            concerns += concerned(True, False, "information/at-bound", name=name)
+        if estimate.is_at_bound:
+            concerns += concern_if(True, False, "information/at-bound", name=name)
         elif estimate.reason is not None:
             reason = estimate.reason
-            concerns += concerned(True, False, "information/not-yet", name=name, reason=reason)
+            concerns += concern_if(True, False, "information/not-yet", name=name, reason=reason)
     return concerns

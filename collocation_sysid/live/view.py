@@ -16,7 +16,7 @@ from ..fem.constants import unit_of
 from ..files import whole_file
 from ..result.run_sections import verdict_of
 from ..result.style import BLUE, ORANGE, dress, mathematical, new_figure
-from .estimator import Update
+from .estimator import LiveUpdate
 
 # Characters of increasing height.
 BARS = "▁▂▃▄▅▆▇█"
@@ -28,7 +28,7 @@ DPI = 100
 FRAMES_A_SECOND = 25
 
 
-def bars(values: Sequence[float], columns: int = COLUMNS) -> str:
+def sparkline(values: Sequence[float], columns: int = COLUMNS) -> str:
     """Return the last values as a line of bars, on a logarithmic scale if all are positive."""
     last = np.array(values[-columns:], dtype=float)
     if not len(last):
@@ -40,7 +40,7 @@ def bars(values: Sequence[float], columns: int = COLUMNS) -> str:
     return "".join(BARS[round(s * (len(BARS) - 1))] for s in share)
 
 
-def picture(updates: Sequence[Update]) -> list[Shown]:
+def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
     """Return the display of the last update, with the history of the estimates."""
     last = updates[-1]
     rows = []
@@ -50,7 +50,7 @@ def picture(updates: Sequence[Update]) -> list[Shown]:
             if estimate.statistical_std_error is None
             else f"{estimate.statistical_std_error:.2g}"
         )
-        history = bars([update.estimates[name].value for update in updates[-COLUMNS:]])
+        history = sparkline([update.estimates[name].value for update in updates[-COLUMNS:]])
         rows.append((name, f"{estimate.value:.5g}", error, unit_of(name), history))
     return [
         f"t = {last.t_s:.2f} s   markers missed by {millimetres(last.marker_rms_m)}   "
@@ -60,7 +60,7 @@ def picture(updates: Sequence[Update]) -> list[Shown]:
     ]
 
 
-def summary(updates: Sequence[Update], settled: Update) -> list[Shown]:
+def final_display(updates: Sequence[LiveUpdate], settled: LiveUpdate) -> list[Shown]:
     """Return the display of the final estimate, and the latency of the frames."""
     took_ms = 1e3 * np.array([update.latency_s for update in updates])
     median, late = np.percentile(took_ms, [50, 99])
@@ -68,16 +68,16 @@ def summary(updates: Sequence[Update], settled: Update) -> list[Shown]:
         f"{len(updates)} frames, latency {median:.1f} ms in the median, {late:.1f} ms at 99 %; "
     )
     latency_text += f"settled {1e3 * settled.latency_s:.0f} ms after the last"
-    return [*picture([*updates, settled]), latency_text]
+    return [*display_of([*updates, settled]), latency_text]
 
 
-def require_film(file: Path) -> None:
+def require_gif(file: Path) -> None:
     """Raise an `InputError` unless the file is a GIF."""
     if file.suffix.lower() != ".gif":
         raise InputError(f"found '{file.suffix}'; expected .gif", file, "--film")
 
 
-def film(updates: Sequence[Update], file: str | Path) -> Path:
+def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     """Write the estimates with their intervals as a growing plot in a GIF; return its path.
 
     Raises
@@ -86,11 +86,13 @@ def film(updates: Sequence[Update], file: str | Path) -> Path:
         If the file is not a GIF.
     """
     path = Path(file)
-    require_film(path)
+    require_gif(path)
     t_s = np.array([update.t_s for update in updates])
     names = list(updates[-1].estimates)
     figure = new_figure(WIDTH_MM, ROW_MM * len(names))
-    lines = [_drawn(figure, k, len(names), name, t_s, updates) for k, name in enumerate(names)]
+    lines = [
+        _draw_parameter(figure, k, len(names), name, t_s, updates) for k, name in enumerate(names)
+    ]
     step = max(1, round(len(t_s) / max(1.0, (t_s[-1] - t_s[0]) * FRAMES_A_SECOND)))
     writer = PillowWriter(fps=FRAMES_A_SECOND)
     with whole_file(path) as draft, writer.saving(figure, str(draft), DPI):
@@ -102,8 +104,8 @@ def film(updates: Sequence[Update], file: str | Path) -> Path:
     return path
 
 
-def _drawn(
-    figure: Figure, k: int, count: int, name: str, t_s: Array, updates: Sequence[Update]
+def _draw_parameter(
+    figure: Figure, k: int, count: int, name: str, t_s: Array, updates: Sequence[LiveUpdate]
 ) -> tuple[list, list[Array]]:
     """Return the lines of a parameter's value and interval, without data yet, and their future
     data.

@@ -14,15 +14,17 @@ from ..recording.clock import STEP_TOLERANCE
 from ..recording.experiment import Experiment
 from ..recording.gauge import Gauge
 from ..recording.poses import PoseSequence
-from .intake import Intake
-from .model import Model
+from .intake import FrameBuffer
+from .model import LiveModel
 from .sweep import LoggedRow
 
 # Smallest number of samples of a motion.
 FEWEST = 3
 
 
-def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Experiment | None:
+def recording_from_log(
+    model: LiveModel, intake: FrameBuffer, log: Sequence[LoggedRow]
+) -> Experiment | None:
     """Return the experiment with the poses, markers and samples of all rows, from the first frame
     on.
 
@@ -30,8 +32,8 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
 
     Parameters
     ----------
-    model : Model
-    intake : Intake
+    model : LiveModel
+    intake : FrameBuffer
     log : sequence of LoggedRow
         All rows, with their samples.
     """
@@ -39,7 +41,7 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
     at_samples = log[:: model.substeps]
     t_s = experiment.t_s[0] + model.interval_s * np.arange(len(at_samples))
     tracks_m = np.full((len(t_s), len(experiment.markers.names), 3), np.nan)
-    for when, tracks in intake.seen(log):
+    for when, tracks in intake.marker_samples(log):
         if abs(when - round(when)) > STEP_TOLERANCE:
             return None
         if round(when) < len(t_s):
@@ -47,7 +49,7 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
     if len(t_s) < FEWEST or np.isnan(tracks_m).all():
         return None
     grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
-    for k, number in enumerate(model.moved_grasps):
+    for k, number in enumerate(model.moving_grasps):
         matrices = np.tile(np.eye(4), (len(t_s), 1, 1))
         for matrix, row in zip(matrices, at_samples, strict=True):
             matrix[:3, :3], matrix[:3, 3] = row.poses[k]
@@ -57,7 +59,7 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
     markers = replace(experiment.markers, t_s=t_s, positions_m=tracks_m)
     readings = []
     for number, gauge in enumerate((*experiment.readings, *model.wrenches), 1):
-        samples = {when: values for of, when, values in intake.told(log) if of == number}
+        samples = {when: values for of, when, values in intake.all_samples(log) if of == number}
         inside = [when for when in sorted(samples) if when <= len(t_s) - 1]
         values = np.array([samples[when] for when in inside])
         if len(inside) < FEWEST or not np.isfinite(values).any():
@@ -71,7 +73,7 @@ def recording_of(model: Model, intake: Intake, log: Sequence[LoggedRow]) -> Expe
     return replace(experiment, t_s=t_s, grasps=grasps, markers=markers, readings=readings)
 
 
-def solved(problem: Problem, recording: Experiment) -> Run:
+def solve_recording(problem: Problem, recording: Experiment) -> Run:
     """Return the run of a recording, solved as a batch.
 
     Raises

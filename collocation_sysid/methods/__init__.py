@@ -4,14 +4,15 @@
 
 Solvers
     `reduced_space` eliminates the motion by the equations of motion and searches only for the
-    parameters; `search` is its trust region, `curvature` its second derivatives, `horizon` and
+    parameters; `minimise` is its trust region, `curvature` its second derivatives, `horizon` and
     `trajectory` its linearised problem, and `workers` runs it in threads or on a Dask cluster.
-    `interior_point` solves for motion and parameters simultaneously with IPOPT; `condensed` removes
+    `interior_point` solves for motion and parameters simultaneously with IPOPT; `condense` removes
     variables that follow from others, `initial_point` computes its start, and `complementarity`
     adds hard contact. `continuation` runs any method on growing parts of the recordings.
     `comparison` contains methods of the literature, to compare with.
 Start
-    `scan` finds a stiffness to start from, `start` simulates trajectories at given parameters.
+    `scan_stiffness` finds a stiffness to start from, `start` simulates trajectories at given
+    parameters.
 Common
     `solution` defines the protocol of methods and the result, `recorder` the history, `options` the
     construction of methods from options by name, `nlpsol` and `callbacks` the interface to CasADi's
@@ -27,7 +28,7 @@ from pydantic import TypeAdapter
 
 from ..errors import InputError, require_among
 from ..stated import documented
-from .comparison.casadi_nlp import why_not
+from .comparison.casadi_nlp import refusal_reason
 from .continuation import STAGES, Continuation
 
 METHODS: dict[str, type] = STAGES | {Continuation.name: Continuation}
@@ -49,17 +50,17 @@ def require_method(name: str, option: str) -> None:
         For an unknown name, and for solvers of CasADi that are not offered, with the reason.
     """
     if name not in METHODS:
-        if (reason := why_not(name)) is not None:
+        if (reason := refusal_reason(name)) is not None:
             raise InputError(reason, None, option)
         require_among(name, METHODS, None, option)
 
 
-def summary(method: str) -> str:
+def method_summary(method: str) -> str:
     """Return the first line of a method's docstring."""
     return inspect.cleandoc(METHODS[method].__doc__ or "").splitlines()[0]
 
 
-def options_schema(method: str) -> dict[str, Any]:
+def method_options_schema(method: str) -> dict[str, Any]:
     """Return the JSON schema of a method's options: types, ranges, defaults and descriptions.
 
     Parameters
@@ -76,7 +77,7 @@ def options_schema(method: str) -> dict[str, Any]:
         option |= {"default": getattr(defaults, name), "description": descriptions[name]}
     return {
         "type": "object",
-        "description": summary(method),
+        "description": method_summary(method),
         "properties": options,
         "additionalProperties": False,
     }

@@ -1,6 +1,7 @@
 """CasADi callbacks that evaluate the NLP's functions and observe the iterations of a solver.
 
-Use `NlpFunctions` for functions with derivatives and `Monitor` for the history; `nlpsol` combines
+Use `NlpFunctions` for functions with derivatives and `IterationMonitor` for the history; `nlpsol`
+combines
 them.
 """
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..fem.rest_shape import RestShapeError
-from ..program.collocation import Collocation, carried_over
+from ..program.collocation import Collocation, convert_variables
 from .recorder import Recorder
 
 HessianValues = Callable[[Array, float, Array, Array], None]
@@ -196,30 +197,30 @@ class NlpFunctions:
         self._functions.append(made)
         return made
 
-    def _evaluate(self, inputs: list[Array], wanted: dict[str, Array]) -> None:
+    def _evaluate(self, inputs: list[Array], outputs: dict[str, Array]) -> None:
         """Write the requested outputs, arrays by name, at the inputs."""
         collocation = self.collocation
         z = inputs[0]
-        if "f" in wanted:
-            wanted["f"][0] = collocation.objective(z)
-        if "grad_f" in wanted:
-            wanted["grad_f"][:] = collocation.gradient(z)
-        if "jac_g" in wanted:
-            rows, _ = collocation.constraints_and_jacobian(z, wanted["jac_g"])
-            if "g" in wanted:
-                wanted["g"][:] = rows
-        elif "g" in wanted:
-            wanted["g"][:] = collocation.constraint_values(z)
+        if "f" in outputs:
+            outputs["f"][0] = collocation.objective(z)
+        if "grad_f" in outputs:
+            outputs["grad_f"][:] = collocation.gradient(z)
+        if "jac_g" in outputs:
+            rows, _ = collocation.constraints_and_jacobian(z, outputs["jac_g"])
+            if "g" in outputs:
+                outputs["g"][:] = rows
+        elif "g" in outputs:
+            outputs["g"][:] = collocation.constraint_values(z)
         if len(inputs) == 2:
             return
         weight, multipliers = self._weights(*inputs[2:])
-        if "grad_l" in wanted:
-            wanted["grad_l"][:] = weight * collocation.gradient(z)
-            wanted["grad_l"] += collocation.jacobian(z).T @ multipliers
-        if "triu_hess" in wanted:
-            self._upper_values(z, weight, multipliers, wanted["triu_hess"])
-        if "hess" in wanted:
-            wanted["hess"][:] = self._upper(z, weight, multipliers)[self._full[1]]
+        if "grad_l" in outputs:
+            outputs["grad_l"][:] = weight * collocation.gradient(z)
+            outputs["grad_l"] += collocation.jacobian(z).T @ multipliers
+        if "triu_hess" in outputs:
+            self._upper_values(z, weight, multipliers, outputs["triu_hess"])
+        if "hess" in outputs:
+            outputs["hess"][:] = self._upper_triangle(z, weight, multipliers)[self._full[1]]
 
     def _forward(self, inputs: list[Array], outputs: list[Array | None]) -> None:
         """Write the directional derivative of grad_l; the inputs are in CasADi's order."""
@@ -231,14 +232,14 @@ class NlpFunctions:
         if len(by_z):
             structure, order = self._full
             rows, columns = structure.get_triplet()
-            values = self._upper(z, *self._weights(weight, multipliers))[order]
+            values = self._upper_triangle(z, *self._weights(weight, multipliers))[order]
             np.add.at(product, rows, values * by_z[columns])
         if by_weight.any():
             product += by_weight * self.collocation.gradient(z)
         if by_multipliers.any():
             product += self.collocation.jacobian(z).T @ by_multipliers
 
-    def _upper(self, z: Array, weight: float, multipliers: Array) -> Array:
+    def _upper_triangle(self, z: Array, weight: float, multipliers: Array) -> Array:
         """Return the values of the upper triangle of the Hessian."""
         values = np.empty(len(self.collocation.hessian_structure[1]))
         self._upper_values(z, weight, multipliers, values)
@@ -247,15 +248,15 @@ class NlpFunctions:
     def _weights(self, weight: Array, multipliers: Array) -> tuple[float, Array]:
         """Return w and y; CasADi passes empty arrays for zeros."""
         if not len(multipliers):
-            multipliers = np.zeros(self.collocation.constraints)
+            multipliers = np.zeros(self.collocation.constraint_count)
         return float(weight[0]) if len(weight) else 0.0, multipliers
 
     @cached_property
     def _inputs(self) -> list[ca.Sparsity]:
         """Sparsity of z, p, w and y."""
         dense = ca.Sparsity.dense
-        variables = self.collocation.variables
-        rows = self.collocation.constraints
+        variables = self.collocation.variable_count
+        rows = self.collocation.constraint_count
         return [dense(variables, 1), ca.Sparsity(0, 1), dense(1, 1), dense(rows, 1)]
 
     @cached_property
@@ -270,8 +271,8 @@ class NlpFunctions:
 
     def _sparsity(self, output: str) -> ca.Sparsity:
         """Return the sparsity of an output, by name."""
-        variables = self.collocation.variables
-        rows = self.collocation.constraints
+        variables = self.collocation.variable_count
+        rows = self.collocation.constraint_count
         if output == "jac_g":
             return ca.Sparsity(rows, variables, *map(_ints, self.collocation.jacobian_structure))
         if output == "triu_hess":
@@ -287,7 +288,7 @@ def _ints(values: NDArray[np.int64]) -> list[int]:
     return values.tolist()
 
 
-class Monitor(ca.Callback):
+class IterationMonitor(ca.Callback):
     """CasADi callback that is called after each iteration: history, best iterate, and requests to
     stop.
 
@@ -339,11 +340,11 @@ class Monitor(ca.Callback):
         """Return the sparsity of input i, an index (CasADi's interface)."""
         program = self.program
         sizes = {
-            "x": program.variables,
+            "x": program.variable_count,
             "f": 1,
-            "g": program.constraints,
-            "lam_x": program.variables,
-            "lam_g": program.constraints,
+            "g": program.constraint_count,
+            "lam_x": program.variable_count,
+            "lam_g": program.constraint_count,
         }
         return ca.Sparsity.dense(sizes.get(ca.nlpsol_out(i), 0), 1)
 
@@ -355,13 +356,13 @@ class Monitor(ca.Callback):
         if self.errors:
             return [1]
         try:
-            self._follow(arguments)
+            self._record(arguments)
         except BaseException as error:
             self.errors.append(error)
         self.seconds += time.perf_counter() - began
-        return [1 if self.stop or self.recorder.late or self.errors else 0]
+        return [1 if self.stop or self.recorder.is_late or self.errors else 0]
 
-    def _follow(self, arguments) -> None:
+    def _record(self, arguments) -> None:
         """Update the best iterate and add an entry to the history."""
         z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
         # Objective and constraints are both of order one.
@@ -371,7 +372,7 @@ class Monitor(ca.Callback):
             self.best = (z, multipliers)
         recorder = self.recorder
         loss = float(value[0]) / self.program.loss_scale
-        variables = carried_over(z, self.program, recorder.collocation)
+        variables = convert_variables(z, self.program, recorder.collocation)
         number = recorder.history[-1].number + 1 if recorder.history else 0
         self.lines += 1
-        recorder.line(number, variables, loss)
+        recorder.add_variables(number, variables, loss)

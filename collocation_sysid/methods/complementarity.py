@@ -2,7 +2,8 @@
 
 The product of pressure and gap is decreased in a few solves, each from the previous solution; the
 first starts from the solution with the contact energy. Only faces that come within an edge length
-of an obstacle in that solution have pressures. Use `hardened` after a solve with the contact
+of an obstacle in that solution have pressures. Use `solve_complementarity` after a solve with the
+contact
 energy.
 """
 
@@ -16,9 +17,9 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..fem.selection import Indices
-from ..model.contact import contacts
+from ..model.contact import contact_terms
 from ..program.collocation import Collocation
-from ..program.touches import nearest
+from ..program.touches import smallest_gaps
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .solution import Solution
@@ -31,7 +32,7 @@ REACH = 1.0
 Solve = Callable[[Collocation, Array], Solution]
 
 
-def require_smooth(obstacles: Iterable[Obstacle]) -> None:
+def require_frictionless(obstacles: Iterable[Obstacle]) -> None:
     """Raise `InputError` if an obstacle has friction.
 
     Raises
@@ -40,14 +41,14 @@ def require_smooth(obstacles: Iterable[Obstacle]) -> None:
         Names the obstacle and the alternatives.
     """
     for each in obstacles:
-        if each.rubs:
+        if each.has_friction:
             raise InputError(
                 f"{each.name} has friction, which contact as complementarity leaves out; expected "
                 'friction = 0, or contact = "energy" of the method interior-point'
             )
 
 
-def hardened(first: Solution, solve: Solve) -> Solution:
+def solve_complementarity(first: Solution, solve: Solve) -> Solution:
     """Return the solution with contact as complementarity.
 
     Parameters
@@ -63,15 +64,15 @@ def hardened(first: Solution, solve: Solve) -> Solution:
         Last solution; an earlier one if its solve did not converge.
     """
     obstacles_by_experiment = {
-        segment.experiment.name: within_reach(segment.experiment, x.reshape(len(x), -1))
-        for segment, x in zip(first.collocation.segments, first.positions_m, strict=True)
+        segment.experiment.name: reachable_obstacles(segment.experiment, x.reshape(len(x), -1))
+        for segment, x in zip(first.collocation.transcriptions, first.positions_m, strict=True)
     }
     solution = first
-    relaxed = _relaxed(first.collocation, obstacles_by_experiment, 0.0)
+    relaxed = _relax(first.collocation, obstacles_by_experiment, 0.0)
     for share in RELAXED:
         # Its pressures are those of the solve before, not such as the smaller product asks for.
-        z = relaxed.made_explicit().pack(*solution.collocation.unpack(solution.z))
-        relaxed = _relaxed(first.collocation, obstacles_by_experiment, share)
+        z = relaxed.with_lifted_variables().pack(*solution.collocation.unpack(solution.z))
+        relaxed = _relax(first.collocation, obstacles_by_experiment, share)
         solution = replace(solve(relaxed, z).after(solution, ""), notes=first.notes)
         if not solution.status.converged:
             break
@@ -83,7 +84,7 @@ def hardened(first: Solution, solve: Solve) -> Solution:
     return replace(solution, given_multipliers=None, notes=(*solution.notes, note))
 
 
-def within_reach(experiment: Experiment, x: Array) -> list[Obstacle]:
+def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     """Return the obstacles of an experiment, restricted to faces that come near in a motion.
 
     Parameters
@@ -100,23 +101,23 @@ def within_reach(experiment: Experiment, x: Array) -> list[Obstacle]:
     """
     obstacles = []
     mesh = experiment.body.mesh
-    for contact, obstacle in zip(contacts(experiment), experiment.obstacles, strict=True):
-        surface = contact.contact.surface
+    for contact, obstacle in zip(contact_terms(experiment), experiment.obstacles, strict=True):
+        surface = contact.law_of_contact.surface
         faces = mesh.surface[surface.faces]
-        gaps = nearest(contact, x).reshape(-1, surface.a_face).min(axis=1)
+        gaps = smallest_gaps(contact, x).reshape(-1, surface.points_per_face).min(axis=1)
         if len(near_faces := np.unique(faces[gaps < REACH * surface.edge_m])):
             obstacle = replace(obstacle, faces=Indices(mesh.file_index[near_faces].tolist()))
         obstacles.append(obstacle)
     return obstacles
 
 
-def with_energy(experiment: Experiment) -> Experiment:
+def with_contact_energy(experiment: Experiment) -> Experiment:
     """Return the experiment with the contact energy for all obstacles."""
     return experiment.with_obstacles([replace(o, relaxed=None) for o in experiment.obstacles])
 
 
-def _relaxed(
-    collocation: Collocation, near: Mapping[str, list[Obstacle]], share: float
+def _relax(
+    collocation: Collocation, obstacles_by_experiment: Mapping[str, list[Obstacle]], share: float
 ) -> Collocation:
     """Return the program with relaxed complementarity.
 
@@ -124,14 +125,14 @@ def _relaxed(
     ----------
     collocation : Collocation
         Program.
-    near : mapping of str to list of Obstacle
+    obstacles_by_experiment : mapping of str to list of Obstacle
         Obstacles by experiment name; other experiments are unchanged.
     share : float
         Product of pressure and gap, in κδ² of each obstacle.
     """
     experiments = [
-        each.with_obstacles([replace(o, relaxed=share) for o in near[each.name]])
-        if each.name in near
+        each.with_obstacles([replace(o, relaxed=share) for o in obstacles_by_experiment[each.name]])
+        if each.name in obstacles_by_experiment
         else each
         for each in collocation.experiments
     ]

@@ -17,18 +17,18 @@ from ..arrays import Array
 from ..checked import Options
 from ..errors import InputError, hint_at
 from ..program.collocation import Collocation
-from ..recording.depth import begun
+from ..recording.depth import until_all_cameras_see
 from ..recording.experiment import Experiment
-from ..recording.tables import FEWEST
+from ..recording.tables import FEWEST_SHARED_SAMPLES
 from .comparison.casadi_nlp import Sleqp, SqpMethod
 from .comparison.penalty import AugmentedLagrangian, Penalty
 from .comparison.shooting import Shooting
 from .interior_point import InteriorPoint
-from .options import SHARES, Shares, built, part_of
+from .options import SHARES, Shares, method_from_options, samples_in_share
 from .recorder import Recorder
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Method, Solution, Status, Watch
-from .start import completed, marched
+from .start import complete_variables, simulate_trajectories
 
 _ONE_HORIZON = (
     InteriorPoint,
@@ -81,7 +81,7 @@ class Continuation(Options):
         if name not in STAGES:
             known = f"expected one of {', '.join(STAGES)}{hint_at(str(name), STAGES)}"
             raise InputError(f"found {name!r}; {known}", None, "stage.method")
-        return built(STAGES[name], options, "stage")
+        return method_from_options(STAGES[name], options, "stage")
 
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -91,13 +91,13 @@ class Continuation(Options):
         Numbers and times of the history continue from part to part. The solve ends with a part that
         was interrupted or refused; the notes contain the result of each part.
         """
-        climb = _Climb(self.method, Recorder(self.name, collocation, watch))
+        climb = _ContinuationState(self.method, Recorder(self.name, collocation, watch))
         if start is not None:
             climb.known = collocation.unpack(start)
         for share in self.shares:
             if not climb.solve(share):
                 break
-        return climb.answer()
+        return climb.solution()
 
 
 def first_samples(experiment: Experiment, count: int) -> Experiment:
@@ -111,21 +111,21 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
         Number of samples; it is increased to the first sample with a marker, or with a depth image.
     """
     markers = experiment.markers
-    stop = min(len(experiment.t_s), max(count, markers.first_seen + 1, 3))
-    fewest = 1 if experiment.static else FEWEST
-    stop, depths = begun(experiment.depths, experiment.t_s, stop, fewest)
+    stop = min(len(experiment.t_s), max(count, markers.first_seen_sample + 1, 3))
+    fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
+    stop, depths = until_all_cameras_see(experiment.depths, experiment.t_s, stop, fewest)
     shorter = replace(markers, t_s=markers.t_s[:stop], positions_m=markers.positions_m[:stop])
     return replace(experiment, t_s=experiment.t_s[:stop], markers=shorter, depths=depths)
 
 
-def first_part(collocation: Collocation, share: float) -> Collocation:
+def first_share(collocation: Collocation, share: float) -> Collocation:
     """Return the problem with the first share of every experiment's samples."""
-    fitted = [segment.experiment for segment in collocation.segments]
-    shorter = [first_samples(e, part_of(len(e.t_s), share)) for e in fitted]
+    fitted = [segment.experiment for segment in collocation.transcriptions]
+    shorter = [first_samples(e, samples_in_share(len(e.t_s), share)) for e in fitted]
     return replace(collocation, experiments=shorter)
 
 
-class _Climb:
+class _ContinuationState:
     """State between the parts: known positions, the last solution, and counts.
 
     Attributes
@@ -150,22 +150,22 @@ class _Climb:
     def solve(self, share: float) -> bool:
         """Solve the first share of the samples; return whether to continue."""
         recorder = self.recorder
-        part = recorder.collocation if share == 1 else first_part(recorder.collocation, share)
-        start = None if self.known is None else _continued(part, *self.known)
+        part = recorder.collocation if share == 1 else first_share(recorder.collocation, share)
+        start = None if self.known is None else _continue_variables(part, *self.known)
         before = max([self.iterations, *(line.number for line in recorder.history[-1:])])
         elapsed_s = recorder.elapsed_s
 
-        def follow(line: Iteration) -> None:
+        def record(line: Iteration) -> None:
             """Record an iteration with its number, time and share in the whole solve."""
             number = line.number + before
             time_s = line.time_s + elapsed_s
             recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
 
-        solution = self.method(part, follow, start)
-        self._learn(solution, share)
+        solution = self.method(part, record, start)
+        self._add(solution, share)
         return solution.status not in (Status.INTERRUPTED, Status.REFUSED)
 
-    def answer(self) -> Solution:
+    def solution(self) -> Solution:
         """Return the solution of the last part as a solution of the complete problem."""
         assert self.last is not None
         assert self.known is not None
@@ -174,7 +174,7 @@ class _Climb:
         z = last.z
         multipliers = last.given_multipliers
         if last.collocation is not recorder.collocation:
-            z = _continued(recorder.collocation, *self.known)
+            z = _continue_variables(recorder.collocation, *self.known)
             multipliers = None
         recorder.notes += last.notes
         return recorder.solution(
@@ -186,27 +186,29 @@ class _Climb:
             evaluations=self.evaluations,
         )
 
-    def _learn(self, found: Solution, share: float) -> None:
+    def _add(self, solution: Solution, share: float) -> None:
         """Store the solution of a part, and add its counts, times and a note."""
-        self.last = found
-        part = found.collocation
-        self.known = part.unpack(found.z)
-        self.iterations += found.iterations
-        self.evaluations += found.evaluations
-        spent = found.timing
+        self.last = solution
+        part = solution.collocation
+        self.known = part.unpack(solution.z)
+        self.iterations += solution.iterations
+        self.evaluations += solution.evaluations
+        spent = solution.timing
         self.recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
-        values = ", ".join(f"{name} = {value:.4g}" for name, value in found.parameters.items())
+        values = ", ".join(f"{name} = {value:.4g}" for name, value in solution.parameters.items())
         self.recorder.notes.append(
-            f"{100 * share:.3g} % of the samples by {found.method}: {found.status.value} after "
-            f"{found.iterations} iterations, {values}"
+            f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} after "
+            f"{solution.iterations} iterations, {values}"
         )
 
 
-def _continued(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
+def _continue_variables(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
     """Return variables z from the first rows of positions.
 
     The missing rows are simulated or, if that fails, those of a rigid motion with the grasp.
     """
-    parts = collocation.parts_at(p, positions)
-    known, _ = marched(collocation, p, [part.x[: part.segment.grid_rows] for part in parts])
-    return completed(collocation, p, known)
+    parts = collocation.iterates_at(p, positions)
+    known, _ = simulate_trajectories(
+        collocation, p, [part.x[: part.segment.grid_times] for part in parts]
+    )
+    return complete_variables(collocation, p, known)

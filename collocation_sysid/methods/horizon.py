@@ -1,6 +1,7 @@
 """Least-squares problem on the first rows of every experiment, linearised by sweeps.
 
-`Horizon` distributes the work on the experiments to `Workers` and joins the results to an
+`Horizon` distributes the work on the experiments to `ExperimentExecutor` and joins the results to
+an
 `Iterate`. It is used by the reduced-space method and by shooting.
 """
 
@@ -18,23 +19,23 @@ from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.factorisation import Choice
 from ..program.lapack import one_blas_thread
-from ..program.least_squares import LeastSquares
+from ..program.least_squares import SquareRootInformation
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
 from .trajectory import (
-    Reached,
-    Seen,
+    FitSummary,
+    SimulationResult,
     SweepReport,
-    Swept,
-    moved,
-    positions,
-    reached,
-    reread,
-    seen,
-    swept,
-    tried,
+    SweepResult,
+    extrapolate,
+    fit_summary,
+    reassociate,
+    simulate_rows,
+    sweep,
+    sweep_after_step,
+    trajectory_positions,
 )
-from .workers import Here, Workers
+from .workers import ExperimentExecutor, LocalExecutor
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,21 +46,21 @@ class Iterate:
     ----------
     p : (np,) array
         All parameters (q, φ), see `Collocation.pack`.
-    trajectories : list of Swept
+    trajectories : list of SweepResult
         Sweep of each experiment, stored by the workers.
     reports : list of SweepReport
         Reports of the sweeps.
-    fit : LeastSquares
+    fit : SquareRootInformation
         Residuals linearised in a step from p: measurements after the feasibility step, and priors.
-    crossed : (np,) array
+    previous_slopes_residual : (np,) array
         S_0ᵀ r of its residuals r, with the slopes S_0 of the previous iterate.
     """
 
     p: Array
     trajectories: list[Any]
     reports: list[SweepReport]
-    fit: LeastSquares
-    crossed: Array
+    fit: SquareRootInformation
+    previous_slopes_residual: Array
 
     @cached_property
     def loss(self) -> float:
@@ -72,12 +73,12 @@ class Iterate:
         return max(report.feasibility_m for report in self.reports)
 
     @cached_property
-    def moved_m(self) -> float:
+    def position_change_m(self) -> float:
         """Largest change of a coordinate since the previous iterate [m]."""
-        return max(report.moved_m for report in self.reports)
+        return max(report.position_change_m for report in self.reports)
 
     @property
-    def finite(self) -> bool:
+    def is_finite(self) -> bool:
         """Whether the loss and the feasibility step are finite."""
         return bool(np.isfinite(self.loss) and np.isfinite(self.feasibility_m))
 
@@ -90,7 +91,7 @@ class Horizon:
     """The problem on the first rows of every experiment.
 
     Arguments named `x` are lists with one entry per experiment, stored by the workers, of any kind
-    that `trajectory.positions` accepts.
+    that `trajectory.trajectory_positions` accepts.
 
     Parameters
     ----------
@@ -104,7 +105,7 @@ class Horizon:
         Stopwatch that measures the sweeps.
     factorisation : {"auto", "band", "sparse", "supernodal"}
         Factorisation of a time step's matrix.
-    workers : Workers, optional
+    workers : ExperimentExecutor, optional
         Where the experiments are processed; by default threads of this process.
     """
 
@@ -115,35 +116,37 @@ class Horizon:
         prior: float | None = None,
         stopwatch: Stopwatch | None = None,
         factorisation: Choice = "auto",
-        workers: Workers | None = None,
+        workers: ExperimentExecutor | None = None,
     ) -> None:
         self.rows = list(rows)
         self.prior = prior
         self.stopwatch = stopwatch or Stopwatch()
-        self.workers = workers or Here(collocation.threads)
-        self.read_in(collocation)
+        self.workers = workers or LocalExecutor(collocation.threads)
+        self.set_collocation(collocation)
         with self.stopwatch.building():
-            stopwatches = self._all(None)
-            factorisations = self._all(factorisation)
-            self.solvers = self.workers.each(
+            stopwatches = self._repeat(None)
+            factorisations = self._repeat(factorisation)
+            self.solvers = self.workers.map_experiments(
                 Sweep, self.segments, self.rows, stopwatches, factorisations
             )
 
-    def read_in(self, collocation: Collocation) -> None:
+    def set_collocation(self, collocation: Collocation) -> None:
         """Use another collocation of the same problem, with measurements associated differently."""
         self.collocation = collocation
-        self.segments = self.workers.hold(collocation)
+        self.segments = self.workers.store_segments(collocation)
 
-    def evaluate(self, p: Array, x: Sequence[Any], known: Iterate | None = None) -> Iterate:
+    def evaluate(
+        self, p: Array, trajectories: Sequence[Any], known_iterate: Iterate | None = None
+    ) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x.
 
         Parameters
         ----------
         p : (np,) array
             All parameters (q, φ).
-        x : sequence
+        trajectories : sequence
             Trajectories, one per experiment.
-        known : Iterate, optional
+        known_iterate : Iterate, optional
             Iterate of the first rows at the same p and positions, which is continued.
 
         Raises
@@ -151,19 +154,19 @@ class Horizon:
         SimulationError
             If a time step is singular or not finite.
         """
-        trajectories = known.trajectories if known else self._all(None)
-        return self._found(p, swept, x, trajectories)
+        known = known_iterate.trajectories if known_iterate else self._repeat(None)
+        return self._run(p, sweep, trajectories, known)
 
-    def tried(self, p: Array, before: Iterate, step: Array) -> Iterate:
+    def evaluate_step(self, p: Array, previous: Iterate, step: Array) -> Iterate:
         """Sweep all experiments after a step of the parameters.
 
-        Static experiments are solved for their equilibria first, see `trajectory.tried`.
+        Static experiments are solved for their equilibria first, see `trajectory.sweep_after_step`.
 
         Parameters
         ----------
         p : (np,) array
             Parameters after the step, within their bounds.
-        before : Iterate
+        previous : Iterate
             Iterate before the step.
         step : (np,) array
             Step of the parameters.
@@ -173,16 +176,16 @@ class Horizon:
         SimulationError
             If a time step is singular or not finite.
         """
-        return self._found(p, tried, before.trajectories, self._own(step))
+        return self._run(p, sweep_after_step, previous.trajectories, self._by_experiment(step))
 
-    def reread(self, p: Array, point: Iterate) -> Iterate:
+    def reassociate(self, p: Array, iterate: Iterate) -> Iterate:
         """Return an iterate at parameters p (np,) with the measurements of the present
         collocation.
         """
-        return self._found(p, reread, point.trajectories)
+        return self._run(p, reassociate, iterate.trajectories)
 
     @one_blas_thread()
-    def _found(self, p: Array, run: Callable[..., Swept], *columns: Sequence[Any]) -> Iterate:
+    def _run(self, p: Array, run: Callable[..., SweepResult], *columns: Sequence[Any]) -> Iterate:
         """Run a function of `trajectory` for every experiment and join the results to an iterate.
 
         Parameters
@@ -194,32 +197,34 @@ class Horizon:
         columns : sequence
             Further arguments, one entry per experiment each.
         """
-        thresholds = self._all(self.collocation.huber)
-        trajectories = self.workers.each(
-            run, self.solvers, self.segments, thresholds, self._own(p), *columns
+        thresholds = self._repeat(self.collocation.huber)
+        trajectories = self.workers.map_experiments(
+            run, self.solvers, self.segments, thresholds, self._by_experiment(p), *columns
         )
-        reports: list[SweepReport] = self.workers.fetch(self.workers.each(_report, trajectories))
+        reports: list[SweepReport] = self.workers.fetch(
+            self.workers.map_experiments(_report, trajectories)
+        )
         nq = self.collocation.nq
-        places = self.collocation.places
-        fit = LeastSquares.none(len(p))
+        places = self.collocation.parameter_indices
+        fit = SquareRootInformation.empty(len(p))
         crossed = np.zeros(len(p))
         for report, own in zip(reports, places, strict=True):
-            self.stopwatch.add(*report.spent)
-            fit = fit.joined(report.fit, own)
-            crossed[own] += report.crossed
-        prior, prior_slopes = self.collocation.prior(p)
+            self.stopwatch.add(*report.times_s)
+            fit = fit.with_problem(report.fit, own)
+            crossed[own] += report.previous_slopes_residual
+        prior, prior_slopes = self.collocation.prior_residuals(p)
         priors = [(prior, np.diag(prior_slopes))]
         if self.prior is not None:
             deviation = (p[:nq] - self.collocation.parameters.guess_q) / self.prior
             priors.append((deviation, np.eye(nq, len(p)) / self.prior))
         for values, by in priors:
-            fit = fit.add(values, by)
+            fit = fit.with_rows(values, by)
             # The slopes of priors are the same everywhere.
             crossed += by.T @ values
         return Iterate(p, trajectories, reports, fit, crossed)
 
-    def extend(
-        self, p: Array, x: Sequence[Any] | None = None, near: Iterate | None = None
+    def simulate(
+        self, p: Array, trajectories: Sequence[Any] | None = None, guess: Iterate | None = None
     ) -> tuple[list[Any], SimulationError | None]:
         """Simulate all experiments at parameters p, as far as the simulations succeed.
 
@@ -227,9 +232,9 @@ class Horizon:
         ----------
         p : (np,) array
             All parameters (q, φ).
-        x : sequence, optional
+        trajectories : sequence, optional
             Trajectories of the first rows, which are continued; none by default.
-        near : Iterate, optional
+        guess : Iterate, optional
             Iterate near whose positions equilibria are searched first.
 
         Returns
@@ -237,60 +242,68 @@ class Horizon:
         tuple of list of Reached and SimulationError or None
             Trajectories, stored by the workers, and the first failure; None if all are complete.
         """
-        known = x or self._all(None)
-        guesses = near.trajectories if near else self._all(None)
-        results = self.workers.each(
-            reached, self.solvers, self.segments, self._own(p), known, guesses
+        known = trajectories or self._repeat(None)
+        guesses = guess.trajectories if guess else self._repeat(None)
+        results = self.workers.map_experiments(
+            simulate_rows, self.solvers, self.segments, self._by_experiment(p), known, guesses
         )
         failures = []
-        for failure, spent in self.workers.fetch(self.workers.each(_end, results)):
+        for failure, spent in self.workers.fetch(
+            self.workers.map_experiments(_failure_and_times, results)
+        ):
             self.stopwatch.add(*spent)
             failures += [failure] if failure else []
         return results, failures[0] if failures else None
 
-    def moved(self, point: Iterate, step: Array) -> list[Any]:
+    def extrapolate(self, iterate: Iterate, step: Array) -> list[Any]:
         """Return the positions, stored by the workers, after a step (np,) of the parameters."""
-        return self.workers.each(moved, self.segments, point.trajectories, self._own(step))
+        return self.workers.map_experiments(
+            extrapolate, self.segments, iterate.trajectories, self._by_experiment(step)
+        )
 
-    def seen(self, p: Array, x: Sequence[Any]) -> list[Seen]:
+    def fit_summaries(self, p: Array, trajectories: Sequence[Any]) -> list[FitSummary]:
         """Return the fit of trajectories x at parameters p, without a sweep."""
-        summaries = self.workers.each(seen, self.segments, self._own(p), x)
+        summaries = self.workers.map_experiments(
+            fit_summary, self.segments, self._by_experiment(p), trajectories
+        )
         return self.workers.fetch(summaries)
 
-    def lengths(self, x: Sequence[Any]) -> list[int]:
+    def row_counts(self, trajectories: Sequence[Any]) -> list[int]:
         """Return the number of rows of each trajectory."""
-        return self.workers.fetch(self.workers.each(_rows, x))
+        return self.workers.fetch(self.workers.map_experiments(_row_count, trajectories))
 
-    def first_rows(self, x: Sequence[Any], counts: Sequence[int]) -> list[Array]:
+    def first_rows(self, trajectories: Sequence[Any], counts: Sequence[int]) -> list[Array]:
         """Return the first `counts[i]` rows of each trajectory i, as arrays (counts[i], 3n) [m]."""
-        return self.workers.fetch(self.workers.each(_first, x, counts))
+        return self.workers.fetch(self.workers.map_experiments(_first_rows, trajectories, counts))
 
-    def _own(self, p: Array) -> list[Array]:
+    def _by_experiment(self, p: Array) -> list[Array]:
         """Return the entries of p (np,) that belong to each experiment."""
-        return [p[own] for own in self.collocation.places]
+        return [p[own] for own in self.collocation.parameter_indices]
 
-    def _all(self, value: Any) -> list[Any]:
+    def _repeat(self, value: Any) -> list[Any]:
         """Return a list with the same value for every experiment."""
         return [value] * len(self.rows)
 
 
-def _report(found: Swept) -> SweepReport:
+def _report(result: SweepResult) -> SweepReport:
     """Return the report of a sweep; workers run this function."""
-    return found.report
+    return result.report
 
 
-def _rows(found: Swept | Reached | Array) -> int:
+def _row_count(result: SweepResult | SimulationResult | Array) -> int:
     """Return the number of rows of a trajectory; workers run this function."""
-    return len(positions(found))
+    return len(trajectory_positions(result))
 
 
-def _end(found: Reached) -> tuple[SimulationError | None, tuple[float, float, float]]:
+def _failure_and_times(
+    result: SimulationResult,
+) -> tuple[SimulationError | None, tuple[float, float, float]]:
     """Return the failure (None if complete) and the times [s] of a simulation; workers run
     this function.
     """
-    return found.failure, found.spent
+    return result.failure, result.times_s
 
 
-def _first(found: Swept | Reached | Array, count: int) -> Array:
+def _first_rows(result: SweepResult | SimulationResult | Array, count: int) -> Array:
     """Return the first `count` rows of a trajectory; workers run this function."""
-    return positions(found)[:count]
+    return trajectory_positions(result)[:count]

@@ -16,9 +16,9 @@ import scipy.sparse.linalg as spla
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..program.collocation import Collocation, carried_over
-from .condensed import Condensed
-from .recorder import Ended, Recorder
+from ..program.collocation import Collocation, convert_variables
+from .condensed import CondensedCollocation
+from .recorder import Recorder, SearchEnded
 from .reduced_space import ReducedSpace
 from .solution import Iteration, Solution, Status, constraint_multipliers
 
@@ -53,7 +53,7 @@ class InitialPoint:
     note: str
 
 
-def coarse_solution(
+def compute_initial_point(
     recorder: Recorder, start: Array | None, *, max_time_s: float = np.inf
 ) -> InitialPoint:
     """Compute an initial point by reduced space, and add every iteration to the recorder.
@@ -68,14 +68,14 @@ def coarse_solution(
         Time after which the search ends with `Status.TIME_LIMIT` [s].
     """
 
-    def follow(line: Iteration) -> None:
+    def record(line: Iteration) -> None:
         """Record an iteration, and end the search if the time is over."""
         recorder.add(line)
         if recorder.elapsed_s > max_time_s:
-            raise Ended(Status.TIME_LIMIT)
+            raise SearchEnded(Status.TIME_LIMIT)
 
     method = ReducedSpace(tolerance=NEAR, max_iterations=MAX_SWEEPS)
-    coarse = method(recorder.collocation, follow, start)
+    coarse = method(recorder.collocation, record, start)
     # Reduced space gives multipliers only where a part of the trajectory was not simulated.
     reached_end = coarse.given_multipliers is None
     is_usable = reached_end and coarse.status not in UNUSABLE and bool(np.isfinite(coarse.z).all())
@@ -93,7 +93,7 @@ def coarse_solution(
 
 
 @dataclass(frozen=True, eq=False)
-class Multipliers:
+class InitialMultipliers:
     """Initial multipliers of the program that is passed to IPOPT.
 
     Attributes
@@ -110,7 +110,7 @@ class Multipliers:
 
 def adjoint_multipliers(
     program: Collocation, collocation: Collocation, z: Array
-) -> Multipliers | None:
+) -> InitialMultipliers | None:
     """Return the multipliers that make the Lagrangian stationary in all positions.
 
     Parameters
@@ -131,24 +131,24 @@ def adjoint_multipliers(
         of_motion = constraint_multipliers(collocation, z)
     except SimulationError:
         return None
-    complete_program = program.whole if isinstance(program, Condensed) else program
-    variables = carried_over(z, collocation, complete_program)
-    constraints = np.zeros(complete_program.constraints)
+    complete_program = program.complete if isinstance(program, CondensedCollocation) else program
+    variables = convert_variables(z, collocation, complete_program)
+    constraints = np.zeros(complete_program.constraint_count)
     constraints[: len(of_motion)] = of_motion
     gradient = complete_program.gradient(variables)
     jacobian = complete_program.jacobian(variables)
-    if added := complete_program.added():
+    if added := complete_program.lifted_count():
         # As many rows as variables: their multipliers follow from those of all other rows.
         slope = gradient + jacobian.T @ constraints
         lifted_jacobian = jacobian[-added:, -added:].T.tocsc()
         constraints[-added:] = -spla.spsolve(lifted_jacobian, slope[-added:])
-    if isinstance(program, Condensed):
+    if isinstance(program, CondensedCollocation):
         constraints = constraints[program.kept_rows]
-        variables = carried_over(z, collocation, program)
+        variables = convert_variables(z, collocation, program)
         gradient = program.gradient(variables)
         jacobian = program.jacobian(variables)
     lower, upper = program.bounds()
     bounded = (lower < upper) & (np.isfinite(lower) | np.isfinite(upper))
     bounds = np.where(bounded, -(gradient + jacobian.T @ constraints), 0.0)
-    multipliers = Multipliers(constraints, bounds)
+    multipliers = InitialMultipliers(constraints, bounds)
     return multipliers if np.isfinite(constraints).all() and np.isfinite(bounds).all() else None

@@ -21,14 +21,14 @@ from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
 from . import nlpsol
 from .callbacks import NlpFunctions
-from .complementarity import hardened, require_smooth
-from .condensed import condensed
-from .initial_point import InitialPoint, adjoint_multipliers, coarse_solution
+from .complementarity import require_frictionless, solve_complementarity
+from .condensed import condense
+from .initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
 from .recorder import Recorder
 from .solution import Solution, Status, Watch
 
 
-def _ipopt_value(value: Any) -> Any:
+def _require_ipopt_value(value: Any) -> Any:
     """Return an IPOPT option if it is text or a number; raise `ValueError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(
@@ -38,7 +38,7 @@ def _ipopt_value(value: Any) -> Any:
     return value
 
 
-IpoptValue = Annotated[Text | Whole | Finite, BeforeValidator(_ipopt_value)]
+IpoptValue = Annotated[Text | Whole | Finite, BeforeValidator(_require_ipopt_value)]
 
 IPOPT_STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
@@ -154,7 +154,7 @@ class InteriorPoint(Options):
         if self.contact == "complementarity":
             for each in experiments:
                 with located(where=f"experiment '{each.name}'"):
-                    require_smooth(each.obstacles)
+                    require_frictionless(each.obstacles)
 
     def __call__(
         self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -166,16 +166,18 @@ class InteriorPoint(Options):
         InputError
             If IPOPT does not know an option, or contact as complementarity meets friction.
         """
-        experiments = [segment.experiment for segment in collocation.segments]
+        experiments = [segment.experiment for segment in collocation.transcriptions]
         self.require(experiments)
         is_hard = self.contact == "complementarity" and any(e.obstacles for e in experiments)
-        solution = self._solved(collocation, watch, start)
+        solution = self._solve(collocation, watch, start)
         if not is_hard or not solution.status.converged:
             return solution
         relaxed_method = replace(self, initial="simulation")
-        return hardened(solution, lambda relaxed, z: relaxed_method._solved(relaxed, watch, z))
+        return solve_complementarity(
+            solution, lambda relaxed, z: relaxed_method._solve(relaxed, watch, z)
+        )
 
-    def _solved(
+    def _solve(
         self, collocation: Collocation, watch: Watch | None, start: Array | None
     ) -> Solution:
         """Return the solution with the contact law of each obstacle, without the
@@ -183,8 +185,8 @@ class InteriorPoint(Options):
         """
         recorder = Recorder(self.name, collocation, watch)
         if self.initial == "simulation":
-            return self._by_ipopt(recorder, start)
-        initial = coarse_solution(recorder, start, max_time_s=self.max_time_s)
+            return self._solve_by_ipopt(recorder, start)
+        initial = compute_initial_point(recorder, start, max_time_s=self.max_time_s)
         coarse = initial.coarse
         spent = coarse.timing
         recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
@@ -200,12 +202,12 @@ class InteriorPoint(Options):
                 evaluations=coarse.evaluations,
             )
         if not initial.is_usable:
-            return self._by_ipopt(recorder, start)
+            return self._solve_by_ipopt(recorder, start)
         recorder.collocation = coarse.collocation
-        solution = self._by_ipopt(recorder, coarse.z, initial)
+        solution = self._solve_by_ipopt(recorder, coarse.z, initial)
         return replace(solution, evaluations=solution.evaluations + coarse.evaluations)
 
-    def _by_ipopt(
+    def _solve_by_ipopt(
         self, recorder: Recorder, start: Array | None, initial: InitialPoint | None = None
     ) -> Solution:
         """Solve the recorder's program by IPOPT.
@@ -222,7 +224,7 @@ class InteriorPoint(Options):
         """
         multipliers = None
         with recorder.stopwatch.building():
-            program = condensed(recorder.collocation.made_explicit())
+            program = condense(recorder.collocation.with_lifted_variables())
             if initial is not None and initial.is_near:
                 multipliers = adjoint_multipliers(program, recorder.collocation, initial.coarse.z)
             is_warm = multipliers is not None
@@ -289,23 +291,23 @@ class InteriorPoint(Options):
         else:
             settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
             collocation = functions.collocation
-            sharpness = _sharpness(collocation)
+            sharpness = _largest_curvature(collocation)
             settings |= {
                 # Rows of pressures are nearly dependent where a surface lies on another.
-                "ipopt.perturb_always_cd": "no" if collocation.added("pressure") else "yes",
+                "ipopt.perturb_always_cd": "no" if collocation.lifted_count("pressure") else "yes",
                 "ipopt.jacobian_regularization_exponent": 0.0,
                 "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
             }
         return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
 
 
-def _sharpness(collocation: Collocation) -> float:
+def _largest_curvature(collocation: Collocation) -> float:
     """Return the largest curvature of the objective with respect to a scaled position, at
     least one.
     """
     units = (
         segment.length_m / float(np.min(segment.experiment.markers.sigma_m))
-        for segment in collocation.segments
+        for segment in collocation.transcriptions
         if segment.experiment.markers.names
     )
     return max(1.0, collocation.loss_scale * max((unit**2 for unit in units), default=0.0))
@@ -339,7 +341,7 @@ class _DampedHessian:
         values : array
             Memory for the values; it is overwritten.
         """
-        is_settled = self._is_settled(self.collocation.parameters_of(z))
+        is_settled = self._ends_warm_up(self.collocation.parameters_from(z))
         is_exact = self.options.hessian == "exact" and is_settled
         self.collocation.hessian_values(z, weight, multipliers if is_exact else None, values)
         values[self._of_x] += self.options.proximal
@@ -348,7 +350,7 @@ class _DampedHessian:
             largest = self.collocation.objective(z) / (2 * STEP_LIMIT**2)
             values[self._of_q] += weight * self._damping * largest
 
-    def _is_settled(self, p: Array) -> bool:
+    def _ends_warm_up(self, p: Array) -> bool:
         """Return whether the step to p was short, and not because of damping; update the
         damping.
         """

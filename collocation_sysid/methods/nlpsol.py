@@ -16,11 +16,11 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..program.collocation import Collocation, carried_over
+from ..program.collocation import Collocation, convert_variables
 from ..starting import LEFT, raises_interrupt
-from .callbacks import HessianValues, Monitor, NlpFunctions
-from .condensed import whole_multipliers
-from .initial_point import Multipliers
+from .callbacks import HessianValues, IterationMonitor, NlpFunctions
+from .condensed import complete_multipliers
+from .initial_point import InitialMultipliers
 from .recorder import Recorder
 from .solution import Solution, Status
 
@@ -49,8 +49,8 @@ def solve(
     hessian: HessianValues,
     settings: Settings,
     statuses: Mapping[str, Status],
-    judged: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
-    initial_multipliers: Multipliers | None = None,
+    judge: Callable[[Status, Array, Array], Status] = lambda status, *_: status,
+    initial_multipliers: InitialMultipliers | None = None,
 ) -> Solution:
     """Solve the recorder's collocation.
 
@@ -72,9 +72,9 @@ def solve(
         Function of the `NlpFunctions` that returns the options of the plugin.
     statuses : mapping
         Status by the solver's return status; others mean a numerical failure.
-    judged : callable
+    judge : callable
         Function of status, variables and multipliers of the problem that returns the final status.
-    initial_multipliers : Multipliers, optional
+    initial_multipliers : InitialMultipliers, optional
         Initial multipliers of the program; zeros by default.
 
     Raises
@@ -91,38 +91,40 @@ def solve(
         recorder.elapsed_s - watch.build - earlier_evaluations_s - earlier_linear_algebra_s
     )
     with watch.building():
-        start = recorder.start(start)
+        start = recorder.initial_variables(start)
         functions = NlpFunctions(program, hessian, errors)
-        monitor = Monitor(recorder, program, errors)
+        monitor = IterationMonitor(recorder, program, errors)
         options = {**_COMMON, "iteration_callback": monitor, **settings(functions)}
-        solver = _nlpsol(plugin, functions, options)
-    initial_variables = carried_over(start, collocation, program)
+        solver = _create_solver(plugin, functions, options)
+    initial_variables = convert_variables(start, collocation, program)
     z, multipliers, return_status, count = _run(
         solver, program.bounds(), initial_variables, monitor, initial_multipliers
     )
-    if errors and not isinstance(errors[0], _LeftBehind):
+    if errors and not isinstance(errors[0], _SolverAbandoned):
         raise errors[0]
     watch.evaluations = earlier_evaluations_s + functions.seconds
     # What is neither set-up nor callback.
     accounted_s = watch.build + watch.evaluations + monitor.seconds + unaccounted_s
     watch.linear_algebra = max(earlier_linear_algebra_s, recorder.elapsed_s - accounted_s)
     status = statuses.get(return_status, Status.NUMERICAL_FAILURE)
-    if monitor.stop or (recorder.late and not status.converged):
+    if monitor.stop or (recorder.is_late and not status.converged):
         status = Status.INTERRUPTED if monitor.stop else Status.TIME_LIMIT
     if not (status.converged and np.isfinite(z).all()):
-        z, multipliers = monitor.best or (initial_variables, np.zeros(program.constraints))
+        z, multipliers = monitor.best or (initial_variables, np.zeros(program.constraint_count))
     # A solver that never began leaves its count as memory had it.
     iterations = 0 if status is Status.REFUSED else count or max(0, monitor.lines - 1)
-    problem_multipliers = whole_multipliers(program, z, multipliers)[: collocation.constraints]
-    problem_variables = carried_over(z, program, collocation)
-    status = judged(status, problem_variables, problem_multipliers)
+    problem_multipliers = complete_multipliers(program, z, multipliers)[
+        : collocation.constraint_count
+    ]
+    problem_variables = convert_variables(z, program, collocation)
+    status = judge(status, problem_variables, problem_multipliers)
     message = f"{status.sentence} ({NAMES.get(plugin, plugin)}: {return_status})"
     return recorder.solution(
         status, message, problem_variables, problem_multipliers, iterations, functions.calls
     )
 
 
-def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
+def _create_solver(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> ca.Function:
     """Return CasADi's solver of a program.
 
     Raises
@@ -130,7 +132,7 @@ def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> c
     InputError
         If the plugin cannot be set up, with the first line of its message.
     """
-    z = ca.MX.sym("z", functions.collocation.variables)
+    z = ca.MX.sym("z", functions.collocation.variable_count)
     value, rows = functions.nlp(z, ca.MX(0, 1))
     output = io.StringIO()
     try:
@@ -145,7 +147,7 @@ def _nlpsol(plugin: str, functions: NlpFunctions, settings: dict[str, Any]) -> c
         raise InputError(f"{name} cannot be set up: {reason}", None, "solver") from error
 
 
-class _LeftBehind(Exception):
+class _SolverAbandoned(Exception):
     """Exception of the callbacks of a solver that was abandoned on its thread."""
 
 
@@ -153,8 +155,8 @@ def _run(
     solver: ca.Function,
     bounds: tuple[Array, Array],
     start: Array,
-    monitor: Monitor,
-    multipliers: Multipliers | None,
+    monitor: IterationMonitor,
+    multipliers: InitialMultipliers | None,
 ) -> tuple[Array, Array, str, int]:
     """Run a solver, on a thread of its own if this is the main thread.
 
@@ -186,13 +188,13 @@ def _run(
         results.append((z, multipliers, str(stats["return_status"]), count))
 
     if threading.current_thread() is threading.main_thread():
-        _on_a_thread(search, monitor)
+        _run_on_thread(search, monitor)
     else:
         search()
     return results[0] if results else (np.full(len(start), np.nan), np.zeros(0), "left behind", 0)
 
 
-def _on_a_thread(search: Callable[[], None], monitor: Monitor) -> None:
+def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> None:
     """Run a search on a thread, so that the main thread can handle signals during long
     factorisations.
     """
@@ -207,11 +209,11 @@ def _on_a_thread(search: Callable[[], None], monitor: Monitor) -> None:
         finally:
             if thread.is_alive():
                 thread.name = LEFT
-                monitor.errors.append(_LeftBehind())
+                monitor.errors.append(_SolverAbandoned())
 
 
 @contextmanager
-def _interruptible(monitor: Monitor) -> Iterator[None]:
+def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
     """Context in which Ctrl-C asks the monitor to stop; a second Ctrl-C raises KeyboardInterrupt.
 
     SIGTERM is treated the same if its handler raises KeyboardInterrupt. The previous handlers are

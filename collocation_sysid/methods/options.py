@@ -1,6 +1,7 @@
 """Construction of methods from options by name, and shares of recordings.
 
-Use `built` to make a method from a table of the problem file. `Shares` is the type of options that
+Use `method_from_options` to make a method from a table of the problem file. `Shares` is the type of
+options that
 list growing first parts of every recording, which are solved one after another.
 """
 
@@ -19,16 +20,16 @@ from ..errors import InputError, hint_at
 T = TypeVar("T", bound="Options")
 
 
-def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
+def method_from_options(kind: type[T], options: Mapping[str, Any], key: str) -> T:
     """Return a method made from its options.
 
     Parameters
     ----------
     kind : type
         Class of the method, with a class attribute `name`.
-    given : mapping
+    options : mapping
         Values by option name; options that are missing have their defaults.
-    where : str
+    key : str
         Key of the problem file that contains the options, for messages.
 
     Raises
@@ -37,28 +38,28 @@ def built(kind: type[T], given: Mapping[str, Any], where: str) -> T:
         For an unknown option, with the most similar known one, or an invalid value.
     """
     known = [field.name for field in fields(kind)]
-    for name in given:
+    for name in options:
         if name not in known:
             has = f"it has {', '.join(known)}{hint_at(name, known)}"
-            raise InputError(f"{kind.name!r} has no option {name!r}; {has}", None, where)
+            raise InputError(f"{kind.name!r} has no option {name!r}; {has}", None, key)
     try:
-        return kind(**given)
+        return kind(**options)
     except InputError as error:
-        raise InputError(error.message, None, f"{where}.{error.where}") from error
+        raise InputError(error.message, None, f"{key}.{error.where}") from error
 
 
 # Fewest samples, or rows of a grid, of a first part.
 FEWEST = 8
 
 
-def part_of(count: int, share: float) -> int:
-    """Return the number of samples in a share of `count` samples, at least `FEWEST` if
+def samples_in_share(count: int, share: float) -> int:
+    """Return the number of samples in a share of `count` samples, at least `FEWEST_SAMPLES` if
     there are as many.
     """
     return min(count, max(FEWEST, round(share * count)))
 
 
-def _ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
+def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
     """Return the shares if they are strictly ascending and end with 1; raise `ValueError`
     otherwise.
     """
@@ -68,5 +69,5 @@ def _ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
     return shares
 
 
-Shares = Annotated[tuple[Positive, ...], AfterValidator(_ascending)]
+Shares = Annotated[tuple[Positive, ...], AfterValidator(_require_ascending)]
 SHARES = (0.25, 0.5, 1.0)

@@ -10,14 +10,14 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..fem.constants import is_mode
+from ..fem.constants import is_field_coefficient
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
 from .solution import Iteration, Solution, Status, Timing, Watch
 from .start import initial_variables
 
 
-class Ended(Exception):
+class SearchEnded(Exception):
     """Exception that ends a search from within.
 
     Attributes
@@ -45,7 +45,7 @@ class Recorder:
         Remarks for the user.
     stopwatch : Stopwatch
         Stopwatch of evaluations and linear algebra.
-    began : float
+    start_s : float
         `time.perf_counter()` at construction [s].
 
     Parameters
@@ -57,7 +57,7 @@ class Recorder:
     watch : callable, optional
         Function that is called with every new `Iteration`.
     max_time_s : float
-        Time after which `late` becomes true [s].
+        Time after which `is_late` becomes true [s].
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Recorder:
         watch: Watch | None = None,
         max_time_s: float = np.inf,
     ) -> None:
-        self.began = time.perf_counter()
+        self.start_s = time.perf_counter()
         self.method = method
         self.collocation = collocation
         self.watch = watch
@@ -79,52 +79,52 @@ class Recorder:
     @property
     def elapsed_s(self) -> float:
         """Time since construction [s]."""
-        return time.perf_counter() - self.began
+        return time.perf_counter() - self.start_s
 
     @property
-    def late(self) -> bool:
+    def is_late(self) -> bool:
         """Whether the elapsed time exceeds `max_time_s`."""
         return self.elapsed_s > self.max_time_s
 
-    def start(self, given: Array | None) -> Array:
+    def initial_variables(self, start: Array | None) -> Array:
         """Return the initial variables (variables,).
 
         Parameters
         ----------
-        given : (variables,) array or None
+        start : (variables,) array or None
             Variables to start from, which are returned as they are; None means a simulation at the
             guess, whose notes are added to `notes`.
         """
-        if given is not None:
-            return given
+        if start is not None:
+            return start
         z, notes = initial_variables(self.collocation)
         self.notes += notes
         return z
 
-    def search(self, steps: Callable[[], tuple[Status, str]]) -> tuple[Status, str]:
+    def run_search(self, search: Callable[[], tuple[Status, str]]) -> tuple[Status, str]:
         """Run a search and return its status and message, also if it ends by an exception.
 
         Parameters
         ----------
-        steps : callable
+        search : callable
             The search; it returns status and message.
 
         Returns
         -------
         tuple of Status and str
-            `Ended` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
+            `SearchEnded` gives its own status, `SimulationError` gives `NOT_SIMULABLE`, and
             `KeyboardInterrupt` gives `INTERRUPTED`. Other exceptions are not caught.
         """
         try:
-            return steps()
-        except Ended as end:
+            return search()
+        except SearchEnded as end:
             return end.status, end.message
         except SimulationError as error:
             return Status.NOT_SIMULABLE, f"{Status.NOT_SIMULABLE.sentence} {error}."
         except KeyboardInterrupt:
             return Status.INTERRUPTED, Status.INTERRUPTED.sentence
 
-    def line(self, number: int, z: Array, loss: float) -> None:
+    def add_variables(self, number: int, z: Array, loss: float) -> None:
         """Evaluate the problem at variables z and add the result to the history.
 
         Parameters
@@ -137,9 +137,14 @@ class Recorder:
             Loss L at z, which is not evaluated again.
         """
         collocation = self.collocation
-        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in collocation.violations_n(z))
+        violation_n = max(float(np.abs(r).max(initial=0.0)) for r in collocation.residuals_n(z))
         line = Iteration(
-            number, loss, collocation.rms_m(z), violation_n, collocation.values(z), self.elapsed_s
+            number,
+            loss,
+            collocation.rms_marker_distance_m(z),
+            violation_n,
+            collocation.parameter_values(z),
+            self.elapsed_s,
         )
         self.add(line)
 
@@ -149,7 +154,9 @@ class Recorder:
         Coefficients of spatially varying parameters are removed from the entry, because there are
         many.
         """
-        shown_values = {name: value for name, value in line.parameters.items() if not is_mode(name)}
+        shown_values = {
+            name: value for name, value in line.parameters.items() if not is_field_coefficient(name)
+        }
         line = replace(line, parameters=shown_values)
         self.history.append(line)
         if self.watch is not None:
@@ -190,7 +197,7 @@ class Recorder:
             multipliers,
             iterations,
             tuple(self.history),
-            Timing.of(self.stopwatch, self.began),
+            Timing.since(self.stopwatch, self.start_s),
             tuple(self.notes),
             evaluations,
         )

@@ -19,7 +19,7 @@ quarter, half and all of the recording) extend the convergence to cases where on
 simulated at the guess. If even one horizon cannot be simulated completely, its first rows are
 solved before the others.
 
-Use it by default: it needs the least memory and time. Its search is in `search`.
+Use it by default: it needs the least memory and time. Its search is in `minimise`.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..fem.kernels import at_once
+from ..fem.kernels import concurrent_count
 from ..program.collocation import Collocation
 from ..program.lapack import one_blas_thread
 from ..program.sweep import Sweep
 from .curvature import require_second_derivatives
-from .recorder import Ended, Recorder
+from .recorder import Recorder, SearchEnded
 from .search import ReducedSearch, SearchOptions
 from .solution import Solution, Status, Watch
-from .start import completed, marched
-from .trajectory import positions
-from .workers import Here, Workers
+from .start import complete_variables, simulate_trajectories
+from .trajectory import trajectory_positions
+from .workers import ExperimentExecutor, LocalExecutor
 
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0
@@ -59,7 +59,7 @@ class ReducedSpace(SearchOptions):
         collocation: Collocation,
         watch: Watch | None = None,
         start: Array | None = None,
-        workers: Workers | None = None,
+        workers: ExperimentExecutor | None = None,
     ) -> Solution:
         """Solve the NLP, see `Method`.
 
@@ -74,7 +74,7 @@ class ReducedSpace(SearchOptions):
             Function that is called with every new `Iteration`.
         start : (variables,) array, optional
             Initial variables; the guess by default.
-        workers : Workers, optional
+        workers : ExperimentExecutor, optional
             Where the experiments are processed; by default threads of this process.
 
         Raises
@@ -89,23 +89,25 @@ class ReducedSpace(SearchOptions):
                     "hessian = 'exact' needs every trajectory in one place; expected "
                     "'gauss-newton' with a scheduler"
                 )
-        workers = workers or Here(collocation.threads)
+        workers = workers or LocalExecutor(collocation.threads)
         recorder = Recorder(self.name, collocation, watch)
         search = ReducedSearch(self, recorder, start, workers)
-        status, message = recorder.search(search.run)
+        status, message = recorder.run_search(search.run)
         collocation = recorder.collocation
         try:
-            trajectories = search.x and workers.fetch(workers.each(positions, search.x))
+            trajectories = search.trajectories and workers.fetch(
+                workers.map_experiments(trajectory_positions, search.trajectories)
+            )
             recorder.notes += workers.notes()
-        except Ended as lost:
+        except SearchEnded as lost:
             status = lost.status
             message = lost.message
-            trajectories, _ = marched(collocation, search.p)
-        z = completed(collocation, search.p, trajectories)
-        rows = [segment.grid_rows for segment in collocation.segments]
+            trajectories, _ = simulate_trajectories(collocation, search.p)
+        z = complete_variables(collocation, search.p, trajectories)
+        rows = [segment.grid_times for segment in collocation.transcriptions]
         is_complete = trajectories is not None and [len(x) for x in trajectories] == rows
-        recorder.notes += _notes(collocation, search.indefinite, z, status)
-        multipliers = None if is_complete else np.zeros(collocation.constraints)
+        recorder.notes += _notes(collocation, search.indefinite_steps, z, status)
+        multipliers = None if is_complete else np.zeros(collocation.constraint_count)
         return recorder.solution(status, message, z, multipliers, search.sweeps, search.sweeps)
 
 
@@ -113,18 +115,18 @@ def memory_mb(collocation: Collocation) -> float:
     """Estimate the memory of a solve [MB]; it increases linearly with the number of time steps."""
     # Two points with positions, p and Z; positions of the answer and of its gradients.
     columns = 2 * (2 + collocation.nq) + 6
-    numbers = columns * collocation.variables
-    chunks = sorted(Sweep(segment).chunk_bytes for segment in collocation.segments)
-    concurrent = at_once(len(chunks), collocation.threads)
+    numbers = columns * collocation.variable_count
+    chunks = sorted(Sweep(segment).chunk_bytes for segment in collocation.transcriptions)
+    concurrent = concurrent_count(len(chunks), collocation.threads)
     return (8 * numbers + sum(chunks[-concurrent:])) / 1e6
 
 
-def _measured(collocation: Collocation) -> tuple[str, str]:
+def _main_measurement(collocation: Collocation) -> tuple[str, str]:
     """Return the kind of measurement that dominates, in words, and the key that states its
     noise.
     """
-    experiments = [segment.experiment for segment in collocation.segments]
-    if any(each.markers.samples for each in experiments):
+    experiments = [segment.experiment for segment in collocation.transcriptions]
+    if any(each.markers.sample_count for each in experiments):
         return "markers", "sigma_m"
     if any(each.depths for each in experiments):
         return "points of depth cameras", "sigma_m of depth"
@@ -133,14 +135,14 @@ def _measured(collocation: Collocation) -> tuple[str, str]:
     return "readings", "sigma of the readings"
 
 
-def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) -> list[str]:
+def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: Status) -> list[str]:
     """Return notes for the user on the answer.
 
     Parameters
     ----------
     collocation : Collocation
         Problem.
-    indefinite : int
+    indefinite_steps : int
         Number of time steps with an indefinite matrix.
     z : (variables,) array
         Final variables.
@@ -148,18 +150,18 @@ def _notes(collocation: Collocation, indefinite: int, z: Array, status: Status) 
         Status of the search.
     """
     notes = []
-    if indefinite:
-        steps = sum(segment.constraint_times for segment in collocation.segments)
+    if indefinite_steps:
+        steps = sum(segment.constraint_times for segment in collocation.transcriptions)
         notes.append(
-            f"the equations of {indefinite} of {steps} timesteps are not positive definite "
+            f"the equations of {indefinite_steps} of {steps} timesteps are not positive definite "
             "at the answer: the body is near buckling, or damped more than its motion allows"
         )
     if status in (Status.CONVERGED, Status.STALLED):
-        squares = sum(part.loss for part in collocation.parts(z))
-        misfit = float(np.sqrt(squares / max(1, collocation.measurements)))
+        squares = sum(part.loss for part in collocation.iterates(z))
+        misfit = float(np.sqrt(squares / max(1, collocation.measurement_count)))
         if misfit > MISFIT:
-            size = f" ({1e3 * collocation.rms_m(z):.3g} mm rms)"
-            measurements, noise_key = _measured(collocation)
+            size = f" ({1e3 * collocation.rms_marker_distance_m(z):.3g} mm rms)"
+            measurements, noise_key = _main_measurement(collocation)
             are_markers = noise_key == "sigma_m"
             notes.append(
                 f"the {measurements} are missed by {misfit:.3g} of their standard deviations"

@@ -7,7 +7,8 @@ grasp; a softer one sags more, follows later and needs less force, until it fits
 simulation fails. So the best start is found by cheap simulations, and the search begins on the side
 where simulations succeed.
 
-The same scan is used if a guess cannot be simulated, or fits worse than a rigid body. Use `started`
+The same scan is used if a guess cannot be simulated, or fits worse than a rigid body. Use
+`start_problem`
 before a method is called.
 """
 
@@ -25,11 +26,11 @@ from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError
 from ..fem.constants import is_modulus, usual_value
 from ..model.parameters import Parameter, Parameters
-from ..program.collocation import Collocation, Part
+from ..program.collocation import Collocation, ExperimentIterate
 from ..program.newton import NewtonOptions
-from ..program.segment import Segment
-from .options import SHARES, part_of
-from .start import marched
+from ..program.segment import Transcription
+from .options import SHARES, samples_in_share
+from .start import simulate_trajectories
 
 # Largest Young's modulus of the scan [Pa].
 STIFFEST_PA = 1e7
@@ -105,7 +106,9 @@ class Scan:
         )
 
 
-def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation, Scan | None]:
+def start_problem(
+    collocation: Collocation, is_complete: bool = False
+) -> tuple[Collocation, Scan | None]:
     """Return the problem with a guess of every parameter, and the scan; None if there was no scan.
 
     Given guesses are kept, unless the body cannot be simulated with them or fits worse than an
@@ -115,7 +118,7 @@ def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation,
     ----------
     collocation : Collocation
         Problem.
-    whole : bool
+    is_complete : bool
         Whether the simulation at the start must reach the end of the recordings.
 
     Raises
@@ -123,23 +126,23 @@ def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation,
     InputError
         If parameters have no guess and the body cannot be simulated at any stiffness.
     """
-    unguessed = collocation.parameters.unguessed
+    unguessed = collocation.parameters.names_without_guess
     if any(is_modulus(name) for name in unguessed):
-        result = scan(collocation, whole=whole)
+        result = scan_stiffness(collocation, is_complete=is_complete)
         return replace(collocation, parameters=result.parameters), result
     if unguessed:
-        usual = usual_parameters(collocation.parameters, STIFFEST_PA)
+        usual = typical_parameters(collocation.parameters, STIFFEST_PA)
         collocation = replace(collocation, parameters=usual)
-    if not _scannable(collocation):
+    if not _has_free_modulus(collocation):
         return collocation, None
-    trial = _Trial(collocation)
-    misfit, failure = trial.guess(whole)
+    trial = _TrialSimulation(collocation)
+    misfit, failure = trial.evaluate_guess(is_complete)
     if failure is None and misfit <= trial.rigid_misfit:
         return collocation, None
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
         reason = "at the guess the measurements are missed by more than an undeformed body would"
-    result = rescue(collocation, reason, whole)
+    result = rescue(collocation, reason, is_complete)
     if result is None:
         return collocation, None  # the method will tell what it needs
     if failure is None and misfit <= result.misfit[result.best]:
@@ -147,7 +150,7 @@ def started(collocation: Collocation, whole: bool = False) -> tuple[Collocation,
     return replace(collocation, parameters=result.parameters), result
 
 
-def rescue(collocation: Collocation, reason: str, whole: bool = False) -> Scan | None:
+def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:
     """Return a scan without the given guesses; None if it finds no start.
 
     Parameters
@@ -156,18 +159,20 @@ def rescue(collocation: Collocation, reason: str, whole: bool = False) -> Scan |
         Problem with guesses.
     reason : str
         Reason for the scan.
-    whole : bool
+    is_complete : bool
         Whether the simulation at the start must reach the end of the recordings.
     """
-    if not _scannable(collocation):
+    if not _has_free_modulus(collocation):
         return None
     try:
-        return scan(without_guesses(collocation), reason, whole)
+        return scan_stiffness(without_guesses(collocation), reason, is_complete)
     except InputError:
         return None
 
 
-def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) -> Scan:
+def scan_stiffness(
+    collocation: Collocation, reason: str = NO_GUESS, is_complete: bool = False
+) -> Scan:
     """Simulate the problem at stiffnesses from stiff to soft, and return the best as a start.
 
     Parameters
@@ -176,7 +181,7 @@ def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) 
         Problem; parameters with a guess keep it.
     reason : str
         Reason for the scan, the beginning of `Scan.sentence`.
-    whole : bool
+    is_complete : bool
         Whether the simulation at the start must reach the end of the recordings.
 
     Raises
@@ -185,18 +190,24 @@ def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) 
         If the body cannot be simulated at any stiffness.
     """
     began = time.perf_counter()
-    trial = _Trial(replace(collocation, parameters=_sized(collocation.parameters, 1.0)))
-    trials = _Tried(trial)
+    trial = _TrialSimulation(
+        replace(collocation, parameters=_with_units(collocation.parameters, 1.0))
+    )
+    trials = _ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
-    trials.walk([STIFFEST_PA * step**k for k in range(STEPS)])
-    if trials.at_end(softest=True):
-        trials.walk_on(min(trials.misfits), step)
-    if trials.at_end(softest=False):
-        trials.warm = None
-        trials.walk_on(max(trials.misfits), 1 / step)
+    trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
+    if trials.is_best_at_end(softest=True):
+        trials.extend_range(min(trials.misfits), step)
+    if trials.is_best_at_end(softest=False):
+        trials.last_trajectories = None
+        trials.extend_range(max(trials.misfits), 1 / step)
     young_pa = np.array(sorted(trials.misfits))
     misfit = np.array([trials.misfits[young] for young in young_pa])
-    candidates = [young for young in _ranked(young_pa, misfit) if not whole or trial.runs(young)]
+    candidates = [
+        young
+        for young in _ranked_moduli(young_pa, misfit)
+        if not is_complete or trial.is_simulable(young)
+    ]
     if not candidates:
         raise InputError(
             f"no start was found: the body cannot be simulated at any of {len(young_pa)} "
@@ -206,9 +217,9 @@ def scan(collocation: Collocation, reason: str = NO_GUESS, whole: bool = False) 
             "parameters",
         )
     best = int(np.flatnonzero(young_pa == candidates[0])[0])
-    start = usual_parameters(collocation.parameters, candidates[0])
-    others = _other_starts(misfit, best) if not whole else ()
-    starts = {k: usual_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
+    start = typical_parameters(collocation.parameters, candidates[0])
+    others = _other_starts(misfit, best) if not is_complete else ()
+    starts = {k: typical_parameters(collocation.parameters, young_pa[k]) for k in (best, *others)}
     return Scan(
         reason,
         young_pa,
@@ -240,7 +251,7 @@ def _other_starts(misfit: Array, best: int) -> tuple[int, ...]:
     return tuple(sorted(possible, key=lambda k: known[k])[:MORE_STARTS])
 
 
-def usual_parameters(parameters: Parameters, young_pa: float) -> Parameters:
+def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     """Return parameters in which missing guesses are replaced by typical values at a Young's
     modulus [Pa].
 
@@ -248,7 +259,7 @@ def usual_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     """
     guesses = {i.name: i.guess for i in parameters.items if i.tied is None and i.guess is not None}
 
-    def value(item: Parameter) -> float:
+    def initial_value(item: Parameter) -> float:
         """Return the guess of a parameter, its prior mean, or a typical value within its bounds."""
         if item.guess is not None:
             return item.guess
@@ -260,16 +271,16 @@ def usual_parameters(parameters: Parameters, young_pa: float) -> Parameters:
         assert usual is not None  # by `parameter`
         return float(np.clip(usual, item.lower, item.upper))
 
-    sized = _sized(parameters, young_pa)
-    return sized.with_guess({item.name: value(item) for item in parameters.free})
+    sized = _with_units(parameters, young_pa)
+    return sized.with_guess({item.name: initial_value(item) for item in parameters.free})
 
 
-def usual_constants(parameters: Parameters) -> dict[str, float]:
+def typical_constants(parameters: Parameters) -> dict[str, float]:
     """Return values by parameter name: guesses, or typical ones of a soft body (`SOFT_PA`)."""
-    return usual_parameters(parameters, SOFT_PA).guesses
+    return typical_parameters(parameters, SOFT_PA).guesses
 
 
-def _ranked(young_pa: Array, misfit: Array) -> list[float]:
+def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
     """Return the moduli that could be simulated: the best, followed by stiffer ones; empty
     if none could.
     """
@@ -279,7 +290,7 @@ def _ranked(young_pa: Array, misfit: Array) -> list[float]:
     return [float(young_pa[k]) for k in range(best, len(young_pa)) if np.isfinite(misfit[k])]
 
 
-def _sized(parameters: Parameters, young_pa: float) -> Parameters:
+def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
     """Return the parameters with a unit for linear ones without: a tenth of Young's modulus
     [Pa].
     """
@@ -289,7 +300,7 @@ def _sized(parameters: Parameters, young_pa: float) -> Parameters:
     )
 
 
-def _scannable(collocation: Collocation) -> bool:
+def _has_free_modulus(collocation: Collocation) -> bool:
     """Return whether a free modulus on a logarithmic scale exists."""
     free = collocation.parameters.free
     return any(is_modulus(item.name) and item.scale == "log" for item in free)
@@ -300,13 +311,13 @@ def without_guesses(collocation: Collocation) -> Collocation:
     value can replace.
     """
 
-    def forgotten(item: Parameter) -> Parameter:
+    def without_guess(item: Parameter) -> Parameter:
         """Return the parameter without its guess, if that can be replaced."""
         is_replaceable = item.prior is not None or usual_value(item.name, 1.0) is not None
         return replace(item, guess=None) if is_replaceable and item in free else item
 
     free = collocation.parameters.free
-    items = tuple(map(forgotten, collocation.parameters.items))
+    items = tuple(map(without_guess, collocation.parameters.items))
     return replace(collocation, parameters=Parameters(items))
 
 
@@ -315,12 +326,12 @@ def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> f
 
     Markers of unknown position are associated with the body at the first samples.
     """
-    collocation, p = collocation.placed(p, positions)
-    parts = collocation.parts_at(p, positions)
+    collocation, p = collocation.place_unknown_markers(p, positions)
+    parts = collocation.iterates_at(p, positions)
     return root_mean(np.concatenate([_residuals(part) for part in parts]) ** 2)
 
 
-def _residuals(part: Part) -> Array:
+def _residuals(iterate: ExperimentIterate) -> Array:
     """Return the residuals of all measurements of one experiment, in standard deviations.
 
     Offsets, clocks and tool parameters of sensors have the values that fit best, because nothing
@@ -329,14 +340,16 @@ def _residuals(part: Part) -> Array:
     """
     residuals = []
     slopes = []
-    predictions = part.sensing.still(part.x)
-    for reading, (residual, slope) in zip(part.segment.readings, predictions, strict=True):
-        rough = reading.roughly(part.x, part.phi)
+    predictions = iterate.observation.linearise_fixed_motion(iterate.x)
+    for reading, (residual, slope) in zip(iterate.segment.residuals, predictions, strict=True):
+        rough = reading.rough_residuals(iterate.x, iterate.phi)
         if rough is not None:
             residuals.append(rough)
             slopes.append(np.zeros((len(rough), slope.shape[-1])))
             continue
-        is_compared = reading.there(len(part.looked[len(residuals)]))[: len(residual)]
+        is_compared = reading.compared_with(len(iterate.observables[len(residuals)]))[
+            : len(residual)
+        ]
         residuals.append(residual[is_compared])
         slopes.append(slope[is_compared] * reading.has_offsets)
     residual = np.concatenate(residuals)
@@ -352,18 +365,20 @@ def _residuals(part: Part) -> Array:
     )
 
 
-def _samples(segment: Segment) -> int:
+def _compared_samples(transcription: Transcription) -> int:
     """Return the number of first samples that are compared, with at least one of each
     measurement.
     """
-    t_s = segment.experiment.t_s
-    seen = [segment.experiment.markers.first_seen]
-    for reading in segment.readings[1:]:
-        seen.append(int(np.searchsorted(t_s, reading.begins_s)) + reading.channel.late)
-    return min(len(t_s), max(part_of(len(t_s), SHARES[0]), max(seen) + 1))
+    t_s = transcription.experiment.t_s
+    seen = [transcription.experiment.markers.first_seen_sample]
+    for reading in transcription.residuals[1:]:
+        seen.append(
+            int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
+        )
+    return min(len(t_s), max(samples_in_share(len(t_s), SHARES[0]), max(seen) + 1))
 
 
-class _Trial:
+class _TrialSimulation:
     """Simulation of the first part of every recording, and its misfit.
 
     Attributes
@@ -372,7 +387,7 @@ class _Trial:
         Number of samples that are compared, by experiment.
     rows : list of int
         Number of grid rows that are compared, by experiment.
-    whole : list of int
+    all_rows : list of int
         Number of all grid rows, by experiment.
     failure : SimulationError or None
         Last failure; None before the first.
@@ -382,31 +397,33 @@ class _Trial:
         self.collocation = collocation
         self.samples = []
         self.rows = []
-        self.whole = []
-        for segment in collocation.segments:
-            self.samples.append(_samples(segment))
+        self.all_rows = []
+        for segment in collocation.transcriptions:
+            self.samples.append(_compared_samples(segment))
             self.rows.append((self.samples[-1] - 1) * segment.substeps + 1)
-            self.whole.append(segment.grid_rows)
+            self.all_rows.append(segment.grid_times)
         self.failure: SimulationError | None = None
 
     @cached_property
     def rigid_misfit(self) -> float:
         """Misfit of an undeformed body that moves with the grasp, in standard deviations."""
         positions = []
-        for segment, rows in zip(self.collocation.segments, self.rows, strict=True):
+        for segment, rows in zip(self.collocation.transcriptions, self.rows, strict=True):
             rigid_positions = segment.experiment.rigid_positions(segment.dynamics.t_s[:rows])
             positions.append(rigid_positions.reshape(rows, -1))
         return _misfit(self.collocation, self.collocation.guess_p, positions)
 
-    def guess(self, whole: bool) -> tuple[float, SimulationError | None]:
+    def evaluate_guess(self, is_complete: bool) -> tuple[float, SimulationError | None]:
         """Return the misfit of the guess and None, or NaN and the failure of its simulation."""
         p = self.collocation.guess_p
-        positions, failure = self._simulated(p, None, self.whole if whole else self.rows)
+        positions, failure = self._simulate(p, None, self.all_rows if is_complete else self.rows)
         if failure is not None:
             return np.nan, failure
-        return self._compared(p, positions), None
+        return self._evaluate(p, positions), None
 
-    def at(self, young_pa: float, warm: list[Array] | None) -> tuple[float, list[Array] | None]:
+    def evaluate_at(
+        self, young_pa: float, guess: list[Array] | None
+    ) -> tuple[float, list[Array] | None]:
         """Return misfit and trajectories at a Young's modulus [Pa]; NaN and None if the simulation
         fails.
 
@@ -414,23 +431,23 @@ class _Trial:
         ----------
         young_pa : float
             Young's modulus [Pa].
-        warm : list of (N, 3n) array or None
+        guess : list of (N, 3n) array or None
             Trajectories at another modulus, near which equilibria are searched.
         """
         p = self._p(young_pa)
-        positions, failure = self._simulated(p, warm, self.rows)
+        positions, failure = self._simulate(p, guess, self.rows)
         if failure is not None:
             self.failure = failure
             return np.nan, None
-        return self._compared(p, positions), positions
+        return self._evaluate(p, positions), positions
 
-    def runs(self, young_pa: float) -> bool:
+    def is_simulable(self, young_pa: float) -> bool:
         """Return whether the complete recordings can be simulated at a Young's modulus [Pa]."""
-        _, failure = self._simulated(self._p(young_pa), None, self.whole)
+        _, failure = self._simulate(self._p(young_pa), None, self.all_rows)
         self.failure = failure or self.failure
         return failure is None
 
-    def key(self, young_pa: float) -> tuple[float, ...]:
+    def parameter_key(self, young_pa: float) -> tuple[float, ...]:
         """Return the parameters at a Young's modulus; moduli beyond all bounds have the
         same key.
         """
@@ -438,58 +455,60 @@ class _Trial:
 
     def _p(self, young_pa: float) -> Array:
         """Return the parameters p (np,) at a Young's modulus [Pa]."""
-        q = usual_parameters(self.collocation.parameters, young_pa).guess_q
+        q = typical_parameters(self.collocation.parameters, young_pa).guess_q
         return np.concatenate([q, np.zeros(self.collocation.nphi)])
 
-    def _compared(self, p: Array, positions: Sequence[Array]) -> float:
+    def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
         """Return the misfit of trajectories at p; NaN if it is not finite."""
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
         misfit = _misfit(self.collocation, p, first)
         return misfit if np.isfinite(misfit) else np.nan
 
-    def _simulated(
+    def _simulate(
         self, p: Array, warm: list[Array] | None, rows: Sequence[int]
     ) -> tuple[list[Array], SimulationError | None]:
-        """Return trajectories of so many rows at p, and the first failure, see `marched`."""
-        return marched(self.collocation, p, None, rows, LOOSE, near=warm)
+        """Return trajectories of so many rows at p, and the first failure, see
+        `simulate_trajectories`.
+        """
+        return simulate_trajectories(self.collocation, p, None, rows, LOOSE, guess=warm)
 
 
-class _Tried:
+class _ScanState:
     """Moduli that were tried so far, with their misfits.
 
     Attributes
     ----------
     misfits : dict of float to float
         Misfit by Young's modulus [Pa]; NaN where the simulation failed.
-    warm : list or None
+    last_trajectories : list or None
         Trajectories of the last simulation that succeeded.
-    lost : bool
+    is_ended_early : bool
         Whether the scan ended before the softest modulus.
     """
 
-    def __init__(self, trial: _Trial) -> None:
+    def __init__(self, trial: _TrialSimulation) -> None:
         self.trial = trial
         self.misfits: dict[float, float] = {}
-        self.warm: list[Array] | None = None
-        self.lost = False
+        self.last_trajectories: list[Array] | None = None
+        self.is_ended_early = False
 
-    def walk(self, young_pa: Sequence[float]) -> None:
+    def try_sequence(self, young_pa: Sequence[float]) -> None:
         """Try Young's moduli in the given order [Pa] until several in a row fail or fit badly.
 
         Moduli that give the same parameters are tried once.
         """
         failures = 0
-        first, *others = ([*same] for _, same in groupby(young_pa, self.trial.key))
+        first, *others = ([*same] for _, same in groupby(young_pa, self.trial.parameter_key))
         for young in (first[-1], *(same[0] for same in others)):
             misfit = self._try(young)
             finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
             is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
             failures = failures + 1 if is_failure else 0
             if failures == LOST:
-                self.lost = True
+                self.is_ended_early = True
                 return
 
-    def walk_on(self, young_pa: float, factor: float) -> None:
+    def extend_range(self, young_pa: float, factor: float) -> None:
         """Try moduli beyond an end of the range, as long as the misfit decreases.
 
         Parameters
@@ -502,7 +521,7 @@ class _Tried:
         best = self.misfits[young_pa]
         beyond = young_pa * factor
         while LIMITS_PA[1] < beyond < LIMITS_PA[0]:
-            if self.trial.key(beyond) == self.trial.key(beyond / factor):
+            if self.trial.parameter_key(beyond) == self.trial.parameter_key(beyond / factor):
                 return
             misfit = self._try(beyond)
             if not misfit < (1 - BETTER) * best:
@@ -510,20 +529,20 @@ class _Tried:
             best = misfit
             beyond = beyond * factor
 
-    def at_end(self, softest: bool) -> bool:
+    def is_best_at_end(self, softest: bool) -> bool:
         """Return whether the best modulus is the softest (or else the stiffest) that was tried.
 
         False for the softest end if the scan ended before it.
         """
         finite_misfits = {young: m for young, m in self.misfits.items() if np.isfinite(m)}
-        if not finite_misfits or (softest and self.lost):
+        if not finite_misfits or (softest and self.is_ended_early):
             return False
         best = min(finite_misfits, key=lambda young: finite_misfits[young])
         return best == (min(self.misfits) if softest else max(self.misfits))
 
     def _try(self, young_pa: float) -> float:
         """Simulate at a modulus, store the misfit, and return it."""
-        misfit, warm = self.trial.at(young_pa, self.warm)
-        self.warm = warm or self.warm
+        misfit, warm = self.trial.evaluate_at(young_pa, self.last_trajectories)
+        self.last_trajectories = warm or self.last_trajectories
         self.misfits[young_pa] = misfit
         return misfit

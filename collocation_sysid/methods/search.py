@@ -16,16 +16,16 @@ from ..arrays import Array
 from ..checked import Count, Options, Positive
 from ..errors import SimulationError
 from ..program.factorisation import Choice
-from .curvature import exact_curvature, updated, with_curvature
+from .curvature import exact_curvature, secant_update, with_curvature
 from .horizon import Horizon, Iterate
-from .options import FEWEST, SHARES, Shares, part_of
+from .options import FEWEST, SHARES, Shares, samples_in_share
 from .recorder import Recorder
 from .solution import Iteration, Status
-from .trajectory import Seen
+from .trajectory import FitSummary
 
 if TYPE_CHECKING:
     from ..program.collocation import Collocation
-    from .workers import Workers
+    from .workers import ExperimentExecutor
 
 # Largest infeasibility of a trial over the length of its step.
 CONTRACTION = 0.5
@@ -116,21 +116,22 @@ class ReducedSearch:
     ----------
     p : (np,) array
         Best parameters (q, φ).
-    x : list or None
-        Best trajectories, stored by the workers, see `trajectory.positions`; None before the first.
+    trajectories : list or None
+        Best trajectories, stored by the workers, see `trajectory.trajectory_positions`; None before
+        the first.
     sweeps : int
         Number of sweeps and simulations so far.
     trust : float
         Longest step, relative to `reach`.
     reach : (np,) array
         Change of each parameter that counts as a step of one.
-    seeing : bool
+    has_depth_cameras : bool
         Whether an experiment has depth cameras.
-    indefinite : int
+    indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
-    most_seen : int
+    most_measurements : int
         Largest number of measurements that were associated.
-    rereadings : int
+    reassociations : int
         Number of new associations so far.
     edge_m, size_m : float
         Mesh edge and body size [m].
@@ -143,7 +144,7 @@ class ReducedSearch:
         Record of the solve; its collocation is replaced when measurements are associated again.
     start : (variables,) array, optional
         Initial variables; None means the guess and simulations.
-    workers : Workers, optional
+    workers : ExperimentExecutor, optional
         Where the experiments are processed; None means threads.
     """
 
@@ -152,35 +153,38 @@ class ReducedSearch:
         options: SearchOptions,
         recorder: Recorder,
         start: Array | None,
-        workers: Workers | None = None,
+        workers: ExperimentExecutor | None = None,
     ) -> None:
         self.options = options
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
         # Points that depth cameras see belong to what is near: they tell of no long step.
-        self.seeing = any(segment.depths for segment in collocation.segments)
-        self.widest = SEEING if self.seeing else WIDEST
-        self.trust = min(options.trust, self.widest)
-        self.indefinite = 0
-        self.lower, self.upper = collocation.bounds_p
-        self.rereadings = 0
-        self.most_seen = 0
-        self.placed = True
+        self.has_depth_cameras = any(segment.depths for segment in collocation.transcriptions)
+        self.largest_trust = SEEING if self.has_depth_cameras else WIDEST
+        self.trust = min(options.trust, self.largest_trust)
+        self.indefinite_steps = 0
+        self.lower, self.upper = collocation.parameter_bounds
+        self.reassociations = 0
+        self.most_measurements = 0
+        self.is_associated = True
         self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
-        # Kept by the workers, see `trajectory.positions`.
-        self.x: list[Any] | None = None
+        # Kept by the workers, see `trajectory.trajectory_positions`.
+        self.trajectories: list[Any] | None = None
         self.workers = workers
         if start is not None:
             start = np.clip(start, *collocation.bounds())
-            self.p = collocation.parameters_of(start)
-            self.x = [part.segment.grasped(part.x, part.phi) for part in collocation.parts(start)]
+            self.p = collocation.parameters_from(start)
+            self.trajectories = [
+                part.segment.with_prescribed_positions(part.x, part.phi)
+                for part in collocation.iterates(start)
+            ]
         self.point: Iterate | None = None
         # The last trial, where cameras have looked anew.
-        self.looked: Any = None, None, None
-        nodes = [segment.body.nodes_m for segment in collocation.segments]
-        self.edge_m = min(segment.length_m for segment in collocation.segments)
+        self.camera_trial: Any = None, None, None
+        nodes = [segment.body.nodes_m for segment in collocation.transcriptions]
+        self.edge_m = min(segment.length_m for segment in collocation.transcriptions)
         self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
 
     # The ladder -------------------------------------------------------------------------------
@@ -199,32 +203,35 @@ class ReducedSearch:
         SimulationError
             If the simulation cannot be extended even after a fit of the rows that were reached.
         """
-        status = self._whole() or self._climb()
+        status = self._solve_from_start() or self._solve_horizons()
         return status, status.sentence
 
-    def _whole(self) -> Status | None:
+    def _solve_from_start(self) -> Status | None:
         """Solve the complete problem from the given positions.
 
         Return None if there are none or the sweep fails; then the positions are discarded.
         """
-        if self.x is None:
+        if self.trajectories is None:
             return None
         try:
-            rows = [segment.grid_rows for segment in self.collocation.segments]
-            return self._descend(self._horizon(rows, last=True), last=True)
+            rows = [segment.grid_times for segment in self.collocation.transcriptions]
+            return self._minimise(self._horizon(rows, last=True), is_last=True)
         except SimulationError:
-            self.x = self.point = None
+            self.trajectories = self.point = None
             return None
 
-    def _climb(self) -> Status:
+    def _solve_horizons(self) -> Status:
         """Solve one horizon after the other, and return the last status."""
         status = Status.CONVERGED
         for share in self.options.ladder:
             last = share == self.options.ladder[-1]
-            rows = [part_of(segment.grid_rows, share) for segment in self.collocation.segments]
+            rows = [
+                samples_in_share(segment.grid_times, share)
+                for segment in self.collocation.transcriptions
+            ]
             rung = self._horizon(rows, last)
-            self._reach(rung)
-            status = self._descend(rung, last)
+            self._extend_to(rung)
+            status = self._minimise(rung, last)
             if status is Status.ITERATION_LIMIT:
                 break
         return status
@@ -238,7 +245,7 @@ class ReducedSearch:
         choice = self.options.factorisation
         return Horizon(self.collocation, rows, prior, watch, choice, self.workers)
 
-    def _reach(self, rung: Horizon) -> None:
+    def _extend_to(self, horizon: Horizon) -> None:
         """Extend the trajectories to the length of a horizon.
 
         If the simulation fails, the rows that were reached are fitted first, and then extended
@@ -251,261 +258,269 @@ class ReducedSearch:
         """
         furthest = 0
         while True:
-            previous = self.x
-            reached, failure = rung.extend(self.p, previous)
+            previous = self.trajectories
+            reached, failure = horizon.simulate(self.p, previous)
             self.sweeps += 1
             if failure is not None and previous is not None:
                 # Rows that only nearly satisfy the equations may lead nowhere; simulated ones do.
-                restarted, restart_failure = rung.extend(self.p)
+                restarted, restart_failure = horizon.simulate(self.p)
                 self.sweeps += 1
-                if sum(rung.lengths(restarted)) > sum(rung.lengths(reached)):
+                if sum(horizon.row_counts(restarted)) > sum(horizon.row_counts(reached)):
                     reached = restarted
                     failure = restart_failure
             if failure is None:
-                self.x = reached
-                self._place(rung, first=previous is None)
+                self.trajectories = reached
+                self._associate_initially(horizon, is_first=previous is None)
                 return
-            rows = rung.lengths(reached)
-            fewest = min(FEWEST, *rung.rows)
+            rows = horizon.row_counts(reached)
+            fewest = min(FEWEST, *horizon.rows)
             is_unstarted = previous is None and min(rows) < fewest
             if is_unstarted or sum(rows) <= furthest or self.sweeps >= self.options.max_iterations:
                 raise failure
             furthest = sum(rows)
-            self.x = reached
-            self._place(rung, first=previous is None)
-            self._descend(self._horizon(rows, last=False), last=False)
+            self.trajectories = reached
+            self._associate_initially(horizon, is_first=previous is None)
+            self._minimise(self._horizon(rows, last=False), is_last=False)
 
     # One rung ---------------------------------------------------------------------------------
 
-    def _descend(self, rung: Horizon, last: bool) -> Status:
+    def _minimise(self, horizon: Horizon, is_last: bool) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
 
         Parameters
         ----------
-        rung : Horizon
+        horizon : Horizon
             Problem on the first rows.
-        last : bool
+        is_last : bool
             Whether it is the complete problem, so that the tolerance applies instead of
             `rung_decrease`.
         """
-        assert self.x is not None
+        assert self.trajectories is not None
         tolerance = self.options.tolerance
-        self.trust = min(self.options.trust, self.widest)
-        point = self._accepted(rung, rung.evaluate(self.p, self.x, self.point))
+        self.trust = min(self.options.trust, self.largest_trust)
+        point = self._accept(horizon, horizon.evaluate(self.p, self.trajectories, self.point))
         rejections = 0
         curvature = np.zeros((len(point.p), len(point.p)))
         previous = np.inf
         while True:
-            step = self._step(point, curvature)
-            length = self._length(step)
+            step = self._next_step(point, curvature)
+            length = self._step_length(step)
             # A step that the trust region cuts short says nothing about the distance to go.
             is_full_step = length < 0.99 * self.trust
             is_short = is_full_step and length <= tolerance
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
             rate = min(1.0, length / previous)
-            if last and is_full_step and length * rate <= SAFETY * tolerance:
-                final_positions = rung.moved(point, step)
-                summaries = rung.seen(point.p + step, final_positions)
+            if is_last and is_full_step and length * rate <= SAFETY * tolerance:
+                final_positions = horizon.extrapolate(point, step)
+                summaries = horizon.fit_summaries(point.p + step, final_positions)
                 if self._are_feasible(summaries):
                     self._record(
                         point.p + step, final_positions, point.predicted_loss(step), summaries
                     )
                     return Status.CONVERGED
             predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
-            if not last and predicted_share < self.options.rung_decrease:
+            if not is_last and predicted_share < self.options.rung_decrease:
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
-            trial = self._try(rung, point, step)
-            is_better = trial is not None and self._is_better(point, step, trial)
-            if trial is not None and is_better and self._is_seen_better(rung, point, trial):
-                if last and length <= LOCAL:
-                    curvature = self._curvature(curvature, point, trial)
-                point = self._accepted(rung, trial)
+            trial = self._try(horizon, point, step)
+            is_better = trial is not None and self._judge(point, step, trial)
+            if (
+                trial is not None
+                and is_better
+                and self._is_better_for_cameras(horizon, point, trial)
+            ):
+                if is_last and length <= LOCAL:
+                    curvature = self._update_curvature(curvature, point, trial)
+                point = self._accept(horizon, trial)
                 rejections = 0
                 previous = length
                 continue
             if is_short and point.feasibility_m <= NEARLY_FEASIBLE * self.size_m:
                 return Status.CONVERGED  # rounding keeps it from getting better
-            if self.seeing and length <= SEEN:
+            if self.has_depth_cameras and length <= SEEN:
                 return Status.CONVERGED  # what is seen changes by more than such a step gains
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return Status.STALLED
             self.trust = SHRINK * length
             rejections += 1
             if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
-                point = self._refined(rung, point)
+                point = self._make_feasible(horizon, point)
 
-    def _curvature(self, curvature: Array, before: Iterate, after: Iterate) -> Array:
+    def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
         """Return what Gauss–Newton neglects of the Hessian (np, np) at `after`,
         approximated or exact.
         """
         if self.options.hessian == "exact":
             return exact_curvature(self.collocation, after, self.recorder.stopwatch)
-        return updated(curvature, before, after)
+        return secant_update(curvature, previous, after)
 
-    def _length(self, step: Array) -> float:
+    def _step_length(self, step: Array) -> float:
         """Return the largest change of a parameter relative to `reach`."""
         return float(np.abs(step / self.reach).max(initial=0.0))
 
-    def _step(self, point: Iterate, curvature: Array) -> Array:
+    def _next_step(self, point: Iterate, curvature: Array) -> Array:
         """Return the step (np,) that minimises the model within bounds and trust region."""
         low = np.maximum(self.lower - point.p, -self.trust * self.reach)
         high = np.minimum(self.upper - point.p, self.trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
         low = np.minimum(low, 0.0) - 1e-15
         high = np.maximum(high, 0.0) + 1e-15
-        return with_curvature(point.fit, curvature).best(low, high)
+        return with_curvature(point.fit, curvature).minimiser(low, high)
 
-    def _try(self, rung: Horizon, point: Iterate, step: Array) -> Iterate | None:
+    def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
         """Sweep after a step from `point`; None if that fails or is not finite."""
         self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
         try:
-            trial = rung.tried(p, point, step)
+            trial = horizon.evaluate_step(p, point, step)
         except SimulationError:
             return None
-        return trial if trial.finite else None
+        return trial if trial.is_finite else None
 
-    def _is_better(self, point: Iterate, step: Array, trial: Iterate) -> bool:
+    def _judge(self, point: Iterate, step: Array, trial: Iterate) -> bool:
         """Return whether a trial is accepted, and adapt the trust region if it is."""
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
-        if trial.feasibility_m > max(CONTRACTION * trial.moved_m, SMALL_STRAIN * self.edge_m):
+        if trial.feasibility_m > max(
+            CONTRACTION * trial.position_change_m, SMALL_STRAIN * self.edge_m
+        ):
             return False
         noise = 1e-12 * point.loss + 1e-20
         if actual < DECREASE * predicted - noise:
             return False
-        length = self._length(step)
+        length = self._step_length(step)
         if actual > 0.75 * predicted and length > 0.9 * self.trust:
-            self.trust = min(2.0 * self.trust, self.widest)
+            self.trust = min(2.0 * self.trust, self.largest_trust)
         elif actual < 0.25 * predicted - noise:
             self.trust = max(0.5 * length, SMALLEST_TRUST)
         return True
 
-    def _refined(self, rung: Horizon, point: Iterate) -> Iterate:
+    def _make_feasible(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return the point after its feasibility step or, if that does not converge, with a
         simulation.
 
         The loss of the projected trajectory is then accurate to a higher order, so that trials are
         no longer compared with a loss that is too low.
         """
-        refined = self._try(rung, point, np.zeros(len(point.p)))
+        refined = self._try(horizon, point, np.zeros(len(point.p)))
         if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
-            return self._restored(rung, point)
-        return self._accepted(rung, refined)
+            return self._resimulated(horizon, point)
+        return self._accept(horizon, refined)
 
-    def _restored(self, rung: Horizon, point: Iterate) -> Iterate:
+    def _resimulated(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return the point with a simulated trajectory, or unchanged if the simulation fails."""
         self.sweeps += 1
-        x, failure = rung.extend(point.p, near=point)
+        x, failure = horizon.simulate(point.p, guess=point)
         if failure is not None:
             return point
         try:
-            resimulated = rung.evaluate(point.p, x)
+            resimulated = horizon.evaluate(point.p, x)
         except SimulationError:
             return point
-        return self._accepted(rung, resimulated) if resimulated.finite else point
+        return self._accept(horizon, resimulated) if resimulated.is_finite else point
 
-    def _are_feasible(self, seen: list[Seen]) -> bool:
+    def _are_feasible(self, summaries: list[FitSummary]) -> bool:
         """Return whether the residuals of the equations of motion are much smaller than the
         tolerance.
         """
         return all(
             each.violation_n <= FEASIBLE_FORCE * segment.force_n
-            for each, segment in zip(seen, self.collocation.segments, strict=True)
+            for each, segment in zip(summaries, self.collocation.transcriptions, strict=True)
         )
 
     # Where recordings are read ----------------------------------------------------------------
 
-    def _place(self, rung: Horizon, first: bool) -> None:
+    def _associate_initially(self, horizon: Horizon, is_first: bool) -> None:
         """Associate markers and cameras of unknown position, from the first rows of the
         trajectories.
 
         Parameters
         ----------
-        rung : Horizon
+        horizon : Horizon
             Problem, which is updated.
-        first : bool
+        is_first : bool
             Whether these are the first trajectories of the search.
         """
-        if (first or not self.placed) and self.x is not None:
-            counts = [segment.rows_to_place for segment in self.collocation.segments]
+        if (is_first or not self.is_associated) and self.trajectories is not None:
+            counts = [segment.rows_to_place for segment in self.collocation.transcriptions]
             if any(counts):
-                rows = rung.first_rows(self.x, counts)
+                rows = horizon.first_rows(self.trajectories, counts)
                 # What cameras see later is not there yet.
-                self.placed = not self.seeing or [*map(len, rows)] == counts
-                self._read_in(rung, *self.collocation.placed(self.p, rows))
+                self.is_associated = not self.has_depth_cameras or [*map(len, rows)] == counts
+                self._set_collocation(
+                    horizon, *self.collocation.place_unknown_markers(self.p, rows)
+                )
 
-    def _read_in(self, rung: Horizon, collocation: Collocation, p: Array) -> None:
+    def _set_collocation(self, horizon: Horizon, collocation: Collocation, p: Array) -> None:
         """Use another collocation of the same problem in the search, the recorder and the
         horizon.
         """
         self.collocation = self.recorder.collocation = collocation
-        rung.read_in(collocation)
-        self.lower, self.upper = collocation.bounds_p
+        horizon.set_collocation(collocation)
+        self.lower, self.upper = collocation.parameter_bounds
         self.p = p
 
-    def _follow(self, rung: Horizon, point: Iterate) -> Iterate:
+    def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return the point with measurements associated at its estimates; unchanged if they are the
         same.
 
         The association is not updated after `REREADINGS` updates.
         """
-        trial, collocation, after = self.looked
+        trial, collocation, after = self.camera_trial
         is_camera_trial = trial is point
         if is_camera_trial:
             p = after.p
         else:
-            counts = [segment.rows_to_follow for segment in self.collocation.segments]
-            rows = rung.first_rows(point.trajectories, counts)
-            collocation, p = self.collocation.following(point.p, rows)
-        if collocation is self.collocation or self.rereadings >= REREADINGS:
+            counts = [segment.rows_to_follow for segment in self.collocation.transcriptions]
+            rows = horizon.first_rows(point.trajectories, counts)
+            collocation, p = self.collocation.follow_estimates(point.p, rows)
+        if collocation is self.collocation or self.reassociations >= REREADINGS:
             return point
-        self.rereadings += 1
-        self._read_in(rung, collocation, p)
-        return after if is_camera_trial else rung.reread(p, point)
+        self.reassociations += 1
+        self._set_collocation(horizon, collocation, p)
+        return after if is_camera_trial else horizon.reassociate(p, point)
 
-    def _is_seen_better(self, rung: Horizon, point: Iterate, trial: Iterate) -> bool:
+    def _is_better_for_cameras(self, horizon: Horizon, point: Iterate, trial: Iterate) -> bool:
         """Return whether a trial is still acceptable with depth points associated at its estimates.
 
         A depth point may then belong to another part of the surface, or to none. True without depth
         cameras; false if the association may not be updated any more.
         """
         before = self.collocation
-        if not self.seeing:
+        if not self.has_depth_cameras:
             return True
-        if self.rereadings >= REREADINGS:
+        if self.reassociations >= REREADINGS:
             return False
-        self.most_seen = max(self.most_seen, before.measurements)
-        after = self._follow(rung, trial)
-        self.rereadings -= self.collocation is not before
-        self.looked = trial, self.collocation, after
-        measurements = self.collocation.measurements
+        self.most_measurements = max(self.most_measurements, before.measurement_count)
+        after = self._reassociate(horizon, trial)
+        self.reassociations -= self.collocation is not before
+        self.camera_trial = trial, self.collocation, after
+        measurements = self.collocation.measurement_count
         each = after.loss / max(1, measurements)
-        before_each = point.loss / max(1, before.measurements)
-        self._read_in(rung, before, point.p)
-        return measurements >= STILL_SEEN * self.most_seen and each <= AS_NEAR * before_each
+        before_each = point.loss / max(1, before.measurement_count)
+        self._set_collocation(horizon, before, point.p)
+        return measurements >= STILL_SEEN * self.most_measurements and each <= AS_NEAR * before_each
 
-    def _accepted(self, rung: Horizon, point: Iterate) -> Iterate:
+    def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Make a point the best so far, associate its measurements, record it, and return it."""
-        self.point = point = self._follow(rung, point)
-        self.indefinite = sum(report.indefinite for report in point.reports)
-        summaries = [report.seen for report in point.reports]
+        self.point = point = self._reassociate(horizon, point)
+        self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
+        summaries = [report.fit_summary for report in point.reports]
         self._record(point.p, point.trajectories, point.loss, summaries)
         return point
 
-    def _record(self, p: Array, x: list[Any], loss: float, seen: list[Seen]) -> None:
+    def _record(self, p: Array, x: list[Any], loss: float, summaries: list[FitSummary]) -> None:
         """Store parameters and trajectories as the best so far, and add them to the history."""
         self.p = p
-        self.x = x
-        squares_m2 = sum(each.squares_m2 for each in seen)
-        rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in seen))))
-        violation_n = max(each.violation_n for each in seen)
-        values = self.collocation.values(p)
+        self.trajectories = x
+        squares_m2 = sum(each.squares_m2 for each in summaries)
+        rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in summaries))))
+        violation_n = max(each.violation_n for each in summaries)
+        values = self.collocation.parameter_values(p)
         time_s = self.recorder.elapsed_s
-        share = sum(each.rows for each in seen) / sum(
-            s.grid_rows for s in self.collocation.segments
+        share = sum(each.rows for each in summaries) / sum(
+            s.grid_times for s in self.collocation.transcriptions
         )
         self.recorder.add(Iteration(self.sweeps, loss, rms_m, violation_n, values, time_s, share))

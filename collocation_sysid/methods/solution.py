@@ -17,8 +17,8 @@ import numpy as np
 
 from ..arrays import Array, root_mean
 from ..errors import InputError, SimulationError, hint_at
-from ..fem.kernels import side_by_side
-from ..program.collocation import Collocation, Part, Violation
+from ..fem.kernels import map_experiments
+from ..program.collocation import Collocation, ExperimentIterate, Violation
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
 from ..recording.experiment import Experiment
@@ -139,17 +139,17 @@ class Timing:
         return Timing(*(mine + its for mine, its in pairs))
 
     @classmethod
-    def of(cls, watch: Stopwatch, began: float) -> Timing:
+    def since(cls, watch: Stopwatch, start_s: float) -> Timing:
         """Return the times that a stopwatch has measured.
 
         Parameters
         ----------
         watch : Stopwatch
             Stopwatch of the solve.
-        began : float
+        start_s : float
             `time.perf_counter()` at the start of the solve [s], for the total.
         """
-        total = time.perf_counter() - began
+        total = time.perf_counter() - start_s
         return cls(watch.build, watch.evaluations, watch.linear_algebra, total)
 
 
@@ -254,7 +254,7 @@ class Solution:
         try:
             return constraint_multipliers(self.collocation, self.z)
         except SimulationError:
-            return np.zeros(self.collocation.constraints)
+            return np.zeros(self.collocation.constraint_count)
 
     @property
     def q(self) -> Array:
@@ -264,7 +264,7 @@ class Solution:
     @property
     def theta(self) -> Array:
         """Constants (k,) of the first experiment's body, see `Body.constants`."""
-        return self.collocation.segments[0].body.theta(self.parameters)
+        return self.collocation.transcriptions[0].body.theta_from_values(self.parameters)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -272,9 +272,9 @@ class Solution:
         return self.collocation.parameters.values(self.q)
 
     @cached_property
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[ExperimentIterate]:
         """Fitted experiments at the solution, in the order of `collocation.segments`."""
-        return self.collocation.parts(self.z)
+        return self.collocation.iterates(self.z)
 
     def nuisance(self, name: str) -> float:
         """Return the value of a nuisance parameter of a recording in its unit.
@@ -309,7 +309,7 @@ class Solution:
         expected = ", ".join(map(repr, found or dict.fromkeys(known)))
         raise InputError(f"{which}; expected one of {expected or '(none)'}{hint_at(name, known)}")
 
-    def part_of(self, experiment: str) -> Part | None:
+    def part_of(self, experiment: str) -> ExperimentIterate | None:
         """Return one experiment at the solution, by name; None if it was not fitted."""
         named = {part.segment.experiment.name: part for part in self.parts}
         return named.get(experiment)
@@ -325,7 +325,7 @@ class Solution:
         """Predicted marker positions (T, M, 3) of each fitted experiment [m], at its
         estimated nuisance parameters φ.
         """
-        return [part.segment.markers.of_positions(part.x, part.phi) for part in self.parts]
+        return [part.segment.markers.predict_positions(part.x, part.phi) for part in self.parts]
 
     @cached_property
     def wrenches(self) -> dict[str, list[Array]]:
@@ -335,7 +335,10 @@ class Solution:
         torque [N m]. NaN means that the sensor was not predicted at that sample.
         """
         parts = [part for part in self.parts if part.segment.sensors]
-        return {part.segment.experiment.name: part.sensing.wrenches(part.x) for part in parts}
+        return {
+            part.segment.experiment.name: part.observation.predict_wrenches(part.x)
+            for part in parts
+        }
 
     @cached_property
     def wrench_rms(self) -> dict[str, tuple[float | None, float | None]]:
@@ -344,7 +347,7 @@ class Solution:
         Only experiments with wrench sensors are included.
         """
         rms_by_experiment = {}
-        for segment in self.collocation.segments:
+        for segment in self.collocation.transcriptions:
             if segment.sensors:
                 readings = self.wrenches[segment.experiment.name]
                 rms_by_experiment[segment.experiment.name] = wrench_rms(
@@ -357,8 +360,10 @@ class Solution:
         """Predicted values (S, m) of custom sensors, by experiment name and sensor name."""
         return {
             part.segment.experiment.name: {
-                gauge.gauge.name: gauge.said(gauge.of_motion(part.motion, part.phi))
-                for gauge in part.segment.gauges
+                gauge.sensor.name: gauge.without_padding(
+                    gauge.predict_motion(part.motion, part.phi)
+                )
+                for gauge in part.segment.custom_sensors
             }
             for part in self.parts
         }
@@ -366,22 +371,22 @@ class Solution:
     @cached_property
     def rms_m(self) -> float:
         """Root mean square distance of all markers from their measurements [m]."""
-        return self.collocation.rms_m(self.z)
+        return self.collocation.rms_marker_distance_m(self.z)
 
     @cached_property
     def rms_by_experiment_m(self) -> dict[str, float]:
         """Root mean square distance of markers from their measurements [m], by experiment name."""
         rms_by_experiment = {}
-        for segment, readings in zip(self.collocation.segments, self.readings_m, strict=True):
+        for segment, readings in zip(self.collocation.transcriptions, self.readings_m, strict=True):
             markers = segment.experiment.markers
-            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.present]
+            squares = np.sum((readings - markers.positions_m) ** 2, axis=2)[markers.is_present]
             rms_by_experiment[segment.experiment.name] = root_mean(squares)
         return rms_by_experiment
 
     @cached_property
     def max_violation_n(self) -> float:
         """Largest residual of the equations of motion [N], computed from `z`."""
-        violations = self.collocation.violations_n(self.z)
+        violations = self.collocation.residuals_n(self.z)
         return float(max(np.abs(residual).max(initial=0.0) for residual in violations))
 
     @cached_property
@@ -401,7 +406,7 @@ class Solution:
 
 
 def wrench_rms(
-    experiment: Experiment, readings: Sequence[Array]
+    experiment: Experiment, predicted: Sequence[Array]
 ) -> tuple[float | None, float | None]:
     """Return the RMS residuals of force [N] and torque [N m], over all wrench sensors of an
     experiment.
@@ -410,7 +415,7 @@ def wrench_rms(
     ----------
     experiment : Experiment
         Experiment with the measured wrenches.
-    readings : sequence of (S, 6) array
+    predicted : sequence of (S, 6) array
         Predicted wrenches of each sensor; NaN entries are ignored.
 
     Returns
@@ -420,7 +425,7 @@ def wrench_rms(
         specimen, the values refer to the whole specimen, see `Wrench.symmetry`. None means that no
         component was measured.
     """
-    pairs = zip(readings, experiment.wrenches, strict=True)
+    pairs = zip(predicted, experiment.wrenches, strict=True)
     residuals = [sensor.symmetry * (read - sensor.values) for read, sensor in pairs]
     components = np.concatenate(residuals) if residuals else np.zeros((0, 6))
     force, torque = (
@@ -430,17 +435,17 @@ def wrench_rms(
     return force, torque
 
 
-def reading_rms(experiment: Experiment, readings: Mapping[str, Array]) -> dict[str, float]:
+def custom_sensor_rms(experiment: Experiment, predicted: Mapping[str, Array]) -> dict[str, float]:
     """Return the RMS residuals of custom sensors by name, in the unit of each sensor.
 
     Parameters
     ----------
     experiment : Experiment
         Experiment with the measured values.
-    readings : mapping of str to (S, m) array
+    predicted : mapping of str to (S, m) array
         Predicted values by sensor name; NaN entries are ignored.
     """
-    residuals = ((g.name, readings[g.name] - g.measured) for g in experiment.readings)
+    residuals = ((g.name, predicted[g.name] - g.measured_values) for g in experiment.readings)
     return {name: float(np.sqrt(np.nanmean(each**2))) for name, each in residuals}
 
 
@@ -451,7 +456,7 @@ def pooled_wrench_rms(solution: Solution) -> tuple[float | None, float | None]:
     """
     squares = np.zeros(2)
     counts = np.zeros(2)
-    for segment in solution.collocation.segments:
+    for segment in solution.collocation.transcriptions:
         components = solution.wrench_rms.get(segment.experiment.name, (None, None))
         for k, value in enumerate(components):
             if value is not None:
@@ -519,28 +524,32 @@ def constraint_multipliers(
         If the equations of a time step are singular.
     """
 
-    def of(part: Part) -> Array:
+    def of_experiment(iterate: ExperimentIterate) -> Array:
         """Return the multipliers of one experiment's equations of motion."""
-        segment = part.segment
-        gradient = collocation.loss_scale * part.gradient()[0]
+        segment = iterate.segment
+        gradient = collocation.loss_scale * iterate.gradient()[0]
         solver = Sweep(segment, stopwatch=stopwatch)
-        y = segment.force_n * solver.backward(part.x, part.setting, gradient)
-        return segment.of_rows(y)
+        y = segment.force_n * solver.backward(iterate.x, iterate.equations, gradient)
+        return segment.select_rows(y)
 
-    multipliers_by_experiment = side_by_side(of, collocation.parts(z), collocation.threads)
+    multipliers_by_experiment = map_experiments(
+        of_experiment, collocation.iterates(z), collocation.threads
+    )
     multipliers = np.concatenate(multipliers_by_experiment)
-    if any(segment.grasp_rows.any() for segment in collocation.segments):
-        _add_grasps(collocation, z, multipliers)
+    if any(segment.is_grasp_constraint.any() for segment in collocation.transcriptions):
+        _set_grasp_multipliers(collocation, z, multipliers)
     return multipliers
 
 
-def _add_grasps(collocation: Collocation, z: Array, multipliers: Array) -> None:
+def _set_grasp_multipliers(collocation: Collocation, z: Array, multipliers: Array) -> None:
     """Set the multipliers of prescribed displacements to minus the remaining gradient, in place.
 
     Their constraints have unit Jacobian rows.
     """
-    slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
-    for part in collocation.parts(slope):
+    slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
+    for part in collocation.iterates(slope):
         segment = part.segment
-        grasped = part.segment.grasp_rows
-        multipliers[segment.rows][grasped] = -segment.of_rows(part.x)[grasped] / segment.length_m
+        grasped = part.segment.is_grasp_constraint
+        multipliers[segment.rows][grasped] = (
+            -segment.select_rows(part.x)[grasped] / segment.length_m
+        )

@@ -1,7 +1,8 @@
 """One experiment's trajectory during a search: sweeps, trials and simulations.
 
 These functions run where the experiment is stored, in this process or on a worker of a cluster. A
-`Swept` is stored there because its size grows with the number of time steps; the search needs only
+`SweepResult` is stored there because its size grows with the number of time steps; the search needs
+only
 its `SweepReport`, whose size does not. Parameters p are the (q, φ) of the experiment alone.
 """
 
@@ -13,24 +14,24 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SimulationError
-from ..program.collocation import Part
-from ..program.least_squares import LeastSquares
-from ..program.marching import march_on
+from ..program.collocation import ExperimentIterate
+from ..program.least_squares import SquareRootInformation
+from ..program.marching import continue_simulation
 from ..program.newton import NewtonOptions
-from ..program.reading import as_squares
-from ..program.segment import Segment
+from ..program.reading import huber_as_least_squares
+from ..program.segment import Transcription
 from ..program.sweep import Sweep, Tangent
-from .start import continued
+from .start import continue_trajectory
 
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
 MARCHED = NewtonOptions(tolerance=1e-6)
 # Of equilibria near known ones. Those that are not found at once are too far for it.
-SETTLED = NewtonOptions(tolerance=1e-9, halvings=0)
+SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0)
 
 
 @dataclass(frozen=True)
-class Seen:
+class FitSummary:
     """Fit of one trajectory to its measurements.
 
     Attributes
@@ -51,19 +52,19 @@ class Seen:
     samples: int
 
     @classmethod
-    def of(cls, part: Part, x: Array, violation_n: float) -> Seen:
+    def from_iterate(cls, iterate: ExperimentIterate, x: Array, violation_n: float) -> FitSummary:
         """Return the fit of positions x (rows, 3n) [m] at the parameters of an experiment.
 
         Parameters
         ----------
-        part : Part
+        iterate : ExperimentIterate
             Experiment with its parameters; its positions are not used.
         x : (rows, 3n) array
             Positions at which the markers are evaluated [m].
         violation_n : float
             Largest residual of the equations of motion [N], as the caller knows it.
         """
-        squares = part.segment.markers.squared_distances_m2(x, part.phi)
+        squares = iterate.segment.markers.squared_distances_m2(x, iterate.phi)
         return cls(len(x), violation_n, float(squares.sum()), len(squares))
 
 
@@ -74,33 +75,33 @@ class SweepReport:
 
     Attributes
     ----------
-    fit : LeastSquares
+    fit : SquareRootInformation
         Residuals linearised in a step of the k parameters.
-    crossed : (k,) array
+    previous_slopes_residual : (k,) array
         S_0ᵀ r with the slopes S_0 of the previous trajectory; zeros without one.
     feasibility_m : float
         Largest coordinate of the feasibility step [m].
-    moved_m : float
+    position_change_m : float
         Largest change of a coordinate since the previous trajectory [m].
-    indefinite : int
+    indefinite_steps : int
         Number of time steps whose matrix is not positive definite.
-    seen : Seen
+    fit_summary : FitSummary
         Fit of the positions after the feasibility step.
-    spent : tuple of three floats
+    times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """
 
-    fit: LeastSquares
-    crossed: Array
+    fit: SquareRootInformation
+    previous_slopes_residual: Array
     feasibility_m: float
-    moved_m: float
-    indefinite: int
-    seen: Seen
-    spent: tuple[float, float, float]
+    position_change_m: float
+    indefinite_steps: int
+    fit_summary: FitSummary
+    times_s: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Swept:
+class SweepResult:
     """Trajectory with the result of one sweep.
 
     Attributes
@@ -130,7 +131,7 @@ class Swept:
 
 
 @dataclass(frozen=True, eq=False)
-class Reached:
+class SimulationResult:
     """Simulated trajectory, complete or not.
 
     Attributes
@@ -139,48 +140,48 @@ class Reached:
         Positions [m], as far as the simulation succeeded.
     failure : SimulationError or None
         Reason why the simulation ended early; None if it is complete.
-    spent : tuple of three floats
+    times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """
 
     x: Array
     failure: SimulationError | None
-    spent: tuple[float, float, float]
+    times_s: tuple[float, float, float]
 
 
-def positions(found: Swept | Reached | Array) -> Array:
+def trajectory_positions(trajectory: SweepResult | SimulationResult | Array) -> Array:
     """Return the positions (rows, 3n) [m] of a sweep result, a simulation, or an array of
     positions.
     """
-    return found if isinstance(found, np.ndarray) else found.x
+    return trajectory if isinstance(trajectory, np.ndarray) else trajectory.x
 
 
-def swept(
+def sweep(
     solver: Sweep,
-    segment: Segment,
+    transcription: Transcription,
     huber: float | None,
     p: Array,
-    start: Swept | Reached | Array,
-    known: Swept | None = None,
-    before: Swept | None = None,
-) -> Swept:
+    trajectory: SweepResult | SimulationResult | Array,
+    known_sweep: SweepResult | None = None,
+    previous: SweepResult | None = None,
+) -> SweepResult:
     """Return the result of one sweep at parameters p and given positions.
 
     Parameters
     ----------
     solver : Sweep
         Solver of the experiment's linearised equations of motion.
-    segment : Segment
+    transcription : Transcription
         Transcription of the experiment.
     huber : float or None
         Not used: each measurement residual has a threshold of its own.
     p : (k,) array
         Parameters (q, φ) of the experiment.
-    start : Swept, Reached or (rows, 3n) array
+    trajectory : SweepResult, SimulationResult or (rows, 3n) array
         Positions [m].
-    known : Swept, optional
+    known_sweep : SweepResult, optional
         Sweep of the first rows at the same p and positions, which is continued.
-    before : Swept, optional
+    previous : SweepResult, optional
         Previous trajectory, from which changes are measured.
 
     Raises
@@ -188,25 +189,26 @@ def swept(
     SimulationError
         If a time step is singular or not finite, or a node has no mass.
     """
-    part = _part(segment, p, positions(start))
-    dynamics = part.setting.dynamics
-    if (massless := dynamics.body.massless(dynamics.theta)) is not None:
+    part = _iterate(transcription, p, trajectory_positions(trajectory))
+    dynamics = part.equations.dynamics
+    if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         raise SimulationError(massless, float(dynamics.t_s[0]))
-    tangent = solver.forward(part.x, part.setting, known.tangent if known else None)
-    return _read(part, huber, tangent, before, solver.stopwatch.taken())
+    tangent = solver.forward(part.x, part.equations, known_sweep.tangent if known_sweep else None)
+    return _sweep_result(part, huber, tangent, previous, solver.stopwatch.read_and_reset())
 
 
-def tried(
+def sweep_after_step(
     solver: Sweep,
-    segment: Segment,
+    transcription: Transcription,
     huber: float | None,
     p: Array,
-    before: Swept,
+    previous: SweepResult,
     step: Array,
-) -> Swept:
+) -> SweepResult:
     """Return the result of one sweep after a step of the parameters to p.
 
-    The positions are those of `before` extrapolated along the sensitivities. Static experiments are
+    The positions are those of `previous` extrapolated along the sensitivities. Static experiments
+    are
     first solved for the equilibrium if one is near: a linear extrapolation stretches slender bodies
     that rotate much, so that its loss would be meaningless.
 
@@ -214,13 +216,13 @@ def tried(
     ----------
     solver : Sweep
         Solver of the experiment's linearised equations of motion.
-    segment : Segment
+    transcription : Transcription
         Transcription of the experiment.
     huber : float or None
-        See `swept`.
+        See `sweep`.
     p : (k,) array
         Parameters (q, φ) after the step.
-    before : Swept
+    previous : SweepResult
         Trajectory before the step.
     step : (k,) array
         Step of the parameters.
@@ -230,22 +232,28 @@ def tried(
     SimulationError
         If a time step is singular or not finite.
     """
-    part = _part(segment, p, moved(segment, before, step))
-    dynamics = part.setting.dynamics
+    part = _iterate(transcription, p, extrapolate(transcription, previous, step))
+    dynamics = part.equations.dynamics
     x = part.x
-    if dynamics.static:
-        equilibria, failure = march_on(
-            segment.experiment,
-            dynamics.first_rows(len(x)),
+    if dynamics.is_static:
+        equilibria, failure = continue_simulation(
+            transcription.experiment,
+            dynamics.truncated_to(len(x)),
             options=SETTLED,
             stopwatch=solver.stopwatch,
-            near=x,
+            near_solution=x,
         )
         x = equilibria if failure is None else x
-    return swept(solver, segment, huber, p, x, before=before)
+    return sweep(solver, transcription, huber, p, x, previous=previous)
 
 
-def reread(solver: Sweep, segment: Segment, huber: float | None, p: Array, found: Swept) -> Swept:
+def reassociate(
+    solver: Sweep,
+    transcription: Transcription,
+    huber: float | None,
+    p: Array,
+    sweep_result: SweepResult,
+) -> SweepResult:
     """Return the sweep with its measurements evaluated by another transcription.
 
     The positions and sensitivities are not computed again.
@@ -254,103 +262,125 @@ def reread(solver: Sweep, segment: Segment, huber: float | None, p: Array, found
     ----------
     solver : Sweep
         Solver, for its stopwatch.
-    segment : Segment
+    transcription : Transcription
         Transcription with new marker or camera associations.
     huber : float or None
-        See `swept`.
+        See `sweep`.
     p : (k,) array
         Parameters (q, φ) of the experiment.
-    found : Swept
+    sweep_result : SweepResult
         Sweep at p.
     """
-    return _read(_part(segment, p, found.x), huber, found.tangent, None, solver.stopwatch.taken())
+    return _sweep_result(
+        _iterate(transcription, p, sweep_result.x),
+        huber,
+        sweep_result.tangent,
+        None,
+        solver.stopwatch.read_and_reset(),
+    )
 
 
-def moved(segment: Segment, found: Swept, step: Array) -> Array:
+def extrapolate(transcription: Transcription, sweep_result: SweepResult, step: Array) -> Array:
     """Return positions (rows, 3n) [m] after the feasibility step and a step (k,) of the
     parameters.
     """
-    return found.x + found.tangent.step + found.tangent.by_p @ step[segment.moving]
+    return (
+        sweep_result.x
+        + sweep_result.tangent.step
+        + sweep_result.tangent.by_p @ step[transcription.dynamic_parameters]
+    )
 
 
-def reached(
+def simulate_rows(
     solver: Sweep,
-    segment: Segment,
+    transcription: Transcription,
     p: Array,
-    known: Swept | Reached | Array | None,
-    near: Swept | None,
-) -> Reached:
+    known_rows: SweepResult | SimulationResult | Array | None,
+    guess: SweepResult | None,
+) -> SimulationResult:
     """Simulate the rows of the solver at parameters p, as far as the simulation succeeds.
 
     Parameters
     ----------
     solver : Sweep
         Solver; its number of rows is that of the result.
-    segment : Segment
+    transcription : Transcription
         Transcription of the experiment.
     p : (k,) array
         Parameters (q, φ) of the experiment.
-    known : Swept, Reached, (m, 3n) array or None
+    known_rows : SweepResult, SimulationResult, (m, 3n) array or None
         First rows, which are continued; None for none.
-    near : Swept or None
+    guess : SweepResult or None
         Trajectory at other parameters, near which equilibria are searched first.
     """
-    part = _part(segment, p, np.zeros((0, segment.dofs)) if known is None else positions(known))
-    guess_positions = None if near is None else near.x
-    x, failure = continued(part, solver.dynamics.rows, MARCHED, solver.stopwatch, guess_positions)
-    return Reached(x, failure, solver.stopwatch.taken())
+    part = _iterate(
+        transcription,
+        p,
+        np.zeros((0, transcription.dof_count))
+        if known_rows is None
+        else trajectory_positions(known_rows),
+    )
+    guess_positions = None if guess is None else guess.x
+    x, failure = continue_trajectory(
+        part, solver.dynamics.row_count, MARCHED, solver.stopwatch, guess_positions
+    )
+    return SimulationResult(x, failure, solver.stopwatch.read_and_reset())
 
 
-def seen(segment: Segment, p: Array, x: Array) -> Seen:
+def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
     """Return the fit of positions x (rows, 3n) [m] at parameters p, with residuals computed
     from them.
     """
-    part = _part(segment, p, x)
-    return Seen.of(part, x, float(np.abs(part.residual_n).max()))
+    part = _iterate(transcription, p, x)
+    return FitSummary.from_iterate(part, x, float(np.abs(part.residual_n).max()))
 
 
-def _part(segment: Segment, p: Array, x: Array) -> Part:
+def _iterate(transcription: Transcription, p: Array, x: Array) -> ExperimentIterate:
     """Return the experiment at parameters p (k,) and positions x (rows, 3n)."""
-    return Part(segment, p[: segment.nq], p[segment.nq :], x)
+    return ExperimentIterate(transcription, p[: transcription.nq], p[transcription.nq :], x)
 
 
-def _read(
-    part: Part,
+def _sweep_result(
+    iterate: ExperimentIterate,
     huber: float | None,
     tangent: Tangent,
-    before: Swept | None,
-    spent: tuple[float, float, float],
-) -> Swept:
+    previous: SweepResult | None,
+    times_s: tuple[float, float, float],
+) -> SweepResult:
     """Return the sweep result: measurement residuals and slopes after the feasibility step.
 
     Parameters
     ----------
-    part : Part
+    iterate : ExperimentIterate
         Experiment at the parameters and positions of the sweep.
     huber : float or None
-        See `swept`.
+        See `sweep`.
     tangent : Tangent
         Feasibility step and sensitivities.
-    before : Swept or None
+    previous : SweepResult or None
         Previous trajectory; None for none.
-    spent : tuple of three floats
+    times_s : tuple of three floats
         Times for `Stopwatch.add` [s].
     """
-    response = part.sensing.looked_along(tangent.by_p, tangent.held)
-    predictions = part.sensing.linearised(part.x, response, tangent.step)
-    matches = zip(predictions, part.segment.readings, strict=True)
-    residuals_and_slopes = [as_squares(*each, reading.huber) for each, reading in matches]
+    response = iterate.observation.response_of_array(tangent.by_p, tangent.grasp_forces)
+    predictions = iterate.observation.linearise(iterate.x, response, tangent.step)
+    matches = zip(predictions, iterate.segment.residuals, strict=True)
+    residuals_and_slopes = [
+        huber_as_least_squares(*each, reading.huber) for each, reading in matches
+    ]
     residual = np.concatenate([values.ravel() for values, _ in residuals_and_slopes])
     slope = np.concatenate(
         [by.reshape(values.size, by.shape[-1]) for values, by in residuals_and_slopes]
     )
     report = SweepReport(
-        fit=LeastSquares.none(slope.shape[1]).add(residual, slope),
-        crossed=np.zeros(slope.shape[1]) if before is None else before.slope.T @ residual,
+        fit=SquareRootInformation.empty(slope.shape[1]).with_rows(residual, slope),
+        previous_slopes_residual=np.zeros(slope.shape[1])
+        if previous is None
+        else previous.slope.T @ residual,
         feasibility_m=float(np.abs(tangent.step).max()),
-        moved_m=0.0 if before is None else float(np.abs(part.x - before.x).max()),
-        indefinite=tangent.indefinite,
-        seen=Seen.of(part, part.x + tangent.step, tangent.violation_n),
-        spent=spent,
+        position_change_m=0.0 if previous is None else float(np.abs(iterate.x - previous.x).max()),
+        indefinite_steps=tangent.indefinite_count,
+        fit_summary=FitSummary.from_iterate(iterate, iterate.x + tangent.step, tangent.violation_n),
+        times_s=times_s,
     )
-    return Swept(part.x, tangent, slope, report)
+    return SweepResult(iterate.x, tangent, slope, report)

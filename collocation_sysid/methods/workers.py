@@ -20,13 +20,13 @@ from weakref import WeakKeyDictionary
 from ..cluster import connected, distributed
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.kernels import alone, side_by_side
+from ..fem.kernels import map_experiments, run_single_threaded
 from ..files import reason
-from ..program.charts import Chart
+from ..program.charts import MarkerAssociation
 from ..program.collocation import Collocation
-from ..program.segment import Segment
+from ..program.segment import Transcription
 from ..recording.experiment import Experiment
-from .recorder import Ended
+from .recorder import SearchEnded
 from .solution import Status
 
 T = TypeVar("T")
@@ -36,17 +36,17 @@ LOOK_EVERY_S = 10
 KEPT_BYTES = {-1: 64 * 2**20, -3: 32 * 2**20}
 
 
-class Workers(Protocol):
+class ExperimentExecutor(Protocol):
     """Protocol of executors, which apply functions to experiments.
 
     Stored values are lists with one entry per experiment, of a type that only the executor knows.
     """
 
-    def hold(self, collocation: Collocation) -> list[Any]:
+    def store_segments(self, collocation: Collocation) -> list[Any]:
         """Store the transcriptions of a problem, and return them as stored values."""
         ...
 
-    def each(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
         """Apply a function to every experiment, and return the results as stored values.
 
         Parameters
@@ -58,7 +58,7 @@ class Workers(Protocol):
         """
         ...
 
-    def fetch(self, kept: Sequence[Any]) -> list[Any]:
+    def fetch(self, stored: Sequence[Any]) -> list[Any]:
         """Return stored values as values in this process; raise the exception of a function
         that failed.
         """
@@ -69,8 +69,8 @@ class Workers(Protocol):
         ...
 
 
-class Here:
-    """Executor with threads of this process, see `side_by_side`.
+class LocalExecutor:
+    """Executor with threads of this process, see `map_experiments`.
 
     Parameters
     ----------
@@ -81,24 +81,24 @@ class Here:
     def __init__(self, threads: int) -> None:
         self.threads = threads
 
-    def hold(self, collocation: Collocation) -> list[Any]:
-        """See `Workers`."""
-        return list(collocation.segments)
+    def store_segments(self, collocation: Collocation) -> list[Any]:
+        """See `ExperimentExecutor`."""
+        return list(collocation.transcriptions)
 
-    def each(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
-        """See `Workers`."""
-        return side_by_side(lambda row: run(*row), [*zip(*columns, strict=True)], self.threads)
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+        """See `ExperimentExecutor`."""
+        return map_experiments(lambda row: run(*row), [*zip(*columns, strict=True)], self.threads)
 
-    def fetch(self, kept: Sequence[Any]) -> list[Any]:
-        """See `Workers`."""
-        return list(kept)
+    def fetch(self, stored: Sequence[Any]) -> list[Any]:
+        """See `ExperimentExecutor`."""
+        return list(stored)
 
     def notes(self) -> list[str]:
-        """See `Workers`."""
+        """See `ExperimentExecutor`."""
         return []
 
 
-class OnCluster:
+class DaskExecutor:
     """Executor with the workers of a Dask cluster; each experiment stays on one of them.
 
     Parameters
@@ -118,24 +118,26 @@ class OnCluster:
         self._homes: list[str] = []
         self._first = _require_package(client)
 
-    def hold(self, collocation: Collocation) -> list[Any]:
-        """See `Workers`; each body and experiment is sent only once."""
-        segments = collocation.segments
-        with self._unless_lost():
+    def store_segments(self, collocation: Collocation) -> list[Any]:
+        """See `ExperimentExecutor`; each body and experiment is sent only once."""
+        segments = collocation.transcriptions
+        with self._end_search_if_lost():
             known = all(segment.experiment in self._sent for segment in segments)
             if not known or len(self._homes) != len(segments):
-                costs = [segment.variables for segment in segments]
-                self._homes = _shared_out(costs, self.client.nthreads())
-            return [self._segment(s, home) for s, home in zip(segments, self._homes, strict=True)]
+                costs = [segment.variable_count for segment in segments]
+                self._homes = _assign_workers(costs, self.client.nthreads())
+            return [
+                self._send_segment(s, home) for s, home in zip(segments, self._homes, strict=True)
+            ]
 
-    def each(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
-        """See `Workers`."""
+    def map_experiments(self, run: Callable[..., Any], *columns: Sequence[Any]) -> list[Any]:
+        """See `ExperimentExecutor`."""
         rows = zip(self._homes, *columns, strict=True)
-        with self._unless_lost():
+        with self._end_search_if_lost():
             return [self._submit(home, run, *row) for home, *row in rows]
 
-    def fetch(self, kept: Sequence[Any]) -> list[Any]:
-        """Return stored values as values in this process, see `Workers`.
+    def fetch(self, stored: Sequence[Any]) -> list[Any]:
+        """Return stored values as values in this process, see `ExperimentExecutor`.
 
         Raises
         ------
@@ -143,12 +145,12 @@ class OnCluster:
             If the scheduler or all workers are lost, or an experiment terminates every worker that
             processes it.
         """
-        with self._unless_lost():
-            return [self._result(future) for future in kept]
+        with self._end_search_if_lost():
+            return [self._result(future) for future in stored]
 
     def notes(self) -> list[str]:
-        """See `Workers`."""
-        with self._unless_lost():
+        """See `ExperimentExecutor`."""
+        with self._end_search_if_lost():
             lost_workers = self._first - self.client.nthreads().keys()
         said = f"{len(lost_workers)} of {len(self._first)} workers were lost on the way: "
         return [f"{said}what they had was done again on others"] if lost_workers else []
@@ -159,23 +161,25 @@ class OnCluster:
             try:
                 return future.result(timeout=LOOK_EVERY_S)
             except distributed().TimeoutError:
-                _require_some(self.client.nthreads())
+                _require_workers(self.client.nthreads())
 
     @contextmanager
-    def _unless_lost(self) -> Iterator[None]:
-        """Context that raises `Ended` instead of Dask's exceptions if the cluster is lost."""
+    def _end_search_if_lost(self) -> Iterator[None]:
+        """Context that raises `SearchEnded` instead of Dask's exceptions if the cluster is lost."""
         dask = distributed()
         try:
             yield
         except dask.scheduler.KilledWorker as error:
-            raise _lost("A recording ended every worker that had it: mind their memory.") from error
+            raise _cluster_lost(
+                "A recording ended every worker that had it: mind their memory."
+            ) from error
         except (Exception, dask.client.CancelledError) as error:
             is_disconnected = isinstance(error, (OSError, dask.client.CancelledError))
-            if isinstance(error, Ended) or (
+            if isinstance(error, SearchEnded) or (
                 self.client.status == "running" and not is_disconnected
             ):
                 raise
-            raise _lost("Its scheduler answers no more.") from error
+            raise _cluster_lost("Its scheduler answers no more.") from error
 
     def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
         """Return a future of a function on a worker; Dask may choose another worker if that is
@@ -186,57 +190,61 @@ class OnCluster:
         # By the name of the function dask knows how long such tasks take.
         key = f"{run.__name__}-{secrets.token_hex(16)}"
         return self.client.submit(
-            _done, run, *arguments, key=key, workers=[home], allow_other_workers=True
+            _run_alone, run, *arguments, key=key, workers=[home], allow_other_workers=True
         )
 
-    def _segment(self, segment: Segment, home: str) -> Any:
+    def _send_segment(self, transcription: Transcription, home: str) -> Any:
         """Return a future of a transcription on a worker."""
 
-        def once(thing: T, make: Callable[[T], Any]) -> Any:
+        def send_once(thing: T, make: Callable[[T], Any]) -> Any:
             """Return the future of an object, which is made at the first call."""
             if thing not in self._sent:
                 self._sent[thing] = make(thing)
             return self._sent[thing]
 
-        def experiment(given: Experiment) -> Any:
-            return self._submit(home, _with_body, _bare(given), once(given.body, body))
+        def experiment(options: Experiment) -> Any:
+            return self._submit(
+                home, _with_body, _with_fields(options), send_once(options.body, body)
+            )
 
-        def body(given: Body) -> Any:
-            return self._submit(home, _itself, given)
+        def body(options: Body) -> Any:
+            return self._submit(home, _identity, options)
 
-        def whole(given: Segment) -> Any:
-            sent = once(given.experiment, experiment)
-            chart = _bare(given.chart)
+        def whole(options: Transcription) -> Any:
+            sent = send_once(options.experiment, experiment)
+            chart = _with_fields(options.association)
             rest = {
-                n: v for n, v in given.__getstate__().items() if n not in ("experiment", "chart")
+                n: v
+                for n, v in options.__getstate__().items()
+                if n not in ("experiment", "association")
             }
-            return self._submit(home, _segment_of, sent, chart, rest)
+            return self._submit(home, _restore_segment, sent, chart, rest)
 
-        return once(segment, whole)
+        return send_once(transcription, whole)
 
 
 @contextmanager
-def workers_of(scheduler: str | None) -> Iterator[OnCluster | None]:
+def connect_executor(scheduler: str | None) -> Iterator[DaskExecutor | None]:
     """Context with an executor on the scheduler at an address; None if the address is None.
 
     Raises
     ------
     InputError
-        If the connection fails or the workers do not fit, see `connected` and `OnCluster`.
+        If the connection fails or the workers do not fit, see `connected` and `DaskExecutor`.
     """
     if scheduler is None:
         yield None
         return
     with connected(scheduler) as client:
-        yield OnCluster(client)
+        yield DaskExecutor(client)
 
 
-def _shared_out(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
+def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
     """Return the worker address of each experiment.
 
     The experiment with the highest cost is assigned first, each to the thread with the least work.
     """
-    _require_some(threads)
+    _require_workers(threads)
     slots = [(address, k) for address, count in threads.items() for k in range(count)]
     loads = dict.fromkeys(slots, 0)
     homes = [""] * len(costs)
@@ -275,15 +283,15 @@ def _refusal(message: str) -> InputError:
     return InputError(message, None, "--scheduler")
 
 
-def _require_some(threads: dict[str, int]) -> None:
-    """Raise `Ended` if no worker is left."""
+def _require_workers(threads: dict[str, int]) -> None:
+    """Raise `SearchEnded` if no worker is left."""
     if not threads:
-        raise _lost("No worker is left.")
+        raise _cluster_lost("No worker is left.")
 
 
-def _lost(why: str) -> Ended:
+def _cluster_lost(reason: str) -> SearchEnded:
     """Return the exception that ends the search because the cluster is lost."""
-    return Ended(Status.CLUSTER_LOST, f"{Status.CLUSTER_LOST.sentence} {why}")
+    return SearchEnded(Status.CLUSTER_LOST, f"{Status.CLUSTER_LOST.sentence} {reason}")
 
 
 # On the workers -----------------------------------------------------------------------------------
@@ -294,14 +302,14 @@ def _version() -> str:
     return version("collocation-sysid")
 
 
-def _done(run: Callable[..., T], *arguments: Any) -> T:
+def _run_alone(run: Callable[..., T], *arguments: Any) -> T:
     """Return `run(*arguments)`, computed on a worker's thread without further threads."""
-    _keep_freed()
-    return alone(run, *arguments)
+    _retain_freed_memory()
+    return run_single_threaded(run, *arguments)
 
 
 @cache
-def _keep_freed() -> None:
+def _retain_freed_memory() -> None:
     """Let the C library keep freed memory of this process for later arrays.
 
     Dask's nannies set MALLOC_TRIM_THRESHOLD_, so that glibc returns every freed array to the
@@ -312,12 +320,12 @@ def _keep_freed() -> None:
             mallopt(option, size)
 
 
-def _itself(thing: T) -> T:
+def _identity(thing: T) -> T:
     """Return the argument; workers run it to store an object."""
     return thing
 
 
-def _bare(thing: T, body: Body | None = None) -> T:
+def _with_fields(thing: T, body: Body | None = None) -> T:
     """Return a copy of an experiment or an association with another body; None removes it
     for transfer.
     """
@@ -329,11 +337,13 @@ def _bare(thing: T, body: Body | None = None) -> T:
 
 def _with_body(experiment: Experiment, body: Body) -> Experiment:
     """Return the experiment with its body; workers run this function."""
-    return _bare(experiment, body)
+    return _with_fields(experiment, body)
 
 
-def _segment_of(experiment: Experiment, chart: Chart, rest: dict[str, Any]) -> Segment:
+def _restore_segment(
+    experiment: Experiment, chart: MarkerAssociation, rest: dict[str, Any]
+) -> Transcription:
     """Return a transcription from its experiment, its association without body, and its
     other arguments.
     """
-    return Segment(experiment, chart=_bare(chart, experiment.body), **rest)
+    return Transcription(experiment, association=_with_fields(chart, experiment.body), **rest)

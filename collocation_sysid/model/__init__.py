@@ -12,14 +12,14 @@ Forces:
 - `force_term`: interface of a force, and forces that have an energy.
 - `weight`: gravity, masses and loads.
 - `contact`: pressure and friction of rigid obstacles.
-- `point_forces`: custom forces and air drag.
-- `generated`: small expressions with generated derivatives.
+- `custom_force_terms`: custom forces and air drag.
+- `law_function`: small expressions with generated derivatives.
 
 Internal (history) variables:
 
 - `viscoelasticity`: memory of the material.
 - `force_history`: internal variables of forces.
-- `histories`: both of them along one motion.
+- `histories_along`: both of them along one motion.
 - `recursion`: recursions h_k = R(h_{k−1}, …) of sensors and memories.
 
 Equations in discrete time:

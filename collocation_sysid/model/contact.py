@@ -1,6 +1,7 @@
 """Contact pressure and friction between a deformable body and rigid obstacles.
 
-Use `contacts` to get the contact terms of an experiment. At points of the surface with undeformed
+Use `contact_terms` to get the contact terms of an experiment. At points of the surface with
+undeformed
 areas A and the gap g(x, X) to an obstacle whose frame has the pose X, the contact energy Ψ, the
 normal force N and the dissipation potential of friction D are
 
@@ -44,13 +45,13 @@ import numpy as np
 from ..arrays import Array, Index
 from ..fem.body import Body
 from ..fem.force_points import ForcePoints
-from ..fem.moduli import engineering
-from ..fem.touching import VECTORS, Touching
+from ..fem.moduli import engineering_constants
+from ..fem.touching import VECTORS_PER_POINT, ContactSurface
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
-from .force_term import Slots, States
-from .generated import Generated
-from .point_forces import Brought, Pointwise
+from .force_term import AssemblyIndices, States
+from .generated import GeneratedFunction
+from .point_forces import Pointwise, PreviousState
 
 # Stiffness κ in multiples of E / (mean edge length of the face); sets the penetration.
 STIFFNESS = 100.0
@@ -68,15 +69,15 @@ RELAXED_WIDTH = 2e-3
 SLIP = (0.01, 1e-4)
 # Number of data of a point: area, r δ², δ, κ in units of `stiffness`, and the length of the step
 # over which the pressure is averaged.
-DATA = 5
+DATA_COUNT = 5
 # Multiple of ε above which a point slips: friction is then at least 95 % of its limit.
-FAST = 3.0
+SLIP_THRESHOLD = 3.0
 # Points are evaluated in multiples of this number, so that only a few sizes are compiled.
-AT_A_TIME = 16
+POINT_BATCH = 16
 # Smallest difference of two gaps, to avoid division by zero [m].
 TINY_M = 1e-30
 # Largest b of relaxed contact in widths, which limits the pressure at gaps near zero or below.
-MOST = 50.0
+LARGEST_SCALED_PRESSURE = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,31 +91,31 @@ class ContactLaw:
     ----------
     body : Body
     obstacle : Obstacle
-    surface : Touching
+    surface : ContactSurface
         Points and areas of the surface that may touch the obstacle.
-    static : bool
+    is_static : bool
         Whether the experiment is static, so that ν is the displacement since the previous sample.
-    averaged : bool
+    is_averaged : bool
         Whether the pressure is the mean over a time step instead of that at ξ.
     """
 
     body: Body
     obstacle: Obstacle
-    surface: Touching
-    static: bool
-    averaged: bool = False
+    surface: ContactSurface
+    is_static: bool
+    is_averaged: bool = False
 
     @property
-    def by_velocity(self) -> bool:
+    def depends_on_velocity(self) -> bool:
         """Whether the force depends on ν: with friction, or if averaged over a step."""
-        return self.obstacle.rubs or self.averaged
+        return self.obstacle.has_friction or self.is_averaged
 
     @cached_property
     def edges_m(self) -> Array:
         """Mean edge length (i,) of the face at each point; of all faces if contact is relaxed."""
         if self.obstacle.relaxed is not None:
             return np.full(len(self.surface.area_m2), self.surface.edge_m)
-        return np.repeat(self.surface.edges_m, self.surface.a_face)
+        return np.repeat(self.surface.edges_m, self.surface.points_per_face)
 
     @cached_property
     def widths_m(self) -> Array:
@@ -123,20 +124,20 @@ class ContactLaw:
             return np.full(len(self.edges_m), self.obstacle.width_m)
         if self.obstacle.relaxed is not None:
             return RELAXED_WIDTH * self.edges_m
-        return (FRICTION_WIDTH if self.obstacle.rubs else WIDTH) * self.edges_m
+        return (FRICTION_WIDTH if self.obstacle.has_friction else WIDTH) * self.edges_m
 
     @property
-    def width_m(self) -> float:
+    def largest_width_m(self) -> float:
         """Largest width δ of all points."""
         return float(self.widths_m.max())
 
     @property
     def slip(self) -> float:
         """Slip ε of friction, in m/s or, in a static experiment, in m per sample."""
-        return self.obstacle.slip or SLIP[self.static] * self.surface.edge_m
+        return self.obstacle.slip or SLIP[self.is_static] * self.surface.edge_m
 
     @cached_property
-    def columns(self) -> Index:
+    def constant_columns(self) -> Index:
         """Indices (c,) in θ of the elastic constants on which κ depends, then of the friction
         coefficient.
         """
@@ -145,7 +146,7 @@ class ContactLaw:
         if self.obstacle.stiffness_pa_m is None:
             offset = self.body.starts[part]
             columns = [offset + k for k in range(len(self.body.parts[part].material.constants))]
-        if (friction := self.obstacle.coefficient) is not None:
+        if (friction := self.obstacle.friction_constant) is not None:
             columns.append(list(self.body.constants).index(friction.name))
         return np.array(columns, dtype=np.int64)
 
@@ -155,25 +156,25 @@ class ContactLaw:
         Parameters
         ----------
         constants : (c,) SX
-            Constants of `columns`.
+            Constants of `constant_columns`.
         """
         if self.obstacle.stiffness_pa_m is not None:
             return ca.SX(self.obstacle.stiffness_pa_m)
         material = self.body.parts[self.surface.part].material
         lame = material.lame(constants[: len(material.constants)])
-        return STIFFNESS * engineering(lame[0], lame[1])[0]
+        return STIFFNESS * engineering_constants(lame[0], lame[1])[0]
 
     def stiffness_at(self, theta: Array) -> Array:
         """Return κ (i,) at each point of a body with constants θ (k,) [Pa/m]."""
-        stiffness = float(ca.evalf(self.stiffness(ca.SX(ca.DM(theta[self.columns])))))
+        stiffness = float(ca.evalf(self.stiffness(ca.SX(ca.DM(theta[self.constant_columns])))))
         return stiffness * self.data[3]
 
-    def friction(self, constants: ca.SX) -> ca.SX:
+    def friction_coefficient(self, constants: ca.SX) -> ca.SX:
         """Return the friction coefficient μ, stated or from the constants (c,)."""
         coefficient = self.obstacle.friction
         return constants[-1] if isinstance(coefficient, str) else ca.SX(coefficient)
 
-    def seen(self, y: ca.SX) -> tuple[ca.SX, ca.SX]:
+    def to_obstacle_frame(self, y: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Express a contact point in the axes of its obstacle.
 
         Parameters
@@ -189,28 +190,28 @@ class ContactLaw:
             Axes of the obstacle, one per column.
         """
         point, *ends = ca.vertsplit(y, 3)
-        axes = ca.horzcat(*ends) / self._size_m
+        axes = ca.horzcat(*ends) / self._frame_size_m
         return axes.T @ point, axes
 
     @property
-    def _size_m(self) -> float:
+    def _frame_size_m(self) -> float:
         """Length of the axes of the obstacle's frame [m]."""
-        return float(self.body.frame_m[1, 0] - self.body.frame_m[0, 0])
+        return float(self.body.frame_nodes_m[1, 0] - self.body.frame_nodes_m[0, 0])
 
-    def gap(self, place: ca.SX) -> ca.SX:
+    def gap_at(self, point_m: ca.SX) -> ca.SX:
         """Return the signed gap g [m] at a point in obstacle axes; negative inside the obstacle.
 
         Parameters
         ----------
-        place : (3,) SX
-            Point relative to the origin of the frame, see `seen` [m].
+        point_m : (3,) SX
+            Point relative to the origin of the frame, see `to_obstacle_frame` [m].
         """
-        return self.obstacle.shape.gap(place + ca.DM(self.body.frame_m[0]))
+        return self.obstacle.shape.signed_distance(point_m + ca.DM(self.body.frame_nodes_m[0]))
 
-    def near(self, gap: ca.SX, data: ca.SX) -> ca.SX:
+    def scaled_pressure(self, gap: ca.SX, data: ca.SX) -> ca.SX:
         """Return b, the pressure divided by κ [m], at a gap.
 
-        With relaxed contact b is r δ² / g, limited to `MOST` widths.
+        With relaxed contact b is r δ² / g, limited to `LARGEST_SCALED_PRESSURE` widths.
 
         Parameters
         ----------
@@ -224,9 +225,9 @@ class ContactLaw:
             reach = ca.fmax(width_m - gap, 0)
             overlap = ca.fmax(-gap, 0)
             return (reach**2 - overlap**2) / width_m
-        return data[1] / ca.fmax(gap, data[1] / (MOST * width_m))
+        return data[1] / ca.fmax(gap, data[1] / (LARGEST_SCALED_PRESSURE * width_m))
 
-    def mean_near(self, gaps: tuple[ca.SX, ca.SX], data: ca.SX) -> ca.SX:
+    def mean_scaled_pressure(self, gaps: tuple[ca.SX, ca.SX], data: ca.SX) -> ca.SX:
         """Return the mean of b while the gap changes linearly from the first to the second
         value.
         """
@@ -248,30 +249,40 @@ class ContactLaw:
         return np.array([self.surface.area_m2, relaxed, self.widths_m, per_unit, step_s])
 
     @cached_property
-    def distance(self) -> Generated:
+    def gap_function(self) -> GeneratedFunction:
         """Expression of the gap g of y, with derivatives."""
-        return Generated(lambda y, _: self.gap(self.seen(y)[0]), 3 * VECTORS, 0, compiled=True)
+        return GeneratedFunction(
+            lambda y, _: self.gap_at(self.to_obstacle_frame(y)[0]),
+            3 * VECTORS_PER_POINT,
+            0,
+            is_compiled=True,
+        )
 
     def gaps(self, y: Array) -> Array:
         """Return the gaps g (T, i) [m] at y (12, T, i)."""
-        return self.distance.value(y, _no_data(y))[0]
+        return self.gap_function.evaluate(y, _no_data(y))[0]
 
     @cached_property
-    def generated(self) -> Generated:
+    def force_function(self) -> GeneratedFunction:
         """Expression of the forces (12,) of (y, ẏ, c), or (y, c) without velocities, and of
         data.
         """
-        moving = 3 * VECTORS * self.by_velocity
-        return Generated(self.force, 3 * VECTORS + moving + len(self.columns), DATA, compiled=True)
+        moving = 3 * VECTORS_PER_POINT * self.depends_on_velocity
+        return GeneratedFunction(
+            self.force_expression,
+            3 * VECTORS_PER_POINT + moving + len(self.constant_columns),
+            DATA_COUNT,
+            is_compiled=True,
+        )
 
     @cached_property
-    def push(self) -> Generated:
+    def point_force_function(self) -> GeneratedFunction:
         """Expression of the force (3,) on a point as a function of its position and velocity alone.
 
         Data are, in this order, the other entries of (y, ẏ), the constants and the data of the
         point.
         """
-        moving = 1 + self.by_velocity
+        moving = 1 + self.depends_on_velocity
 
         def force(u: ca.SX, data: ca.SX) -> ca.SX:
             """Return the force on the point; `u` is its position and, if needed, velocity."""
@@ -280,32 +291,44 @@ class ContactLaw:
             frame_ends = ca.vertsplit(frame[0], 9)
             y = [part for pair in zip(moving_parts, frame_ends, strict=True) for part in pair]
             constants, point_data = ca.vertsplit(
-                frame[1], [0, len(self.columns), len(self.columns) + DATA]
+                frame[1], [0, len(self.constant_columns), len(self.constant_columns) + DATA_COUNT]
             )
-            return self.force(ca.vertcat(*y, constants), point_data)[:3]
+            return self.force_expression(ca.vertcat(*y, constants), point_data)[:3]
 
-        return Generated(force, 3 * moving, 9 * moving + len(self.columns) + DATA, compiled=True)
+        return GeneratedFunction(
+            force,
+            3 * moving,
+            9 * moving + len(self.constant_columns) + DATA_COUNT,
+            is_compiled=True,
+        )
 
     @cached_property
-    def pressed(self) -> Generated:
+    def complementarity_function(self) -> GeneratedFunction:
         """Expression of forces (12,) at given b and of the complementarity residual, of (y, c,
         b).
         """
-        return Generated(self._pressed, 3 * VECTORS + len(self.columns) + 1, DATA, compiled=True)
+        return GeneratedFunction(
+            self._complementarity_expression,
+            3 * VECTORS_PER_POINT + len(self.constant_columns) + 1,
+            DATA_COUNT,
+            is_compiled=True,
+        )
 
-    def _pressed(self, u: ca.SX, data: ca.SX) -> ca.SX:
+    def _complementarity_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
         """Return the forces at given b, followed by b + g − √((b − g)² + 4 r δ²)."""
         inputs, b = ca.vertsplit(u, [0, u.numel() - 1, u.numel()])
-        gap = self.gap(self.seen(inputs[: 3 * VECTORS])[0])
+        gap = self.gap_at(self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0])
         residual = b + gap - ca.sqrt((b - gap) ** 2 + 4 * data[1])
-        return ca.vertcat(self.force(inputs, data, b), residual)
+        return ca.vertcat(self.force_expression(inputs, data, b), residual)
 
     @cached_property
-    def pressing(self) -> Generated:
+    def scaled_pressure_function(self) -> GeneratedFunction:
         """Expression of b of the gap."""
-        return Generated(self.near, 1, DATA)
+        return GeneratedFunction(self.scaled_pressure, 1, DATA_COUNT)
 
-    def force(self, u: ca.SX, data: ca.SX, pressing: ca.SX | None = None) -> ca.SX:
+    def force_expression(
+        self, u: ca.SX, data: ca.SX, scaled_pressure: ca.SX | None = None
+    ) -> ca.SX:
         """Return the contact forces (12,) on y: on the point, then on the ends of the frame's axes
         [N].
 
@@ -315,17 +338,17 @@ class ContactLaw:
             Stacked (y, ẏ, c), or (y, c) if the force does not depend on velocities.
         data : (5,) SX
             Data of the point.
-        pressing : SX, optional
+        scaled_pressure : SX, optional
             Given b; that of the gap by default.
         """
-        place, axes, slope, normal_n = self._normal(u, data, pressing)
+        place, axes, slope, normal_n = self._normal(u, data, scaled_pressure)
         # The forces on the ends of the axes follow from the coordinates of the point in these axes.
         push = normal_n * slope
-        force = ca.vertcat(axes @ push, ca.vec(u[:3] @ push.T) / self._size_m)
-        if not self.obstacle.rubs:
+        force = ca.vertcat(axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m)
+        if not self.obstacle.has_friction:
             return force
-        _, friction, _ = self._rub(u, place, axes @ slope, normal_n)
-        return force + ca.vertcat(friction, -ca.vec(friction @ (place / self._size_m).T))
+        _, friction, _ = self._friction(u, place, axes @ slope, normal_n)
+        return force + ca.vertcat(friction, -ca.vec(friction @ (place / self._frame_size_m).T))
 
     def _normal(
         self, u: ca.SX, data: ca.SX, pressing: ca.SX | None
@@ -333,17 +356,17 @@ class ContactLaw:
         """Return the point in obstacle axes, these axes, the gradient of the gap there and the
         force N.
         """
-        place, axes = self.seen(u[: 3 * VECTORS])
+        place, axes = self.to_obstacle_frame(u[: 3 * VECTORS_PER_POINT])
         symbol = ca.SX.sym("place", 3)
-        gap = self.gap(symbol)
-        slope = ca.gradient(self.gap(symbol), symbol)
+        gap = self.gap_at(symbol)
+        slope = ca.gradient(self.gap_at(symbol), symbol)
         gap, slope = ca.substitute([gap, slope], [symbol], [place])
         if pressing is not None:
             scaled_pressure = pressing
-        elif self.averaged:
-            scaled_pressure = self.mean_near(self._end_gaps(u, half_s=data[4] / 2), data)
+        elif self.is_averaged:
+            scaled_pressure = self.mean_scaled_pressure(self._end_gaps(u, half_s=data[4] / 2), data)
         else:
-            scaled_pressure = self.near(gap, data)
+            scaled_pressure = self.scaled_pressure(gap, data)
         return (
             place,
             axes,
@@ -353,16 +376,18 @@ class ContactLaw:
 
     def _end_gaps(self, u: ca.SX, half_s: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the gaps at both ends of a step, half a step before and after ξ."""
-        y = u[: 3 * VECTORS]
-        v = u[3 * VECTORS : 6 * VECTORS]
-        before, after = (self.gap(self.seen(y + way * v)[0]) for way in (-half_s, half_s))
+        y = u[: 3 * VECTORS_PER_POINT]
+        v = u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT]
+        before, after = (
+            self.gap_at(self.to_obstacle_frame(y + way * v)[0]) for way in (-half_s, half_s)
+        )
         return before, after
 
     def _constants(self, u: ca.SX) -> ca.SX:
         """Return the constants (c,), which are the last entries of u."""
-        return u[u.numel() - len(self.columns) :]
+        return u[u.numel() - len(self.constant_columns) :]
 
-    def _rub(
+    def _friction(
         self, u: ca.SX, place: ca.SX, slope: ca.SX, normal_n: ca.SX
     ) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Return friction limit μ N, friction force (3,) and tangential relative velocity (3,).
@@ -378,11 +403,11 @@ class ContactLaw:
         normal_n : SX
             Normal force N.
         """
-        relative, *ends = ca.vertsplit(u[3 * VECTORS : 6 * VECTORS], 3)
-        relative -= ca.horzcat(*ends) @ (place / self._size_m)
+        relative, *ends = ca.vertsplit(u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3)
+        relative -= ca.horzcat(*ends) @ (place / self._frame_size_m)
         normal = slope / ca.norm_2(slope)
         tangential = relative - normal * ca.dot(normal, relative)
-        limit_n = self.friction(self._constants(u)) * normal_n
+        limit_n = self.friction_coefficient(self._constants(u)) * normal_n
         return (
             limit_n,
             -limit_n / ca.sqrt(ca.sumsqr(tangential) + self.slip**2) * tangential,
@@ -390,7 +415,7 @@ class ContactLaw:
         )
 
     @cached_property
-    def rubbing(self) -> Generated:
+    def friction_function(self) -> GeneratedFunction:
         """Expression of friction of (y, ẏ, c), 6 values.
 
         These are the limit μ N, the same where the point slips (else 0), the friction force (3,)
@@ -399,11 +424,11 @@ class ContactLaw:
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
             place, axes, slope, normal_n = self._normal(u, data, None)
-            limit_n, friction, tangential = self._rub(u, place, axes @ slope, normal_n)
-            slips = ca.sumsqr(tangential) > (FAST * self.slip) ** 2
+            limit_n, friction, tangential = self._friction(u, place, axes @ slope, normal_n)
+            slips = ca.sumsqr(tangential) > (SLIP_THRESHOLD * self.slip) ** 2
             return ca.vertcat(limit_n, limit_n * slips, friction, -ca.dot(friction, tangential))
 
-        return Generated(friction_values, self.generated.inputs, DATA)
+        return GeneratedFunction(friction_values, self.force_function.input_size, DATA_COUNT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,50 +437,54 @@ class Contact(Pointwise):
 
     Attributes
     ----------
-    contact : ContactLaw
-    share : float
+    law_of_contact : ContactLaw
+    factor : float
         Factor of the force.
-    brought : Brought, optional
+    given_pressure : PreviousState, optional
         Given b of a program that has b as variables; b follows from the gap by default.
-    weighed : (1, T, points), optional
+    variable_weights : (1, T, points), optional
         Weights of the complementarity residuals in second derivatives.
     step_s : float
         Length of the time steps over which an averaged pressure is a mean; 0 if it is not averaged.
     """
 
-    contact: ContactLaw
-    share: float = 1.0
-    brought: Brought | None = None
-    weighed: Array | None = None
+    law_of_contact: ContactLaw
+    factor: float = 1.0
+    given_pressure: PreviousState | None = None
+    variable_weights: Array | None = None
     step_s: float = 0.0
     size = 0
-    slides = True
+    uses_increments = True
 
     @property
     def points(self) -> ForcePoints:  # type: ignore[override]
         """Points of the surface, with the obstacle's frame."""
-        return self.contact.surface.points
+        return self.law_of_contact.surface.points
 
     @property
-    def law(self) -> Generated:
+    def law(self) -> GeneratedFunction:
         """Force law: of the gap, or of given b with the complementarity residual."""
-        return self.contact.generated if self.brought is None else self.contact.pressed
+        return (
+            self.law_of_contact.force_function
+            if self.given_pressure is None
+            else self.law_of_contact.complementarity_function
+        )
 
     @property
-    def relaxed(self) -> bool:
+    def is_complementarity(self) -> bool:
         """Whether the contact is relaxed complementarity."""
-        return self.contact.obstacle.relaxed is not None
+        return self.law_of_contact.obstacle.relaxed is not None
 
     @property
-    def carries(self) -> int:  # type: ignore[override]
+    def internal_variable_count(self) -> int:  # type: ignore[override]
         """Number of values that are given at each point: 1 where b is given, else 0."""
-        return int(self.brought is not None)
+        return int(self.given_pressure is not None)
 
-    def pressing(self, xi: Array) -> Array:
+    def scaled_pressures(self, xi: Array) -> Array:
         """Return the pressures divided by κ, b (1, T, i) [m], at positions ξ (T, 3n)."""
-        gaps = self.contact.gaps(self.points.vectors(xi))
-        data = np.broadcast_to(self.contact.data[:, None], (DATA, *gaps.shape))
-        return self.contact.pressing.value(gaps[None], data)
+        gaps = self.law_of_contact.gaps(self.points.vectors(xi))
+        data = np.broadcast_to(self.law_of_contact.data[:, None], (DATA_COUNT, *gaps.shape))
+        return self.law_of_contact.scaled_pressure_function.evaluate(gaps[None], data)
 
     def rigid_limit_n(self, states: States) -> Array:
         """Return the change (T, 3n) of the forces if contact were rigid, to first order [N].
@@ -469,59 +498,61 @@ class Contact(Pointwise):
         ----------
         states : States
         """
-        evaluated = self._at(states)
+        evaluated = self._inputs_at(states)
         y = evaluated.u[evaluated.y]
-        gap, normal = self.contact.distance.slopes(y, _no_data(y))
-        _, slopes = self.law.slopes(evaluated.u, evaluated.data)
+        gap, normal = self.law_of_contact.gap_function.evaluate_with_jacobian(y, _no_data(y))
+        _, slopes = self.law.evaluate_with_jacobian(evaluated.u, evaluated.data)
         change = np.einsum("vkti,kti->vti", slopes[evaluated.y, :3], normal[0, :3] * gap[0])
-        return self.share * self.points.summed(change, evaluated.chosen)
+        return self.factor * self.points.assemble(change, evaluated.chosen)
 
-    def rubbing(self, states: States) -> Array:
-        """Return the sums over the points (6, T) of `ContactLaw.rubbing`."""
-        evaluated = self._at(states)
-        return self.contact.rubbing.value(evaluated.u, evaluated.data).sum(axis=2)
+    def friction_sums(self, states: States) -> Array:
+        """Return the sums over the points (6, T) of `ContactLaw.friction_function`."""
+        evaluated = self._inputs_at(states)
+        return self.law_of_contact.friction_function.evaluate(evaluated.u, evaluated.data).sum(
+            axis=2
+        )
 
     @property
-    def by_velocity(self) -> bool:
+    def is_nonlinear_in_velocity(self) -> bool:
         """Whether the force depends on velocities: with friction, or if averaged over a step."""
-        return self.contact.by_velocity
+        return self.law_of_contact.depends_on_velocity
 
     @property
-    def turns(self) -> bool:
+    def has_skew_stiffness(self) -> bool:
         """Whether derivatives by positions have a skew part: only if the force depends on
         velocities.
         """
-        return self.contact.by_velocity
+        return self.law_of_contact.depends_on_velocity
 
     @property
-    def spins(self) -> bool:  # type: ignore[override]
+    def has_skew_damping(self) -> bool:  # type: ignore[override]
         """Whether derivatives by velocities are non-symmetric: only if averaged over a step."""
-        return self.contact.averaged
+        return self.law_of_contact.is_averaged
 
-    def at(self, u: Array) -> Self:
+    def with_inputs(self, u: Array) -> Self:
         """Return self: contact has no inputs beside the constants of the body."""
         return self
 
-    def rows(self, rows: slice) -> Self:
+    def at_times(self, rows: slice) -> Self:
         """Return self: contact is the same at all times."""
         return self
 
-    def towards(self, other: Self, share: float) -> Self:
+    def interpolate(self, other: Self, share: float) -> Self:
         """Return self: obstacles move with the nodes of their frames."""
         return self
 
-    def acting(self, states: States) -> tuple[Index | None, Array]:
+    def active_points(self, states: States) -> tuple[Index | None, Array]:
         """Return the indices of the points that may have a pressure, and y (12, T, i) of these
         points.
 
         These are the points within δ at any of the times, and some more to fill a multiple of
-        `AT_A_TIME`. With relaxed contact all points act, and the indices are None.
+        `POINT_BATCH`. With relaxed contact all points act, and the indices are None.
         """
         y = self.points.vectors(states.xi)
-        if self.relaxed:
+        if self.is_complementarity:
             return None, y
-        is_near = np.any(self._least_gaps(states, y) < self.contact.widths_m, axis=0)
-        is_near[np.flatnonzero(~is_near)[: -is_near.sum() % AT_A_TIME]] = True
+        is_near = np.any(self._least_gaps(states, y) < self.law_of_contact.widths_m, axis=0)
+        is_near[np.flatnonzero(~is_near)[: -is_near.sum() % POINT_BATCH]] = True
         chosen = np.flatnonzero(is_near)
         return chosen, y[..., chosen]
 
@@ -529,28 +560,32 @@ class Contact(Pointwise):
         """Return the gaps (T, i) at y; if averaged over a step, the smaller one of its two ends."""
         half_s = self.step_s / 2
         if not half_s:
-            return self.contact.gaps(y)
+            return self.law_of_contact.gaps(y)
         half_step = half_s * self.points.vectors(states.nu)
-        return np.minimum(self.contact.gaps(y - half_step), self.contact.gaps(y + half_step))
+        return np.minimum(
+            self.law_of_contact.gaps(y - half_step), self.law_of_contact.gaps(y + half_step)
+        )
 
-    def deepest(self, x: Array) -> tuple[float, Array]:
+    def deepest_point(self, x: Array) -> tuple[float, Array]:
         """Return the depth δ − g of the deepest point at positions x (3n,) [m], and the normal (3,)
         there.
 
         The depth is negative if no point has a pressure.
         """
         y = self.points.vectors(x[None])
-        gap, slopes = self.contact.distance.slopes(y, _no_data(y))
+        gap, slopes = self.law_of_contact.gap_function.evaluate_with_jacobian(y, _no_data(y))
         deepest = int(gap[0, 0].argmin())
-        return self.contact.widths_m[deepest] - float(gap[0, 0, deepest]), slopes[0, :3, 0, deepest]
+        return self.law_of_contact.widths_m[deepest] - float(gap[0, 0, deepest]), slopes[
+            0, :3, 0, deepest
+        ]
 
     def constants(self, states: States) -> Array:
         """Return the constants (c, 1) on which stiffness and friction depend."""
-        return states.theta[self.contact.columns][:, None]
+        return states.theta[self.law_of_contact.constant_columns][:, None]
 
-    def columns(self, places: Slots) -> Index:
+    def constant_columns(self, places: AssemblyIndices) -> Index:
         """Return the indices in θ of these constants."""
-        return self.contact.columns
+        return self.law_of_contact.constant_columns
 
     def data(self, chosen: Index | None) -> Array:
         """Return the data (5, 1, i) of the chosen points; of all points for None."""
@@ -558,7 +593,7 @@ class Contact(Pointwise):
 
     def data_of(self, points: Index | slice) -> Array:
         """Return the data (5, i) of some points, with the time step."""
-        data = self.contact.data[:, points].copy()
+        data = self.law_of_contact.data[:, points].copy()
         data[4] = self.step_s
         return data
 
@@ -568,7 +603,7 @@ def _no_data(y: Array) -> Array:
     return np.zeros((0, *y.shape[1:]))
 
 
-def contacts(experiment: Experiment, step_s: float = 0.0) -> tuple[Contact, ...]:
+def contact_terms(experiment: Experiment, step_s: float = 0.0) -> tuple[Contact, ...]:
     """Return the contact terms of an experiment's obstacles.
 
     Parameters
@@ -581,7 +616,7 @@ def contacts(experiment: Experiment, step_s: float = 0.0) -> tuple[Contact, ...]
     terms = []
     for obstacle in experiment.obstacles:
         averaged = step_s > 0 and obstacle.relaxed is None
-        law = contact_law(experiment.body, obstacle, static=experiment.static, averaged=averaged)
+        law = contact_law(experiment.body, obstacle, static=experiment.is_static, averaged=averaged)
         terms.append(Contact(law, step_s=step_s if averaged else 0.0))
     return tuple(terms)
 
@@ -601,7 +636,7 @@ def contact_law(
     averaged : bool
         Whether the pressure is the mean over a time step.
     """
-    return ContactLaw(body, obstacle, obstacle.surface(body), static, averaged)
+    return ContactLaw(body, obstacle, obstacle.contact_surface(body), static, averaged)
 
 
 def mean_square(first: ca.SX, second: ca.SX) -> ca.SX:

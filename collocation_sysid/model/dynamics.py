@@ -9,7 +9,8 @@ so that with G = ∂F/∂ξ and C = ∂F/∂ν at evaluation t (see `schemes`)
 
     −∂c_t/∂x_t = s_0 M − w_0 (p_0 G + q_0 C).
 
-Use `Dynamics.of` to discretise an experiment, `Dynamics.residual` and `Dynamics.linearise` to
+Use `Dynamics.from_experiment` to discretise an experiment, `Dynamics.residual` and
+`Dynamics.linearise` to
 evaluate all rows, and `StencilRow` for time-marching methods that need the coefficients of one row.
 """
 
@@ -28,13 +29,13 @@ from ..fem.pattern import SymmetricPattern
 from ..recording.experiment import Experiment
 from .force_history import ForceHistory
 from .forces import Forces
-from .histories import AnyHistory, histories, onto
+from .histories import AnyHistory, histories_along, insert_histories
 from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
-from .weight import Mass
+from .weight import DofMasses
 
 
 @dataclass(frozen=True, eq=False)
-class Tables:
+class StencilTables:
     """Stencil coefficients of every row, padded with zeros to the largest lag of the scheme.
 
     Attributes
@@ -52,9 +53,9 @@ class Tables:
     r: Array  # (N,)
 
     @classmethod
-    def of(cls, scheme: Scheme, rows: int, first_row: int) -> Tables:
+    def from_scheme(cls, scheme: Scheme, rows: int, first_row: int) -> StencilTables:
         """Return the tables of rows 0 … `rows` − 1; rows before `first_row` are zero."""
-        p, q, w, s = (np.zeros((rows, scheme.reach + 1)) for _ in range(4))
+        p, q, w, s = (np.zeros((rows, scheme.largest_lag + 1)) for _ in range(4))
         r = np.zeros(rows)
         for row in range(first_row, rows):
             stencil = scheme.stencil(row)
@@ -76,19 +77,19 @@ class Dynamics:
     Attributes
     ----------
     body : Body
-    tables : Tables
+    tables : StencilTables
         Stencil coefficients of every row.
     t_s : (N,)
         Times of the grid.
     first_row : int
         Index of the first equation: 0 or 1.
-    mass : Mass
+    mass : DofMasses
         Mass of every dof in each row: the mean over the evaluations of the row.
     forces : Forces
         Forces at the N evaluations.
-    goals_m : (N, 3n)
+    prescribed_m : (N, 3n)
         Prescribed positions; NaN where a dof is free.
-    taken : (N, 3n) bool
+    is_temporarily_held : (N, 3n) bool
         True where a grasp holds a dof that is free at other times. The forces at such a dof are
         balanced by the reaction force and omitted from all rows, so that a released dof starts like
         the first step, from its velocity.
@@ -98,25 +99,27 @@ class Dynamics:
         Start velocity v_0.
     loaded_since_s : float
         Time for which the body has been in its start shape; infinite if its memory has relaxed.
-    static : bool
+    is_static : bool
         Whether each row is an equilibrium.
     """
 
     body: Body
-    tables: Tables
+    tables: StencilTables
     t_s: Array
     first_row: int
-    mass: Mass
+    mass: DofMasses
     forces: Forces
-    goals_m: Array
-    taken: NDArray[np.bool_]
+    prescribed_m: Array
+    is_temporarily_held: NDArray[np.bool_]
     evaluated_s: Array
     start_velocity_m_s: Array
     loaded_since_s: float = np.inf
-    static: bool = False
+    is_static: bool = False
 
     @classmethod
-    def of(cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1) -> Dynamics:
+    def from_experiment(
+        cls, experiment: Experiment, scheme: str | Scheme, substeps: int = 1
+    ) -> Dynamics:
         """Discretise an experiment in time.
 
         Parameters
@@ -127,67 +130,69 @@ class Dynamics:
         substeps : int
             Number of time steps between samples; ignored for a static experiment.
         """
-        if experiment.static:
+        if experiment.is_static:
             t_s = experiment.t_s
-            table = SLIDING if any(o.rubs for o in experiment.obstacles) else QUASI_STATIC
+            table = SLIDING if any(o.has_friction for o in experiment.obstacles) else QUASI_STATIC
         else:
             rows = (len(experiment.t_s) - 1) * substeps + 1
             t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
             table = as_scheme(scheme, experiment.start_rule)
         rows = len(t_s)
         first_row = 0 if experiment.start == "equilibrium" else 1
-        tables = Tables.of(table, rows, first_row)
+        tables = StencilTables.from_scheme(table, rows, first_row)
         velocity = experiment.start_velocities_m_s
         dofs = experiment.body.pattern.size
         lags = tables.p @ np.arange(tables.p.shape[1])
         evaluated_s = t_s - lags * experiment.timestep_s / substeps
         averaged_s = 0.0
-        if not experiment.static and table.is_midpoint:
+        if not experiment.is_static and table.is_midpoint:
             averaged_s = experiment.timestep_s / substeps
-        forces = Forces.of(experiment, evaluated_s, step_s=averaged_s)
-        goals = experiment.grasped(t_s)[1].reshape(rows, -1)
+        forces = Forces.from_experiment(experiment, evaluated_s, step_s=averaged_s)
+        goals = experiment.prescribed_displacements(t_s)[1].reshape(rows, -1)
         taken = ~np.isnan(goals)
-        taken[:, experiment.held_dofs] = False
+        taken[:, experiment.prescribed_dofs] = False
         return cls(
             body=experiment.body,
             tables=tables,
             t_s=t_s,
             first_row=first_row,
-            mass=_of_rows(tables, forces.mass),
+            mass=_row_masses(tables, forces.mass),
             forces=forces,
-            goals_m=goals,
-            taken=taken,
+            prescribed_m=goals,
+            is_temporarily_held=taken,
             evaluated_s=evaluated_s,
             start_velocity_m_s=np.zeros(dofs) if velocity is None else np.array(velocity).ravel(),
             loaded_since_s=experiment.loaded_since_s,
-            static=experiment.static,
+            is_static=experiment.is_static,
         )
 
-    def at(self, u: Array) -> Dynamics:
+    def with_inputs(self, u: Array) -> Dynamics:
         """Return these equations at inputs u (N, U), see `inputs`."""
-        return self._under(self.forces.at(u))
+        return self._with_forces(self.forces.with_inputs(u))
 
     def with_theta(self, theta: Sequence[float] | Array) -> Dynamics:
         """Return these equations for a body with constants θ (k,)."""
-        return self._under(self.forces.with_theta(theta))
+        return self._with_forces(self.forces.with_theta(theta))
 
-    def _under(self, forces: Forces) -> Dynamics:
+    def _with_forces(self, forces: Forces) -> Dynamics:
         """Return these equations with other forces, and with the masses of these forces."""
         if forces.mass is self.forces.mass:
             return replace(self, forces=forces)
-        return replace(self, forces=forces, mass=_of_rows(self.tables, forces.mass))
+        return replace(self, forces=forces, mass=_row_masses(self.tables, forces.mass))
 
-    def to_evaluations(self, of_rows: Array) -> Array:
-        """Apply the transpose of `of_rows`: distribute row quantities (N, …) to the evaluations."""
-        total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (of_rows.ndim - 1))
-        shares = of_rows / np.where(total == 0, 1.0, total)
-        return np.where(total == 0, of_rows, 0.0) + self.combine_transposed(self.tables.w, shares)
+    def rows_to_evaluations(self, row_values: Array) -> Array:
+        """Apply the transpose of `row_values`: distribute row quantities (N, …) to the evaluations."""
+        total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (row_values.ndim - 1))
+        shares = row_values / np.where(total == 0, 1.0, total)
+        return np.where(total == 0, row_values, 0.0) + self.combine_transposed(
+            self.tables.w, shares
+        )
 
-    def of_rows(self, at_evaluations: Array) -> Array:
+    def evaluations_to_rows(self, evaluation_values: Array) -> Array:
         """Return the mean over the evaluations of each row (N, …), weighted like the forces."""
-        return _mean(self.tables, at_evaluations)
+        return _evaluation_mean(self.tables, evaluation_values)
 
-    def first_rows(self, rows: int) -> Dynamics:
+    def truncated_to(self, rows: int) -> Dynamics:
         """Return these equations on the first grid times only; self if there are no more.
 
         Parameters
@@ -195,17 +200,17 @@ class Dynamics:
         rows : int
             Number of grid times to keep.
         """
-        if rows >= self.rows:
+        if rows >= self.row_count:
             return self
         t = self.tables
         return replace(
             self,
-            tables=Tables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows]),
+            tables=StencilTables(t.p[:rows], t.q[:rows], t.w[:rows], t.s[:rows], t.r[:rows]),
             t_s=self.t_s[:rows],
-            mass=self.mass.rows(slice(rows)),
-            forces=self.forces.rows(slice(rows)),
-            goals_m=self.goals_m[:rows],
-            taken=self.taken[:rows],
+            mass=self.mass.at_times(slice(rows)),
+            forces=self.forces.at_times(slice(rows)),
+            prescribed_m=self.prescribed_m[:rows],
+            is_temporarily_held=self.is_temporarily_held[:rows],
             evaluated_s=self.evaluated_s[:rows],
         )
 
@@ -215,17 +220,17 @@ class Dynamics:
         return self.forces.pattern
 
     @property
-    def rows(self) -> int:
+    def row_count(self) -> int:
         """Number N of grid times."""
         return len(self.t_s)
 
     @property
     def step_s(self) -> float:
         """Time step Δt of the grid; 1 s for a static experiment, which does not depend on Δt."""
-        return 1.0 if self.static else float(self.t_s[1] - self.t_s[0])
+        return 1.0 if self.is_static else float(self.t_s[1] - self.t_s[0])
 
     @property
-    def reach(self) -> int:
+    def largest_lag(self) -> int:
         """Largest lag of the scheme, in time steps."""
         return self.tables.p.shape[1] - 1
 
@@ -253,15 +258,15 @@ class Dynamics:
         return weights
 
     @property
-    def until_next_s(self) -> Array:
+    def interval_to_next_s(self) -> Array:
         """Time from each evaluation to the next (N,).
 
         The last entry is one step, or 1 s if static.
         """
-        if self.static:
+        if self.is_static:
             return np.append(np.diff(self.t_s), 1.0)
-        lags = self.tables.p @ np.arange(self.reach + 1.0)
-        return self.step_s * np.append(np.diff(np.arange(self.rows) - lags), 1.0)
+        lags = self.tables.p @ np.arange(self.largest_lag + 1.0)
+        return self.step_s * np.append(np.diff(np.arange(self.row_count) - lags), 1.0)
 
     @property
     def theta(self) -> Array:
@@ -269,7 +274,7 @@ class Dynamics:
         return self.forces.theta
 
     def histories(
-        self, x: Array, brought: Mapping[int, Array] | None = None
+        self, x: Array, previous_states: Mapping[int, Array] | None = None
     ) -> tuple[AnyHistory, ...]:
         """Return the internal variables along a motion; an empty tuple if there are none.
 
@@ -277,40 +282,43 @@ class Dynamics:
         ----------
         x : (N, 3n)
             Positions [m]; fewer rows for the beginning of the motion.
-        brought : mapping, optional
+        previous_states : mapping, optional
             Given internal variables of the previous evaluation, by the index of the history.
             Internal variables that are not given are computed from x.
         """
-        if not (self.body.remembers or self.forces.carrying):
+        if not (self.body.has_memory or self.forces.terms_with_internal_variables):
             return ()
         first_rows = slice(len(x))
-        states = self.evaluated_at(x)
-        return histories(
-            self.forces.rows(first_rows),
+        states = self.all_evaluation_states(x)
+        return histories_along(
+            self.forces.at_times(first_rows),
             states,
-            until_next_s=self.until_next_s[first_rows],
+            until_next_s=self.interval_to_next_s[first_rows],
             loaded_s=self.loaded_since_s,
-            brought=brought or {},
+            previous_states=previous_states or {},
         )
 
-    def pressed(self, x: Array, pressed: Mapping[int, Array]) -> tuple[AnyHistory, ...]:
+    def contact_with_given_pressures(
+        self, x: Array, scaled_pressures: Mapping[int, Array]
+    ) -> tuple[AnyHistory, ...]:
         """Return contact forces at given pressures b, in the form of histories.
 
         Parameters
         ----------
         x : (N, 3n)
             Positions [m].
-        pressed : mapping
-            Scaled contact pressure b (1, N, points) by the index of the force in `Forces.further`.
+        scaled_pressures : mapping
+            Scaled contact pressure b (1, N, points) by the index of the force in
+            `Forces.external_terms`.
         """
-        states = self.evaluated_at(x)
+        states = self.all_evaluation_states(x)
         since_s = np.zeros(len(x))
         return tuple(
-            ForceHistory.of(self.forces, number, *states, since_s, b)
-            for number, b in pressed.items()
+            ForceHistory.from_states(self.forces, number, *states, since_s, b)
+            for number, b in scaled_pressures.items()
         )
 
-    def evaluated_at(self, x: Array) -> tuple[Array, Array]:
+    def all_evaluation_states(self, x: Array) -> tuple[Array, Array]:
         """Return ξ and ν at all evaluations, including a given start.
 
         Parameters
@@ -328,20 +336,22 @@ class Dynamics:
         nu[: self.first_row] = self.start_velocity_m_s
         return xi, nu
 
-    def forces_along(self, along: Sequence[AnyHistory], rows: slice | None = None) -> Forces:
+    def forces_with_histories(
+        self, histories: Sequence[AnyHistory], rows: slice | None = None
+    ) -> Forces:
         """Return the forces of some rows with the internal variables of the motion.
 
         Parameters
         ----------
-        along : sequence of histories
+        histories : sequence of histories
         rows : slice, optional
             Indices of the rows; by default all from `first_row` on.
         """
-        rows = slice(self.first_row, self.rows) if rows is None else rows
-        return onto(self.forces.rows(rows), along, rows)
+        rows = slice(self.first_row, self.row_count) if rows is None else rows
+        return insert_histories(self.forces.at_times(rows), histories, rows)
 
     def combine(self, table: Array, rows: Array) -> Array:
-        """Return Σ_i table[t, i] rows[t − i] for every t, for `rows` (N, …)."""
+        """Return Σ_i table[t, i] rows[t − i] for every t, for `row_count` (N, …)."""
         return _combine(table, rows)
 
     def combine_transposed(self, table: Array, rows: Array) -> Array:
@@ -354,30 +364,33 @@ class Dynamics:
                 result[: len(rows) - lag] += column * rows[lag:]
         return result
 
-    def residual(self, x: Array, along: Sequence[AnyHistory] = ()) -> Array:
+    def residual(self, x: Array, histories: Sequence[AnyHistory] = ()) -> Array:
         """Return the residuals c (N, 3n) [N]; rows before `first_row` are zero.
 
         Parameters
         ----------
         x : (N, 3n)
             Positions [m].
-        along : sequence of histories
+        histories : sequence of histories
             Internal variables of the motion; computed from x where the sequence is empty.
         """
-        return self.assemble_residual(x, self.force(x, along))
+        return self.assemble_residual(x, self.force(x, histories))
 
     @property
-    def evaluated(self) -> Forces:
+    def evaluated_forces(self) -> Forces:
         """Forces of the rows from `first_row` on."""
-        return self.forces.rows(slice(self.first_row, self.rows))
+        return self.forces.at_times(slice(self.first_row, self.row_count))
 
-    def force(self, x: Array, along: Sequence[AnyHistory] = ()) -> Array:
+    def force(self, x: Array, histories: Sequence[AnyHistory] = ()) -> Array:
         """Return the forces F (N − first_row, 3n) [N] at the evaluation states of x (N, 3n).
 
-        `along` are the internal variables of the motion; computed from x where the sequence is
+        `histories_along` are the internal variables of the motion; computed from x where the
+        sequence is
         empty.
         """
-        return self.forces_along(along or self.histories(x)).total(*self.evaluation_states(x))
+        return self.forces_with_histories(histories or self.histories(x)).total(
+            *self.evaluation_states(x)
+        )
 
     def assemble_residual(self, x: Array, force: Array) -> Array:
         """Return the residuals c (N, 3n) [N] from forces that have been evaluated.
@@ -391,18 +404,18 @@ class Dynamics:
         """
         total = np.zeros_like(x)
         total[self.first_row :] = force
-        inertia = self.mass.kg * self.acceleration(x)
-        return self.combine(self.tables.w, self.without_taken(total)) - inertia
+        inertia = self.mass.inertia_kg * self.acceleration(x)
+        return self.combine(self.tables.w, self.zero_held_forces(total)) - inertia
 
-    def without_taken(self, rows: Array) -> Array:
-        """Set the forces at dofs of `taken` to zero, in place, and return the array.
+    def zero_held_forces(self, rows: Array) -> Array:
+        """Set the forces at dofs of `is_temporarily_held` to zero, in place, and return the array.
 
         Parameters
         ----------
         rows : (N, 3n, …)
             Forces at the evaluations, or their derivatives; modified.
         """
-        rows[self.taken] = 0
+        rows[self.is_temporarily_held] = 0
         return rows
 
     def acceleration(self, x: Array) -> Array:
@@ -412,7 +425,7 @@ class Dynamics:
         return acceleration
 
     def linearise(
-        self, x: Array, out: Array | None = None, along: Sequence[AnyHistory] = ()
+        self, x: Array, out: Array | None = None, histories: Sequence[AnyHistory] = ()
     ) -> Linearisation:
         """Return forces and derivatives at the evaluation states of x (N, 3n).
 
@@ -422,11 +435,11 @@ class Dynamics:
             Positions [m].
         out : array, optional
             Memory for the result, see `Forces.linearise`.
-        along : sequence of histories
+        histories : sequence of histories
             Internal variables of the motion; computed from x where the sequence is empty. They are
             held fixed in the derivatives.
         """
-        forces = self.forces_along(along or self.histories(x))
+        forces = self.forces_with_histories(histories or self.histories(x))
         return forces.linearise(*self.evaluation_states(x), out)
 
     def block_terms(self, lag: int) -> Iterator[tuple[int, Array, Array]]:
@@ -442,12 +455,12 @@ class Dynamics:
             Coefficients; terms without any nonzero coefficient are skipped.
         """
         t = self.tables
-        for j in range(min(lag + 1, self.rows)):
-            a = np.zeros(self.rows)
-            b = np.zeros(self.rows)
+        for j in range(min(lag + 1, self.row_count)):
+            a = np.zeros(self.row_count)
+            b = np.zeros(self.row_count)
             weights = t.w[j:, j]
-            a[j:] = weights * t.p[: self.rows - j, lag - j]
-            b[j:] = weights * t.q[: self.rows - j, lag - j] / self.step_s
+            a[j:] = weights * t.p[: self.row_count - j, lag - j]
+            b[j:] = weights * t.q[: self.row_count - j, lag - j] / self.step_s
             if a.any() or b.any():
                 yield j, a, b
 
@@ -467,12 +480,12 @@ def _combine(table: Array, rows: Array) -> Array:
     return result
 
 
-def _of_rows(tables: Tables, at_evaluations: Mass) -> Mass:
+def _row_masses(tables: StencilTables, at_evaluations: DofMasses) -> DofMasses:
     """Return the mass in each row, from the mass at the evaluations."""
-    return replace(at_evaluations, tied_kg=_mean(tables, at_evaluations.tied_kg))
+    return replace(at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg))
 
 
-def _mean(tables: Tables, at_evaluations: Array) -> Array:
+def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
     # Weighted like the forces, so that gravity alone accelerates all masses equally, also a load
     # that is joining.
     """Return the mean over the evaluations of each row (N, …), weighted like the forces.
@@ -508,7 +521,7 @@ class StencilRow:
     mass_kg: Array
 
     @classmethod
-    def of(cls, dynamics: Dynamics, t: int) -> StencilRow:
+    def from_dynamics(cls, dynamics: Dynamics, t: int) -> StencilRow:
         """Return the coefficients and masses of the row with index t."""
         tables = dynamics.tables
         step_s = dynamics.step_s
@@ -518,11 +531,11 @@ class StencilRow:
             tuple(tables.w[t].tolist()),
             tuple((tables.s[t] / step_s**2).tolist()),
             float(tables.r[t]) / step_s,
-            dynamics.mass.row_kg(t),
+            dynamics.mass.inertia_at(t),
         )
 
     @cached_property
-    def lags(self) -> list[int]:
+    def nonzero_lags(self) -> list[int]:
         """Lags from 1 on whose positions the evaluation of the force depends on."""
         return [i for i in range(1, len(self.p)) if self.p[i] or self.q[i]]
 
@@ -557,7 +570,9 @@ class StencilRow:
         return skew_part + self.q[lag] * by_velocity_skew if by_velocity_skew.size else skew_part
 
 
-def weighted(coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]) -> Array:
+def weighted_sum_of_past(
+    coefficients: Sequence[float], past: Iterable[Array], shape: tuple[int, ...]
+) -> Array:
     """Return Σ_i coefficients[i] past[i − 1] over the lags i from 1 on.
 
     Parameters

@@ -1,6 +1,6 @@
 """Internal variables of one force along a motion, with derivatives forward and backward in time.
 
-See `point_forces` for the law of a force with internal variables h. At evaluation k, with the
+See `custom_force_terms` for the law of a force with internal variables h. At evaluation k, with the
 previous variables b = h_{k−1}, columns of derivatives follow by the chain rule,
 
     dF_k ∋ ∂F/∂b db,   dh_k = ∂h/∂b db + ∂h/∂y dy_k + ∂h/∂ẏ dẏ_k + ∂h/∂c dc_k,
@@ -9,8 +9,9 @@ and backward in time, with weights λ_k of the forces and μ_k of h_k,
 
     μ_{k−1} = (∂h/∂b)ᵀ μ_k + (∂F/∂b)ᵀ λ_k,   y_k gets (∂h/∂y)ᵀ μ_k, and ẏ_k likewise.
 
-`ForceHistory` holds all evaluations; `Carrying` propagates columns forward, `Pulling` propagates
-weights backward. `Left` is the state at one time, for time-marching methods.
+`ForceHistory` holds all evaluations; `ForceForwardColumns` propagates columns forward,
+`ForceAdjoint` propagates
+weights backward. `ForcePreviousState` is the state at one time, for time-marching methods.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Array, Index
-from ..fem.body import Curvature
+from ..fem.body import SecondDerivatives
 from .force_term import States
 from .forces import Forces
-from .point_forces import Brought, Parts, Pointwise
+from .point_forces import LawDerivatives, Pointwise, PreviousState
 
 # Number of evaluations whose derivatives are kept at a time; limits memory.
 CHUNK = 16
@@ -39,10 +40,10 @@ class ForceHistory:
     forces : Forces
         Forces at all evaluations.
     number : int
-        Index of the force in `Forces.further`.
+        Index of the force in `Forces.external_terms`.
     xi, nu : (N, 3n)
         Positions [m] and velocities [m/s] at the evaluations.
-    brought : Brought
+    previous_state : PreviousState
         Internal variables of the previous evaluation, at each evaluation.
     """
 
@@ -50,10 +51,10 @@ class ForceHistory:
     number: int
     xi: Array
     nu: Array
-    brought: Brought
+    previous_state: PreviousState
 
     @classmethod
-    def of(
+    def from_states(
         cls,
         forces: Forces,
         number: int,
@@ -69,7 +70,7 @@ class ForceHistory:
         forces : Forces
             Forces at the N evaluations.
         number : int
-            Index of the force in `Forces.further`.
+            Index of the force in `Forces.external_terms`.
         xi, nu : (N, 3n)
             Positions [m] and velocities [m/s], the first of which are those of the start.
         since_s : (N,)
@@ -77,79 +78,83 @@ class ForceHistory:
         before : (n, N, I), optional
             Given variables h_{k−1} at each evaluation; computed from the states by default.
         """
-        term = forces.pointwise(number)[0]
-        shape = term.carries, len(xi), term.points.count
-        brought = Brought(np.zeros(shape) if before is None else before, since_s)
+        term = forces.pointwise_term(number)[0]
+        shape = term.internal_variable_count, len(xi), term.points.count
+        brought = PreviousState(np.zeros(shape) if before is None else before, since_s)
         history = cls(forces, number, xi, nu, brought)
         if before is None:
             for k in range(len(xi) - 1):
-                brought.before[:, k + 1] = history.left(slice(k, k + 1))[:, 0]
+                brought.before[:, k + 1] = history.internal_variables(slice(k, k + 1))[:, 0]
         return history
 
-    def left(self, rows: slice) -> Array:
+    def internal_variables(self, rows: slice) -> Array:
         """Return the internal variables h (n, T, I) after some evaluations."""
-        return self.at(rows).left(self._states(rows))
+        return self.term_at(rows).internal_variables(self._states(rows))
 
-    def at(self, rows: slice, weighed: Array | None = None) -> Pointwise:
+    def term_at(self, rows: slice, variable_weights: Array | None = None) -> Pointwise:
         """Return the force term at some evaluations, with its previous internal variables.
 
         Parameters
         ----------
         rows : slice
             Indices of the evaluations.
-        weighed : (n, T, I), optional
+        variable_weights : (n, T, I), optional
             Weights of h in second derivatives; 0 by default.
         """
-        before, since_s = self.brought
-        term = self.forces.pointwise(self.number)[0].rows(rows)
-        return term.bringing(Brought(before[:, rows], since_s[rows]), weighed)
+        before, since_s = self.previous_state
+        term = self.forces.pointwise_term(self.number)[0].at_times(rows)
+        return term.with_previous_state(
+            PreviousState(before[:, rows], since_s[rows]), variable_weights
+        )
 
     def _states(self, rows: slice) -> States:
         """Return the states of some evaluations, as the force uses them."""
-        term = self.forces.pointwise(self.number)[0]
-        return self.forces.states(self.xi[rows], self.nu[rows])(term)
+        term = self.forces.pointwise_term(self.number)[0]
+        return self.forces.states_of_terms(self.xi[rows], self.nu[rows])(term)
 
-    def onto(self, forces: Forces, rows: slice) -> Forces:
+    def insert_into(self, forces: Forces, rows: slice) -> Forces:
         """Return the forces of the evaluations `rows` with the previous internal variables of this
         force.
         """
-        return forces.with_further(self.number, self.at(rows))
+        return forces.with_term(self.number, self.term_at(rows))
 
     @property
-    def last(self) -> Left:
+    def final_state(self) -> ForcePreviousState:
         """State after the last evaluation."""
         last = slice(len(self.xi) - 1, None)
-        return Left(self.number, self.at(last), self.left(last))
+        return ForcePreviousState(self.number, self.term_at(last), self.internal_variables(last))
 
-    def parts(self, rows: slice) -> Parts:
+    def derivatives(self, rows: slice) -> LawDerivatives:
         """Return the derivatives of F and h at some evaluations, each (d + n, …, T, I)."""
-        return self._moved(self.at(rows).parts(self._states(rows)))
+        return self._without_static_velocity(self.term_at(rows).derivatives(self._states(rows)))
 
-    def _moved(self, parts: Parts) -> Parts:
+    def _without_static_velocity(self, parts: LawDerivatives) -> LawDerivatives:
         """Return the derivatives, with those by ẏ zero if the force gets no velocities
         (statics).
         """
-        term = self.forces.pointwise(self.number)[0]
-        rests = self.forces.still and not term.slides
+        term = self.forces.pointwise_term(self.number)[0]
+        rests = self.forces.is_static and not term.uses_increments
         return parts._replace(v=np.zeros_like(parts.v)) if rests else parts
 
     @property
-    def columns(self) -> Index:
+    def input_columns(self) -> Index:
         """Columns (c,) of the force's constants among all inputs."""
-        return self.forces.pointwise(self.number)[1]
+        return self.forces.pointwise_term(self.number)[1]
 
     # Second derivatives of weights · F + μ · h ----------------------------------------------------
 
-    def weighed(self, forces: Forces, mu: Array) -> Forces:
+    def with_variable_weights(self, forces: Forces, mu: Array) -> Forces:
         """Return the forces of all evaluations, with weights μ (n, N, I) of h in second
         derivatives.
         """
-        return forces.with_further(self.number, self.at(slice(None), mu))
+        return forces.with_term(self.number, self.term_at(slice(None), mu))
 
-    def add_curvature(self, curvature: Curvature, mu: Array) -> None:
-        """Do nothing: `weighed` already includes all second derivatives by states and inputs."""
+    def add_curvature(self, curvature: SecondDerivatives, mu: Array) -> None:
+        """Do nothing: `with_variable_weights` already includes all second derivatives by states and
+        inputs.
+        """
 
-    def bent(self, mu: Array, weights: Array) -> Parts:
+    def mixed_second_derivatives(self, mu: Array, weights: Array) -> LawDerivatives:
         """Return the second derivatives of weights · F + μ · h by (u, b), each (…, n, N, I).
 
         Parameters
@@ -160,21 +165,25 @@ class ForceHistory:
             Weights of the forces.
         """
         all_rows = slice(None)
-        return self._moved(self.at(all_rows, mu).bent(self._states(all_rows), weights))
+        return self._without_static_velocity(
+            self.term_at(all_rows, mu).mixed_second_derivatives(self._states(all_rows), weights)
+        )
 
     # Along a motion -------------------------------------------------------------------------------
 
-    def forward(
+    def forward_columns(
         self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
-    ) -> Carrying:
-        """Return an iterator of the columns db forward in time, see `Carrying`."""
-        return Carrying(self, by_p, done, known)
+    ) -> ForceForwardColumns:
+        """Return an iterator of the columns db forward in time, see `ForceForwardColumns`."""
+        return ForceForwardColumns(self, by_p, done, known)
 
-    def backward(self) -> Pulling:
-        """Return an iterator of the weights μ backward in time, see `Pulling`."""
-        return Pulling(self)
+    def adjoint(self) -> ForceAdjoint:
+        """Return an iterator of the weights μ backward in time, see `ForceAdjoint`."""
+        return ForceAdjoint(self)
 
-    def pulled(self, force_weights: Array, by_p: Array) -> tuple[Array, Array, Array]:
+    def vector_jacobian_product(
+        self, force_weights: Array, by_p: Array
+    ) -> tuple[Array, Array, Array]:
         """Return the derivatives of Σ λ_k F_k(h_{k−1}) through h by ξ and ν, (N, 3n) each, and by p
         (m,).
 
@@ -185,25 +194,25 @@ class ForceHistory:
         by_p : (N, U, m)
             Derivatives of the inputs by the parameters.
         """
-        pulling = self.backward()
+        pulling = self.adjoint()
         by_xi = np.zeros_like(self.xi)
         by_nu = np.zeros_like(self.xi)
         by_parameters = np.zeros(by_p.shape[2])
         for k in reversed(range(len(self.xi))):
-            by_xi[k], by_nu[k] = pulling.pulled()
-            by_parameters += pulling.by_inputs() @ by_p[k][self.columns]
-            pulling.retreat(force_weights[k])
+            by_xi[k], by_nu[k] = pulling.state_gradient()
+            by_parameters += pulling.input_gradient() @ by_p[k][self.input_columns]
+            pulling.step_back(force_weights[k])
         return by_xi, by_nu, by_parameters
 
 
 @dataclass(frozen=True, eq=False)
-class Left:
+class ForcePreviousState:
     """Internal variables of one force at one time, for time marching.
 
     Attributes
     ----------
     number : int
-        Index of the force in `Forces.further`.
+        Index of the force in `Forces.external_terms`.
     term : Pointwise
         Force at that time, with the internal variables before it.
     after : (n, 1, I)
@@ -215,28 +224,32 @@ class Left:
     after: Array
 
     @classmethod
-    def of(cls, forces: Forces, number: int, x: Array, v: Array) -> Left:
+    def from_state(cls, forces: Forces, number: int, x: Array, v: Array) -> ForcePreviousState:
         """Return the internal variables after the state (x, v), (3n,) each, with the forces
         there.
         """
-        term = forces.pointwise(number)[0]
-        return cls(number, term, term.left(forces.states(x, v)(term)))
+        term = forces.pointwise_term(number)[0]
+        return cls(number, term, term.internal_variables(forces.states_of_terms(x, v)(term)))
 
-    def now(self, forces: Forces) -> Forces:
+    def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return forces in the same state, with the internal variables before it."""
-        brought = self.term.brought
+        brought = self.term.previous_state
         if brought is None:
             return forces
-        return forces.with_further(self.number, forces.pointwise(self.number)[0].bringing(brought))
+        return forces.with_term(
+            self.number, forces.pointwise_term(self.number)[0].with_previous_state(brought)
+        )
 
-    def ahead(self, forces: Forces, interval_s: float) -> Forces:
+    def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
         """Return forces in a state one interval later, with the internal variables `after`
         inserted.
         """
-        brought = Brought(self.after, np.array([interval_s]))
-        return forces.with_further(self.number, forces.pointwise(self.number)[0].bringing(brought))
+        brought = PreviousState(self.after, np.array([interval_s]))
+        return forces.with_term(
+            self.number, forces.pointwise_term(self.number)[0].with_previous_state(brought)
+        )
 
-    def following(self, forces: Forces, x: Array, v: Array, interval_s: float) -> Left:
+    def advance(self, forces: Forces, x: Array, v: Array, interval_s: float) -> ForcePreviousState:
         """Return the internal variables in the state (x, v) one interval later.
 
         Parameters
@@ -247,10 +260,12 @@ class Left:
             Position [m] and velocity [m/s] at the later time.
         interval_s : float
         """
-        return Left.of(self.ahead(forces, interval_s), self.number, x, v)
+        return ForcePreviousState.from_state(
+            self.insert_after_interval(forces, interval_s), self.number, x, v
+        )
 
 
-class _Along:
+class _DerivativeIterator:
     """Derivatives of a history at one evaluation after the other, computed in chunks.
 
     Attributes
@@ -264,23 +279,25 @@ class _Along:
     def __init__(self, history: ForceHistory, at: int) -> None:
         self.history = history
         self.next = at
-        self.points = history.forces.pointwise(history.number)[0].points
-        self.shape = history.brought.before[:, 0].shape
+        self.points = history.forces.pointwise_term(history.number)[0].points
+        self.shape = history.previous_state.before[:, 0].shape
         self._chunk = -1
-        self._parts = Parts(*np.zeros((4, 0)))
+        self._parts = LawDerivatives(*np.zeros((4, 0)))
 
-    def slopes(self) -> tuple[Parts, Parts]:
+    def derivatives(self) -> tuple[LawDerivatives, LawDerivatives]:
         """Return ∂F (d, …, I) and ∂h (n, …, I) at the next evaluation."""
         chunk, k = divmod(self.next, CHUNK)
         d = self.points.dofs
         if chunk != self._chunk:
             self._chunk = chunk
-            self._parts = self.history.parts(slice(chunk * CHUNK, (chunk + 1) * CHUNK))
+            self._parts = self.history.derivatives(slice(chunk * CHUNK, (chunk + 1) * CHUNK))
         now = [part[:, :, k] for part in self._parts]
-        return Parts(*(part[:d] for part in now)), Parts(*(part[d:] for part in now))
+        return LawDerivatives(*(part[:d] for part in now)), LawDerivatives(
+            *(part[d:] for part in now)
+        )
 
 
-class Carrying(_Along):
+class ForceForwardColumns(_DerivativeIterator):
     """Columns db of the internal variables, propagated forward in time.
 
     Parameters
@@ -306,12 +323,12 @@ class Carrying(_Along):
         shape = *self.shape, by_p(0).shape[1]
         self.columns = np.zeros(shape) if known is None else known.copy()
 
-    def force(self) -> Array:
+    def force_columns(self) -> Array:
         """Return the contribution of the internal variables to dF at the next evaluation, (3n,
         columns).
         """
-        contribution = np.einsum("abi,bic->aci", self.slopes()[0].b, self.columns)
-        return self.points.summed(contribution).T
+        contribution = np.einsum("abi,bic->aci", self.derivatives()[0].b, self.columns)
+        return self.points.assemble(contribution).T
 
     def advance(self, of_state: Callable[[], Array], of_rate: Callable[[], Array]) -> None:
         """Pass the next evaluation and update the columns, in place.
@@ -321,8 +338,8 @@ class Carrying(_Along):
         of_state, of_rate : callable
             Changes (3n, columns) of ξ and ν there; called only if the variables depend on them.
         """
-        _, by = self.slopes()
-        of_inputs = self.by_p(self.next)[self.history.columns]
+        _, by = self.derivatives()
+        of_inputs = self.by_p(self.next)[self.history.input_columns]
         columns = np.einsum("abi,bic->aic", by.b, self.columns)
         columns += np.einsum("abi,bc->aic", by.c, of_inputs)
         for part, state_change in ((by.y, of_state), (by.v, of_rate)):
@@ -332,7 +349,7 @@ class Carrying(_Along):
         self.next = self.next + 1
 
 
-class Pulling(_Along):
+class ForceAdjoint(_DerivativeIterator):
     """Weights μ of the internal variables, propagated backward in time.
 
     Parameters
@@ -344,21 +361,23 @@ class Pulling(_Along):
         super().__init__(history, len(history.xi) - 1)
         self.columns = np.zeros(self.shape)
 
-    def pulled(self) -> tuple[Array, Array]:
+    def state_gradient(self) -> tuple[Array, Array]:
         """Return the derivatives of μ · h by ξ and ν of the evaluation, (3n,) each."""
-        by = self.slopes()[1]
-        by_x, by_v = (self.points.summed(self._of(each)[:, None])[0] for each in (by.y, by.v))
+        by = self.derivatives()[1]
+        by_x, by_v = (
+            self.points.assemble(self._weighted_by_mu(each)[:, None])[0] for each in (by.y, by.v)
+        )
         return by_x, by_v
 
-    def by_inputs(self) -> Array:
+    def input_gradient(self) -> Array:
         """Return the derivatives of μ · h by the constants (c,) of the force."""
-        return self._of(self.slopes()[1].c).sum(axis=1)
+        return self._weighted_by_mu(self.derivatives()[1].c).sum(axis=1)
 
-    def _of(self, by: Array) -> Array:
+    def _weighted_by_mu(self, by: Array) -> Array:
         """Return the derivatives `by` (n, …, I) weighted by μ and summed over h."""
         return np.einsum("abi,ai->bi", by, self.columns)
 
-    def retreat(self, force_weight: Array) -> None:
+    def step_back(self, force_weight: Array) -> None:
         """Pass the evaluation backward and update μ, in place.
 
         Parameters
@@ -366,8 +385,8 @@ class Pulling(_Along):
         force_weight : (3n,)
             Weights λ of its forces.
         """
-        of_force, by = self.slopes()
+        of_force, by = self.derivatives()
         weights = self.points.vectors(force_weight[None])[:, 0]
         pushes = np.einsum("abi,ai->bi", of_force.b, weights)
-        self.columns = self._of(by.b) + pushes
+        self.columns = self._weighted_by_mu(by.b) + pushes
         self.next = self.next - 1

@@ -17,7 +17,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from ..arrays import Array, Index
-from ..fem.body import Curvature, Linearisation
+from ..fem.body import Linearisation, SecondDerivatives
 from ..fem.pattern import SymmetricPattern
 
 
@@ -41,7 +41,7 @@ class States:
 
 
 @dataclass(frozen=True, eq=False)
-class Slots:
+class AssemblyIndices:
     """Positions in the shared arrays to which a term adds its derivatives.
 
     Attributes
@@ -65,38 +65,38 @@ class ForceTerm(ABC):
         Number of the term's inputs.
     couplings : SymmetricPattern or None
         Pairs of dofs coupled by the force; None if the force does not depend on the state.
-    slides : bool
+    uses_increments : bool
         Whether the force uses the displacement since the previous sample in place of the velocity
         in a static experiment, as friction does. Other terms get zero velocities there.
-    by_velocity : bool
+    is_nonlinear_in_velocity : bool
         Whether derivatives by the velocity may themselves depend on the velocity.
-    spins : bool
+    has_skew_damping : bool
         Whether the derivatives by the velocity may be non-symmetric, as for gyroscopic forces.
-    carries : int
+    internal_variable_count : int
         Number of internal variables of each instance; nonzero only for a `Pointwise` term.
     """
 
     size: int
     couplings: SymmetricPattern | None
-    slides: bool = False
-    carries: int = 0
-    by_velocity: bool = False
-    spins: bool = False
+    uses_increments: bool = False
+    internal_variable_count: int = 0
+    is_nonlinear_in_velocity: bool = False
+    has_skew_damping: bool = False
 
     @abstractmethod
-    def at(self, u: Array) -> Self:
+    def with_inputs(self, u: Array) -> Self:
         """Return this force at inputs u (T, size)."""
 
     @abstractmethod
-    def rows(self, rows: slice) -> Self:
+    def at_times(self, rows: slice) -> Self:
         """Return this force at some of the times."""
 
     @abstractmethod
-    def scaled(self, share: float) -> Self:
+    def scaled(self, factor: float) -> Self:
         """Return this force multiplied by a factor."""
 
     @abstractmethod
-    def towards(self, other: Self, share: float) -> Self:
+    def interpolate(self, other: Self, share: float) -> Self:
         """Return this force with its loads and times interpolated linearly to those of another
         time.
 
@@ -113,34 +113,38 @@ class ForceTerm(ABC):
         """Return the forces F (T, 3n) [N]."""
 
     @abstractmethod
-    def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
+    def add_derivatives(
+        self, linearisation: Linearisation, places: AssemblyIndices, states: States
+    ) -> None:
         """Add the forces and their first derivatives to a linearisation, in place.
 
         Parameters
         ----------
-        at : Linearisation
+        linearisation : Linearisation
             Shared arrays; modified.
-        places : Slots
+        places : AssemblyIndices
             Columns and entries of this term in the arrays.
         states : States
         """
 
     @abstractmethod
-    def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
+    def add_second_derivatives(
+        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
+    ) -> None:
         """Add the derivatives of weightsᵀ F to a curvature, in place.
 
         Parameters
         ----------
-        at : Curvature
+        curvature : SecondDerivatives
             Shared arrays; modified.
-        places : Slots
+        places : AssemblyIndices
             Columns and entries of this term in the arrays.
         states : States
         weights : (T, 3n)
         """
 
 
-class Scalar(Protocol):
+class ShapeFunctional(Protocol):
     """Scalar function S of the node positions, such as the length of a tendon or the volume of a
     cavity.
 
@@ -160,7 +164,7 @@ class Scalar(Protocol):
         """Return ∂²S/∂x² (T, m) on the couplings, at positions (T, 3n)."""
         ...
 
-    def hessian_along(self, states: Array, ways: Array) -> Array:
+    def hessian_derivative(self, states: Array, ways: Array) -> Array:
         """Return the derivative (T, m) of the Hessian in the directions `ways` (T, 3n)."""
         ...
 
@@ -171,13 +175,13 @@ class Potential(ForceTerm):
 
     Attributes
     ----------
-    scalar : Scalar
+    scalar : ShapeFunctional
         Function S of the positions.
     amplitude : (T, 1)
         Factor c of the energy; the only input of the force.
     """
 
-    scalar: Scalar
+    scalar: ShapeFunctional
     amplitude: Array
 
     @property
@@ -190,39 +194,45 @@ class Potential(ForceTerm):
         """Pairs of dofs coupled by S."""
         return self.scalar.couplings
 
-    def at(self, u: Array) -> Self:
+    def with_inputs(self, u: Array) -> Self:
         """Return this force with another amplitude (T, 1)."""
         return replace(self, amplitude=u)
 
-    def rows(self, rows: slice) -> Self:
+    def at_times(self, rows: slice) -> Self:
         """Return this force at some of the times."""
-        return self.at(self.amplitude[rows])
+        return self.with_inputs(self.amplitude[rows])
 
-    def scaled(self, share: float) -> Self:
+    def scaled(self, factor: float) -> Self:
         """Return this force multiplied by a factor."""
-        return self.at(share * self.amplitude)
+        return self.with_inputs(factor * self.amplitude)
 
-    def towards(self, other: Self, share: float) -> Self:
+    def interpolate(self, other: Self, share: float) -> Self:
         """Return this force with its amplitude interpolated to that of another time."""
-        return self.at(self.amplitude + share * (other.amplitude - self.amplitude))
+        return self.with_inputs(self.amplitude + share * (other.amplitude - self.amplitude))
 
     def force(self, states: States) -> Array:
         """Return the forces −c ∂S/∂x (T, 3n) [N]."""
         return -self.amplitude * self.scalar.gradient(states.xi)
 
-    def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
+    def add_derivatives(
+        self, linearisation: Linearisation, places: AssemblyIndices, states: States
+    ) -> None:
         """Add the forces and their first derivatives to a linearisation, in place."""
         gradient = self.scalar.gradient(states.xi)
-        np.subtract(at.force, self.amplitude * gradient, out=at.force)
-        at.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(states.xi)
-        at.by_theta[:, :, places.inputs.start] -= gradient
+        np.subtract(linearisation.force, self.amplitude * gradient, out=linearisation.force)
+        linearisation.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(
+            states.xi
+        )
+        linearisation.by_theta[:, :, places.inputs.start] -= gradient
 
-    def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
+    def add_second_derivatives(
+        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
+    ) -> None:
         """Add the derivatives of weightsᵀ F to a curvature, in place."""
         xi = states.xi
         column = places.inputs.start
-        third_derivatives = self.scalar.hessian_along(xi, weights)
-        at.position_position[:, places.entries] -= self.amplitude * third_derivatives
+        third_derivatives = self.scalar.hessian_derivative(xi, weights)
+        curvature.position_position[:, places.entries] -= self.amplitude * third_derivatives
         hessian_products = self.couplings.products(self.scalar.hessian(xi), weights)
-        at.position_theta[:, :, column] -= hessian_products
-        at.theta[:, column] -= np.einsum("ti,ti->t", weights, self.scalar.gradient(xi))
+        curvature.position_theta[:, :, column] -= hessian_products
+        curvature.theta[:, column] -= np.einsum("ti,ti->t", weights, self.scalar.gradient(xi))

@@ -1,6 +1,7 @@
 """All forces on a body at some times: F(ξ, ν; u) = f(ξ, ν; θ) + Σ terms.
 
-Use `Forces.of` for an experiment and `Forces.on` for a body alone. The sum includes the internal
+Use `Forces.from_experiment` for an experiment and `Forces.of_body_alone` for a body alone. The sum
+includes the internal
 forces f of materials and damping laws (see `fem.body`), the weight, tendons, pressures, contact,
 air drag and custom forces; no other module adds forces. Derivatives by the state are on the
 sparsity pattern of all couplings. Columns of derivatives by θ are followed by those by the other
@@ -18,14 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
-from ..fem.body import Body, Curvature, Linearisation
-from ..fem.memory import Past
-from ..fem.pattern import Joined, SymmetricPattern
+from ..fem.body import Body, Linearisation, SecondDerivatives
+from ..fem.memory import MemoryInput
+from ..fem.pattern import JointPattern, SymmetricPattern
 from ..recording.experiment import Experiment
-from .contact import Contact, contacts
-from .force_term import ForceTerm, Potential, Slots, States
-from .point_forces import PointForces, Pointwise, air_drag, point_forces
-from .weight import Mass, Weight
+from .contact import Contact, contact_terms
+from .force_term import AssemblyIndices, ForceTerm, Potential, States
+from .point_forces import CustomForce, Pointwise, air_drag_terms, custom_force_terms
+from .weight import DofMasses, Weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,28 +39,28 @@ class Forces:
     ----------
     weight : Weight
         Gravity and loads; also holds body and masses.
-    further : tuple of ForceTerm
+    external_terms : tuple of ForceTerm
         All other external forces.
-    joined : Joined
+    joint_pattern : JointPattern
         Common sparsity pattern of the mesh graph and the couplings of the further terms.
     theta : (k,)
         Constants θ of the body; NaN where they are not known yet.
-    still : bool
+    is_static : bool
         Whether the experiment is static. ν is then the displacement since the previous sample, see
-        `ForceTerm.slides`.
-    past : Past, optional
+        `ForceTerm.uses_increments`.
+    memory_state : MemoryInput, optional
         Internal variables of a body with memory at the evaluations; None for no overstress.
     """
 
     weight: Weight
-    further: tuple[ForceTerm, ...]
-    joined: Joined
+    external_terms: tuple[ForceTerm, ...]
+    joint_pattern: JointPattern
     theta: Array
-    still: bool = False
-    past: Past | None = None
+    is_static: bool = False
+    memory_state: MemoryInput | None = None
 
     @classmethod
-    def of(
+    def from_experiment(
         cls,
         experiment: Experiment,
         t_s: ArrayLike,
@@ -81,31 +82,37 @@ class Forces:
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         potentials = tuple(
-            Potential(actuator.measure, actuator.amplitude(times)[:, None])
+            Potential(actuator.measure, actuator.energy_amplitude_at(times)[:, None])
             for actuator in experiment.actuators
         )
-        touching = contacts(experiment, step_s)
+        touching = contact_terms(experiment, step_s)
         further = (
             *potentials,
             *touching,
-            *air_drag(experiment, times),
-            *point_forces(experiment.body, times),
+            *air_drag_terms(experiment, times),
+            *custom_force_terms(experiment.body, times),
         )
         unknown = np.full(len(experiment.body.constants), np.nan)
-        still = experiment.static
-        forces = cls(Weight.of(experiment, times), further, experiment.joined, unknown, still)
+        still = experiment.is_static
+        forces = cls(
+            Weight.from_experiment(experiment, times),
+            further,
+            experiment.coupled_graph,
+            unknown,
+            still,
+        )
         return forces if theta is None else forces.with_theta(theta)
 
     @classmethod
-    def on(cls, body: Body, theta: Sequence[float] | Array) -> Forces:
+    def of_body_alone(cls, body: Body, theta: Sequence[float] | Array) -> Forces:
         """Return the forces on a body without loads, gravity or contact, at one time.
 
         Custom forces of the body's own are included.
         """
-        custom = point_forces(body, np.zeros(1))
+        custom = custom_force_terms(body, np.zeros(1))
         known = np.asarray(theta, dtype=float)
-        weight = Weight.none(body).with_theta(known)
-        return cls(weight, custom, body.joined_with(()), known)
+        weight = Weight.of_body_alone(body).with_theta(known)
+        return cls(weight, custom, body.joint_pattern_with(()), known)
 
     def with_theta(self, theta: Sequence[float] | Array) -> Forces:
         """Return these forces for a body with constants θ (k,)."""
@@ -118,56 +125,58 @@ class Forces:
         return self.weight.body
 
     @property
-    def mass(self) -> Mass:
+    def mass(self) -> DofMasses:
         """Masses of the dofs that give inertia, weight and mass-proportional damping."""
         return self.weight.mass
 
     @property
     def pattern(self) -> SymmetricPattern:
         """Sparsity pattern of the derivatives by the state."""
-        return self.joined.pattern
+        return self.joint_pattern.pattern
 
     @cached_property
     def terms(self) -> tuple[ForceTerm, ...]:
         """External forces: the weight first, then the further terms."""
-        return (self.weight, *self.further)
+        return (self.weight, *self.external_terms)
 
     @cached_property
-    def _ends(self) -> list[int]:
+    def _input_offsets(self) -> list[int]:
         """First column of each term's inputs in u, and the length of u."""
         sizes = [term.size for term in self.terms]
         return list(accumulate(sizes, initial=len(self.body.constants)))
 
     @cached_property
-    def mass_by_input(self) -> dict[int, Array]:
+    def mass_derivatives(self) -> dict[int, Array]:
         """Derivatives ∂M/∂u (3n,) of the masses, by the index of each input on which M depends."""
-        return self.weight.mass_by_input(self._ends[0])
+        return self.weight.mass_derivatives(self._input_offsets[0])
 
-    def at(self, u: Array) -> Forces:
+    def with_inputs(self, u: Array) -> Forces:
         """Return these forces at inputs u (T, U)."""
-        forces = self.with_theta(u[0, : self._ends[0]])
-        if self._ends[0] == self._ends[-1]:
+        forces = self.with_theta(u[0, : self._input_offsets[0]])
+        if self._input_offsets[0] == self._input_offsets[-1]:
             return forces
         weight, *further = (
-            term.at(u[:, start:stop])
-            for term, start, stop in zip(forces.terms, self._ends, self._ends[1:], strict=False)
+            term.with_inputs(u[:, start:stop])
+            for term, start, stop in zip(
+                forces.terms, self._input_offsets, self._input_offsets[1:], strict=False
+            )
         )
-        return replace(forces, weight=weight, further=tuple(further))
+        return replace(forces, weight=weight, external_terms=tuple(further))
 
-    def rows(self, rows: slice) -> Forces:
+    def at_times(self, rows: slice) -> Forces:
         """Return these forces at some of the times."""
-        further = tuple(term.rows(rows) for term in self.further)
-        return replace(self, weight=self.weight.rows(rows), further=further)
+        further = tuple(term.at_times(rows) for term in self.external_terms)
+        return replace(self, weight=self.weight.at_times(rows), external_terms=further)
 
-    def scaled(self, share: float) -> Forces:
+    def scaled(self, factor: float) -> Forces:
         """Return these forces with all external ones multiplied by a factor.
 
         Masses are unchanged.
         """
-        further = tuple(term.scaled(share) for term in self.further)
-        return replace(self, weight=self.weight.scaled(share), further=further)
+        further = tuple(term.scaled(factor) for term in self.external_terms)
+        return replace(self, weight=self.weight.scaled(factor), external_terms=further)
 
-    def towards(self, other: Forces, share: float) -> Forces:
+    def interpolate(self, other: Forces, share: float) -> Forces:
         """Return forces with the loads interpolated linearly to those of another time.
 
         Internal variables, constants and couplings are those of `other`.
@@ -180,44 +189,54 @@ class Forces:
             Fraction of the way: 0 for this time, 1 for the other.
         """
         further = tuple(
-            term.towards(that, share)
-            for term, that in zip(self.further, other.further, strict=True)
+            term.interpolate(that, share)
+            for term, that in zip(self.external_terms, other.external_terms, strict=True)
         )
-        return replace(other, weight=self.weight.towards(other.weight, share), further=further)
+        return replace(
+            other, weight=self.weight.interpolate(other.weight, share), external_terms=further
+        )
 
-    def with_further(self, number: int, term: ForceTerm) -> Forces:
+    def with_term(self, number: int, term: ForceTerm) -> Forces:
         """Return these forces with one of the further terms replaced.
 
         Parameters
         ----------
         number : int
-            Index in `further`.
+            Index in `external_terms`.
         term : ForceTerm
         """
-        before = self.further[:number]
-        after = self.further[number + 1 :]
-        return replace(self, further=(*before, term, *after))
+        before = self.external_terms[:number]
+        after = self.external_terms[number + 1 :]
+        return replace(self, external_terms=(*before, term, *after))
 
     def without_contact(self) -> tuple[Forces, list[Contact]]:
         """Return these forces without the contacts that have an energy, and the contacts removed.
 
         The sparsity pattern is unchanged. Contact as complementarity stays.
         """
-        touching = [term for term in self.further if isinstance(term, Contact) and not term.relaxed]
-        further = tuple(term for term in self.further if term not in touching)
-        places = [p.entries for t, p in self._placed if t.couplings and t not in touching]
-        pattern = Joined(self.pattern, (self.joined.places[0], *places))
-        return replace(self, further=further, joined=pattern), touching
+        touching = [
+            term
+            for term in self.external_terms
+            if isinstance(term, Contact) and not term.is_complementarity
+        ]
+        further = tuple(term for term in self.external_terms if term not in touching)
+        places = [
+            p.entries for t, p in self._terms_with_indices if t.couplings and t not in touching
+        ]
+        pattern = JointPattern(self.pattern, (self.joint_pattern.places[0], *places))
+        return replace(self, external_terms=further, joint_pattern=pattern), touching
 
-    def undriven(self) -> Forces:
+    def only_loads(self) -> Forces:
         """Return weight and loads with internal forces, without all further terms."""
-        return replace(self, further=(), joined=Joined.of((self.body.pattern,)))
+        return replace(
+            self, external_terms=(), joint_pattern=JointPattern.from_patterns((self.body.pattern,))
+        )
 
     def total(self, xi: Array, nu: Array) -> Array:
         """Return the sum of all forces F (T, 3n) [N] at positions ξ and velocities ν."""
-        states_for = self.states(xi, nu)
+        states_for = self.states_of_terms(xi, nu)
         total = self.body.force(
-            xi, states_for(self.weight).nu, self.theta, self.mass.tied, self.past
+            xi, states_for(self.weight).nu, self.theta, self.mass.compact_tied_kg, self.memory_state
         )
         for term in self.terms:
             total = total + term.force(states_for(term))
@@ -226,7 +245,7 @@ class Forces:
     def linearise(self, xi: Array, nu: Array, out: Array | None = None) -> Linearisation:
         """Return the forces and their first derivatives by state and inputs.
 
-        Internal variables of `past` and of the terms are held fixed.
+        Internal variables of `memory_state` and of the terms are held fixed.
 
         Parameters
         ----------
@@ -235,46 +254,51 @@ class Forces:
         out : (T, linearisation_width), optional
             Memory for the body's part of the result, which holds views of it.
         """
-        states_for = self.states(xi, nu)
+        states_for = self.states_of_terms(xi, nu)
         still_nu = states_for(self.weight).nu
-        at = self.body.linearise(xi, still_nu, self.theta, out, self.mass.tied, self.past)
-        if self.still:
+        at = self.body.linearise(
+            xi, still_nu, self.theta, out, self.mass.compact_tied_kg, self.memory_state
+        )
+        if self.is_static:
             at.by_velocity[:] = 0.0
-        if self._is_wider:
-            spread = self.joined.spread
+        if self._has_external_derivatives:
+            spread = self.joint_pattern.expand
             at = Linearisation(
                 at.force,
                 spread(at.by_position),
                 spread(at.by_velocity),
-                self._widened(at.by_theta),
+                self._with_input_columns(at.by_theta),
                 spread(at.by_position_skew),
-                np.zeros((len(at.force), self.pattern.entries * self.spins)),
+                np.zeros((len(at.force), self.pattern.entry_count * self.has_skew_damping)),
             )
-        for term, places in self._placed:
-            term.add_slopes(at, places, states_for(term))
+        for term, places in self._terms_with_indices:
+            term.add_derivatives(at, places, states_for(term))
         return at
 
     @property
-    def _is_wider(self) -> bool:
+    def _has_external_derivatives(self) -> bool:
         """Whether derivatives have more entries or columns than those of the body's internal
         forces.
         """
-        more = self._ends[-1] > self._ends[0] or self.pattern is not self.body.pattern
-        return bool(self.further) or more
+        more = (
+            self._input_offsets[-1] > self._input_offsets[0]
+            or self.pattern is not self.body.pattern
+        )
+        return bool(self.external_terms) or more
 
     @property
     def linearisation_width(self) -> int:
         """Length of one time's row of `out` in `linearise`."""
         return self.body.linearisation_width
 
-    def curvature(
+    def weighted_hessian(
         self, xi: Array, nu: Array, weights: Array, out: Array | None = None
-    ) -> Curvature:
+    ) -> SecondDerivatives:
         """Return the derivatives of weightsᵀ F and of weighted internal variables by state and
         inputs.
 
         The weighted internal variables are Σ σ · S of a memory with stress weights, and those that
-        `Pointwise.weighed` weights in forces.
+        `Pointwise.variable_weights` weights in forces.
 
         Parameters
         ----------
@@ -284,21 +308,27 @@ class Forces:
         out : (T, curvature_width), optional
             Memory for the body's part of the result, which holds views of it.
         """
-        states_for = self.states(xi, nu)
-        at = self.body.curvature(
-            xi, states_for(self.weight).nu, weights, self.theta, out, self.mass.tied, self.past
+        states_for = self.states_of_terms(xi, nu)
+        at = self.body.second_derivatives(
+            xi,
+            states_for(self.weight).nu,
+            weights,
+            self.theta,
+            out,
+            self.mass.compact_tied_kg,
+            self.memory_state,
         )
-        if self.still:
+        if self.is_static:
             for by_velocity in (
                 at.position_velocity,
                 at.velocity_theta,
                 at.position_velocity_skew,
             ):
                 by_velocity[:] = 0.0
-        if self._is_wider:
-            spread = self.joined.spread
-            with_columns = self._widened
-            at = Curvature(
+        if self._has_external_derivatives:
+            spread = self.joint_pattern.expand
+            with_columns = self._with_input_columns
+            at = SecondDerivatives(
                 spread(at.position_position),
                 spread(at.position_velocity),
                 with_columns(at.position_theta),
@@ -307,29 +337,31 @@ class Forces:
                 with_columns(at.theta),
                 spread(at.position_velocity_skew),
                 # Room for the curvature by velocities, where forces may have some.
-                np.zeros((len(at.theta), self.pattern.entries * self._by_velocity)),
+                np.zeros(
+                    (len(at.theta), self.pattern.entry_count * self._is_nonlinear_in_velocity)
+                ),
             )
-        for term, places in self._placed:
+        for term, places in self._terms_with_indices:
             states = states_for(term)
-            term.add_curvature(at, places, states, weights.reshape(states.xi.shape))
+            term.add_second_derivatives(at, places, states, weights.reshape(states.xi.shape))
         return at
 
     @cached_property
-    def spins(self) -> bool:
+    def has_skew_damping(self) -> bool:
         """Whether derivatives by the velocity have a skew part."""
-        return any(term.spins for term in self.further)
+        return any(term.has_skew_damping for term in self.external_terms)
 
     @cached_property
-    def _by_velocity(self) -> bool:
+    def _is_nonlinear_in_velocity(self) -> bool:
         """Whether derivatives by the velocity of any term depend on the velocity."""
-        return any(term.by_velocity for term in self.further)
+        return any(term.is_nonlinear_in_velocity for term in self.external_terms)
 
     @property
     def curvature_width(self) -> int:
-        """Length of one time's row of `out` in `curvature`."""
+        """Length of one time's row of `out` in `weighted_hessian`."""
         return self.body.curvature_width
 
-    def states(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
+    def states_of_terms(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:
         """Return a function that gives each term its states.
 
         In a static experiment only terms that use displacements since the previous sample
@@ -337,56 +369,64 @@ class Forces:
         """
         size = self.body.pattern.size
         moving = States(xi.reshape(-1, size), nu.reshape(-1, size), self.theta)
-        resting = replace(moving, nu=np.zeros_like(moving.nu)) if self.still else moving
-        return lambda term: moving if term.slides else resting
+        resting = replace(moving, nu=np.zeros_like(moving.nu)) if self.is_static else moving
+        return lambda term: moving if term.uses_increments else resting
 
     @cached_property
-    def _placed(self) -> list[tuple[ForceTerm, Slots]]:
+    def _terms_with_indices(self) -> list[tuple[ForceTerm, AssemblyIndices]]:
         """Every external term with its columns and entries in the shared arrays."""
-        entries: Iterator[Index] = iter(self.joined.places[1:])
+        entries: Iterator[Index] = iter(self.joint_pattern.places[1:])
         nowhere: Index = np.zeros(0, dtype=np.int64)
         return [
             (
                 term,
-                Slots(slice(start, stop), nowhere if term.couplings is None else next(entries)),
+                AssemblyIndices(
+                    slice(start, stop), nowhere if term.couplings is None else next(entries)
+                ),
             )
-            for term, start, stop in zip(self.terms, self._ends, self._ends[1:], strict=False)
+            for term, start, stop in zip(
+                self.terms, self._input_offsets, self._input_offsets[1:], strict=False
+            )
         ]
 
-    def pointwise(self, number: int) -> tuple[Pointwise, Index]:
+    def pointwise_term(self, number: int) -> tuple[Pointwise, Index]:
         """Return one of the further terms, and the columns of its constants among all inputs.
 
         Parameters
         ----------
         number : int
-            Index in `further`; the term must be a `Pointwise`.
+            Index in `external_terms`; the term must be a `Pointwise`.
         """
-        term, places = self._placed[1 + number]
+        term, places = self._terms_with_indices[1 + number]
         assert isinstance(term, Pointwise)
-        return term, term.columns(places)
+        return term, term.constant_columns(places)
 
     @property
-    def air_drag(self) -> PointForces | None:
+    def air_drag(self) -> CustomForce | None:
         """Drag of the air around the body; None in a vacuum or in a static experiment."""
-        terms = (term for term in self.further if isinstance(term, PointForces) and term.of_air)
+        terms = (
+            term
+            for term in self.external_terms
+            if isinstance(term, CustomForce) and term.is_air_drag
+        )
         return next(terms, None)
 
     @property
-    def carrying(self) -> list[int]:
-        """Indices in `further` of the terms with internal variables."""
-        return [k for k, term in enumerate(self.further) if term.carries]
+    def terms_with_internal_variables(self) -> list[int]:
+        """Indices in `external_terms` of the terms with internal variables."""
+        return [k for k, term in enumerate(self.external_terms) if term.internal_variable_count]
 
     @property
-    def pressing(self) -> list[int]:
-        """Indices in `further` of the contacts as complementarity."""
-        further = enumerate(self.further)
-        return [k for k, term in further if isinstance(term, Contact) and term.relaxed]
+    def complementarity_terms(self) -> list[int]:
+        """Indices in `external_terms` of the contacts as complementarity."""
+        further = enumerate(self.external_terms)
+        return [k for k, term in further if isinstance(term, Contact) and term.is_complementarity]
 
-    def _widened(self, by_theta: Array) -> Array:
+    def _with_input_columns(self, by_theta: Array) -> Array:
         """Return derivatives by θ (…, k) with zero columns appended for the inputs of the terms (…,
         U).
         """
-        further = self._ends[-1] - self._ends[0]
+        further = self._input_offsets[-1] - self._input_offsets[0]
         if not further:
             return by_theta
         return np.concatenate([by_theta, np.zeros((*by_theta.shape[:-1], further))], axis=-1)

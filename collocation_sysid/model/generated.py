@@ -16,42 +16,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..fem.kernels import COMPILING, Instances, make_instances
+from ..fem.kernels import COMPILING, Instances, make_instance_evaluator
 
 Expression = Callable[[ca.SX, ca.SX], ca.SX]
 
 
 @dataclass(frozen=True, eq=False)
-class Generated:
+class GeneratedFunction:
     """Expression y(u, data), evaluated at all instances, with first and second derivatives by u.
 
     Attributes
     ----------
     expression : callable
         ``expression(u, data) -> y`` in CasADi operations on column vectors.
-    inputs : int
+    input_size : int
         Length k of u.
-    data : int
+    data_size : int
         Length d of the data.
-    compiled : bool
+    is_compiled : bool
         Whether to compile the expression to native code; worthwhile at many instances.
     """
 
     expression: Expression
-    inputs: int
-    data: int
-    compiled: bool = False
+    input_size: int
+    data_size: int
+    is_compiled: bool = False
 
-    def value(self, u: Array, data: Array) -> Array:
+    def evaluate(self, u: Array, data: Array) -> Array:
         """Return the values y (m, …) at inputs (k, …) or (k,) and data (d, …)."""
-        return self._mapped(self._value, u, data)[0][:, 0]
+        return self._evaluate_at_instances(self._value, u, data)[0][:, 0]
 
-    def slopes(self, u: Array, data: Array) -> tuple[Array, Array]:
+    def evaluate_with_jacobian(self, u: Array, data: Array) -> tuple[Array, Array]:
         """Return the values y (m, …) and the derivatives ∂y/∂u (m, k, …)."""
-        value, slopes = self._mapped(self._slopes, u, data)
+        value, slopes = self._evaluate_at_instances(self._slopes, u, data)
         return value[:, 0], slopes
 
-    def curvature(self, u: Array, data: Array, weights: Array | None = None) -> Array:
+    def weighted_hessian(self, u: Array, data: Array, weights: Array | None = None) -> Array:
         """Return the second derivatives (k, k, …) of Σ weights · y by u.
 
         Parameters
@@ -64,26 +64,26 @@ class Generated:
         weights = (
             np.ones((self._symbols[2].numel(), *data.shape[1:])) if weights is None else weights
         )
-        return self._mapped(self._curvature, u, data, weights)[0]
+        return self._evaluate_at_instances(self._curvature, u, data, weights)[0]
 
     @cached_property
-    def depends(self) -> NDArray[np.bool_]:
+    def dependent_inputs(self) -> NDArray[np.bool_]:
         """Mask (k,) of the inputs u on which any value y depends."""
         u, _, y = self._symbols
-        mask = np.zeros(self.inputs, dtype=bool)
+        mask = np.zeros(self.input_size, dtype=bool)
         mask[ca.jacobian(y, u).sparsity().get_col()] = True
         return mask
 
-    def takes(self, datum: int) -> bool:
+    def depends_on_datum(self, datum: int) -> bool:
         """Return whether any value y depends on the datum with this index."""
         _, data, y = self._symbols
-        if datum not in self._taken:
-            self._taken[datum] = ca.depends_on(y, data[datum])
-        return self._taken[datum]
+        if datum not in self._datum_dependence:
+            self._datum_dependence[datum] = ca.depends_on(y, data[datum])
+        return self._datum_dependence[datum]
 
     @cached_property
-    def _taken(self) -> dict[int, bool]:
-        """Results of `takes` by index of the datum, filled on demand."""
+    def _datum_dependence(self) -> dict[int, bool]:
+        """Results of `depends_on_datum` by index of the datum, filled on demand."""
         return {}
 
     @cached_property
@@ -93,13 +93,13 @@ class Generated:
         return not ca.depends_on(ca.jacobian(y, u), u)
 
     @cached_property
-    def slope_pattern(self) -> NDArray[np.bool_]:
+    def jacobian_pattern(self) -> NDArray[np.bool_]:
         """Mask (m, k) of the structurally nonzero derivatives ∂y/∂u."""
         u, _, y = self._symbols
         return np.array(ca.DM(ca.jacobian(y, u).sparsity(), 1.0).full(), dtype=bool)
 
     @cached_property
-    def curvature_pattern(self) -> NDArray[np.bool_]:
+    def hessian_pattern(self) -> NDArray[np.bool_]:
         """Mask (k, k) of the structurally nonzero second derivatives of any y."""
         u, _, y = self._symbols
         second, _ = ca.hessian(ca.sum1(y), u)
@@ -108,8 +108,8 @@ class Generated:
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Symbols u and data, and the dense expression y of them."""
-        u = ca.SX.sym("u", self.inputs)
-        data = ca.SX.sym("data", self.data)
+        u = ca.SX.sym("u", self.input_size)
+        data = ca.SX.sym("data", self.data_size)
         return u, data, ca.densify(ca.SX(self.expression(u, data)))
 
     @cached_property
@@ -120,16 +120,18 @@ class Generated:
     @cached_property
     def _slopes(self) -> ca.Function:
         u, data, y = self._symbols
-        return ca.Function("slopes", [u, data], [y, ca.densify(ca.jacobian(y, u))], CSE)
+        return ca.Function("slopes", [u, data], [y, ca.densify(ca.jacobian(y, u))], CASADI_OPTIONS)
 
     @cached_property
     def _curvature(self) -> ca.Function:
         u, data, y = self._symbols
         weights = ca.SX.sym("weights", y.numel())
         second, _ = ca.hessian(ca.dot(weights, y), u)
-        return ca.Function("curvature", [u, data, weights], [ca.densify(second)], CSE)
+        return ca.Function("curvature", [u, data, weights], [ca.densify(second)], CASADI_OPTIONS)
 
-    def _mapped(self, function: ca.Function, u: Array, *others: Array) -> list[Array]:
+    def _evaluate_at_instances(
+        self, function: ca.Function, u: Array, *others: Array
+    ) -> list[Array]:
         """Return the outputs of a CasADi function at all instances, each (rows, columns, …).
 
         Evaluators are created on the first call and kept. `others` are the data and, for the second
@@ -145,7 +147,7 @@ class Generated:
         name = function.name()
         with COMPILING:
             if name not in self._evaluators:
-                self._evaluators[name] = make_instances(function, self.compiled)
+                self._evaluators[name] = make_instance_evaluator(function, self.is_compiled)
         outputs = self._evaluators[name]([x.reshape(len(x), count) for x in (u, *others)])
         pairs = zip(outputs, sizes, strict=True)
         return [each.reshape(*size[::-1], *shape).swapaxes(0, 1) for each, size in pairs]
@@ -157,4 +159,4 @@ class Generated:
 
 
 # Options of generated CasADi functions: common subexpressions are evaluated once.
-CSE = {"cse": True}
+CASADI_OPTIONS = {"cse": True}

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Index
 from ..recording.experiment import Experiment
-from ..recording.grasp import held_dofs
+from ..recording.grasp import prescribed_dofs
 from ..recording.nuisance import OBSTACLE_TILT, OBSTACLE_TIME, NuisanceRow
 from ..recording.obstacle import Obstacle
 from .nuisance import NuisanceMap
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class PrescribedDisplacements:
     """Prescribed positions of the dofs that are grasped at some time, on the time grid.
 
     Attributes
@@ -42,13 +42,13 @@ class Held:
     by_phi: Array
 
     @property
-    def moves(self) -> bool:
+    def depends_on_phi(self) -> bool:
         """Whether the prescribed positions depend on φ."""
         return self.by_phi.shape[2] > 0
 
 
 @dataclass(frozen=True, eq=False)
-class Grasping:
+class GraspConstraint:
     """Grasps of an experiment on its time grid.
 
     Attributes
@@ -66,57 +66,63 @@ class Grasping:
     @cached_property
     def dofs(self) -> Index:
         """Indices (g,) of the dofs that are grasped at some time, ascending."""
-        return held_dofs(self.experiment.grasps)
+        return prescribed_dofs(self.experiment.grasps)
 
-    def at(self, phi: Array) -> Held:
+    def evaluate_at(self, phi: Array) -> PrescribedDisplacements:
         """Return the prescribed positions at nuisance parameters φ."""
-        if not self.nuisance.moves_grasps:
-            return self._fixed
-        places, slopes = self.places(phi)
-        rotations, shifts = self.poses
-        by_phi = self._zeros + np.einsum("tgj,gjk->tgk", rotations, slopes)
+        if not self.nuisance.affects_grasps:
+            return self._constant_positions
+        places, slopes = self.displaced_nodes(phi)
+        rotations, shifts = self.pose_rows
+        by_phi = self._direct_derivatives + np.einsum("tgj,gjk->tgk", rotations, slopes)
         positions = np.einsum("tgj,gj->tg", rotations, places) + shifts
-        positions += self._zeros @ phi[self.nuisance.moving]
+        positions += self._direct_derivatives @ phi[self.nuisance.motion_indices]
         by_phi[np.isnan(positions)] = 0.0
-        return Held(self.dofs, positions, by_phi)
+        return PrescribedDisplacements(self.dofs, positions, by_phi)
 
-    def places(self, phi: Array) -> tuple[Array, Array]:
+    def displaced_nodes(self, phi: Array) -> tuple[Array, Array]:
         """Return H X (g, 3) of the node of each grasped dof, and its derivatives by φ (g, 3, m)."""
-        places, by_own = self.nuisance.in_grasps.slopes(self._own(phi), self._points)
-        places[:, ~self._gripped] = self._points[:, ~self._gripped]
-        by_own[..., ~self._gripped] = 0
-        slopes = np.zeros((3, len(self.nuisance.moving), places.shape[1]))
+        places, by_own = self.nuisance.grasp_motion.evaluate_with_jacobian(
+            self._phi_of_grasps(phi), self._points
+        )
+        places[:, ~self._is_body_node] = self._points[:, ~self._is_body_node]
+        by_own[..., ~self._is_body_node] = 0
+        slopes = np.zeros((3, len(self.nuisance.motion_indices), places.shape[1]))
         slopes[:, self._columns] = by_own
-        places = places.T[self._node]
-        slopes = np.moveaxis(slopes, 2, 0)[self._node]
-        for columns, obstacle, row, axis, place in self._of_obstacles:
+        places = places.T[self._node_of_dof]
+        slopes = np.moveaxis(slopes, 2, 0)[self._node_of_dof]
+        for columns, obstacle, row, axis, place in self._obstacle_parameters:
             if row != OBSTACLE_TIME:
-                column = np.flatnonzero(self.nuisance.moving == place)[0]
+                column = np.flatnonzero(self.nuisance.motion_indices == place)[0]
                 frame_m = self.experiment.body.nodes_m[obstacle.nodes]
-                directions = np.broadcast_to(obstacle.direction, frame_m.shape)
+                directions = np.broadcast_to(obstacle.offset_direction, frame_m.shape)
                 if row == OBSTACLE_TILT:
-                    directions = np.cross(obstacle.across[axis], frame_m - obstacle.shape.middle_m)
+                    directions = np.cross(
+                        obstacle.tilt_axes[axis], frame_m - obstacle.shape.tilt_centre_m
+                    )
                 displacement = self.nuisance.scales[place] * np.repeat(directions, 3, axis=0)
                 slopes[columns, :, column] = displacement
                 places[columns] += phi[place] * displacement
         return places, slopes
 
-    def curvature(self, phi: Array, weights: Array) -> Array:
+    def weighted_hessian(self, phi: Array, weights: Array) -> Array:
         """Return Σ weights[t, g] ∂²position/∂φ² (m, m), for weights (N, g) that are zero while
         free.
         """
-        point_weights = np.einsum("tgj,tg->gj", np.nan_to_num(self.poses[0]), weights)
+        point_weights = np.einsum("tgj,tg->gj", np.nan_to_num(self.pose_rows[0]), weights)
         node_weights = np.zeros_like(self._points.T)
-        np.add.at(node_weights, self._node, point_weights)
-        node_weights[~self._gripped] = 0.0
-        hessian = np.zeros((len(self.nuisance.moving),) * 2)
-        second = self.nuisance.in_grasps.curvature(self._own(phi), self._points, node_weights.T)
+        np.add.at(node_weights, self._node_of_dof, point_weights)
+        node_weights[~self._is_body_node] = 0.0
+        hessian = np.zeros((len(self.nuisance.motion_indices),) * 2)
+        second = self.nuisance.grasp_motion.weighted_hessian(
+            self._phi_of_grasps(phi), self._points, node_weights.T
+        )
         hessian[np.ix_(self._columns, self._columns)] = second.sum(axis=2)
         return hessian
 
-    def _own(self, phi: Array) -> Array:
+    def _phi_of_grasps(self, phi: Array) -> Array:
         """Return the nuisance parameters of the motion H."""
-        return phi[self.nuisance.of_grasps]
+        return phi[self.nuisance.grasp_indices]
 
     @property
     def _points(self) -> Array:
@@ -124,42 +130,46 @@ class Grasping:
         return self.experiment.body.nodes_m[self._nodes[0]].T
 
     @cached_property
-    def _zeros(self) -> Array:
+    def _direct_derivatives(self) -> Array:
         """Derivatives of positions (N, g, m) by zeros of displacements and by delays of
         obstacles.
         """
-        derivatives = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.moving)))
-        for number, grasp in enumerate(self.experiment.gripping):
-            rows = np.flatnonzero(grasp.holds(self.t_s))
-            for axis, place in zip(grasp.zero, self.nuisance.zero(number), strict=False):
+        derivatives = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices)))
+        for number, grasp in enumerate(self.experiment.body_grasps):
+            rows = np.flatnonzero(grasp.is_active(self.t_s))
+            for axis, place in zip(
+                grasp.zero, self.nuisance.displacement_zero_indices(number), strict=False
+            ):
                 columns = np.searchsorted(self.dofs, 3 * grasp.nodes + "xyz".index(axis))
-                column = np.flatnonzero(self.nuisance.moving == place)
+                column = np.flatnonzero(self.nuisance.motion_indices == place)
                 derivatives[np.ix_(rows, columns, column)] = self.nuisance.scales[place]
         half_interval_s = 0.5e-3 * self.experiment.timestep_s
-        for columns, obstacle, row, _, place in self._of_obstacles:
+        for columns, obstacle, row, _, place in self._obstacle_parameters:
             if row == OBSTACLE_TIME:
                 places_m = self.experiment.body.nodes_m[obstacle.nodes]
                 after, before = (
-                    obstacle.poses.carry(places_m, self.t_s + s)
+                    obstacle.poses.carried_positions(places_m, self.t_s + s)
                     for s in (half_interval_s, -half_interval_s)
                 )
                 rate = (before - after).reshape(len(self.t_s), -1) / (2 * half_interval_s)
-                column = np.flatnonzero(self.nuisance.moving == place)
+                column = np.flatnonzero(self.nuisance.motion_indices == place)
                 derivatives[:, columns, column] = self.nuisance.scales[place] * rate
         return derivatives
 
     @property
-    def _of_obstacles(self) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
+    def _obstacle_parameters(self) -> Iterator[tuple[Index, Obstacle, NuisanceRow, int, int]]:
         """Nuisance parameters of obstacles: positions of the dofs, obstacle, row, axis and index in
         φ.
         """
-        for number, obstacle in enumerate(self.experiment.obstacles, len(self.experiment.gripping)):
-            columns = np.searchsorted(self.dofs, obstacle.dofs)
-            for row, axis, place in self.nuisance.of_obstacle(number):
+        for number, obstacle in enumerate(
+            self.experiment.obstacles, len(self.experiment.body_grasps)
+        ):
+            columns = np.searchsorted(self.dofs, obstacle.prescribed_dofs)
+            for row, axis, place in self.nuisance.obstacle_parameters(number):
                 yield columns, obstacle, row, axis, place
 
     @cached_property
-    def _gripped(self) -> NDArray[np.bool_]:
+    def _is_body_node(self) -> NDArray[np.bool_]:
         """Mask of the grasped nodes that belong to the body, not to an obstacle's frame."""
         return ~np.isin(self._nodes[0], self.experiment.body.frames)
 
@@ -172,31 +182,33 @@ class Grasping:
         return nodes, places
 
     @property
-    def _node(self) -> Index:
+    def _node_of_dof(self) -> Index:
         """Index of each grasped dof's node among the grasped nodes (g,)."""
         return self._nodes[1]
 
     @property
     def _columns(self) -> Index:
         """Positions of the parameters of H among the nuisance parameters that affect the motion."""
-        return np.flatnonzero(np.isin(self.nuisance.moving, self.nuisance.of_grasps))
+        return np.flatnonzero(np.isin(self.nuisance.motion_indices, self.nuisance.grasp_indices))
 
     @cached_property
-    def _fixed(self) -> Held:
+    def _constant_positions(self) -> PrescribedDisplacements:
         """Prescribed positions where they do not depend on φ."""
-        goals_m = self.experiment.grasped(self.t_s)[1].reshape(len(self.t_s), -1)
-        return Held(self.dofs, goals_m[:, self.dofs], np.zeros((len(goals_m), len(self.dofs), 0)))
+        goals_m = self.experiment.prescribed_displacements(self.t_s)[1].reshape(len(self.t_s), -1)
+        return PrescribedDisplacements(
+            self.dofs, goals_m[:, self.dofs], np.zeros((len(goals_m), len(self.dofs), 0))
+        )
 
     @cached_property
-    def poses(self) -> tuple[Array, Array]:
+    def pose_rows(self) -> tuple[Array, Array]:
         """For each dof its row of U_t: rotation (N, g, 3) and shift (N, g) [m], NaN while free."""
         rotations, shifts_m = (
             np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ())
         )
         for grasp in self.experiment.grasps:
-            times = np.flatnonzero(grasp.holds(self.t_s))
-            place = np.searchsorted(self.dofs, grasp.dofs)
-            axis = grasp.dofs % 3
+            times = np.flatnonzero(grasp.is_active(self.t_s))
+            place = np.searchsorted(self.dofs, grasp.prescribed_dofs)
+            axis = grasp.prescribed_dofs % 3
             pose_rotations, pose_shifts = grasp.poses.at(self.t_s[times])
             rotations[np.ix_(times, place)] = pose_rotations[:, axis]
             shifts_m[np.ix_(times, place)] = pose_shifts[:, axis]

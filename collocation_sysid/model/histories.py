@@ -2,8 +2,8 @@
 
 A history holds the internal variables at all evaluations of a motion. It inserts them into the
 forces, and provides their derivatives forward and backward in time. A previous state holds them at
-one time and advances them step by step, in time-marching methods. Use `histories` for a whole
-motion; use `left_at_start` and `following` for time marching.
+one time and advances them step by step, in time-marching methods. Use `histories_along` for a whole
+motion; use `start_states` and `advance_states` for time marching.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..arrays import Array
-from .force_history import ForceHistory, Left
+from .force_history import ForceHistory, ForcePreviousState
 from .forces import Forces
-from .viscoelasticity import History, Remembered
+from .viscoelasticity import MemoryHistory, MemoryState
 
-AnyHistory = History | ForceHistory
-AnyLeft = Remembered | Left
+AnyHistory = MemoryHistory | ForceHistory
+PreviousState = MemoryState | ForcePreviousState
 
 
-def histories(
+def histories_along(
     forces: Forces,
     states: tuple[Array, Array],
     until_next_s: Array,
     loaded_s: float,
-    brought: Mapping[int, Array],
+    previous_states: Mapping[int, Array],
 ) -> tuple[AnyHistory, ...]:
     """Return the internal variables along a motion: of the memory, then of each force.
 
@@ -40,68 +40,75 @@ def histories(
         Time from each evaluation to the next.
     loaded_s : float
         Time for which the body has been in its start shape; infinite if its memory has relaxed.
-    brought : mapping
+    previous_states : mapping
         Given internal variables of the previous evaluation, by the index of the history in the
         result; those that are not given are computed from the states.
     """
     collected = list[AnyHistory]()
     xi, nu = states
     since_s = np.append(0.0, until_next_s[:-1])
-    if forces.body.remembers:
+    if forces.body.has_memory:
         collected.append(
-            History.of(forces.body, xi, forces.theta, until_next_s, loaded_s, brought.get(0))
+            MemoryHistory.from_states(
+                forces.body, xi, forces.theta, until_next_s, loaded_s, previous_states.get(0)
+            )
         )
-    for number in forces.carrying:
-        before = brought.get(len(collected))
-        collected.append(ForceHistory.of(forces, number, xi, nu, since_s, before))
+    for number in forces.terms_with_internal_variables:
+        before = previous_states.get(len(collected))
+        collected.append(ForceHistory.from_states(forces, number, xi, nu, since_s, before))
     return tuple(collected)
 
 
-def onto(forces: Forces, along: Sequence[AnyHistory], rows: slice) -> Forces:
+def insert_histories(forces: Forces, histories: Sequence[AnyHistory], rows: slice) -> Forces:
     """Return the forces of some evaluations with the internal variables of the histories.
 
     Parameters
     ----------
     forces : Forces
         Forces at the evaluations `rows`.
-    along : sequence of histories
+    histories : sequence of histories
     rows : slice
         Indices of the evaluations.
     """
-    for history in along:
-        forces = history.onto(forces, rows)
+    for history in histories:
+        forces = history.insert_into(forces, rows)
     return forces
 
 
-def left_at_start(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[AnyLeft, ...]:
+def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[PreviousState, ...]:
     """Return the internal variables in the start state: positions x and velocities v, (3n,) each.
 
     The memory comes first, then each force with internal variables, in the order of the forces.
     """
-    states: list[AnyLeft] = [Left.of(forces, number, x, v) for number in forces.carrying]
-    if forces.body.remembers:
-        states.insert(0, Remembered.at_start(forces.body, x, forces.theta, loaded_s))
+    states: list[PreviousState] = [
+        ForcePreviousState.from_state(forces, number, x, v)
+        for number in forces.terms_with_internal_variables
+    ]
+    if forces.body.has_memory:
+        states.insert(0, MemoryState.at_start(forces.body, x, forces.theta, loaded_s))
     return tuple(states)
 
 
-def ahead(forces: Forces, left: Sequence[AnyLeft], interval_s: float) -> Forces:
+def insert_previous_states(
+    forces: Forces, previous_states: Sequence[PreviousState], interval_s: float
+) -> Forces:
     """Return the forces in a state that follows the previous states after an interval [s].
 
     Parameters
     ----------
     forces : Forces
         Forces at one time.
-    left : sequence
+    previous_states : sequence
         Internal variables at the previous time.
     interval_s : float
     """
-    for each in left:
-        forces = each.ahead(forces, interval_s)
+    for each in previous_states:
+        forces = each.insert_after_interval(forces, interval_s)
     return forces
 
 
-def following(
-    forces: Forces, left: Sequence[AnyLeft], x: Array, v: Array, interval_s: float
-) -> tuple[AnyLeft, ...]:
+def advance_states(
+    forces: Forces, previous_states: Sequence[PreviousState], x: Array, v: Array, interval_s: float
+) -> tuple[PreviousState, ...]:
     """Return the internal variables in a state (x, v), (3n,) each, one interval later."""
-    return tuple(each.following(forces, x, v, interval_s) for each in left)
+    return tuple(each.advance(forces, x, v, interval_s) for each in previous_states)

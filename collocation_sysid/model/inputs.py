@@ -3,7 +3,8 @@
 The entries of u at each evaluation are, in this order: the constants θ of the body; gravity (3),
 if a nuisance parameter rotates it; the share of each load whose time is estimated; the amplitude of
 each tendon and pressure. The parameters p are those that affect the motion: the shared coordinates
-q, then the nuisance parameters φ of `NuisanceMap.moving`. Every force provides its derivatives by u
+q, then the nuisance parameters φ of `NuisanceMap.motion_indices`. Every force provides its
+derivatives by u
 (see `forces`); this module generates ∂u/∂p and Σ w ∂²u/∂p².
 """
 
@@ -19,11 +20,11 @@ import numpy as np
 from ..arrays import Array
 from ..recording.actuator import Actuator
 from ..recording.experiment import Experiment
-from ..recording.loads import ramp
+from ..recording.loads import smooth_ramp
 from ..recording.nuisance import JOINING
 from .dynamics import Dynamics
-from .generated import Generated
-from .nuisance import NuisanceMap, Timed
+from .generated import GeneratedFunction
+from .nuisance import NuisanceMap, TimedLoad
 from .parameters import Parameters, ThetaMap
 
 Expression = Callable[[ca.SX, ca.SX], ca.SX]
@@ -41,14 +42,14 @@ class Input:
         ``expression(p, data) -> (size,)`` in CasADi operations.
     data : (d, N) or (d, 1)
         Data at the N evaluations; (d, 1) for entries that are constant in time.
-    by_state : bool
+    is_coupled_to_state : bool
         Whether the mixed second derivative of the forces by these entries and the state is nonzero.
     """
 
     size: int
     expression: Expression
     data: Array
-    by_state: bool = True
+    is_coupled_to_state: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,19 +58,19 @@ class Inputs:
 
     Attributes
     ----------
-    inputs : sequence of Input
+    groups : sequence of Input
         Groups of entries, in the order of u.
-    parameters : int
+    parameter_count : int
         Length m of p.
-    times : int
+    time_count : int
         Number N of evaluations.
     """
 
-    inputs: Sequence[Input]
-    parameters: int
-    times: int
+    groups: Sequence[Input]
+    parameter_count: int
+    time_count: int
 
-    def at(self, p: Array) -> tuple[Array, Array]:
+    def evaluate_at(self, p: Array) -> tuple[Array, Array]:
         """Return the inputs u (N, U) and their derivatives ∂u/∂p (N, U, m) at parameters p (m,).
 
         If all entries are constant in time, both arrays are read-only views with stride 0 along the
@@ -77,56 +78,58 @@ class Inputs:
         """
         values = []
         slopes = []
-        rows = max((e.data.shape[1] for e in self.inputs), default=1)
-        for each, generated in zip(self.inputs, self._generated, strict=True):
-            value, slope = generated.slopes(p, each.data)
+        rows = max((e.data.shape[1] for e in self.groups), default=1)
+        for each, generated in zip(self.groups, self._functions, strict=True):
+            value, slope = generated.evaluate_with_jacobian(p, each.data)
             values.append(np.broadcast_to(value.T, (rows, each.size)))
-            shape = (rows, each.size, self.parameters)
+            shape = (rows, each.size, self.parameter_count)
             slopes.append(np.broadcast_to(np.moveaxis(slope, 2, 0), shape))
         u = np.concatenate(values, axis=1)
         by_p = np.concatenate(slopes, axis=1)
-        if rows == self.times:
+        if rows == self.time_count:
             return u, by_p
-        full_shape = self.times, *by_p.shape[1:]
+        full_shape = self.time_count, *by_p.shape[1:]
         return np.broadcast_to(u, full_shape[:2]), np.broadcast_to(by_p, full_shape)
 
-    def curvature(self, p: Array, weights: Array) -> Array:
+    def weighted_hessian(self, p: Array, weights: Array) -> Array:
         """Return Σ_t weights[t] · ∂²u_t/∂p² (m, m) for weights (N, U)."""
-        hessian = np.zeros((self.parameters,) * 2)
+        hessian = np.zeros((self.parameter_count,) * 2)
         offset = 0
-        for each, generated in zip(self.inputs, self._generated, strict=True):
+        for each, generated in zip(self.groups, self._functions, strict=True):
             group_weights = weights[:, offset : offset + each.size].T
             if each.data.shape[1] == 1:
                 group_weights = group_weights.sum(axis=1, keepdims=True)
-            hessian += generated.curvature(p, each.data, group_weights).sum(axis=2)
+            hessian += generated.weighted_hessian(p, each.data, group_weights).sum(axis=2)
             offset += each.size
         return hessian
 
     @cached_property
-    def _generated(self) -> list[Generated]:
-        """Expressions of the groups with derivatives, in the order of `inputs`."""
-        return [Generated(e.expression, self.parameters, len(e.data)) for e in self.inputs]
+    def _functions(self) -> list[GeneratedFunction]:
+        """Expressions of the groups with derivatives, in the order of `groups`."""
+        return [
+            GeneratedFunction(e.expression, self.parameter_count, len(e.data)) for e in self.groups
+        ]
 
     @cached_property
-    def by_state(self) -> Array:
-        """Mask (m,) of the parameters on which entries with `Input.by_state` depend."""
-        mask = np.zeros(self.parameters, dtype=bool)
-        for each, generated in zip(self.inputs, self._generated, strict=True):
-            if each.by_state:
-                mask |= generated.depends
+    def is_coupled_to_state(self) -> Array:
+        """Mask (m,) of the parameters on which entries with `Input.is_coupled_to_state` depend."""
+        mask = np.zeros(self.parameter_count, dtype=bool)
+        for each, generated in zip(self.groups, self._functions, strict=True):
+            if each.is_coupled_to_state:
+                mask |= generated.dependent_inputs
         return mask
 
 
 def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
     """Return equations of motion with the inputs that φ changes: gravity and load shares."""
     forces = dynamics.forces
-    loads = [timed.load for timed in nuisance.timed]
-    has_gravity_input = len(nuisance.of_gravity) > 0
-    weight = forces.weight.with_inputs(has_gravity_input, loads, dynamics.evaluated_s)
+    loads = [timed.load for timed in nuisance.timed_loads]
+    has_gravity_input = len(nuisance.gravity_indices) > 0
+    weight = forces.weight.with_load_inputs(has_gravity_input, loads, dynamics.evaluated_s)
     return replace(dynamics, forces=replace(forces, weight=weight))
 
 
-def inputs_of(
+def inputs_from_experiment(
     experiment: Experiment, parameters: Parameters, nuisance: NuisanceMap, evaluated_s: Array
 ) -> Inputs:
     """Return the inputs of an experiment.
@@ -142,7 +145,7 @@ def inputs_of(
     constants = ThetaMap(parameters, experiment.body)
     no_data = np.zeros((0, 1))
     nq = len(parameters.free)
-    place = {phi: nq + k for k, phi in enumerate(nuisance.moving.tolist())}
+    place = {phi: nq + k for k, phi in enumerate(nuisance.motion_indices.tolist())}
 
     def theta(p: ca.SX, _: ca.SX) -> ca.SX:
         """Return the constants θ of the body, of q alone."""
@@ -154,37 +157,39 @@ def inputs_of(
 
     def gravity(p: ca.SX, _: ca.SX) -> ca.SX:
         """Return gravity (3,) in the frame of the body."""
-        return nuisance.gravity_expression(p[[place[k] for k in nuisance.of_gravity.tolist()]])
+        return nuisance.gravity_expression(p[[place[k] for k in nuisance.gravity_indices.tolist()]])
 
-    def share(phi: int, timed: Timed) -> Input:
+    def share(phi: int, timed: TimedLoad) -> Input:
         """Return the input of the share of a load: the change from its share at the stated time."""
         sign = 1.0 if timed.change == "from_s" else -1.0
         interval_s = experiment.timestep_s
 
         def change(p: ca.SX, since_s: ca.SX) -> ca.SX:
             late_s = value(p, phi)
-            return sign * (ramp((since_s - late_s) / interval_s) - ramp(since_s / interval_s))
+            return sign * (
+                smooth_ramp((since_s - late_s) / interval_s) - smooth_ramp(since_s / interval_s)
+            )
 
         return Input(1, change, evaluated_s[None] - timed.stated_s)
 
     def amplitude(number: int, actuator: Actuator) -> Input:
         """Return the input of the amplitude of a tendon or pressure."""
-        stated_calibration = nuisance.stated_off[number].tolist()
-        places = nuisance.drive_places(number)
+        stated_calibration = nuisance.stated_calibration[number].tolist()
+        places = nuisance.actuator_calibration_indices(number)
 
         def driven(p: ca.SX, course: ca.SX) -> ca.SX:
             calibration = (
                 nominal + value(p, phi)
                 for nominal, phi in zip(stated_calibration, places, strict=True)
             )
-            return actuator.driven(course, *calibration)
+            return actuator.energy_amplitude(course, *calibration)
 
-        return Input(1, driven, actuator.course.at(evaluated_s)[None])
+        return Input(1, driven, actuator.stated_values.values_at(evaluated_s)[None])
 
     groups = [Input(len(experiment.body.constants), theta, no_data)]
-    if len(nuisance.of_gravity):
-        groups.append(Input(3, gravity, no_data, by_state=False))
-    joining = zip(nuisance.places(JOINING).tolist(), nuisance.timed, strict=True)
+    if len(nuisance.gravity_indices):
+        groups.append(Input(3, gravity, no_data, is_coupled_to_state=False))
+    joining = zip(nuisance.indices_of_rows(JOINING).tolist(), nuisance.timed_loads, strict=True)
     groups += [share(phi, timed) for phi, timed in joining]
     groups += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
-    return Inputs(groups, nq + len(nuisance.moving), len(evaluated_s))
+    return Inputs(groups, nq + len(nuisance.motion_indices), len(evaluated_s))

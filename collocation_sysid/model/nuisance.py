@@ -29,8 +29,8 @@ from ..errors import InputError
 from ..fem.constants import unit_of, without_unit
 from ..files import reason
 from ..recording.experiment import Experiment
-from ..recording.grasp import Grasp, held_nodes
-from ..recording.loads import Change, Force, PointMass
+from ..recording.grasp import Grasp, prescribed_nodes
+from ..recording.loads import Force, LoadTime, PointMass
 from ..recording.nuisance import (
     DEPTH_BIAS,
     DEPTH_EDGE,
@@ -43,36 +43,36 @@ from ..recording.nuisance import (
     OBSTACLE_TILT,
     OBSTACLE_TIME,
     PLACE,
-    PRESSURE_LOST,
+    POSE_TURN,
+    PRESSURE_OFFSET,
     TARE,
-    TENSION_LOST,
+    TENSION_OFFSET,
     TILT,
     TIME,
-    TURN,
     ZERO,
+    Component,
     NuisanceRow,
-    Of,
-    rotation,
+    cayley_rotation,
 )
 from ..recording.obstacle import Obstacle
 from ..recording.wrench import COMPONENTS, UNITS, Wrench
-from .generated import Generated
+from .generated import GeneratedFunction
 
 Load = TypeVar("Load", PointMass, Force)
 
 # Largest deviation of a delay from the current whole number of samples: the range of interpolation.
 LARGEST_SHIFT_SAMPLES = 2.0
 # Largest delay as a fraction of the recording's duration; more would leave too few samples.
-LARGEST_SHIFT_SHARE = 0.25
+LARGEST_DELAY_FRACTION = 0.25
 # Largest delay of a joining load, in prior standard deviations: more than any true value.
-LARGEST_DELAY = 4.0
+LARGEST_JOINING_DELAY_SIGMAS = 4.0
 # Factor that keeps a joining load inside the recording: at its ends it would join at once or never.
-NARROWER = 1 - 1e-9
+INSIDE_RECORDING_FACTOR = 1 - 1e-9
 # What a row must change (see `NuisanceRow.changes`) to affect the motion.
-MOVING = {"gravity", "grasps", "loads", "drives"}
+CHANGES_OF_MOTION = {"gravity", "grasps", "loads", "drives"}
 
 
-class Timed(NamedTuple):
+class TimedLoad(NamedTuple):
     """Load that joins or leaves at an estimated time.
 
     Attributes
@@ -83,7 +83,7 @@ class Timed(NamedTuple):
     """
 
     load: PointMass | Force
-    change: Change
+    change: LoadTime
 
     @property
     def stated_s(self) -> float:
@@ -92,7 +92,7 @@ class Timed(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Entry:
+class NuisanceEntry:
     """One nuisance parameter.
 
     Attributes
@@ -133,7 +133,7 @@ class NuisanceMap:
         Names with units, such as "swing: place of tip, x [m]".
     scales : (k,)
         Prior standard deviations, in the units of the names.
-    reach : (k,)
+    step_limits : (k,)
         Largest change of φ in one step of the solver; infinite for parameters that enter linearly.
     interval_s : float
         Time between samples.
@@ -145,29 +145,29 @@ class NuisanceMap:
         Pivot c of the rigid motion in the frame of the markers.
     grasp_pivot_m : (3,)
         Pivot c_h of the motion of the body in its grasp.
-    stated_off : (A, 2)
+    stated_calibration : (A, 2)
         Factor f and loss b of each tension and pressure, as stated.
-    timed : tuple of Timed
+    timed_loads : tuple of TimedLoad
         Loads with an estimated time, in the order of their parameters.
     recorded_s : (float, float)
         First and last time of the recording.
     """
 
-    entries: tuple[Entry, ...]
+    entries: tuple[NuisanceEntry, ...]
     names: tuple[str, ...]
     scales: Array
-    reach: Array
+    step_limits: Array
     interval_s: float
     duration_s: float
     gravity_m_s2: Array
     pivot_m: Array
     grasp_pivot_m: Array
-    stated_off: Array
-    timed: tuple[Timed, ...]
+    stated_calibration: Array
+    timed_loads: tuple[TimedLoad, ...]
     recorded_s: tuple[float, float]
 
     @classmethod
-    def of(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
+    def from_experiment(cls, experiment: Experiment, pivot_m: Array | None = None) -> NuisanceMap:
         """Return the nuisance parameters of an experiment.
 
         A parameter that recordings share has the same name in all of them.
@@ -191,7 +191,7 @@ class NuisanceMap:
         scales = np.array([entry.sigma for entry in entries], dtype=float)
         steps = {e.row.name: e.row.step(experiment) for e in entries if e.row.step is not None}
         reach = [min(e.row.reach, steps.get(e.row.name, np.inf) / e.sigma) for e in entries]
-        grasped_nodes = held_nodes(experiment.gripping)
+        grasped_nodes = prescribed_nodes(experiment.body_grasps)
         nuisance_map = cls(
             entries,
             tuple(f"{scope.get(e.row.name, experiment.name)}: {e.label}" for e in entries),
@@ -202,15 +202,15 @@ class NuisanceMap:
             np.array(experiment.gravity_m_s2),
             middle_m if pivot_m is None else pivot_m,
             body.nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0),
-            np.array([a.off for a in experiment.actuators]).reshape(-1, 2),
-            tuple(timed for _, timed in _timed(experiment)),
+            np.array([a.factor_and_offset for a in experiment.actuators]).reshape(-1, 2),
+            tuple(timed for _, timed in _timed_loads(experiment)),
             (float(experiment.t_s[0]), float(experiment.t_s[-1])),
         )
         for row in experiment.nuisance.own:
-            nuisance_map._require_smooth(row)
+            nuisance_map._require_valid_expression(row)
         return nuisance_map
 
-    def _require_smooth(self, row: NuisanceRow) -> None:
+    def _require_valid_expression(self, row: NuisanceRow) -> None:
         """Raise an `InputError` if a custom reading or clock cannot be evaluated and
         differentiated.
         """
@@ -239,7 +239,7 @@ class NuisanceMap:
         """Number k of nuisance parameters."""
         return len(self.names)
 
-    def valued(self, phi: Array) -> Iterator[tuple[Entry, str, float]]:
+    def iterate_values(self, phi: Array) -> Iterator[tuple[NuisanceEntry, str, float]]:
         """Yield entry, name and value with unit of each parameter, except for the places of
         markers.
         """
@@ -247,60 +247,60 @@ class NuisanceMap:
             if entry.row != PLACE:
                 yield entry, name, float(value)
 
-    def places(self, *rows: NuisanceRow, of: int | None = None) -> Index:
+    def indices_of_rows(self, *rows: NuisanceRow, component: int | None = None) -> Index:
         """Return the indices in φ of some rows, of all components or of one.
 
         Parameters
         ----------
         *rows : NuisanceRow
-        of : int, optional
+        component : int, optional
             Index of the component.
         """
-        return self._where(lambda e: e.row in rows and of in (None, e.number))
+        return self._indices_where(lambda e: e.row in rows and component in (None, e.number))
 
-    def _where(self, chosen: Callable[[Entry], bool]) -> Index:
+    def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
         """Return the indices in φ of the entries for which a function is true."""
         return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
 
     @cached_property
-    def moving(self) -> Index:
+    def motion_indices(self) -> Index:
         """Indices in φ of the parameters that affect the motion: gravity, grasps, loads,
         actuators.
         """
-        return self._where(lambda e: not MOVING.isdisjoint(e.row.changes))
+        return self._indices_where(lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes))
 
     @cached_property
-    def of_drives(self) -> Index:
+    def actuator_indices(self) -> Index:
         """Indices in φ of the calibration of tensions and pressures."""
-        return self._where(lambda e: "drives" in e.row.changes)
+        return self._indices_where(lambda e: "drives" in e.row.changes)
 
-    def drive_places(self, number: int) -> tuple[int, int]:
+    def actuator_calibration_indices(self, number: int) -> tuple[int, int]:
         """Return the indices in φ of factor and loss of an actuator.
 
         −1 where they are not estimated.
         """
         indices = [-1, -1]
-        for k in self.of_drives:
+        for k in self.actuator_indices:
             if self.entries[k].number == number:
-                indices[self.entries[k].row in (TENSION_LOST, PRESSURE_LOST)] = int(k)
+                indices[self.entries[k].row in (TENSION_OFFSET, PRESSURE_OFFSET)] = int(k)
         return indices[0], indices[1]
 
-    def drives(self, phi: Array) -> Array:
+    def actuator_calibration(self, phi: Array) -> Array:
         """Return factor f and loss b (A, 2) of each tension and pressure at φ."""
-        calibration = self.stated_off.copy()
+        calibration = self.stated_calibration.copy()
         values = phi * self.scales
         for number in range(len(calibration)):
-            for column, place in enumerate(self.drive_places(number)):
+            for column, place in enumerate(self.actuator_calibration_indices(number)):
                 calibration[number, column] += 0.0 if place < 0 else values[place]
         return calibration
 
     # What markers read --------------------------------------------------------------------------
 
-    def of_markers(self, count: int) -> Index:
+    def marker_indices(self, count: int) -> Index:
         """Return the indices in φ (count, f) on which the measurement of each of `count` markers
         depends.
         """
-        read = self._where(lambda e: e.row.reading is not None or e.row.clock is not None)
+        read = self._indices_where(lambda e: e.row.reading is not None or e.row.clock is not None)
         single = [k for k in read if self.entries[k].row.of == "marker"]
         of_marker = [[k for k in single if self.entries[k].number == m] for m in range(count)]
         common = np.tile(np.setdiff1d(read, single), (count, 1))
@@ -309,26 +309,26 @@ class NuisanceMap:
         )
 
     @cached_property
-    def of_clock(self) -> Index:
+    def clock_indices(self) -> Index:
         """Indices in φ of the parameters that shift the times at which markers were measured."""
-        return self._where(lambda e: e.row.clock is not None)
+        return self._indices_where(lambda e: e.row.clock is not None)
 
-    def late_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
+    def marker_delay_s(self, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
         """Return the delay of a marker's measurement relative to the time t_s [s].
 
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `places`.
+            Parameters at the indices `indices_of_rows`.
         places : array of int
-            Indices in φ of the marker, a row of `of_markers`.
+            Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
             Time of the sample.
         """
-        values = self.by_row(phi, places)
+        values = self.values_by_row(phi, places)
         return sum((row.clock(values[row], t_s, self) for row in values if row.clock), ca.SX(0))
 
-    def read(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
+    def marker_measurement(self, y: ca.SX, phi: ca.SX, places: Index, t_s: ca.SX) -> ca.SX:
         """Return the measured position (3,) of a marker whose true position is y (3,).
 
         Effects common to all markers are applied before those of the single marker.
@@ -337,13 +337,13 @@ class NuisanceMap:
         ----------
         y : (3,) SX
         phi : SX
-            Parameters at the indices `places`.
+            Parameters at the indices `indices_of_rows`.
         places : array of int
-            Indices in φ of the marker, a row of `of_markers`.
+            Indices in φ of the marker, a row of `marker_indices`.
         t_s : SX
             Time of the sample.
         """
-        values = self.by_row(phi, places)
+        values = self.values_by_row(phi, places)
         for row in sorted(values, key=lambda row: row.of == "marker"):
             y = y if row.reading is None else row.reading(y, values[row], t_s, self)
         return y
@@ -351,17 +351,17 @@ class NuisanceMap:
     # What moves the body ------------------------------------------------------------------------
 
     @cached_property
-    def moves_grasps(self) -> bool:
+    def affects_grasps(self) -> bool:
         """Whether any φ that affects the motion is not of gravity, so that prescribed positions may
         change.
         """
-        return len(np.setdiff1d(self.moving, self.of_gravity)) > 0
+        return len(np.setdiff1d(self.motion_indices, self.gravity_indices)) > 0
 
-    def zero(self, number: int) -> Index:
+    def displacement_zero_indices(self, number: int) -> Index:
         """Return the indices in φ of the zeros of a grasp's displacement, axis by axis."""
-        return self.places(ZERO, of=number)
+        return self.indices_of_rows(ZERO, component=number)
 
-    def of_obstacle(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
+    def obstacle_parameters(self, number: int) -> list[tuple[NuisanceRow, int, int]]:
         """Return row, axis and index in φ of every nuisance parameter of an obstacle.
 
         Parameters
@@ -369,13 +369,13 @@ class NuisanceMap:
         number : int
             Index among the grasps, in which obstacles follow the grippers.
         """
-        own = (k for k in self.moving.tolist() if self.entries[k].row.of == "obstacle")
+        own = (k for k in self.motion_indices.tolist() if self.entries[k].row.of == "obstacle")
         here = ((self.entries[k], k) for k in own if self.entries[k].number == number)
         return [(entry.row, entry.axis, k) for entry, k in here]
 
     def with_grasps(self, grasps: Sequence[Grasp], phi: Array) -> tuple[Grasp, ...]:
         """Return the grasps and obstacles at their poses at φ."""
-        motion = self.in_grasp(phi)
+        motion = self.grasp_motion_matrix(phi)
         return tuple(self._with_grasp(k, grasp, motion, phi) for k, grasp in enumerate(grasps))
 
     def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
@@ -392,19 +392,19 @@ class NuisanceMap:
         """
         if isinstance(grasp, Obstacle):
             deviations: dict[NuisanceRow, Array] = {}
-            for row, axis, place in self.of_obstacle(number):
+            for row, axis, place in self.obstacle_parameters(number):
                 deviations.setdefault(row, np.zeros(2))[axis] = phi[place] * self.scales[place]
             zeros = np.zeros(2)
             offset, delay_s = (
                 deviations.get(r, zeros)[0] for r in (OBSTACLE_OFFSET, OBSTACLE_TIME)
             )
-            return grasp.off_by(offset, deviations.get(OBSTACLE_TILT, zeros), delay_s)
+            return grasp.displaced(offset, deviations.get(OBSTACLE_TILT, zeros), delay_s)
         zero_m = np.zeros(3)
-        for place in self.zero(number):
+        for place in self.displacement_zero_indices(number):
             zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
-        return replace(grasp, poses=grasp.poses.after(motion).shifted(zero_m))
+        return replace(grasp, poses=grasp.poses.after(motion).with_shift(zero_m))
 
-    def limits(self, samples: int) -> tuple[Array, Array]:
+    def bounds(self, samples: int) -> tuple[Array, Array]:
         """Return the lowest and the highest φ (k,) with valid measurements and loads.
 
         Parameters
@@ -415,28 +415,32 @@ class NuisanceMap:
         """
         low = np.array([entry.row.low for entry in self.entries])
         high = np.array([entry.row.high for entry in self.entries])
-        for k in self.places(TIME):
+        for k in self.indices_of_rows(TIME):
             middle_s = samples * self.interval_s
             unit = self.scales[k]
             range_s = LARGEST_SHIFT_SAMPLES * self.interval_s
-            largest_s = max(range_s, LARGEST_SHIFT_SHARE * self.duration_s)
+            largest_s = max(range_s, LARGEST_DELAY_FRACTION * self.duration_s)
             low[k] = max(middle_s - range_s, -largest_s) / unit
             high[k] = min(middle_s + range_s, largest_s) / unit
-        for k, timed in zip(self.places(JOINING), self.timed, strict=True):
+        for k, timed in zip(self.indices_of_rows(JOINING), self.timed_loads, strict=True):
             margins = (np.array(self.recorded_s) - timed.stated_s) / self.scales[k]
-            low[k], high[k] = np.clip(NARROWER * margins, -LARGEST_DELAY, LARGEST_DELAY)
+            low[k], high[k] = np.clip(
+                INSIDE_RECORDING_FACTOR * margins,
+                -LARGEST_JOINING_DELAY_SIGMAS,
+                LARGEST_JOINING_DELAY_SIGMAS,
+            )
         return low, high
 
     def with_times(self, experiment: Experiment, phi: Array) -> Experiment:
         """Return the experiment with its loads joining and leaving at the times estimated by φ."""
-        if not self.timed:
+        if not self.timed_loads:
             return experiment
-        late_s = (phi * self.scales)[self.places(JOINING)]
+        late_s = (phi * self.scales)[self.indices_of_rows(JOINING)]
 
         def moved(load: Load) -> Load:
             times = {
                 timed.change: timed.stated_s + float(late)
-                for timed, late in zip(self.timed, late_s, strict=True)
+                for timed, late in zip(self.timed_loads, late_s, strict=True)
                 if timed.load is load
             }
             return replace(load, **times) if times else load
@@ -446,63 +450,63 @@ class NuisanceMap:
         return replace(experiment, masses=masses, forces=forces)
 
     @cached_property
-    def of_grasps(self) -> Index:
+    def grasp_indices(self) -> Index:
         """Indices in φ of rotation and shift of the body in its grasp."""
-        return self.places(GRASP_TURN, GRASP_SHIFT)
+        return self.indices_of_rows(GRASP_TURN, GRASP_SHIFT)
 
     @cached_property
-    def in_grasps(self) -> Generated:
-        """Expression of H X for a point X, of the φ of `of_grasps`."""
-        return Generated(self._carried, len(self.of_grasps), 3)
+    def grasp_motion(self) -> GeneratedFunction:
+        """Expression of H X for a point X, of the φ of `grasp_indices`."""
+        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), 3)
 
-    def _carried(self, phi: ca.SX, point: ca.SX) -> ca.SX:
+    def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
         """Return H X as an expression."""
-        values = self.by_row(phi, self.of_grasps)
+        values = self.values_by_row(phi, self.grasp_indices)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
-            point = rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
+            point = cayley_rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
         if GRASP_SHIFT in values:
             point = point + values[GRASP_SHIFT]
         return point
 
-    def in_grasp(self, phi: Array) -> Array:
+    def grasp_motion_matrix(self, phi: Array) -> Array:
         """Return H at φ as a 4×4 matrix [[R, p], [0, 1]]."""
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
-        images = self.in_grasps.value(phi[self.of_grasps], points)
+        images = self.grasp_motion.evaluate(phi[self.grasp_indices], points)
         matrix = np.eye(4)
         matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
         return matrix
 
     def gravity(self, phi: Array) -> Array:
         """Return gravity (3,) in the frame of the body at φ [m/s²]."""
-        if not len(self.of_gravity):
+        if not len(self.gravity_indices):
             return self.gravity_m_s2
-        return ca.evalf(self.gravity_expression(ca.SX(phi[self.of_gravity]))).full().ravel()
+        return ca.evalf(self.gravity_expression(ca.SX(phi[self.gravity_indices]))).full().ravel()
 
     @cached_property
-    def of_gravity(self) -> Index:
+    def gravity_indices(self) -> Index:
         """Indices in φ of the parameters that rotate gravity in the frame of the body."""
-        return self.places(TILT, TURN)
+        return self.indices_of_rows(TILT, POSE_TURN)
 
     def gravity_expression(self, phi: ca.SX) -> ca.SX:
         """Return gravity (3,) in the frame of the body as an expression of the φ of
-        `of_gravity`.
+        `gravity_indices`.
         """
-        values = self.by_row(phi, self.of_gravity)
+        values = self.values_by_row(phi, self.gravity_indices)
         gravity = ca.DM(self.gravity_m_s2)
         if TILT in values:
-            gravity = self._tilted(values[TILT])
-        if TURN in values:
-            gravity = rotation(values[TURN]).T @ gravity
+            gravity = self._tilted_gravity(values[TILT])
+        if POSE_TURN in values:
+            gravity = cayley_rotation(values[POSE_TURN]).T @ gravity
         return ca.SX(gravity)
 
-    def by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
+    def values_by_row(self, phi: ca.SX, places: Index) -> dict[NuisanceRow, ca.SX]:
         """Return parameters with units by row, each a column vector.
 
         Parameters
         ----------
         phi : SX
-            Parameters at the indices `places`.
+            Parameters at the indices `indices_of_rows`.
         places : array of int
             Indices in φ.
         """
@@ -512,7 +516,7 @@ class NuisanceMap:
             parts.setdefault(self.entries[k].row, []).append(values[position])
         return {row: ca.vertcat(*each) for row, each in parts.items()}
 
-    def _tilted(self, angles: ca.SX) -> ca.SX:
+    def _tilted_gravity(self, angles: ca.SX) -> ca.SX:
         """Return gravity of the stated magnitude, tilted by two angles [rad] about the axes across
         it.
         """
@@ -526,24 +530,24 @@ class NuisanceMap:
         return ca.SX(size * tilted / ca.norm_2(tilted))
 
 
-def _entries(experiment: Experiment) -> Iterator[Entry]:
+def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
     """Yield every nuisance parameter of an experiment, in the order of φ."""
-    for _, rows in groupby(experiment.nuisance.rows, key=lambda row: row.of):
+    for _, rows in groupby(experiment.nuisance.kinds, key=lambda row: row.of):
         applicable = [row for row in rows if row.applies(experiment)]
         for number, component_name in (
             _components(experiment, applicable[0].of) if applicable else ()
         ):
             for row in applicable:
-                for axis, name, unit, sigma in _axes(experiment, row, number):
+                for axis, name, unit, sigma in _component_axes(experiment, row, number):
                     label = row.label.format(which=component_name, axis=name)
-                    yield Entry(row, number, axis, f"{label} [{unit}]", sigma)
+                    yield NuisanceEntry(row, number, axis, f"{label} [{unit}]", sigma)
     for number, gauge in enumerate(experiment.readings):
         for axis, (name, sigma) in enumerate(gauge.unknowns.items()):
             label = f"{without_unit(name)} of {gauge.name} [{unit_of(name) or '1'}]"
-            yield Entry(GAUGE, number, axis, label, sigma)
+            yield NuisanceEntry(GAUGE, number, axis, label, sigma)
 
 
-def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
+def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, str]]:
     """Return index and name of all components of one kind, such as all markers."""
     names = experiment.markers.names
     if of == "recording":
@@ -553,13 +557,13 @@ def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
     if of == "place":
         return [(m, names[m]) for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()]
     if of == "grasp":
-        return [(k, str(k + 1)) for k in range(len(experiment.gripping))]
+        return [(k, str(k + 1)) for k in range(len(experiment.body_grasps))]
     if of == "obstacle":
-        return enumerate((each.name for each in experiment.obstacles), len(experiment.gripping))
+        return enumerate((each.name for each in experiment.obstacles), len(experiment.body_grasps))
     if of == "depth":
         return enumerate(depth.name for depth in experiment.depths)
     if of == "load":
-        return enumerate(which for which, _ in _timed(experiment))
+        return enumerate(which for which, _ in _timed_loads(experiment))
     if of == "sensor":
         count = len(_wrenches(experiment))
         return [(k, f" {k + 1}" if count > 1 else "") for k in range(count)]
@@ -569,7 +573,7 @@ def _components(experiment: Experiment, of: Of) -> Iterable[tuple[int, str]]:
     return enumerate(pressures, start=len(experiment.tendons))
 
 
-def _axes(
+def _component_axes(
     experiment: Experiment, row: NuisanceRow, number: int
 ) -> list[tuple[int, str, str, float]]:
     """Return index, name, unit and prior deviation of each estimated axis of a component.
@@ -585,12 +589,12 @@ def _axes(
         return []
     if row == TARE:
         wrench = _wrenches(experiment)[number]
-        measured = np.flatnonzero(wrench.measured).tolist()
+        measured = np.flatnonzero(wrench.measured_components).tolist()
         return [(k, COMPONENTS[k], UNITS[k], sigma * float(wrench.sigmas[k])) for k in measured]
     if row in (OBSTACLE_TILT, OBSTACLE_TIME):
         obstacle = experiment.grasps[number]
         assert isinstance(obstacle, Obstacle)
-        if not (obstacle.shape.flat if row == OBSTACLE_TILT else len(obstacle.poses.t_s) > 1):
+        if not (obstacle.shape.has_tilt if row == OBSTACLE_TILT else len(obstacle.poses.t_s) > 1):
             return []
     if row in (DEPTH_BIAS, DEPTH_SCALE) and experiment.depths[number].camera.matrix is None:
         return []
@@ -605,15 +609,15 @@ def _wrenches(experiment: Experiment) -> list[Wrench]:
     return [grasp.wrench for grasp in experiment.grasps if grasp.wrench is not None]
 
 
-def _timed(experiment: Experiment) -> list[tuple[str, Timed]]:
+def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
     """Return label and load for every time of a load that is to be estimated."""
     if not experiment.nuisance.joining_s:
         return []
-    verbs: dict[Change, str] = {"from_s": "joining", "until_s": "leaving"}
+    verbs: dict[LoadTime, str] = {"from_s": "joining", "until_s": "leaving"}
     return [
-        (f"{verbs[change]} of {kind} {number}", Timed(load, change))
+        (f"{verbs[change]} of {kind} {number}", TimedLoad(load, change))
         for kind, loads in (("mass", experiment.masses), ("force", experiment.forces))
         for number, load in enumerate(loads, start=1)
-        for change in get_args(Change)
-        if experiment.changes(load, change)
+        for change in get_args(LoadTime)
+        if experiment.changes_within(load, change)
     ]

@@ -87,8 +87,8 @@ def principal_root(stencil: Stencil, h: float, damping_ratio: float = 0.0) -> co
     damping_ratio : float
         Physical damping ratio ζ.
     """
-    force = _sum(h**2 * np.array(stencil.p), 2 * damping_ratio * h * np.array(stencil.q))
-    in_u = _sum(np.convolve(stencil.w, force), np.array(stencil.s))
+    force = _polynomial_sum(h**2 * np.array(stencil.p), 2 * damping_ratio * h * np.array(stencil.q))
+    in_u = _polynomial_sum(np.convolve(stencil.w, force), np.array(stencil.s))
     roots = np.roots(in_u)  # of z: the coefficient of u⁰ leads
     upper = roots[roots.imag >= -1e-12 * np.abs(roots)]
     return complex(upper[np.argmax(np.abs(upper))])
@@ -98,7 +98,7 @@ def substeps_needed(
     scheme: Scheme,
     angular_frequency_rad_s: float,
     timestep_s: float,
-    limit: float,
+    damping_limit: float,
     period_error: float = PERIOD_ERROR,
     damping_ratio: float = 0.0,
 ) -> int | None:
@@ -111,7 +111,7 @@ def substeps_needed(
         Angular frequency ω of the undamped mode.
     timestep_s : float
         Time between samples.
-    limit : float
+    damping_limit : float
         Largest absolute numerical damping ratio.
     period_error : float
         Largest absolute relative error of the period, evaluated without physical damping.
@@ -130,7 +130,7 @@ def substeps_needed(
             numerical_mode(scheme, angular_frequency_rad_s, timestep_s / substeps, ratio)
             for ratio in (0.0, damping_ratio)
         )
-        return abs(damped.damping_ratio) <= limit and abs(mode.period_error) <= period_error
+        return abs(damped.damping_ratio) <= damping_limit and abs(mode.period_error) <= period_error
 
     high = 1
     while not suffices(high):
@@ -144,7 +144,7 @@ def substeps_needed(
     return high
 
 
-def _sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _polynomial_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the sum of two polynomials, given by their coefficients from the lowest power on."""
     total = np.zeros(max(len(a), len(b)))
     total[: len(a)] += a

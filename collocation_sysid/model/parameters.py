@@ -1,6 +1,7 @@
 """Shared parameters of a problem: guesses, bounds, priors, ties, and the solver's coordinates q.
 
-Use `Parameters.of` to declare the parameters of a problem and `ThetaMap` to evaluate the constants
+Use `Parameters.from_mapping` to declare the parameters of a problem and `ThetaMap` to evaluate the
+constants
 θ of a body. The solver works on q, with one entry for each free parameter in the order of
 `Parameters.free`: the logarithm of a positive parameter, or a linear parameter divided by its
 typical change. Parameters have the names of the constants of the model, or of moduli from which
@@ -24,15 +25,15 @@ from ..fem.body import Body
 from ..fem.constants import (
     INSTANTANEOUS,
     Scale,
-    bare,
     constant_named,
     is_density,
-    is_mode,
+    is_field_coefficient,
     is_modulus,
     usual_value,
+    without_region,
 )
-from ..fem.moduli import ENGINEERING, engineering
-from .generated import Generated
+from ..fem.moduli import ENGINEERING, engineering_constants
+from .generated import GeneratedFunction
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Unknown:
 
 
 # Keys of the table of a parameter in a problem file.
-KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
+PARAMETER_KEYS = (*(field.name for field in fields(Unknown)), "fixed", "tied_to", "ratio")
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Parameter:
         Initial value, or the value of a fixed parameter; None if a scan is to find it.
     lower, upper : float
         Bounds; positive for a logarithmic parameter.
-    fixed : bool
+    is_fixed : bool
         Whether the parameter keeps its guess.
     prior : tuple (mean, deviation) or None
         Normal prior: ((ln value − ln mean) / deviation)² is added to the loss; for a linear
@@ -118,7 +119,7 @@ class Parameter:
     guess: float | None
     lower: float = 0.0
     upper: float = np.inf
-    fixed: bool = False
+    is_fixed: bool = False
     prior: tuple[float, float] | None = None
     scale: Scale = "log"
     unit: float = 1.0
@@ -127,7 +128,7 @@ class Parameter:
     def __post_init__(self) -> None:
         if self.tied is not None:
             return
-        if self.fixed:
+        if self.is_fixed:
             self._check_fixed()
             return
         least = 0.0 if self.scale == "log" else constant_named(self.name).at_least
@@ -144,7 +145,7 @@ class Parameter:
                 None,
                 self.name,
             )
-        self._refuse_beyond(self.upper, "upper")
+        self._require_below_limit(self.upper, "upper")
         if self.prior is not None and not (
             self.prior[1] > 0 and (self.prior[0] > 0 or self.scale == "linear")
         ):
@@ -155,14 +156,14 @@ class Parameter:
     def _check_fixed(self) -> None:
         """Raise an `InputError` if the fixed value is inadmissible for the constant."""
         constant = constant_named(self.name)
-        least = constant.at_least if self.scale == "linear" else constant.least
+        least = constant.at_least if self.scale == "linear" else constant.lower_limit
         value = np.nan if self.guess is None else self.guess
         if not (np.isfinite(value) and value >= least):
             expected = "a number" if least < 0 else "a number >= 0"
             raise InputError(f"fixed = {value:g}, expected {expected}", None, self.name)
-        self._refuse_beyond(value, "fixed")
+        self._require_below_limit(value, "fixed")
 
-    def _refuse_beyond(self, value: float, what: str) -> None:
+    def _require_below_limit(self, value: float, what: str) -> None:
         """Raise an `InputError` if a value reaches the upper limit of the constant, such as ν =
         0.5.
 
@@ -173,20 +174,24 @@ class Parameter:
             Key of the value in the message: "upper" or "fixed".
         """
         if not value < (limit := constant_named(self.name).below):
-            why = ": an incompressible body has no finite λ" if bare(self.name) == "poisson" else ""
+            why = (
+                ": an incompressible body has no finite λ"
+                if without_region(self.name) == "poisson"
+                else ""
+            )
             raise InputError(
                 f"{what} = {value:g}, expected less than {limit:g}{why}", None, self.name
             )
 
-    def q(self, value: float) -> float:
+    def to_coordinate(self, value: float) -> float:
         """Return the solver's coordinate q of a value."""
         return float(np.log(value)) if self.scale == "log" else value / self.unit
 
-    def value(self, q: float) -> float:
+    def from_coordinate(self, q: float) -> float:
         """Return the value at a solver's coordinate q."""
         return float(np.exp(q)) if self.scale == "log" else q * self.unit
 
-    def per_value(self, value: float) -> float:
+    def value_derivative(self, value: float) -> float:
         """Return the derivative of the value by q, at a value."""
         return value if self.scale == "log" else self.unit
 
@@ -196,13 +201,13 @@ class Parameter:
 FIRST_CONTRAST = 2.0
 
 
-def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
+def complete_parameter(name: str, user_statement: Unknown | Tied | float) -> Parameter:
     """Return the complete definition of a parameter, with defaults from its constant.
 
     Parameters
     ----------
     name : str
-    given : Unknown, Tied or float
+    user_statement : Unknown, Tied or float
         The user's statement; a number is a fixed value.
 
     Raises
@@ -212,17 +217,21 @@ def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
         without guess, prior and usual value.
     """
     constant = constant_named(name)
-    if isinstance(given, Tied):
-        return Parameter(name, 0.0, tied=given)
-    if not isinstance(given, Unknown):
-        return Parameter(name, float(given), fixed=True)
-    scale = given.scale or constant.scale
+    if isinstance(user_statement, Tied):
+        return Parameter(name, 0.0, tied=user_statement)
+    if not isinstance(user_statement, Unknown):
+        return Parameter(name, float(user_statement), is_fixed=True)
+    scale = user_statement.scale or constant.scale
     low, high = constant.bounds
     if scale == "linear" and constant.scale == "log":
         low = -high
     if scale == "log" and low <= 0:
         low = 1e-9 * high
-    if given.guess is None and given.prior is None and usual_value(name, 1.0) is None:
+    if (
+        user_statement.guess is None
+        and user_statement.prior is None
+        and usual_value(name, 1.0) is None
+    ):
         raise InputError(
             "no guess is given and no usual value is known of it; expected guess = a value",
             None,
@@ -230,10 +239,10 @@ def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
         )
     # The size of a modulus without a guess follows from the scan.
     size = np.nan if is_modulus(name) else 0.0
-    size = size if given.guess is None else abs(given.guess)
-    typical = given.typical or constant.typical or size
+    size = size if user_statement.guess is None else abs(user_statement.guess)
+    typical = user_statement.typical or constant.typical or size
     if scale == "linear" and typical == 0:
-        statement = "no guess" if given.guess is None else "guess = 0"
+        statement = "no guess" if user_statement.guess is None else "guess = 0"
         raise InputError(
             f"{statement} of a linear parameter does not tell its size; expected typical, what it "
             "may change by in a step",
@@ -243,15 +252,17 @@ def parameter(name: str, given: Unknown | Tied | float) -> Parameter:
     try:
         return Parameter(
             name,
-            None if given.guess is None else float(given.guess),
-            low if given.lower is None else float(given.lower),
-            high if given.upper is None else float(given.upper),
-            prior=(0.0, 1.0) if given.prior is None and is_mode(name) else given.prior,
+            None if user_statement.guess is None else float(user_statement.guess),
+            low if user_statement.lower is None else float(user_statement.lower),
+            high if user_statement.upper is None else float(user_statement.upper),
+            prior=(0.0, 1.0)
+            if user_statement.prior is None and is_field_coefficient(name)
+            else user_statement.prior,
             scale=scale,
             unit=float(typical) if scale == "linear" else 1.0,
         )
     except InputError as error:
-        if given.lower is not None and given.upper is not None:
+        if user_statement.lower is not None and user_statement.upper is not None:
             raise
         message = f"{error.message}; where lower or upper is not given, these bounds are assumed"
         raise InputError(message, None, name) from error
@@ -289,13 +300,13 @@ class Parameters:
                 )
 
     def __repr__(self) -> str:
-        described = (item for item in self.items if not is_mode(item.name))
-        return f"Parameters({', '.join(map(_stated, described))})"
+        described = (item for item in self.items if not is_field_coefficient(item.name))
+        return f"Parameters({', '.join(map(_describe, described))})"
 
     @classmethod
-    def of(cls, given: Mapping[str, Unknown | Tied | float]) -> Parameters:
+    def from_mapping(cls, statements: Mapping[str, Unknown | Tied | float]) -> Parameters:
         """Return parameters from the user's statements by name; a number is a fixed value."""
-        return cls(tuple(parameter(name, value) for name, value in given.items()))
+        return cls(tuple(complete_parameter(name, value) for name, value in statements.items()))
 
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
         """Return these parameters with those of the bodies' fields that are not stated yet.
@@ -304,25 +315,27 @@ class Parameters:
         the prior of its field.
         """
         bodies = tuple(bodies)
-        names = dict.fromkeys(name for body in bodies for name in body.mode_names)
+        names = dict.fromkeys(name for body in bodies for name in body.field_coefficient_names)
         priors = {
-            name: (1.0, deviation) for body in bodies for name, deviation in body.contrasts.items()
+            name: (1.0, deviation)
+            for body in bodies
+            for name, deviation in body.contrast_deviations.items()
         }
         own_items = (
             replace(item, prior=priors[item.name])
-            if item.name in priors and item.prior is None and not item.fixed
+            if item.name in priors and item.prior is None and not item.is_fixed
             else item
             for item in self.items
         )
         contrasts = (
-            parameter(name, Unknown(FIRST_CONTRAST, prior=prior))
+            complete_parameter(name, Unknown(FIRST_CONTRAST, prior=prior))
             for name, prior in priors.items()
             if name not in self.names
         )
-        modes = (parameter(name, Unknown(0.0)) for name in names if name not in self.names)
+        modes = (complete_parameter(name, Unknown(0.0)) for name in names if name not in self.names)
         return Parameters((*own_items, *contrasts, *modes))
 
-    def fixed_at(self, values: Mapping[str, float]) -> Parameters:
+    def only_fixed(self, values: Mapping[str, float]) -> Parameters:
         """Return only the parameters with these names, fixed at these values.
 
         Other parameters are omitted; see `with_fixed` to keep them.
@@ -330,7 +343,8 @@ class Parameters:
         selected = (item for item in self.items if item.name in values)
         return Parameters(
             tuple(
-                replace(item, guess=values[item.name], fixed=True, tied=None) for item in selected
+                replace(item, guess=values[item.name], is_fixed=True, tied=None)
+                for item in selected
             )
         )
 
@@ -342,10 +356,10 @@ class Parameters:
     @cached_property
     def free(self) -> tuple[Parameter, ...]:
         """Parameters that are estimated, in the order of q."""
-        return tuple(item for item in self.items if not item.fixed and item.tied is None)
+        return tuple(item for item in self.items if not item.is_fixed and item.tied is None)
 
     @property
-    def linear(self) -> frozenset[str]:
+    def linear_names(self) -> frozenset[str]:
         """Names of the parameters with linear scale."""
         return frozenset(item.name for item in self.items if item.scale == "linear")
 
@@ -356,11 +370,11 @@ class Parameters:
         """
         item = next((each for each in self.free if each.name == name), None)
         if item is None:
-            return name in self.linear, (-np.inf, np.inf)
+            return name in self.linear_names, (-np.inf, np.inf)
         return item.scale == "linear", (item.lower, item.upper)
 
     @property
-    def unguessed(self) -> tuple[str, ...]:
+    def names_without_guess(self) -> tuple[str, ...]:
         """Names of the estimated parameters without a guess."""
         return tuple(item.name for item in self.free if item.guess is None)
 
@@ -373,14 +387,14 @@ class Parameters:
         InputError
             If a parameter has no guess.
         """
-        return np.array([item.q(_guess(item)) for item in self.free])
+        return np.array([item.to_coordinate(_guess(item)) for item in self.free])
 
     @property
     def bounds_q(self) -> tuple[Array, Array]:
         """Lower and upper bounds of q, (nq,) each."""
         return (
-            np.array([item.q(item.lower) for item in self.free]),
-            np.array([item.q(item.upper) for item in self.free]),
+            np.array([item.to_coordinate(item.lower) for item in self.free]),
+            np.array([item.to_coordinate(item.upper) for item in self.free]),
         )
 
     def expressions(self, q: ca.SX) -> dict[str, ca.SX]:
@@ -397,7 +411,7 @@ class Parameters:
         """Return the value of every parameter at q, by name."""
         by_name = {item.name: float(item.guess or 0.0) for item in self.items}
         for item, coordinate in zip(self.free, q, strict=True):
-            by_name[item.name] = item.value(float(coordinate))
+            by_name[item.name] = item.from_coordinate(float(coordinate))
         for item in self.items:
             if item.tied is not None:
                 by_name[item.name] = item.tied.ratio * by_name[item.tied.to]
@@ -414,7 +428,7 @@ class Parameters:
         """
         return self.values(self.guess_q)
 
-    def prior(self, q: Array) -> tuple[Array, Array]:
+    def prior_residuals(self, q: Array) -> tuple[Array, Array]:
         """Return the residuals of the priors and their derivatives by q, (nq,) each.
 
         Both are zero for parameters without a prior.
@@ -425,7 +439,7 @@ class Parameters:
             if item.prior is not None:
                 mean, deviation = item.prior
                 slopes[k] = (1.0 if item.scale == "log" else item.unit) / deviation
-                residuals[k] = (q[k] - item.q(mean)) * slopes[k]
+                residuals[k] = (q[k] - item.to_coordinate(mean)) * slopes[k]
         return residuals, slopes
 
     def with_guess(self, values: Mapping[str, float]) -> Parameters:
@@ -452,12 +466,12 @@ class Parameters:
         """
         return Parameters(
             tuple(
-                Parameter(i.name, values[i.name], fixed=True) if i.name in values else i
+                Parameter(i.name, values[i.name], is_fixed=True) if i.name in values else i
                 for i in self.items
             )
         )
 
-    def fit(self, bodies: Iterable[Body]) -> None:
+    def require_constants_of(self, bodies: Iterable[Body]) -> None:
         """Raise an `InputError` if the parameters do not determine the constants of the bodies.
 
         Raises
@@ -473,7 +487,7 @@ class Parameters:
                 parameter, _, key = name.rpartition(".")
                 if parameter in known:  # a misspelt key of a parameter's table reads like a region
                     raise InputError(
-                        f"unknown key; expected one of {', '.join(KEYS)}{hint_at(key, KEYS)}",
+                        f"unknown key; expected one of {', '.join(PARAMETER_KEYS)}{hint_at(key, PARAMETER_KEYS)}",
                         None,
                         name,
                     )
@@ -491,8 +505,8 @@ class Parameters:
                     "no part of the model uses it: every region has a value of its own", None, name
                 )
         for item in self.items:
-            stiff = bare(item.name) in ("mu_pa", "young_pa")
-            if item.fixed and item.guess == 0 and (stiff or is_density(item.name)):
+            stiff = without_region(item.name) in ("mu_pa", "young_pa")
+            if item.is_fixed and item.guess == 0 and (stiff or is_density(item.name)):
                 what = "a stiffness" if stiff else "a density"
                 raise InputError(f"fixed = 0, expected {what} above 0", None, item.name)
 
@@ -508,11 +522,11 @@ def _guess(item: Parameter) -> float:
     return item.guess
 
 
-def _stated(item: Parameter) -> str:
+def _describe(item: Parameter) -> str:
     """Return a short description of a parameter for `repr`."""
     if item.tied is not None:
         return f"{item.name} = {item.tied.ratio:g} × {item.tied.to}"
-    if item.fixed:
+    if item.is_fixed:
         return f"{item.name} = {item.guess:g}"
     start = "" if item.guess is None else f" from {item.guess:g}"
     return f"{item.name}{start} in [{item.lower:g}, {item.upper:g}]"
@@ -533,57 +547,59 @@ class ThetaMap:
 
     def expression(self, q: ca.SX, _: ca.SX | None = None) -> ca.SX:
         """Return θ (k,) as an expression in q; the second argument is not used."""
-        return ca.vertcat(*self.body.assembled(self.parameters.expressions(q)))
+        return ca.vertcat(*self.body.assemble_theta(self.parameters.expressions(q)))
 
     def theta(self, q: Sequence[float] | Array) -> Array:
         """Return the constants θ (k,) at q (nq,)."""
-        return self._theta.value(_numbers(q), NOTHING)
+        return self._theta.evaluate(_as_float_array(q), NOTHING)
 
-    def slopes(self, q: Array) -> Array:
+    def jacobian(self, q: Array) -> Array:
         """Return the derivatives ∂θ/∂q (k, nq)."""
-        return self._theta.slopes(_numbers(q), NOTHING)[1]
+        return self._theta.evaluate_with_jacobian(_as_float_array(q), NOTHING)[1]
 
     @property
     def derived_names(self) -> tuple[str, ...]:
         """Names of the derived moduli, such as "young_pa"."""
         return self._derived[0]
 
-    def derived(self, q: Array) -> tuple[Array, Array]:
+    def derived_moduli(self, q: Array) -> tuple[Array, Array]:
         """Return the derived moduli (d,) at q, in the order of their names, and derivatives by q
         (d, nq).
         """
-        return self._derived[1].slopes(_numbers(q), NOTHING)
+        return self._derived[1].evaluate_with_jacobian(_as_float_array(q), NOTHING)
 
     @cached_property
-    def _theta(self) -> Generated:
+    def _theta(self) -> GeneratedFunction:
         """Expression of θ with derivatives."""
-        return Generated(self.expression, len(self.parameters.free), 0)
+        return GeneratedFunction(self.expression, len(self.parameters.free), 0)
 
     @cached_property
-    def _derived(self) -> tuple[tuple[str, ...], Generated]:
+    def _derived(self) -> tuple[tuple[str, ...], GeneratedFunction]:
         """Names of the derived moduli, and their expression with derivatives."""
         names = self.parameters.names
         body = self.body
-        derived_names, _ = _derived(
-            names, body, self.expression(ca.SX.sym("q", self._theta.inputs))
+        derived_names, _ = _derived_moduli(
+            names, body, self.expression(ca.SX.sym("q", self._theta.input_size))
         )
 
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
-            return _derived(names, body, self.expression(q))[1]
+            return _derived_moduli(names, body, self.expression(q))[1]
 
-        return derived_names, Generated(values, self._theta.inputs, 0)
+        return derived_names, GeneratedFunction(values, self._theta.input_size, 0)
 
 
 # Data of an expression that depends on q alone.
 NOTHING = np.zeros(0)
 
 
-def _numbers(q: Sequence[float] | Array) -> Array:
+def _as_float_array(q: Sequence[float] | Array) -> Array:
     """Return q as an array of floats."""
     return np.asarray(q, dtype=np.float64)
 
 
-def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str, ...], ca.SX]:
+def _derived_moduli(
+    names: Sequence[str], body: Body, theta: ca.SX
+) -> tuple[tuple[str, ...], ca.SX]:
     """Return names and expressions of the moduli that follow from θ.
 
     These are (E, ν) of every part at small strain, unless they are parameters themselves, and (λ,
@@ -598,10 +614,10 @@ def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str,
     theta : (k,) SX
     """
     derived: dict[str, ca.SX] = {}
-    shares = body.split(theta)
-    for part, share, source in zip(body.parts, shares, body.sources(names), strict=True):
+    shares = body.split_theta(theta)
+    for part, share, source in zip(body.parts, shares, body.constant_sources(names), strict=True):
         lame = part.material.lame(share[: len(part.material.constants)])
-        young, poisson = engineering(lame[0], lame[1])
+        young, poisson = engineering_constants(lame[0], lame[1])
         moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}
         by_young = "young_pa" in source.names
         prefix = f"{part.name}."
@@ -612,22 +628,24 @@ def _derived(names: Sequence[str], body: Body, theta: ca.SX) -> tuple[tuple[str,
             if own not in source.names and (own in ENGINEERING or by_young):
                 derived[part.full_name(own)] = value
         if part.prony:
-            memory_constants = share[part.of_law : part.of_law + 2 * len(part.prony)]
+            memory_constants = share[
+                part.law_constant_count : part.law_constant_count + 2 * len(part.prony)
+            ]
             derived[part.full_name(INSTANTANEOUS.name)] = young * (
                 1 + ca.sum1(memory_constants[::2])
             )
     return tuple(derived), ca.vertcat(*derived.values()) if derived else ca.SX(0, 1)
 
 
-def theta_of(
-    body: Body, given: Parameters | Mapping[str, float] | Sequence[float] | Array
+def resolve_theta(
+    body: Body, values: Parameters | Mapping[str, float] | Sequence[float] | Array
 ) -> Array:
     """Return the constants θ (k,) of a body from parameters, values by name, or θ itself.
 
     Parameters
     ----------
     body : Body
-    given : Parameters, mapping or sequence of float
+    values : Parameters, mapping or sequence of float
         Parameters are evaluated at their guesses.
 
     Raises
@@ -635,14 +653,14 @@ def theta_of(
     InputError
         If names or numbers are missing or unknown.
     """
-    if isinstance(given, Parameters):
-        return body.theta(given.guesses)
-    if isinstance(given, Mapping):
-        Parameters.of(given).fit([body])
-        return body.theta(given)
-    if len(given) != len(body.constants):
+    if isinstance(values, Parameters):
+        return body.theta_from_values(values.guesses)
+    if isinstance(values, Mapping):
+        Parameters.from_mapping(values).require_constants_of([body])
+        return body.theta_from_values(values)
+    if len(values) != len(body.constants):
         raise InputError(
-            f"{len(given)} parameters given, expected {len(body.constants)}: "
+            f"{len(values)} parameters given, expected {len(body.constants)}: "
             f"{', '.join(body.constants)}"
         )
-    return np.array(given, dtype=float)
+    return np.array(values, dtype=float)

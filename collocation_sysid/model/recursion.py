@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import Array
-from .generated import Generated
+from .generated import GeneratedFunction
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 
@@ -33,39 +33,39 @@ class Recursion:
     expression : callable
         ``expression(before, now, last, constants, data) -> state`` in CasADi operations on column
         vectors: h_{k−1}, s_k, s_{k−1}, c and the data at k; returns h_k.
-    state : int
+    state_size : int
         Length n of the state h.
-    looked : int
+    signal_size : int
         Length i of the signal s.
-    constants : int
+    constant_count : int
         Length C of the constants c.
-    data : int
+    data_size : int
         Length d of the data at each time.
     """
 
     expression: Expression
-    state: int
-    looked: int
-    constants: int
-    data: int
+    state_size: int
+    signal_size: int
+    constant_count: int
+    data_size: int
 
     @property
-    def ends(self) -> list[int]:
-        """End indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of `step`."""
-        sizes = [self.state, self.looked, self.looked, self.constants]
+    def input_offsets(self) -> list[int]:
+        """End indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of `step_function`."""
+        sizes = [self.state_size, self.signal_size, self.signal_size, self.constant_count]
         return np.cumsum(sizes).tolist()
 
     @cached_property
-    def step(self) -> Generated:
+    def step_function(self) -> GeneratedFunction:
         """Expression R of the stacked inputs u = (h_{k−1}, s_k, s_{k−1}, c), with derivatives."""
 
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
-            before, now, last, constants = ca.vertsplit(u, [0, *self.ends])
+            before, now, last, constants = ca.vertsplit(u, [0, *self.input_offsets])
             return self.expression(before, now, last, constants, data)
 
-        return Generated(expression, self.ends[-1], self.data)
+        return GeneratedFunction(expression, self.input_offsets[-1], self.data_size)
 
-    def coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:
+    def linear_coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:
         """Return ∂R/∂(h_{k−1}, s_k, s_{k−1}) of a recursion that is linear in these, column by
         column.
 
@@ -79,13 +79,13 @@ class Recursion:
         (n (n + 2 i),) SX
             The Jacobian (n, n + 2 i), stacked column by column.
         """
-        u = ca.SX.sym("u", self.ends[2])
-        before, now, last = ca.vertsplit(u, [0, *self.ends[:3]])
+        u = ca.SX.sym("u", self.input_offsets[2])
+        before, now, last = ca.vertsplit(u, [0, *self.input_offsets[:3]])
         return ca.vec(ca.jacobian(self.expression(before, now, last, constants, data), u))
 
 
 @dataclass(frozen=True, eq=False)
-class Evolution:
+class RecursionTrajectory:
     """States of a recursion along a given signal, with derivatives forward and backward in time.
 
     Attributes
@@ -95,7 +95,7 @@ class Evolution:
         Constants c.
     data : (d, N, I)
         Data at each time and instance.
-    looked : (i, N, I)
+    signal : (i, N, I)
         Signal s.
     states : (n, N, I)
         States h.
@@ -104,11 +104,13 @@ class Evolution:
     recursion: Recursion
     constants: Array
     data: Array
-    looked: Array
+    signal: Array
     states: Array
 
     @classmethod
-    def of(cls, recursion: Recursion, constants: Array, data: Array, looked: Array) -> Evolution:
+    def from_signal(
+        cls, recursion: Recursion, constants: Array, data: Array, signal: Array
+    ) -> RecursionTrajectory:
         """Run the recursion from the start along a signal.
 
         Parameters
@@ -117,55 +119,57 @@ class Evolution:
         constants : (C,)
         data : (d, N, I) or broadcastable to it
             Data that are equal for all instances may have the shape (d, N, 1).
-        looked : (i, N, I)
+        signal : (i, N, I)
             Signal s.
         """
-        data = np.broadcast_to(data, (recursion.data, *looked.shape[1:]))
-        states = np.zeros((recursion.state, *looked.shape[1:]))
-        trajectory = cls(recursion, constants, data, looked, states)
-        for k in range(looked.shape[1]):
+        data = np.broadcast_to(data, (recursion.data_size, *signal.shape[1:]))
+        states = np.zeros((recursion.state_size, *signal.shape[1:]))
+        trajectory = cls(recursion, constants, data, signal, states)
+        for k in range(signal.shape[1]):
             now = slice(k, k + 1)
-            states[:, now] = recursion.step.value(trajectory._u(now), data[:, now])
+            states[:, now] = recursion.step_function.evaluate(
+                trajectory._stacked_inputs(now), data[:, now]
+            )
         return trajectory
 
-    def _u(self, here: slice) -> Array:
+    def _stacked_inputs(self, times: slice) -> Array:
         """Return the stacked inputs (h_{k−1}, s_k, s_{k−1}, c) at consecutive times.
 
         At the start, h_{k−1} is zero and s_{k−1} is s_0.
         """
-        before = np.arange(here.start, here.stop) - 1
+        before = np.arange(times.start, times.stop) - 1
         states = np.where((before < 0)[:, None], 0.0, self.states[:, before])
-        last = self.looked[:, np.maximum(before, 0)]
+        last = self.signal[:, np.maximum(before, 0)]
         c = np.broadcast_to(self.constants[:, None, None], (len(self.constants), *last.shape[1:]))
-        return np.concatenate([states, self.looked[:, here], last, c])
+        return np.concatenate([states, self.signal[:, times], last, c])
 
     @cached_property
-    def _slopes(self) -> list[Array]:
+    def _jacobians(self) -> list[Array]:
         """Derivatives of R by h_{k−1}, s_k, s_{k−1} and c, a list of arrays (n, …, N, I)."""
-        step = self.recursion.step
-        all_times = slice(0, self.looked.shape[1])
-        by_u = step.slopes(self._u(all_times), self.data)[1]
-        return np.split(by_u, self.recursion.ends[:-1], axis=1)
+        step = self.recursion.step_function
+        all_times = slice(0, self.signal.shape[1])
+        by_u = step.evaluate_with_jacobian(self._stacked_inputs(all_times), self.data)[1]
+        return np.split(by_u, self.recursion.input_offsets[:-1], axis=1)
 
-    def forward(self, looked: Array, constants: Array) -> Array:
+    def jacobian_vector_product(self, signal_changes: Array, constant_changes: Array) -> Array:
         """Return the changes of the states (n, N, I, c) for c directions at once.
 
         Parameters
         ----------
-        looked : (i, N, I, c)
+        signal_changes : (i, N, I, c)
             Changes of the signal s.
-        constants : (C, c)
+        constant_changes : (C, c)
             Changes of the constants.
         """
-        by_state, by_now, by_last, by_constants = self._slopes
-        changes = np.einsum("abkp,bkpc->akpc", by_now, looked)
-        changes += np.einsum("abkp,bc->akpc", by_constants, constants)
-        changes[:, 1:] += np.einsum("abkp,bkpc->akpc", by_last[:, :, 1:], looked[:, :-1])
+        by_state, by_now, by_last, by_constants = self._jacobians
+        changes = np.einsum("abkp,bkpc->akpc", by_now, signal_changes)
+        changes += np.einsum("abkp,bc->akpc", by_constants, constant_changes)
+        changes[:, 1:] += np.einsum("abkp,bkpc->akpc", by_last[:, :, 1:], signal_changes[:, :-1])
         for k in range(1, changes.shape[1]):
             changes[:, k] += np.einsum("abp,bpc->apc", by_state[:, :, k], changes[:, k - 1])
         return changes
 
-    def backward(self, weights: Array) -> tuple[Array, Array]:
+    def vector_jacobian_product(self, weights: Array) -> tuple[Array, Array]:
         """Return the gradient of Σ weights · h by the signal (i, N, I) and by the constants (C,).
 
         Parameters
@@ -173,7 +177,7 @@ class Evolution:
         weights : (n, N, I)
             Weights of the states; not modified.
         """
-        by_state, by_now, by_last, by_constants = self._slopes
+        by_state, by_now, by_last, by_constants = self._jacobians
         total = weights.copy()
         for k in range(total.shape[1] - 1, 0, -1):
             total[:, k - 1] += np.einsum("abp,ap->bp", by_state[:, :, k], total[:, k])

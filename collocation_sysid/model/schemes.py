@@ -87,7 +87,7 @@ class Scheme:
         return all((each.p, each.q) == ((0.5, 0.5), (1.0, -1.0)) for each in stencils)
 
     @property
-    def reach(self) -> int:
+    def largest_lag(self) -> int:
         """Largest lag l with ∂c_t/∂x_{t−l} ≠ 0, in time steps."""
         lags = []
         for stencil in (self.regular, *self.start):
@@ -132,12 +132,12 @@ SCHEMES: dict[str, Scheme] = {
 }
 
 
-def as_scheme(given: str | Scheme, start_rule: str = "standard") -> Scheme:
+def as_scheme(scheme_or_name: str | Scheme, start_rule: str = "standard") -> Scheme:
     """Return a scheme by its name in `SCHEMES`, or the given scheme, with the start rule applied.
 
     Parameters
     ----------
-    given : str or Scheme
+    scheme_or_name : str or Scheme
     start_rule : {"standard", "paper"}
         "paper" drops the inertia of the first step (a = 0); for backward Euler only.
 
@@ -146,9 +146,9 @@ def as_scheme(given: str | Scheme, start_rule: str = "standard") -> Scheme:
     InputError
         For an unknown scheme or start rule, or "paper" with another scheme than backward Euler.
     """
-    if isinstance(given, str) and given not in SCHEMES:
-        raise InputError(f"no scheme {given!r}; available: {', '.join(SCHEMES)}")
-    scheme = SCHEMES[given] if isinstance(given, str) else given
+    if isinstance(scheme_or_name, str) and scheme_or_name not in SCHEMES:
+        raise InputError(f"no scheme {scheme_or_name!r}; available: {', '.join(SCHEMES)}")
+    scheme = SCHEMES[scheme_or_name] if isinstance(scheme_or_name, str) else scheme_or_name
     if start_rule == "standard":
         return scheme
     if start_rule != "paper":

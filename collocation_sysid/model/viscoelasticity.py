@@ -16,8 +16,9 @@ and backward in time, with weights λ_k of the forces and μ_k of m_k,
 
     μ_{k−1} = d_k μ_k + (∂f_H/∂H)ᵀ λ_k,   ξ_k gets (∂S_k/∂ξ_k)ᵀ Σ a_k μ_k.
 
-`History` holds all evaluations; `Slopes` propagates columns forward, `Weights` propagates weights
-backward; `Remembered` is the state at one time, for time marching. The recursion is one of
+`MemoryHistory` holds all evaluations; `MemoryForwardColumns` propagates columns forward,
+`MemoryAdjoint` propagates weights
+backward; `MemoryState` is the state at one time, for time marching. The recursion is one of
 `recursion`; since it is linear in m and S, all points of a branch share its coefficients, which
 avoids most of the cost of a generated recursion for each point.
 """
@@ -31,19 +32,19 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import Array, Index
-from ..fem.body import Body, Curvature
-from ..fem.memory import Past, PointLayout, fading
+from ..fem.body import Body, SecondDerivatives
+from ..fem.memory import MemoryInput, MemoryLayout, fading_coefficients
 from .forces import Forces
-from .generated import Generated
+from .generated import GeneratedFunction
 from .recursion import Recursion
 
 # Number of evaluations whose stress derivatives are kept at a time; limits memory.
-CHUNK = 16
+EVALUATIONS_PER_CHUNK = 16
 # Number of relaxation times after which a load counts as relaxed: exp(−1000) is 0 in doubles.
-LONG = 1e3
+RELAXED_TIMES = 1e3
 
 
-def _even(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
+def _stiffening_of_interval(u: ca.SX, spacing_s: ca.SX) -> ca.SX:
     """Return c of an interval in which S changes linearly.
 
     Parameters
@@ -63,7 +64,7 @@ def _stiffening(u: ca.SX, data: ca.SX) -> ca.SX:
     since_s = data[0]
     began = data[1]
     at_once = u[0] * ca.exp(-since_s / u[1])
-    return began * at_once + (1 - began) * _even(u, since_s + began)
+    return began * at_once + (1 - began) * _stiffening_of_interval(u, since_s + began)
 
 
 def _overstress(before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX) -> ca.SX:
@@ -73,7 +74,7 @@ def _overstress(before: ca.SX, now: ca.SX, _: ca.SX, u: ca.SX, data: ca.SX) -> c
     at the start, else 0; and the time to the next evaluation.
     """
     e = ca.exp(-data[2] / u[1])
-    return e * before + (e * _stiffening(u, data) - _even(u, data[2])) * now
+    return e * before + (e * _stiffening(u, data) - _stiffening_of_interval(u, data[2])) * now
 
 
 OVERSTRESS = Recursion(_overstress, 1, 1, 2, 3)
@@ -81,15 +82,15 @@ OVERSTRESS = Recursion(_overstress, 1, 1, 2, 3)
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
     """Return the coefficients c, d and a of an evaluation."""
-    return ca.vertcat(_stiffening(u, data), OVERSTRESS.coefficients(u, data)[:2])
+    return ca.vertcat(_stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2])
 
 
-COEFFICIENTS = Generated(_coefficients, 2, 3)
-STIFFENING = Generated(_stiffening, 2, 3)
+COEFFICIENTS = GeneratedFunction(_coefficients, 2, 3)
+STIFFENING = GeneratedFunction(_stiffening, 2, 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Fading:
+class FadingCoefficients:
     """Coefficients c, d and a of B branches at N evaluations, with derivatives by g and τ.
 
     Attributes
@@ -114,7 +115,9 @@ class Fading:
     by: Array
 
     @classmethod
-    def of(cls, body: Body, theta: Array, until_next_s: Array, loaded_s: float) -> Fading:
+    def from_body(
+        cls, body: Body, theta: Array, until_next_s: Array, loaded_s: float
+    ) -> FadingCoefficients:
         """Return the coefficients of all branches of a body.
 
         Parameters
@@ -131,15 +134,15 @@ class Fading:
         branches = len(body.memory.branches)
         shape = (branches, len(until_next_s))
         since_s = np.empty(shape)
-        since_s[:, 0] = np.minimum(loaded_s, LONG * theta[places[1]])
+        since_s[:, 0] = np.minimum(loaded_s, RELAXED_TIMES * theta[places[1]])
         since_s[:, 1:] = until_next_s[:-1]
         began = np.broadcast_to(np.arange(shape[1]) == 0, shape)
         data = np.stack([since_s, began, np.broadcast_to(until_next_s, shape)])
         u = np.broadcast_to(theta[places][..., None], (2, branches, len(until_next_s)))
-        (c, d, a), by = COEFFICIENTS.slopes(u, data)
+        (c, d, a), by = COEFFICIENTS.evaluate_with_jacobian(u, data)
         return cls(places, u, data, c, d, a, by)
 
-    def along(self, theta_q: Array) -> tuple[Array, Array]:
+    def jacobian_vector_product(self, theta_q: Array) -> tuple[Array, Array]:
         """Return the derivatives (q, B, N) of d and of a in the directions `theta_q` (k, q) of
         θ.
         """
@@ -148,7 +151,7 @@ class Fading:
 
 
 @dataclass(frozen=True, eq=False)
-class History:
+class MemoryHistory:
     """Memory of the material at the evaluations of a motion.
 
     Attributes
@@ -160,9 +163,9 @@ class History:
         Positions at the evaluations [m].
     stress : (N, width)
         Long-term stress S at all points.
-    fading : Fading
+    fading : FadingCoefficients
         Coefficients of the recursion.
-    brought : (N, all branches)
+    previous_variables : (N, all branches)
         Internal variables m_{k−1} at each evaluation.
     """
 
@@ -170,19 +173,19 @@ class History:
     theta: Array
     xi: Array
     stress: Array
-    fading: Fading
-    brought: Array
+    fading: FadingCoefficients
+    previous_variables: Array
 
     @classmethod
-    def of(
+    def from_states(
         cls,
         body: Body,
         xi: Array,
         theta: Array,
         until_next_s: Array,
         loaded_s: float,
-        brought: Array | None = None,
-    ) -> History:
+        previous_variables: Array | None = None,
+    ) -> MemoryHistory:
         """Return the memory along given states.
 
         Parameters
@@ -196,41 +199,43 @@ class History:
             Time from each evaluation to the next.
         loaded_s : float
             Time for which the body has been in its start shape; infinite if its memory has relaxed.
-        brought : (N, all branches), optional
+        previous_variables : (N, all branches), optional
             Given internal variables m_{k−1}; computed from the states by default.
         """
         stress = body.stresses.stress(xi, theta)
-        fades = Fading.of(body, theta, until_next_s, loaded_s)
-        if brought is None:
-            borne = body.memory.borne(stress)
-            d, a = map(body.memory.spread, (fades.d, fades.a))
-            brought = np.zeros(borne.shape)
-            for k in range(len(brought) - 1):
-                brought[k + 1] = d[k] * brought[k] + a[k] * borne[k]
-        return cls(body, theta, xi, stress, fades, brought)
+        fades = FadingCoefficients.from_body(body, theta, until_next_s, loaded_s)
+        if previous_variables is None:
+            borne = body.memory.to_branches(stress)
+            d, a = map(body.memory.repeat_over_points, (fades.d, fades.a))
+            previous_variables = np.zeros(borne.shape)
+            for k in range(len(previous_variables) - 1):
+                previous_variables[k + 1] = d[k] * previous_variables[k] + a[k] * borne[k]
+        return cls(body, theta, xi, stress, fades, previous_variables)
 
     @property
-    def memory(self) -> PointLayout:
+    def memory(self) -> MemoryLayout:
         """Layout of points and branches in the arrays."""
         return self.body.memory
 
-    def carried(self, rows: slice) -> Past:
+    def past_at(self, rows: slice) -> MemoryInput:
         """Return the memory's contribution to the forces at some evaluations."""
-        past = self.memory.nothing(len(self.xi[rows]))
+        past = self.memory.relaxed(len(self.xi[rows]))
         fades = self.fading
-        past.overstress[:] = self.memory.summed(self.brought[rows])
+        past.overstress[:] = self.memory.sum_over_branches(self.previous_variables[rows])
         for branch, c in zip(self.memory.branches, fades.c, strict=True):
             past.stiffening[:, branch.part] += c[rows]
-        second = STIFFENING.curvature(fades.u, fades.data)
-        past.slopes[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
-        past.bends[:, fades.places[:, None], fades.places] = np.moveaxis(second[..., rows], 3, 0)
+        second = STIFFENING.weighted_hessian(fades.u, fades.data)
+        past.stiffening_derivatives[:, fades.places] = np.moveaxis(fades.by[0, ..., rows], 2, 0)
+        past.stiffening_second_derivatives[:, fades.places[:, None], fades.places] = np.moveaxis(
+            second[..., rows], 3, 0
+        )
         return past
 
-    def onto(self, forces: Forces, rows: slice) -> Forces:
+    def insert_into(self, forces: Forces, rows: slice) -> Forces:
         """Return the forces of the evaluations `rows` with the memory inserted."""
-        return replace(forces, past=self.carried(rows))
+        return replace(forces, memory_state=self.past_at(rows))
 
-    def weighed(self, forces: Forces, mu: Array) -> Forces:
+    def with_variable_weights(self, forces: Forces, mu: Array) -> Forces:
         """Return the forces of all evaluations, with weights μ of a_k S_k in second derivatives.
 
         Parameters
@@ -238,13 +243,13 @@ class History:
         forces : Forces
         mu : (N, all branches)
         """
-        past = replace(self.carried(slice(None)), stress_weights=self.stress_weights(mu))
-        return replace(forces, past=past)
+        past = replace(self.past_at(slice(None)), stress_weights=self.stress_weights(mu))
+        return replace(forces, memory_state=past)
 
-    def forward(
+    def forward_columns(
         self, by_p: Callable[[int], Array], done: int = 0, known: Array | None = None
-    ) -> Slopes:
-        """Return an iterator of the columns dm forward in time, see `Slopes`.
+    ) -> MemoryForwardColumns:
+        """Return an iterator of the columns dm forward in time, see `MemoryForwardColumns`.
 
         Parameters
         ----------
@@ -255,28 +260,30 @@ class History:
         known : (columns, all branches), optional
             Columns after those evaluations; 0 by default.
         """
-        return Slopes(self, by_p(0)[: len(self.theta)], done, known)
+        return MemoryForwardColumns(self, by_p(0)[: len(self.theta)], done, known)
 
-    def backward(self) -> Weights:
-        """Return an iterator of the weights μ backward in time, see `Weights`."""
-        return Weights(self)
+    def adjoint(self) -> MemoryAdjoint:
+        """Return an iterator of the weights μ backward in time, see `MemoryAdjoint`."""
+        return MemoryAdjoint(self)
 
     @property
-    def last(self) -> Remembered:
+    def final_state(self) -> MemoryState:
         """State of the memory after the last evaluation."""
-        c = self.memory.spread(self.fading.c)[-1]
-        overstress = self.brought[-1] + c * self.memory.borne(self.stress[-1])
-        return Remembered(self.body, self.theta, self.stress[-1], overstress)
+        c = self.memory.repeat_over_points(self.fading.c)[-1]
+        overstress = self.previous_variables[-1] + c * self.memory.to_branches(self.stress[-1])
+        return MemoryState(self.body, self.theta, self.stress[-1], overstress)
 
     @property
-    def gaps(self) -> Array:
+    def recursion_residuals(self) -> Array:
         """Residuals m_k − d_k m_{k−1} − a_k S_k (N − 1, all branches).
 
         Zero if m satisfies the recursion.
         """
-        d, a = (self.memory.spread(each[:, :-1]) for each in (self.fading.d, self.fading.a))
-        m = self.brought
-        borne = self.memory.borne(self.stress[:-1])
+        d, a = (
+            self.memory.repeat_over_points(each[:, :-1]) for each in (self.fading.d, self.fading.a)
+        )
+        m = self.previous_variables
+        borne = self.memory.to_branches(self.stress[:-1])
         return m[1:] - d * m[:-1] - a * borne
 
     # Derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k), μ (N, all branches) --------------------------
@@ -285,24 +292,33 @@ class History:
         """Return σ_k (N, width) such that Σ μ_k a_k S_k = Σ σ_k S_k, for weights μ (N, all
         branches).
         """
-        return self.memory.summed(self.memory.spread(self.fading.a) * mu)
+        return self.memory.sum_over_branches(self.memory.repeat_over_points(self.fading.a) * mu)
 
-    def _summed(self, mu: Array) -> Array:
+    def _overstress_inputs(self, mu: Array) -> Array:
         """Return the inputs (5, B, N) of `OVERSTRESS` whose value is Σ μ_k m_k of each branch.
 
         The recursion is linear in m and S, so the inputs are Σ μ_k m_{k−1} and Σ μ_k S_k.
         """
-        borne = self.memory.borne(self.stress)
-        before, now = (self.memory.totals(mu * each) for each in (self.brought, borne))
+        borne = self.memory.to_branches(self.stress)
+        before, now = (
+            self.memory.sum_over_points(mu * each) for each in (self.previous_variables, borne)
+        )
         return np.stack([before, now, 0 * now, *self.fading.u])
 
-    def stress_by(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
-        """Yield ∂S/∂θ θ_q (T, q, width) of `CHUNK` evaluations at a time, with their slice."""
-        for start in range(0, len(self.xi), CHUNK):
-            rows = slice(start, start + CHUNK)
-            yield rows, self.body.stresses.stress_by(self.xi[rows], self.theta, theta_q)
+    def stress_derivatives(self, theta_q: Array) -> Iterator[tuple[slice, Array]]:
+        """Yield ∂S/∂θ θ_q (T, q, width) of `EVALUATIONS_PER_CHUNK` evaluations at a time, with
+        their slice.
+        """
+        for start in range(0, len(self.xi), EVALUATIONS_PER_CHUNK):
+            rows = slice(start, start + EVALUATIONS_PER_CHUNK)
+            yield (
+                rows,
+                self.body.stresses.stress_theta_derivatives(self.xi[rows], self.theta, theta_q),
+            )
 
-    def pulled(self, force_weights: Array, by_p: Array) -> tuple[Array, Array, Array]:
+    def vector_jacobian_product(
+        self, force_weights: Array, by_p: Array
+    ) -> tuple[Array, Array, Array]:
         """Return the derivatives of Σ λ_k f_H(H_k) through H by ξ and ν, (N, 3n) each, and by p
         (m,).
 
@@ -320,61 +336,73 @@ class History:
         theta_q = theta_p[:, used]
         by_parameters = np.zeros(theta_p.shape[1])
         stresses = self.body.stresses
-        d = self.memory.spread(self.fading.d)
-        pushes = self.memory.borne(stresses.against(self.xi, force_weights, self.theta))
+        d = self.memory.repeat_over_points(self.fading.d)
+        pushes = self.memory.to_branches(
+            stresses.memory_force_vjp(self.xi, force_weights, self.theta)
+        )
         mu = np.zeros_like(pushes)
         for k in range(len(mu) - 1, 0, -1):
             mu[k - 1] = d[k] * mu[k] + pushes[k]
-        _, by = OVERSTRESS.step.slopes(self._summed(mu), self.fading.data)
-        by_fading = by[0, OVERSTRESS.ends[2] :]
+        _, by = OVERSTRESS.step_function.evaluate_with_jacobian(
+            self._overstress_inputs(mu), self.fading.data
+        )
+        by_fading = by[0, OVERSTRESS.input_offsets[2] :]
         by_q = np.einsum("jbn,jbq->q", by_fading, theta_q[self.fading.places])
         sigma = self.stress_weights(mu)
-        for rows, slopes in self.stress_by(theta_q):
+        for rows, slopes in self.stress_derivatives(theta_q):
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
         by_parameters[used] = by_q
-        return stresses.pulled(self.xi, sigma, self.theta), np.zeros_like(self.xi), by_parameters
+        return (
+            stresses.stress_vjp(self.xi, sigma, self.theta),
+            np.zeros_like(self.xi),
+            by_parameters,
+        )
 
-    def add_curvature(self, curvature: Curvature, mu: Array) -> None:
+    def add_curvature(self, curvature: SecondDerivatives, mu: Array) -> None:
         """Add the second derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k) that involve (g, τ).
 
-        The derivatives are added in place to the N states of a `Curvature` that already has those
-        of Σ σ_k S_k, see `weighed`. Mixed derivatives are those with ξ and with elastic constants,
+        The derivatives are added in place to the N states of a `SecondDerivatives` that already has
+        those
+        of Σ σ_k S_k, see `with_variable_weights`. Mixed derivatives are those with ξ and with
+        elastic constants,
         through S.
 
         Parameters
         ----------
-        curvature : Curvature
+        curvature : SecondDerivatives
             Second derivatives of the forces; modified.
         mu : (N, all branches)
             Weights μ.
         """
         memory = self.memory
         places = self.fading.places
-        inputs = self._summed(mu)
+        inputs = self._overstress_inputs(mu)
         data = self.fading.data
-        elastic = self.body.elastic_places
-        fading_inputs = slice(OVERSTRESS.ends[2], None)
-        slopes = OVERSTRESS.step.slopes(inputs, data)[1]
-        second = OVERSTRESS.step.curvature(inputs, data)
+        elastic = self.body.elastic_indices
+        fading_inputs = slice(OVERSTRESS.input_offsets[2], None)
+        slopes = OVERSTRESS.step_function.evaluate_with_jacobian(inputs, data)[1]
+        second = OVERSTRESS.step_function.weighted_hessian(inputs, data)
         curvature.theta[:, places] += np.moveaxis(slopes[0, fading_inputs], 2, 0)
         curvature.theta_theta[:, places[:, None], places] += np.moveaxis(
             second[fading_inputs, fading_inputs], 3, 0
         )
         mixed = second[fading_inputs, 1]
-        for number, branch_mask in enumerate(memory.spread(np.eye(len(memory.branches)))):
-            weights = memory.summed(branch_mask * mu)
-            by_xi = self.body.stresses.pulled(self.xi, weights, self.theta)
+        for number, branch_mask in enumerate(
+            memory.repeat_over_points(np.eye(len(memory.branches)))
+        ):
+            weights = memory.sum_over_branches(branch_mask * mu)
+            by_xi = self.body.stresses.stress_vjp(self.xi, weights, self.theta)
             for place, factor in zip(places[:, number], mixed[:, number], strict=True):
                 curvature.position_theta[:, :, place] += factor[:, None] * by_xi
-        for rows, by in self.stress_by(np.eye(len(self.theta))[:, elastic]):
-            by_moduli = memory.totals(memory.borne(by) * mu[rows, None])
+        for rows, by in self.stress_derivatives(np.eye(len(self.theta))[:, elastic]):
+            by_moduli = memory.sum_over_points(memory.to_branches(by) * mu[rows, None])
             both = np.einsum("jbt,bte->tjbe", mixed[..., rows], by_moduli)
             curvature.theta_theta[rows, places[..., None], elastic] += both
             curvature.theta_theta[rows, elastic, places[..., None]] += both
 
 
 @dataclass(frozen=True, eq=False)
-class Remembered:
+class MemoryState:
     """State of the material's memory at one time, for time marching.
 
     Attributes
@@ -394,66 +422,68 @@ class Remembered:
     overstress: Array
 
     @classmethod
-    def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> Remembered:
+    def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> MemoryState:
         """Return the memory in the start shape x (3n,), loaded for a time `loaded_s`."""
-        return History.of(body, x[None], theta, np.ones(1), loaded_s).last
+        return MemoryHistory.from_states(body, x[None], theta, np.ones(1), loaded_s).final_state
 
-    def now(self, forces: Forces) -> Forces:
+    def insert_at_same_time(self, forces: Forces) -> Forces:
         """Return forces in the same state, with the overstress Q inserted."""
-        past = self.body.memory.nothing(1)
-        past.overstress[0] = self.body.memory.summed(self.overstress)
-        return replace(forces, past=past)
+        past = self.body.memory.relaxed(1)
+        past.overstress[0] = self.body.memory.sum_over_branches(self.overstress)
+        return replace(forces, memory_state=past)
 
-    def ahead(self, forces: Forces, interval_s: float) -> Forces:
+    def insert_after_interval(self, forces: Forces, interval_s: float) -> Forces:
         """Return forces in a state one interval later, with the memory inserted."""
-        past = self.body.memory.nothing(1)
-        brought, c = self._brought(interval_s)
-        past.overstress[0] = self.body.memory.summed(brought)
+        past = self.body.memory.relaxed(1)
+        brought, c = self._after_interval(interval_s)
+        past.overstress[0] = self.body.memory.sum_over_branches(brought)
         for branch, own in zip(self.body.memory.branches, c, strict=True):
             past.stiffening[0, branch.part] += own
-        return replace(forces, past=past)
+        return replace(forces, memory_state=past)
 
-    def following(self, forces: Forces, x: Array, v: Array, interval_s: float) -> Remembered:
+    def advance(self, forces: Forces, x: Array, v: Array, interval_s: float) -> MemoryState:
         """Return the memory in the state x (3n,) one interval later.
 
         Forces and velocity are not used.
         """
         memory = self.body.memory
-        brought, c = self._brought(interval_s)
+        brought, c = self._after_interval(interval_s)
         stress = self.body.stresses.stress(x[None], self.theta)[0]
-        overstress = brought + memory.spread(c) * memory.borne(stress)
-        return Remembered(self.body, self.theta, stress, overstress)
+        overstress = brought + memory.repeat_over_points(c) * memory.to_branches(stress)
+        return MemoryState(self.body, self.theta, stress, overstress)
 
-    def _brought(self, interval_s: float) -> tuple[Array, Array]:
+    def _after_interval(self, interval_s: float) -> tuple[Array, Array]:
         """Return e Q − c S of all branches, and c (B,), for an interval."""
         memory = self.body.memory
         share, tau_s = self.theta[[(b.share, b.tau) for b in memory.branches]].T
-        e, c = fading(share, tau_s, interval_s)
-        borne = memory.borne(self.stress)
-        return memory.spread(e) * self.overstress - memory.spread(c) * borne, c
+        e, c = fading_coefficients(share, tau_s, interval_s)
+        borne = memory.to_branches(self.stress)
+        return memory.repeat_over_points(e) * self.overstress - memory.repeat_over_points(
+            c
+        ) * borne, c
 
 
-def at_start(forces: Forces, loaded_s: float) -> Forces:
+def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
     """Return forces on the start shape, with the overstress of a load that was applied recently.
 
     The forces are unchanged for a body without memory, or if `loaded_s` is infinite.
     """
     body = forces.body
-    if not body.remembers or np.isinf(loaded_s):
+    if not body.has_memory or np.isinf(loaded_s):
         return forces
-    past = body.memory.nothing(1)
-    c = Fading.of(body, forces.theta, np.ones(1), loaded_s).c
+    past = body.memory.relaxed(1)
+    c = FadingCoefficients.from_body(body, forces.theta, np.ones(1), loaded_s).c
     for branch, own in zip(body.memory.branches, c, strict=True):
         past.stiffening[:, branch.part] += own
-    return replace(forces, past=past)
+    return replace(forces, memory_state=past)
 
 
-class Slopes:
+class MemoryForwardColumns:
     """Columns dm of the internal variables, propagated forward in time.
 
     Parameters
     ----------
-    history : History
+    history : MemoryHistory
     theta_q : (k, columns)
         Derivatives of θ.
     done : int
@@ -463,31 +493,33 @@ class Slopes:
     """
 
     def __init__(
-        self, history: History, theta_q: Array, done: int = 0, known: Array | None = None
+        self, history: MemoryHistory, theta_q: Array, done: int = 0, known: Array | None = None
     ) -> None:
         self.history = history
         self.next = done
         self.memory = history.memory
         self.stresses = history.body.stresses
         self.theta = history.theta
-        shape = theta_q.shape[1], history.brought.shape[1]
+        shape = theta_q.shape[1], history.previous_variables.shape[1]
         self.columns = np.zeros(shape) if known is None else known.copy()
         # Work space, kept: fresh pages would cost as much as the numbers in them.
         self._stress = np.zeros((len(self.columns), self.stresses.width))
         self._state = np.zeros((len(self.columns), history.xi.shape[1]))
         self._direction = np.zeros_like(self._state)
-        self._moduli = np.flatnonzero(theta_q[history.body.elastic_places].any(axis=0))
+        self._moduli = np.flatnonzero(theta_q[history.body.elastic_indices].any(axis=0))
         self._theta_q = theta_q[:, self._moduli]
         self._by_moduli = np.zeros((0, 0, 0))
         fades = history.fading
         self._own = np.flatnonzero(theta_q[fades.places].any(axis=(0, 1)))
-        self._d, self._a = map(self.memory.spread, (fades.d, fades.a))
-        self._d_own, self._a_own = fades.along(theta_q[:, self._own])
+        self._d, self._a = map(self.memory.repeat_over_points, (fades.d, fades.a))
+        self._d_own, self._a_own = fades.jacobian_vector_product(theta_q[:, self._own])
 
-    def force(self) -> Array:
+    def force_columns(self) -> Array:
         """Return the contribution of the memory to dF at the next evaluation, (3n, columns)."""
         self._state[:] = self.history.xi[self.next]
-        return self.stresses.force(self._state, self.memory.summed(self.columns), self.theta).T
+        return self.stresses.memory_force(
+            self._state, self.memory.sum_over_branches(self.columns), self.theta
+        ).T
 
     def advance(self, of_state: Callable[[], Array], _: Callable[[], Array]) -> None:
         """Pass the next evaluation and update the columns, in place.
@@ -500,7 +532,7 @@ class Slopes:
         k = self.next
         history = self.history
         stress = self._stress
-        spread = self.memory.spread
+        spread = self.memory.repeat_over_points
         self._state[:] = history.xi[k]
         self._direction[:] = of_state().T
         # Of a single branch the stress itself is not needed.
@@ -512,56 +544,56 @@ class Slopes:
             self._direction *= a
         else:
             stress.fill(0.0)
-        self.stresses.along(self._state, self._direction, self.theta, stress)
-        for column, slope in zip(self._moduli, self._slopes(k), strict=True):
+        self.stresses.stress_jvp(self._state, self._direction, self.theta, stress)
+        for column, slope in zip(self._moduli, self._elastic_stress_derivatives(k), strict=True):
             stress[column] += a * slope if alone else slope
         if not alone:
-            self.columns += a * self.memory.borne(stress)
-        m = history.brought[k]
-        borne = self.memory.borne(history.stress[k])
+            self.columns += a * self.memory.to_branches(stress)
+        m = history.previous_variables[k]
+        borne = self.memory.to_branches(history.stress[k])
         for j, column in enumerate(self._own):
             self.columns[column] += spread(self._d_own[j, :, k]) * m
             self.columns[column] += spread(self._a_own[j, :, k]) * borne
         self.next += 1
 
-    def _slopes(self, k: int) -> Array:
+    def _elastic_stress_derivatives(self, k: int) -> Array:
         """Return the derivatives of S at evaluation k by the columns that change elastic
         constants.
         """
         if not len(self._moduli):
             return self._by_moduli
-        if k % CHUNK == 0 or not len(self._by_moduli):
-            first = k - k % CHUNK
-            xi = self.history.xi[first : first + CHUNK]
-            self._by_moduli = self.stresses.stress_by(xi, self.theta, self._theta_q)
-        return self._by_moduli[k % CHUNK]
+        if k % EVALUATIONS_PER_CHUNK == 0 or not len(self._by_moduli):
+            first = k - k % EVALUATIONS_PER_CHUNK
+            xi = self.history.xi[first : first + EVALUATIONS_PER_CHUNK]
+            self._by_moduli = self.stresses.stress_theta_derivatives(xi, self.theta, self._theta_q)
+        return self._by_moduli[k % EVALUATIONS_PER_CHUNK]
 
 
-class Weights:
+class MemoryAdjoint:
     """Weights μ of the internal variables, propagated backward in time.
 
     Parameters
     ----------
-    history : History
+    history : MemoryHistory
     """
 
-    def __init__(self, history: History) -> None:
+    def __init__(self, history: MemoryHistory) -> None:
         self.history = history
         self.next = len(history.xi) - 1
-        self.columns = np.zeros(history.brought.shape[1])
+        self.columns = np.zeros(history.previous_variables.shape[1])
 
-    def pulled(self) -> tuple[Array, Array]:
+    def state_gradient(self) -> tuple[Array, Array]:
         """Return the derivatives of μ · m by ξ and ν of the evaluation, (3n,) each; by ν zero."""
         history = self.history
         k = self.next
-        weights = history.memory.summed(
-            history.memory.spread(history.fading.a[:, k]) * self.columns
+        weights = history.memory.sum_over_branches(
+            history.memory.repeat_over_points(history.fading.a[:, k]) * self.columns
         )
         state = history.xi[k]
-        by_x = history.body.stresses.pulled(state[None], weights[None], history.theta)[0]
+        by_x = history.body.stresses.stress_vjp(state[None], weights[None], history.theta)[0]
         return by_x, np.zeros_like(by_x)
 
-    def retreat(self, force_weight: Array) -> None:
+    def step_back(self, force_weight: Array) -> None:
         """Pass the evaluation backward and update μ, in place.
 
         Parameters
@@ -573,7 +605,7 @@ class Weights:
         k = self.next
         state = history.xi[k][None]
         weight = force_weight[None]
-        push = history.body.stresses.against(state, weight, history.theta)[0]
-        d = history.memory.spread(history.fading.d[:, k])
-        self.columns = d * self.columns + history.memory.borne(push)
+        push = history.body.stresses.memory_force_vjp(state, weight, history.theta)[0]
+        d = history.memory.repeat_over_points(history.fading.d[:, k])
+        self.columns = d * self.columns + history.memory.to_branches(push)
         self.next -= 1

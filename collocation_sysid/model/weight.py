@@ -24,15 +24,15 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from ..fem.air import ADDED_MASS_SHARE
-from ..fem.body import Body, Curvature, Linearisation
+from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.regions import Theta
 from ..recording.experiment import Experiment
 from ..recording.loads import Force, PointMass
-from .force_term import ForceTerm, Slots, States
+from .force_term import AssemblyIndices, ForceTerm, States
 
 
 @dataclass(frozen=True, eq=False)
-class Mass:
+class DofMasses:
     """Masses of every dof at T times: the body, what is tied to it, and the air.
 
     Attributes
@@ -52,32 +52,32 @@ class Mass:
     displaced_kg: Array
     added_kg: Array
 
-    def rows(self, rows: slice) -> Mass:
+    def at_times(self, rows: slice) -> DofMasses:
         """Return these masses at some of the times."""
         return replace(self, tied_kg=self.tied_kg[rows])
 
     @cached_property
-    def kg(self) -> Array:
+    def inertia_kg(self) -> Array:
         """Inertia M + A (T, 3n): all mass that accelerates with the dofs, including the air."""
-        return self._with(self.own_kg + self.added_kg)
+        return self._plus_tied(self.own_kg + self.added_kg)
 
     @cached_property
     def damped_kg(self) -> Array:
         """Mass M (T, 3n) damped by γ_m: the body and what is tied to it, without the air."""
-        return self._with(self.own_kg)
+        return self._plus_tied(self.own_kg)
 
     @cached_property
-    def weighed_kg(self) -> Array:
+    def weight_kg(self) -> Array:
         """Mass M − D (T, 3n) whose weight acts on the dofs: less the air that the body
         displaces.
         """
-        return self._with(self.own_kg - self.displaced_kg)
+        return self._plus_tied(self.own_kg - self.displaced_kg)
 
-    def row_kg(self, t: int) -> Array:
+    def inertia_at(self, t: int) -> Array:
         """Return the inertia M + A (3n,) at the time with index t."""
         return self.own_kg + self.added_kg + self.tied_kg[t]
 
-    def _with(self, constant_kg: Array) -> Array:
+    def _plus_tied(self, constant_kg: Array) -> Array:
         """Return the sum of a constant mass (3n,) and the tied masses (T, 3n).
 
         If the tied masses are constant views with stride 0, so is the result.
@@ -87,7 +87,7 @@ class Mass:
         return constant_kg + self.tied_kg
 
     @cached_property
-    def tied(self) -> Array | None:
+    def compact_tied_kg(self) -> Array | None:
         """Tied masses as (3n,) if they are constant in time, else (T, 3n).
 
         None if there are none.
@@ -104,12 +104,12 @@ class Weight(ForceTerm):
     Attributes
     ----------
     body : Body
-    mass : Mass
+    mass : DofMasses
         Masses of the dofs, including all tied masses.
     gravity_m_s2 : (3,)
     applied_n : (T, 3n)
         Applied nodal forces, independent of the positions of the nodes.
-    turns : bool
+    has_gravity_input : bool
         Whether gravity is an input.
     joining_kg : (L, 3n)
         Masses m_l of the loads whose time is estimated.
@@ -120,10 +120,10 @@ class Weight(ForceTerm):
     """
 
     body: Body
-    mass: Mass
+    mass: DofMasses
     gravity_m_s2: Array
     applied_n: Array
-    turns: bool
+    has_gravity_input: bool
     joining_kg: Array
     joining_n: Array
     share: Array
@@ -131,36 +131,38 @@ class Weight(ForceTerm):
     couplings = None
 
     @classmethod
-    def of(cls, experiment: Experiment, t_s: ArrayLike) -> Weight:
+    def from_experiment(cls, experiment: Experiment, t_s: ArrayLike) -> Weight:
         """Return the weight and loads of an experiment at the times `t_s` (T,)."""
-        applied = experiment.node_forces_n(t_s)
+        applied = experiment.stated_node_forces_n(t_s)
         body = experiment.body
-        tied = np.repeat(experiment.tied_mass_kg(t_s), 3, axis=1)
+        tied = np.repeat(experiment.point_mass_at_nodes_kg(t_s), 3, axis=1)
         air_kg = experiment.air_density_kg_m3 * body.dof_volume_m3
-        mass = Mass(_own_kg(body), _compact(tied), air_kg, ADDED_MASS_SHARE * air_kg)
-        applied = _compact(applied.reshape(len(applied), -1))
+        mass = DofMasses(_own_kg(body), _as_constant_view(tied), air_kg, ADDED_MASS_SHARE * air_kg)
+        applied = _as_constant_view(applied.reshape(len(applied), -1))
         return cls(body, mass, experiment.gravity_m_s2, applied, False, *_no_loads(applied))
 
     @classmethod
-    def none(cls, body: Body) -> Weight:
+    def of_body_alone(cls, body: Body) -> Weight:
         """Return the weight of a body without gravity, loads and air, at one time."""
         nothing = np.zeros((1, body.pattern.size))
         no_air_kg = nothing[0]
-        mass = Mass(_own_kg(body), nothing, no_air_kg, no_air_kg)
+        mass = DofMasses(_own_kg(body), nothing, no_air_kg, no_air_kg)
         return cls(body, mass, np.zeros(3), nothing, False, *_no_loads(nothing))
 
     def with_theta(self, theta: Theta) -> Self:
         """Return this weight for a body with constants θ, which contain free densities."""
-        if not self.body.mass_slopes:
+        if not self.body.mass_derivatives:
             return self
         return replace(self, mass=replace(self.mass, own_kg=self.body.mass_of_dofs(theta)))
 
-    def with_inputs(self, turns: bool, loads: Sequence[PointMass | Force], t_s: Array) -> Weight:
+    def with_load_inputs(
+        self, has_gravity_input: bool, loads: Sequence[PointMass | Force], t_s: Array
+    ) -> Weight:
         """Return this weight with gravity and the shares of some loads as inputs.
 
         Parameters
         ----------
-        turns : bool
+        has_gravity_input : bool
             Whether gravity is an input.
         loads : sequence of PointMass or Force
             Loads whose shares are inputs.
@@ -171,50 +173,52 @@ class Weight(ForceTerm):
         for k, load in enumerate(loads):
             nodes = kg.shape[1] // 3
             if isinstance(load, PointMass):
-                kg[k] = np.repeat(load.at_nodes(nodes), 3)
+                kg[k] = np.repeat(load.node_mass_kg(nodes), 3)
             else:
-                newtons[k] = load.at_nodes(t_s, nodes).reshape(len(t_s), -1)
-        return replace(self, turns=turns, joining_kg=kg, joining_n=newtons, share=share)
+                newtons[k] = load.node_forces_n(t_s, nodes).reshape(len(t_s), -1)
+        return replace(
+            self, has_gravity_input=has_gravity_input, joining_kg=kg, joining_n=newtons, share=share
+        )
 
     @property
     def size(self) -> int:  # type: ignore[override]
         """Number of inputs: 3 for gravity, if it is one, and 1 for each joining load."""
-        return 3 * self.turns + len(self.joining_kg)
+        return 3 * self.has_gravity_input + len(self.joining_kg)
 
-    def at(self, u: Array) -> Self:
+    def with_inputs(self, u: Array) -> Self:
         """Return this weight at inputs u (T, size); gravity is taken from the first time."""
         if not self.size:
             return self
-        weight = replace(self, gravity_m_s2=u[0, :3]) if self.turns else self
+        weight = replace(self, gravity_m_s2=u[0, :3]) if self.has_gravity_input else self
         if not len(self.joining_kg):
             return weight
-        share = u[:, 3 * self.turns :]
+        share = u[:, 3 * self.has_gravity_input :]
         change = share - self.share
         tied_kg = self.mass.tied_kg + change @ self.joining_kg
         applied_n = self.applied_n + np.einsum("tl,ltd->td", change, self.joining_n)
         mass = replace(self.mass, tied_kg=tied_kg)
         return replace(weight, mass=mass, applied_n=applied_n, share=share)
 
-    def rows(self, rows: slice) -> Self:
+    def at_times(self, rows: slice) -> Self:
         """Return this weight at some of the times."""
         return replace(
             self,
-            mass=self.mass.rows(rows),
+            mass=self.mass.at_times(rows),
             applied_n=self.applied_n[rows],
             joining_n=self.joining_n[:, rows],
             share=self.share[rows],
         )
 
-    def scaled(self, share: float) -> Self:
+    def scaled(self, factor: float) -> Self:
         """Return gravity and loads multiplied by a factor, with unchanged masses."""
         return replace(
             self,
-            gravity_m_s2=share * self.gravity_m_s2,
-            applied_n=share * self.applied_n,
-            joining_n=share * self.joining_n,
+            gravity_m_s2=factor * self.gravity_m_s2,
+            applied_n=factor * self.applied_n,
+            joining_n=factor * self.joining_n,
         )
 
-    def towards(self, other: Self, share: float) -> Self:
+    def interpolate(self, other: Self, share: float) -> Self:
         """Return this weight with masses and loads interpolated linearly to those of another time.
 
         Gravity stays that of this time.
@@ -238,7 +242,7 @@ class Weight(ForceTerm):
         """Gravity of every dof (3n,) [m/s²]."""
         return np.tile(self.gravity_m_s2, self.body.pattern.size // 3)
 
-    def mass_by_input(self, first: int) -> dict[int, Array]:
+    def mass_derivatives(self, first: int) -> dict[int, Array]:
         """Return ∂M/∂u (3n,) by the index of each input on which M depends.
 
         Parameters
@@ -246,8 +250,8 @@ class Weight(ForceTerm):
         first : int
             Index in u of the first input of this term.
         """
-        shares = enumerate(self.joining_kg, first + 3 * self.turns)
-        return self.body.mass_slopes | dict(shares)
+        shares = enumerate(self.joining_kg, first + 3 * self.has_gravity_input)
+        return self.body.mass_derivatives | dict(shares)
 
     def force(self, states: States) -> Array:
         """Return weight and applied forces (T, 3n) [N].
@@ -259,49 +263,57 @@ class Weight(ForceTerm):
     @cached_property
     def external_n(self) -> Array:
         """Weight and applied forces (T, 3n) [N], independent of the state."""
-        return self.mass.weighed_kg * self.gravity + self.applied_n
+        return self.mass.weight_kg * self.gravity + self.applied_n
 
-    def add_slopes(self, at: Linearisation, places: Slots, states: States) -> None:
+    def add_derivatives(
+        self, linearisation: Linearisation, places: AssemblyIndices, states: States
+    ) -> None:
         """Add the forces and their first derivatives to a linearisation, in place."""
-        np.add(at.force, self.external_n, out=at.force)
-        for density, slope in self.body.mass_slopes.items():
-            at.by_theta[:, :, density] += slope * self.gravity
+        np.add(linearisation.force, self.external_n, out=linearisation.force)
+        for density, slope in self.body.mass_derivatives.items():
+            linearisation.by_theta[:, :, density] += slope * self.gravity
         first_column = places.inputs.start
-        if self.turns:
+        if self.has_gravity_input:
             for axis in range(3):
-                at.by_theta[:, axis::3, first_column + axis] += self.mass.weighed_kg[:, axis::3]
-        for k, (kg, newtons) in enumerate(self._joining, first_column + 3 * self.turns):
-            at.by_theta[:, :, k] += kg * self._falling(states) + newtons
+                linearisation.by_theta[:, axis::3, first_column + axis] += self.mass.weight_kg[
+                    :, axis::3
+                ]
+        for k, (kg, newtons) in enumerate(self._joining, first_column + 3 * self.has_gravity_input):
+            linearisation.by_theta[:, :, k] += kg * self._load_acceleration(states) + newtons
 
-    def add_curvature(self, at: Curvature, places: Slots, states: States, weights: Array) -> None:
+    def add_second_derivatives(
+        self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
+    ) -> None:
         """Add the derivatives of weightsᵀ F to a curvature, in place."""
-        for density, slope in self.body.mass_slopes.items():
-            at.theta[:, density] += weights @ (slope * self.gravity)
+        for density, slope in self.body.mass_derivatives.items():
+            curvature.theta[:, density] += weights @ (slope * self.gravity)
         first_column = places.inputs.start
-        if self.turns:
+        if self.has_gravity_input:
             gravity_columns = slice(first_column, first_column + 3)
-            at.theta[:, gravity_columns] += _of_axes(weights * self.mass.weighed_kg)
-            for place, kg in self.mass_by_input(first_column).items():
-                mixed = _of_axes(weights * kg)
-                at.theta_theta[:, place, gravity_columns] += mixed
-                at.theta_theta[:, gravity_columns, place] += mixed
-        for k, (kg, newtons) in enumerate(self._joining, first_column + 3 * self.turns):
-            share_derivative = kg * self._falling(states) + newtons
-            at.theta[:, k] += np.einsum("ti,ti->t", weights, share_derivative)
-            at.velocity_theta[:, :, k] -= self.body.tied_drag(states.theta) * kg * weights
+            curvature.theta[:, gravity_columns] += _sum_over_nodes(weights * self.mass.weight_kg)
+            for place, kg in self.mass_derivatives(first_column).items():
+                mixed = _sum_over_nodes(weights * kg)
+                curvature.theta_theta[:, place, gravity_columns] += mixed
+                curvature.theta_theta[:, gravity_columns, place] += mixed
+        for k, (kg, newtons) in enumerate(self._joining, first_column + 3 * self.has_gravity_input):
+            share_derivative = kg * self._load_acceleration(states) + newtons
+            curvature.theta[:, k] += np.einsum("ti,ti->t", weights, share_derivative)
+            curvature.velocity_theta[:, :, k] -= (
+                self.body.tied_damping_rate(states.theta) * kg * weights
+            )
             for gamma, share in self.body.tied_shares.items():
                 mixed = (weights * kg * states.nu) @ share
-                at.theta_theta[:, gamma, k] -= mixed
-                at.theta_theta[:, k, gamma] -= mixed
+                curvature.theta_theta[:, gamma, k] -= mixed
+                curvature.theta_theta[:, k, gamma] -= mixed
 
     @property
     def _joining(self) -> zip[tuple[Array, Array]]:
         """Pairs of mass (3n,) and force (T, 3n) of each joining load."""
         return zip(self.joining_kg, self.joining_n, strict=True)
 
-    def _falling(self, states: States) -> Array:
+    def _load_acceleration(self, states: States) -> Array:
         """Return the acceleration g − γ_m ν (T, 3n) by which a tied mass loads the body [m/s²]."""
-        return self.gravity - self.body.tied_drag(states.theta) * states.nu
+        return self.gravity - self.body.tied_damping_rate(states.theta) * states.nu
 
 
 def _own_kg(body: Body) -> Array:
@@ -325,11 +337,11 @@ def _no_loads(rows: Array, count: int = 0) -> tuple[Array, Array, Array]:
     return np.zeros((count, dofs)), np.zeros((count, times, dofs)), np.zeros((times, count))
 
 
-def _of_axes(dofs: Array) -> Array:
+def _sum_over_nodes(dofs: Array) -> Array:
     """Return the sums over the nodes (T, 3) of dof values (T, 3n)."""
     return dofs.reshape(len(dofs), -1, 3).sum(axis=1)
 
 
-def _compact(rows: Array) -> Array:
+def _as_constant_view(rows: Array) -> Array:
     """Return equal rows as a read-only view of one row with stride 0; other arrays unchanged."""
     return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows

@@ -12,14 +12,14 @@ import numpy as np
 from ..errors import InputError, require_among
 from ..files import require_regular
 from ..methods import METHODS, require_method
-from ..problem.explaining import short
+from ..problem.explaining import shortened
 from ..problem.reading import parse_toml
 
 MOST_RUNS = 10_000
 RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 
-def each_once(text: str) -> tuple[str, ...]:
+def unique_items(text: str) -> tuple[str, ...]:
     """Return the items of text separated by commas, each once, in their order."""
     return tuple(dict.fromkeys(item.strip() for item in text.split(",") if item.strip()))
 
@@ -32,7 +32,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     InputError
         For an unknown name, with the most similar known one.
     """
-    names = each_once(text)
+    names = unique_items(text)
     if not names:
         raise InputError(f"expected some of {', '.join(METHODS)}", None, option)
     for name in names:
@@ -44,7 +44,7 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
 
 
 def read_truth(
-    sources: Sequence[str], known: Sequence[str], needed: Sequence[str]
+    sources: Sequence[str], known_rows: Sequence[str], needed: Sequence[str]
 ) -> dict[str, float]:
     """Return the true values of parameters, by name.
 
@@ -52,7 +52,7 @@ def read_truth(
     ----------
     sources : sequence of str
         TOML files, or "name=value" separated by commas; later ones override earlier ones.
-    known : sequence of str
+    known_rows : sequence of str
         Names of all parameters of the problem.
     needed : sequence of str
         Names of those that are estimated.
@@ -67,8 +67,8 @@ def read_truth(
     for item in sources:
         source, table = _truth_table(item)
         for name, value in table.items():
-            require_among(name, known, source, "--truth")
-            truth[name] = _positive(name, value, source)
+            require_among(name, known_rows, source, "--truth")
+            truth[name] = _positive_value(name, value, source)
     if missing := [name for name in needed if sources and name not in truth]:
         raise InputError(
             f"{', '.join(missing)} missing; expected the true value of every estimated parameter",
@@ -102,14 +102,14 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
     return path, table
 
 
-def _positive(name: str, value: Any, source: Path | None) -> float:
+def _positive_value(name: str, value: Any, source: Path | None) -> float:
     """Return a value as a positive number; raise `InputError` otherwise."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not 0 < number < np.inf:
-        quoted = value[:60] if isinstance(value, str) else short(value)
+        quoted = value[:60] if isinstance(value, str) else shortened(value)
         raise InputError(f"found {name} = {quoted}; expected a positive number", source, "--truth")
     return number
 
@@ -117,7 +117,7 @@ def _positive(name: str, value: Any, source: Path | None) -> float:
 # Swept keys ---------------------------------------------------------------------------------------
 
 
-def parse_over(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def parse_swept_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the values of each swept key, as text for `--set`.
 
     Parameters
@@ -143,14 +143,14 @@ def parse_over(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
         if key in over:
             raise InputError(f"{key} is given twice; put its values in one list", None, "--over")
         ranged = ":" in values and not values.startswith(('"', "'", "[", "{"))
-        over[key] = tuple(_range(key, values) if ranged else _items(values))
+        over[key] = tuple(_range_values(key, values) if ranged else _split_values(values))
     if not over:
         raise InputError("missing; expected at least one key to sweep over", None, "--over")
     require_few(math.prod(map(len, over.values())), "--over", "runs")
     return over
 
 
-def require_few(count: int, option: str, what: str) -> None:
+def require_few(count: int, option: str, noun: str) -> None:
     """Raise `InputError` if a study has more than `MOST_RUNS` runs.
 
     Parameters
@@ -159,15 +159,15 @@ def require_few(count: int, option: str, what: str) -> None:
         Number of runs.
     option : str
         Command-line option that the message refers to.
-    what : str
+    noun : str
         What is counted, for the message.
     """
     if count > MOST_RUNS:
         number = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
-        raise InputError(f"asks for {number} {what}; expected at most {MOST_RUNS:,}", None, option)
+        raise InputError(f"asks for {number} {noun}; expected at most {MOST_RUNS:,}", None, option)
 
 
-def _range(key: str, text: str) -> Iterable[str]:
+def _range_values(key: str, text: str) -> Iterable[str]:
     """Return the values of a range "first:last:count" or "first:last:log:count" as text."""
     first, *middle, count = text.split(":")
     try:
@@ -199,7 +199,7 @@ def _range(key: str, text: str) -> Iterable[str]:
     return [f"{value:.12g}" for value in spaced(low, high, number)]
 
 
-def _items(text: str) -> list[str]:
+def _split_values(text: str) -> list[str]:
     """Split text at the commas that are outside brackets, braces and quotes."""
     items = [""]
     depth = 0

@@ -15,7 +15,7 @@ Akaike's criterion is −2 ln L + 2k. For n independent normal errors of unknown
 ln(RSS/n), up to a constant that all models of the same data share. Residuals of an imperfect model
 are not independent: ten samples with the same error count as one. n is therefore the equivalent
 number of independent samples: samples over 1 + 2 Σ_k (1 − k/T) ρ_k along time, and observables by
-(tr Σ)²/tr Σ² across, with the ρ and Σ of `autocorrelation`.
+(tr Σ)²/tr Σ² across, with the ρ and Σ of `process_autocorrelation`.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from ..problem import Problem, RolloutOptions
 from ..program.simulation import with_markers
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
-from ..runs.forward_simulation import Rollout, roll_out
+from ..runs.forward_simulation import ForwardSimulation, simulate_experiment
 from ..runs.solving import solve
 from ..statistics.autocorrelation import ErrorProcess, error_processes
-from ..statistics.budget import Sources, budget
-from ..statistics.considered import assumed
+from ..statistics.budget import VarianceSources, budget
+from ..statistics.considered import changes_of_assumptions
 from ..statistics.linearised import (
-    FitBlock,
     LinearisedFit,
-    information,
-    linearised_fit,
-    values_of,
+    ResidualBlock,
+    factorise_information,
+    linearise_fit,
+    parameter_values,
 )
 from ..statistics.noise import ROUNDING
-from ..statistics.uncertainty import uncertainty_of
-from .laws import Disagreement, disagreements
+from ..statistics.uncertainty import uncertainty_from_fit
+from .laws import Disagreement, find_disagreements
 from .process import Record
-from .study import PlannedRun, recordings
+from .study import PlannedRun, fitted_recordings
 from .table import Row
 
 # Predictions closer than this, as a logarithm, are considered equal.
@@ -83,7 +83,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     for run in planned:
         fit = (records.get(run.key) or {}).get("model") or {}
         of_model.setdefault(run.swept["model"], {})[run.held_out or ""] = fit
-    rows = [_row(label, fits) for label, fits in of_model.items()]
+    rows = [_model_row(label, fits) for label, fits in of_model.items()]
     _add_criterion(rows)
     _add_ratios(rows)
     chosen = chosen_row(rows)
@@ -92,7 +92,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     return rows
 
 
-def _row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
+def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
     """Return the row of a model from its fits by held-out recording; "" is the fit to all."""
     complete_fit = fits.get("", {})
     predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
@@ -106,7 +106,7 @@ def _row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
         "free": None if free is None else len(free),
         "unit": unit,
         "rms": (complete_fit.get("rms") or {}).get(unit),
-        "held_out_rms": _pooled([*predictions.values()]),
+        "held_out_rms": _pooled_rms([*predictions.values()]),
         "predictions": {name: each.get("rms") for name, each in predictions.items()},
         "blocks": {name: each.get("blocks") for name, each in predictions.items()},
         "failures": {n: fits[n]["failure"] for n in predictions if fits[n].get("failure")},
@@ -117,7 +117,7 @@ def _row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
     }
 
 
-def _pooled(predictions: Sequence[Mapping[str, Any]]) -> float | None:
+def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the RMS over all predictions; None if one is missing or their units differ."""
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
@@ -154,10 +154,10 @@ def _add_ratios(rows: Sequence[Row]) -> None:
         names = [name for name, rms in best["predictions"].items() if rms]
         logs = [log(row["predictions"][name] / best["predictions"][name]) for name in names]
         row["log_ratio"] = log(row["held_out_rms"] / best["held_out_rms"])
-        row["log_ratio_error"] = _error(row, best, logs)
+        row["log_ratio_error"] = _log_ratio_error(row, best, logs)
 
 
-def _error(row: Row, best: Row, logs: Sequence[float]) -> float:
+def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
     """Return the standard error of the logarithmic ratio.
 
     It is the larger of those from blocks in time and from recordings.
@@ -188,11 +188,11 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
     if best is None:
         fitted = [row for row in rows if row["delta_aic"] is not None]
         return min(fitted, key=lambda r: r["delta_aic"], default=None)
-    as_good = _as_good(rows, LIKELY)
+    as_good = _equally_good(rows, LIKELY)
     return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
 
 
-def _as_good(rows: Sequence[Row], errors: float) -> list[Row]:
+def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
     """Return the models that predict as well as the best, within so many standard errors."""
     return [
         row
@@ -225,11 +225,11 @@ def advice(rows: Sequence[Row]) -> str:
             f"ahead of {rival['model']}."
         )
     predicted = [row for row in others if row["log_ratio"] is not None]
-    failures = [_lost(row, chosen) for row in others if row["log_ratio"] is None]
+    failures = [_failed_prediction(row, chosen) for row in others if row["log_ratio"] is None]
     if not predicted:
         return " ".join([f"{use}: no other predicts what is held out.", *failures])
     rival = min(predicted, key=lambda row: row["log_ratio"])
-    sentences = [f"{use}: {_compared(chosen, rival)}.", _sureness(chosen, rival), *failures]
+    sentences = [f"{use}: {_comparison(chosen, rival)}.", _certainty(chosen, rival), *failures]
     return " ".join([*sentences, *(each.sentence for each in law_disagreements(rows))])
 
 
@@ -238,10 +238,10 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
     chosen = next((row for row in rows if row["chosen"]), None)
     if chosen is None or chosen["log_ratio"] is None:
         return []
-    return disagreements(_as_good(rows, SURE), chosen)
+    return find_disagreements(_equally_good(rows, SURE), chosen)
 
 
-def _lost(row: Row, chosen: Row) -> str:
+def _failed_prediction(row: Row, chosen: Row) -> str:
     """Return a sentence on a model with which the held-out samples cannot be predicted."""
     without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
     sentence = f"{row['model']} does not predict {without}"
@@ -253,34 +253,34 @@ def _lost(row: Row, chosen: Row) -> str:
     )
 
 
-def _compared(chosen: Row, rival: Row) -> str:
+def _comparison(chosen: Row, rival: Row) -> str:
     """Return the comparison of the chosen model with its closest rival, in words."""
-    prediction = f"it predicts what is held out to {_size(chosen)}"
-    ratio, error = _between(chosen, rival)
+    prediction = f"it predicts what is held out to {_prediction_text(chosen)}"
+    ratio, error = _log_ratio_between(chosen, rival)
     more = chosen["free"] - rival["free"]
     count = f"{abs(more)} parameter{'s' * (abs(more) > 1)}"
     size = f" with {count} {'more' if more > 0 else 'fewer'}" if more else ""
     support = rival["delta_aic"] - chosen["delta_aic"]
     better, worse = (chosen, rival) if support > 0 else (rival, chosen)
     return (
-        f"{prediction}{size}, {rival['model']} to {_size(rival)}, {exp(ratio):.3g} times as far "
+        f"{prediction}{size}, {rival['model']} to {_prediction_text(rival)}, {exp(ratio):.3g} times as far "
         f"off (±{100 * error:.2g} %). AIC puts {better['model']} {abs(support):.3g} ahead of "
         f"{worse['model']}"
     )
 
 
-def _size(row: Row) -> str:
+def _prediction_text(row: Row) -> str:
     """Return the prediction error of a model as text with its unit."""
-    factor, unit = shown_in(row["unit"])
+    factor, unit = display_unit(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
 
 
-def shown_in(unit: str) -> tuple[float, str]:
+def display_unit(unit: str) -> tuple[float, str]:
     """Return factor and unit for display: metres as millimetres, other units unchanged."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
-def _between(chosen: Row, rival: Row) -> tuple[float, float]:
+def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
     """Return the logarithmic ratio of the rival's error to the chosen model's, and its
     standard error.
     """
@@ -288,9 +288,9 @@ def _between(chosen: Row, rival: Row) -> tuple[float, float]:
     return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
 
 
-def _sureness(chosen: Row, rival: Row) -> str:
+def _certainty(chosen: Row, rival: Row) -> str:
     """Return a sentence on how certain the choice is."""
-    ratio, error = _between(chosen, rival)
+    ratio, error = _log_ratio_between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
     if ratio > SURE * error and support > NO_SUPPORT:
         return "These recordings leave no doubt about that."
@@ -359,35 +359,35 @@ class Evidence:
         return independent * float(np.log(self.misfit)) + self.prior + 2 * self.fitted
 
 
-def evidence_of(fit: LinearisedFit) -> Evidence:
+def evidence_from_fit(fit: LinearisedFit) -> Evidence:
     """Return the evidence of a model from its linearised fit at the solution."""
-    factored = information(fit)
-    rounding = ROUNDING**2 * fit.measurements
-    independent = float(fit.measurements)
+    factored = factorise_information(fit)
+    rounding = ROUNDING**2 * fit.measurement_count
+    independent = float(fit.measurement_count)
     if fit.chi_squared > rounding:
         processes = error_processes(fit, factored)
         pairs = zip(fit.blocks, processes, strict=True)
-        independent = sum(_independent(b, p) for b, p in pairs if b.measurements)
+        independent = sum(_independent_measurements(b, p) for b, p in pairs if b.measurement_count)
     return Evidence(
         max(fit.chi_squared, rounding),
         float(np.sum(fit.prior_residual**2)),
-        factored.fitted,
-        fit.measurements,
+        factored.determined_count,
+        fit.measurement_count,
         independent,
     )
 
 
-def _independent(block: FitBlock, process: ErrorProcess) -> float:
+def _independent_measurements(block: ResidualBlock, process: ErrorProcess) -> float:
     """Return the equivalent number of independent measurements in one block of residuals."""
-    lags = np.arange(1, len(process.along_time))
-    in_time = 1 + 2 * float((1 - lags / len(block.t_s)) @ process.along_time[1:])
+    lags = np.arange(1, len(process.autocorrelation))
+    in_time = 1 + 2 * float((1 - lags / len(block.t_s)) @ process.autocorrelation[1:])
     is_observed = block.channels[2].any(axis=0)
-    among = process.among_channels[np.ix_(is_observed, is_observed)]
+    among = process.channel_covariance[np.ix_(is_observed, is_observed)]
     total = float(np.trace(among)) ** 2
     # Few samples make channels look alike that are not: that much is taken off tr Σ².
     sum_of_squares = float(np.sum(among**2)) - total / max(process.samples, 1.0)
     channels = float(np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among)))
-    return block.measurements * channels / len(among) / max(1.0, in_time)
+    return block.measurement_count * channels / len(among) / max(1.0, in_time)
 
 
 # Share of a single recording that is fitted.
@@ -396,7 +396,7 @@ FITTED = 2 / 3
 BLOCKS = 8
 
 
-def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
+def fit_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]:
     """Fit a model to all recordings, or to all but the held-out one, and return its fit and
     prediction.
 
@@ -415,13 +415,13 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
         Status, parameters and RMS; with converged fits also "evidence" and "budget" if all are
         fitted, else "prediction", which is None with a "failure" if the simulation failed.
     """
-    known, start_s = without(problem, held_out) if held_out else (problem, np.inf)
+    known, start_s = hold_out(problem, held_out) if held_out else (problem, np.inf)
     solution = solve(known, method)
     record: dict[str, Any] = {
         "status": solution.status.value,
         "converged": solution.status.converged,
         "rms": {"m": solution.rms_m, "N": pooled_wrench_rms(solution)[0]},
-        "parameters": values_of(solution.collocation, solution.q),
+        "parameters": parameter_values(solution.collocation, solution.q),
         "free": [item.name for item in problem.parameters.free],
         "time_s": solution.timing.total,
     }
@@ -429,23 +429,25 @@ def model_record(problem: Problem, method: str, held_out: str) -> dict[str, Any]
         return record
     if not held_out:
         try:
-            fit = linearised_fit(solution.collocation, solution.z)
+            fit = linearise_fit(solution.collocation, solution.z)
         except SimulationError as error:
             return record | {"converged": False, "status": str(error)}
         return record | {
-            "evidence": asdict(evidence_of(fit)),
-            "budget": _budget(problem, solution, fit),
+            "evidence": asdict(evidence_from_fit(fit)),
+            "budget": _budget_record(problem, solution, fit),
         }
     experiment = next(e for e in known.experiments if e.name == held_out)
     # With the scheme that was fitted: what is compared are models, not integrators.
-    rollout = roll_out(replace(known, rollout=RolloutOptions("scheme")), experiment, solution)
-    if not isinstance(rollout, Rollout):
+    rollout = simulate_experiment(
+        replace(known, rollout=RolloutOptions("scheme")), experiment, solution
+    )
+    if not isinstance(rollout, ForwardSimulation):
         return record | {"prediction": None, "failure": rollout}
     complete_experiment = next(e for e in problem.experiments if e.name == held_out)
-    return record | {"prediction": _missed(complete_experiment, rollout, start_s)}
+    return record | {"prediction": _prediction_error(complete_experiment, rollout, start_s)}
 
 
-def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[str, Any]:
+def _budget_record(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[str, Any]:
     """Return the uncertainty budget of each estimate, without noise of the poses, step and mesh.
 
     Empty if the error bars cannot be computed.
@@ -453,36 +455,36 @@ def _budget(problem: Problem, solution: Solution, fit: LinearisedFit) -> dict[st
     options = problem.uncertainty
     parameters = solution.collocation.parameters
     try:
-        known = uncertainty_of(fit, parameters, solution.q, options)
-        changes = assumed(solution.collocation, solution.z, options.considered)
+        known = uncertainty_from_fit(fit, parameters, solution.q, options)
+        changes = changes_of_assumptions(solution.collocation, solution.z, options.considered)
     except (InputError, SimulationError):
         return {}  # without error bars there is none
     means = options.assumptions.means
-    sources = Sources.of(fit, changes, parameters, solution.q, known, means)
+    sources = VarianceSources.from_fit(fit, changes, parameters, solution.q, known, means)
     return {name: asdict(line) for name, line in budget(sources, known, {}, parameters).items()}
 
 
-def without(problem: Problem, name: str) -> tuple[Problem, float]:
+def hold_out(problem: Problem, name: str) -> tuple[Problem, float]:
     """Return the problem without a recording, or without its end, and the time of the first
     held-out sample [s].
 
     The end of a single recording is held out. The time is −∞ if the complete recording is held out.
     """
     chosen = next(e for e in problem.experiments if e.name == name)
-    if len(recordings(problem)) > 1:
+    if len(fitted_recordings(problem)) > 1:
         remaining = replace(chosen, validation=True)
         start_s = -np.inf
     else:
         start_s = float(chosen.t_s[0] + FITTED * chosen.duration_s)
         tracks = np.where((chosen.t_s > start_s)[:, None, None], np.nan, chosen.markers.positions_m)
-        grasps = tuple(_until(grasp, start_s) for grasp in chosen.grasps)
-        depths = [each for d in chosen.depths if (each := d.until(start_s)) is not None]
+        grasps = tuple(_without_later_wrench(grasp, start_s) for grasp in chosen.grasps)
+        depths = [each for d in chosen.depths if (each := d.until_time(start_s)) is not None]
         remaining = replace(with_markers(chosen, tracks), grasps=grasps, depths=depths)
     experiments = [remaining if e is chosen else e for e in problem.experiments]
     return replace(problem, experiments=experiments), start_s
 
 
-def _until(grasp: Grasp, end_s: float) -> Grasp:
+def _without_later_wrench(grasp: Grasp, end_s: float) -> Grasp:
     """Return the grasp without measurements of its sensor after a time [s]."""
     wrench = grasp.wrench
     if wrench is None:
@@ -491,7 +493,9 @@ def _until(grasp: Grasp, end_s: float) -> Grasp:
     return replace(grasp, wrench=replace(wrench, values=values))
 
 
-def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[str, Any]:
+def _prediction_error(
+    experiment: Experiment, rollout: ForwardSimulation, start_s: float
+) -> dict[str, Any]:
     """Return RMS, number of samples and sums of squares by block, of held-out measurements against
     a simulation.
 
@@ -502,8 +506,8 @@ def _missed(experiment: Experiment, rollout: Rollout, start_s: float) -> dict[st
     unit = "m"
     t_s = experiment.t_s
     residuals = rollout.trajectory.markers_m - markers.positions_m
-    is_counted = markers.present
-    if not markers.samples:
+    is_counted = markers.is_present
+    if not markers.sample_count:
         t_s = np.concatenate([sensor.t_s for sensor in experiment.wrenches])
         pairs = zip(rollout.wrenches, experiment.wrenches, strict=True)
         residuals = np.concatenate(

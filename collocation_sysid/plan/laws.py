@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..display import Table
-from ..fem.constants import bare, is_damping, symbol_of, with_unit
+from ..fem.constants import is_damping, symbol_of, symbol_with_unit, without_region
 from ..statistics.budget import BudgetLine
-from ..statistics.estimates import Coordinate
+from ..statistics.estimates import IntervalCoordinate
 from ..statistics.remedies import LAW
 from .table import Row
 
@@ -36,7 +36,7 @@ class Disagreement:
         Name of the parameter.
     values : mapping of str to float
         Estimate by law, the chosen one first.
-    without : BudgetLine or None
+    chosen_budget : BudgetLine or None
         Budget with the chosen law alone; None if it is not known.
     combined95 : tuple of two floats or None
         Combined interval with the difference between laws; None if the budget is not known.
@@ -46,7 +46,7 @@ class Disagreement:
 
     name: str
     values: Mapping[str, float]
-    without: BudgetLine | None
+    chosen_budget: BudgetLine | None
     combined95: tuple[float, float] | None
     share: float
 
@@ -56,13 +56,13 @@ class Disagreement:
         low = min(self.values.values())
         high = max(self.values.values())
         symbol = symbol_of(self.name)
-        unit = with_unit(self.name).removeprefix(symbol)
+        unit = symbol_with_unit(self.name).removeprefix(symbol)
         range_text = f"By those that predict alike, {symbol} is {low:.3g} to {high:.3g}{unit}"
         conclusion = f"{range_text}: these recordings do not tell it better."
-        if self.without is None or self.combined95 is None:
+        if self.chosen_budget is None or self.combined95 is None:
             return conclusion
         ends, least = (
-            "{:.3g} to {:.3g}".format(*w) for w in (self.combined95, self.without.combined95)
+            "{:.3g} to {:.3g}".format(*w) for w in (self.combined95, self.chosen_budget.combined95)
         )
         share = f"{self.share:.0%} of the variance"
         return (
@@ -70,7 +70,7 @@ class Disagreement:
         )
 
 
-def disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
+def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
     """Return the parameters in which models disagree.
 
     Parameters
@@ -84,44 +84,46 @@ def disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
     result = []
     for name in chosen["parameters"]:
         values = {r["model"]: r["parameters"].get(name) for r in (chosen, *others)}
-        if (bare(name) in MODULI or is_damping(name)) and all(v and v > 0 for v in values.values()):
+        if (without_region(name) in MODULI or is_damping(name)) and all(
+            v and v > 0 for v in values.values()
+        ):
             estimates = {model: float(value or 0.0) for model, value in values.items()}
             if max(estimates.values()) > APART * min(estimates.values()):
-                result.append(_of_number(name, estimates, chosen["budget"].get(name)))
+                result.append(_disagreement(name, estimates, chosen["budget"].get(name)))
     return result
 
 
-def _of_number(
-    name: str, values: Mapping[str, float], known: Mapping[str, object] | None
+def _disagreement(
+    name: str, values: Mapping[str, float], known_rows: Mapping[str, object] | None
 ) -> Disagreement:
     """Return the disagreement of one parameter, from the chosen model's budget line; None
     if unknown.
     """
-    if known is None:
+    if known_rows is None:
         return Disagreement(name, values, None, None, 0.0)
-    line = BudgetLine(**known)  # type: ignore[arg-type]
-    coordinate = Coordinate.of(name, (*values.values(), *line.combined95), False)
-    coordinates = np.array([coordinate.at(value) for value in values.values()])
-    with_law = line.widened(
+    line = BudgetLine(**known_rows)  # type: ignore[arg-type]
+    coordinate = IntervalCoordinate.for_estimate(name, (*values.values(), *line.combined95), False)
+    coordinates = np.array([coordinate.from_value(value) for value in values.values()])
+    with_law = line.with_source(
         LAW, float(np.sqrt(np.mean((coordinates - coordinates[0]) ** 2))), coordinate
     )
     return Disagreement(name, values, line, with_law.combined95, with_law.shares[LAW])
 
 
-def law_table(told: Sequence[Disagreement]) -> Table:
+def law_table(differences: Sequence[Disagreement]) -> Table:
     """Return a table of estimates by law, with their spread and the chosen law's intervals."""
-    laws = dict.fromkeys(model for each in told for model in each.values)
+    laws = dict.fromkeys(model for each in differences for model in each.values)
     rows = []
-    for each in told:
+    for each in differences:
         values = [each.values[law] for law in laws]
         spread = 100 * (max(values) / min(values) - 1)
         intervals = (
             w and "{:.3g} … {:.3g}".format(*w)
-            for w in (each.without and each.without.combined95, each.combined95)
+            for w in (each.chosen_budget and each.chosen_budget.combined95, each.combined95)
         )
         cells = (f"{value:.4g}" for value in values)
         rows.append(
-            (with_unit(each.name), *cells, f"{spread:.0f} %", *(w or "" for w in intervals))
+            (symbol_with_unit(each.name), *cells, f"{spread:.0f} %", *(w or "" for w in intervals))
         )
     heads = ("", *laws, "spread", "combined interval", "with the law")
     return Table("Which law?", heads, tuple(rows))

@@ -33,14 +33,14 @@ from ..result.style import (
 from ..runs.result import Result
 from ..tree import read
 from .process import Record
-from .study import short_keys
+from .study import shortened_keys
 from .table import (
     Row,
-    Yardstick,
+    SuccessCriterion,
     best_run,
-    distance,
+    guess_distance,
     parameters_in,
-    reference,
+    reference_parameters,
     wilson_interval,
 )
 
@@ -54,7 +54,7 @@ PANEL_MM = 32.0
 
 
 def comparison_plots(
-    rows: Sequence[Row], records: Mapping[str, Record], yardstick: Yardstick
+    rows: Sequence[Row], records: Mapping[str, Record], yardstick: SuccessCriterion
 ) -> dict[str, Figure]:
     """Return the figures of a comparison by file name; those without data are left out."""
     figures: dict[str, Figure] = {}
@@ -64,7 +64,7 @@ def comparison_plots(
         if records[answered[0]["key"]]["tip"] is not None:
             figures["tip"] = tip_tracks(answered, records)
     done = [row for row in rows if row["status"] != "missing"]
-    centre = reference(done, yardstick) if done else {}
+    centre = reference_parameters(done, yardstick) if done else {}
     # A run without a guess that failed has no place among the starts.
     done = [row for row in done if all(row[f"guess_{name}"] is not None for name in centre)]
     if centre and len({row["start"] for row in done}) > 1:
@@ -112,17 +112,19 @@ def convergence_in_time(rows: Sequence[Row], records: Mapping[str, Record]) -> F
 # Starts -------------------------------------------------------------------------------------------
 
 
-def success_by_distance(rows: Sequence[Row], centre: Mapping[str, float], known: bool) -> Figure:
+def success_by_distance(
+    rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool
+) -> Figure:
     """Return a figure of the success rate against the largest ratio of guess to reference,
     in logarithmic bins.
     """
     figure = new_figure(PAGE_MM / 2, 65)
     axes = figure.subplots()
-    factors = np.array([distance(row, centre) for row in rows])
+    factors = np.array([guess_distance(row, centre) for row in rows])
     edges = np.geomspace(max(1.0, factors.min()), factors.max() * (1 + 1e-9), DISTANCE_BINS + 1)
     methods = _by_method(rows)
     for k, (method, (colour, runs)) in enumerate(methods.items()):
-        off = np.array([distance(row, centre) for row in runs])
+        off = np.array([guess_distance(row, centre) for row in runs])
         places = []
         rates = []
         bars = []
@@ -139,7 +141,7 @@ def success_by_distance(rows: Sequence[Row], centre: Mapping[str, float], known:
         axes.errorbar(
             places, rates, np.abs(np.array(bars)).T, color=colour, label=method, **style
         )  # fmt: skip
-    title = f"Success by distance from the {'truth' if known else 'best answer'}"
+    title = f"Success by distance from the {'truth' if known_rows else 'best answer'}"
     dress(axes, title, "factor of the guess that is farthest off", "success [%]")
     axes.set_xscale("log")
     axes.set_xticks(edges, [f"{edge:.2g}" for edge in edges])
@@ -149,7 +151,7 @@ def success_by_distance(rows: Sequence[Row], centre: Mapping[str, float], known:
     return figure
 
 
-def basins(rows: Sequence[Row], centre: Mapping[str, float], known: bool) -> Figure:
+def basins(rows: Sequence[Row], centre: Mapping[str, float], known_rows: bool) -> Figure:
     """Start points over each pair of parameters, a row of panels for each method.
 
     Guesses are drawn relative to the truth, or to the best answer.
@@ -169,12 +171,12 @@ def basins(rows: Sequence[Row], centre: Mapping[str, float], known: bool) -> Fig
                     s=9, marker=marker, color=colour, linewidths=0.8,
                     label="success" if success else "failure",
                 )  # fmt: skip
-            axes.plot(1, 1, "+", color=BLACK, ms=6, label="truth" if known else "best answer")
+            axes.plot(1, 1, "+", color=BLACK, ms=6, label="truth" if known_rows else "best answer")
             dress(axes, method if axes is line[0] else "", "", mathematical(second))
     for axes, (first, _) in zip(panels[-1], pairs, strict=True):
         axes.set_xlabel(mathematical(first), fontsize=TEXT_PT)
-    _ratio_axes(panels[0, 0], max(distance(row, centre) for row in rows))
-    title = f"guesses over the {'truth' if known else 'best answer'}"
+    _ratio_axes(panels[0, 0], max(guess_distance(row, centre) for row in rows))
+    title = f"guesses over the {'truth' if known_rows else 'best answer'}"
     legend_of_all(
         figure, 3, loc="outside upper right", fontsize=SMALL_PT, title=title,
         title_fontsize=SMALL_PT, alignment="right",
@@ -239,9 +241,9 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
     width = max(PAGE_MM / 2, min(PAGE_MM, 80.0 * len(swept)))
     figure = new_figure(width, 14 + PANEL_MM * len(names))
     panels = figure.subplots(len(names), len(swept), sharex="col", sharey="row", squeeze=False)
-    shorts = dict(short_keys(swept))
+    shorts = dict(shortened_keys(swept))
     for column, key in enumerate(swept):
-        places, texts = _places([row[key] for row in rows])
+        places, texts = _axis_positions([row[key] for row in rows])
         for line, name in zip(panels, names, strict=True):
             for label, colour, shift, chosen in _groups(rows, swept, key, shorts):
                 _draw_estimates(line[column], rows, places + shift, name, chosen, colour, label)
@@ -260,7 +262,7 @@ def estimates_against(rows: Sequence[Row], swept: Sequence[str]) -> Figure:
     return figure
 
 
-def _places(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
+def _axis_positions(values: Sequence[str]) -> tuple[Array, dict[float, str]]:
     """Return the positions of swept values on the axis, evenly spaced, and their labels."""
     order = list(dict.fromkeys(values))
     names = {float(place): _shortened(value) for place, value in enumerate(order)}

@@ -54,7 +54,7 @@ GRACE_S = 10.0
 def execute(
     planned: dict[str, Any],
     time_limit_s: float | None = None,
-    stopped: Callable[[], bool] = lambda: False,
+    is_stopped: Callable[[], bool] = lambda: False,
     retries: int = 1,
 ) -> Record:
     """Execute a run in its own process and return its record, whatever happens to the process.
@@ -66,7 +66,7 @@ def execute(
     time_limit_s : float, optional
         Time after which the process is asked to end, loading included [s]; it is killed if it does
         not. The record then contains the best iterate, if there is one.
-    stopped : callable
+    is_stopped : callable
         Function that is called now and then; the process is killed once it returns true.
     retries : int
         Further attempts if the process crashes.
@@ -76,7 +76,7 @@ def execute(
     while attempts <= retries:
         attempts += 1
         began = time.monotonic()
-        record = _attempt(planned, time_limit_s, stopped)
+        record = _attempt(planned, time_limit_s, is_stopped)
         record["wall_s"] = time.monotonic() - began
         if record["outcome"] != CRASHED:
             break
@@ -110,7 +110,7 @@ def _attempt(
             except (OSError, ValueError):
                 return interruption or {
                     "outcome": CRASHED,
-                    "message": _last_words(process.returncode, stderr),
+                    "message": _crash_message(process.returncode, stderr),
                 }
             return (
                 record
@@ -123,7 +123,7 @@ def _watch(
     process: subprocess.Popen,
     planned: dict[str, Any],
     time_limit_s: float | None,
-    stopped: Callable[[], bool],
+    is_stopped: Callable[[], bool],
 ) -> Record | None:
     """Send the run to the process and wait for its end.
 
@@ -149,18 +149,18 @@ def _watch(
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(min(remaining_s, LOOK_EVERY_S))
                 return None
-            if stopped():
+            if is_stopped():
                 return {"outcome": STOPPED, "message": "stopped with the study"}
     finally:
         with contextlib.suppress(OSError):
             process.stdin.close()
 
 
-def _last_words(code: int, said: IO[bytes]) -> str:
+def _crash_message(code: int, stderr: IO[bytes]) -> str:
     """Return how a process ended, with the last line of its error output."""
     cause = killed_by(code) or f"its process ended with code {code}"
-    said.seek(0)
-    lines = said.read()[-2000:].decode(errors="replace").split("\n")
+    stderr.seek(0)
+    lines = stderr.read()[-2000:].decode(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return f"{cause}: {last}" if last else cause
 
@@ -199,7 +199,7 @@ class RunStore:
             return None
         return record if isinstance(record, dict) and record.get("key") == key else None
 
-    def finished(self, key: str, time_limit_s: float | None) -> Record | None:
+    def load_finished(self, key: str, time_limit_s: float | None) -> Record | None:
         """Return the record of a run; None if the run should be executed again.
 
         A run is repeated if it crashed, or if it exceeded a time limit below the present one.
@@ -246,7 +246,7 @@ class RunOptions(Options):
 
 
 @dataclass(frozen=True)
-class Pool:
+class RunExecutor:
     """Executor of runs.
 
     Attributes
@@ -267,8 +267,8 @@ class Pool:
 def run_all(
     planned: Sequence[PlannedRun],
     store: RunStore,
-    limits: RunOptions,
-    done: Callable[[Record, int], None] = lambda record, slots: None,
+    options: RunOptions,
+    on_record: Callable[[Record, int], None] = lambda record, slots: None,
 ) -> None:
     """Execute the runs of a study and store their records, each as soon as it has ended.
 
@@ -278,9 +278,9 @@ def run_all(
         Runs, started in this order; the caller has removed finished ones.
     store : RunStore
         Storage of the records.
-    limits : RunOptions
+    options : RunOptions
         Options of the execution.
-    done : callable
+    on_record : callable
         Function that is called with every new record and the number of runs at once.
 
     Raises
@@ -292,14 +292,14 @@ def run_all(
     """
     if not planned:
         return
-    with (_cluster if limits.scheduler else _threads)(limits) as pool:
+    with (_cluster_executor if options.scheduler else _thread_executor)(options) as pool:
         futures = {pool.submit(run): run for run in planned}
         try:
             for future in as_completed(futures):
-                record = _record_of(future, futures[future], limits)
+                record = _result_record(future, futures[future], options)
                 if record["outcome"] != STOPPED:
                     store.save(record)
-                    done(record, pool.slots)
+                    on_record(record, pool.slots)
         except BaseException:
             for future in futures:
                 future.cancel()
@@ -307,7 +307,7 @@ def run_all(
             raise
 
 
-def _record_of(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
+def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
     """Return the record of a run, also if its worker was lost."""
     try:
         return future.result()
@@ -323,7 +323,7 @@ def _record_of(future: Future, planned: PlannedRun, limits: RunOptions) -> Recor
 
 
 @contextmanager
-def _threads(limits: RunOptions) -> Iterator[Pool]:
+def _thread_executor(limits: RunOptions) -> Iterator[RunExecutor]:
     """Context with an executor of threads, which wait for processes on this machine."""
     slots = limits.workers or available_threads()
     stop = threading.Event()
@@ -333,11 +333,11 @@ def _threads(limits: RunOptions) -> Iterator[Pool]:
             """Start a run and return the future of its record."""
             return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
 
-        yield Pool(submit, slots, stop.set)
+        yield RunExecutor(submit, slots, stop.set)
 
 
 @contextmanager
-def _cluster(limits: RunOptions) -> Iterator[Pool]:
+def _cluster_executor(limits: RunOptions) -> Iterator[RunExecutor]:
     """Context with an executor on the workers of a scheduler."""
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
     with connected(limits.scheduler) as client:
@@ -346,11 +346,11 @@ def _cluster(limits: RunOptions) -> Iterator[Pool]:
 
             def submit(run: PlannedRun) -> Future:
                 """Start a run and return the future of its record."""
-                return executor.submit(_on_worker, run.as_dict(), limits.time_limit_s, flag)
+                return executor.submit(_execute_on_worker, run.as_dict(), limits.time_limit_s, flag)
 
-            yield Pool(submit, max(1, sum(client.nthreads().values())), stop.set)
+            yield RunExecutor(submit, max(1, sum(client.nthreads().values())), stop.set)
 
 
-def _on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
+def _execute_on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
     """Execute a run on a worker until the event named `flag` is set, and return its record."""
     return execute(planned, time_limit_s, distributed().Event(flag).is_set)

@@ -51,7 +51,7 @@ class StudyProgress(Watched):
             self._live.refresh()  # the first run may take less time than a frame
         return self
 
-    def done(self, record: Record, slots: int) -> None:
+    def count_run(self, record: Record, slots: int) -> None:
         """Count a finished run and update the display.
 
         Parameters
@@ -67,12 +67,12 @@ class StudyProgress(Watched):
         status = (record.get("result") or record).get("status", record["outcome"])
         count = f"{self.total - len(self._waiting)}/{self.total} runs"
         wall = record.get("wall_s") or 0.0
-        line = f"{count}: {run.label} {status} in {wall:.1f} s{self._left(slots)}"
+        line = f"{count}: {run.label} {status} in {wall:.1f} s{self._remaining_text(slots)}"
         self.update(Text(line, style="dim"), line)
 
-    def _left(self, slots: int) -> str:
+    def _remaining_text(self, slots: int) -> str:
         """Return the estimated remaining time as text; empty if it is unknown."""
-        remaining_s = time_left_s(
+        remaining_s = remaining_time_s(
             [run.method for run in self._waiting.values()], self._walls, slots
         )
         return "" if remaining_s is None else f"; about {duration(remaining_s)} left"
@@ -87,7 +87,7 @@ class DesignProgress(Watched):
         super().__init__(console, quiet)
         self.evaluations = evaluations
 
-    def tried(self, number: int, log_size: float) -> None:
+    def show_best(self, number: int, log_size: float) -> None:
         """Show the smallest error bar so far.
 
         Parameters
@@ -102,12 +102,12 @@ class DesignProgress(Watched):
         seldom = number % EVERY == 0 or number == self.evaluations
         self.update(Text(f"{line} (Ctrl-C keeps it)", style="dim"), line if seldom else "")
 
-    def say(self, what: str) -> None:
+    def show_activity(self, what: str) -> None:
         """Show the present activity."""
         self.update(Text(f"{what} (Ctrl-C keeps the best)", style="dim"), what)
 
 
-def time_left_s(
+def remaining_time_s(
     waiting: Sequence[str], walls: Mapping[str, Sequence[float]], slots: int
 ) -> float | None:
     """Return the estimated time for the waiting runs [s]; None if it is unknown.

@@ -26,7 +26,7 @@ from ..problem.reading import read_problem_file
 from ..problem.schema import ParameterSection, ProblemFile
 from ..recording.formats.logs import stored_files
 from .arguments import require_few
-from .variants import Variant
+from .variants import ModelVariant
 
 KEY_LENGTH = 20
 
@@ -77,14 +77,14 @@ class PlannedRun:
             return f"{self.swept['model']}{what}"
         if not self.swept:
             return f"{self.method}, start {self.start}"
-        return ", ".join(f"{short}={self.swept[key]}" for key, short in short_keys(self.swept))
+        return ", ".join(f"{short}={self.swept[key]}" for key, short in shortened_keys(self.swept))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the run as a dictionary for JSON."""
         return asdict(self)
 
 
-def short_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def shortened_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield each dotted key with the shortest ending that distinguishes it from the others."""
     for key in keys:
         parts = key.split(".")
@@ -198,7 +198,8 @@ def plan_comparison(
         file, _ = read_problem_file(problem.path, start_overrides)
         details = {"start": start, "allow_code": allow_code}
         planned += [
-            _planned(problem.path, file, method, start_overrides, **details) for method in methods
+            _planned_run(problem.path, file, method, start_overrides, **details)
+            for method in methods
         ]
     return planned
 
@@ -241,13 +242,13 @@ def plan_sweep(
             where = "--over" if error.source == "--set" else error.source
             raise InputError(error.message, where, error.where) from error
         details = {"swept": swept, "allow_code": allow_code}
-        planned.append(_planned(path, file, method, run_overrides, **details))
+        planned.append(_planned_run(path, file, method, run_overrides, **details))
     return planned
 
 
 def plan_models(
     problem: Problem,
-    variants: Sequence[Variant],
+    variants: Sequence[ModelVariant],
     method: str | None = None,
     allow_code: bool = False,
 ) -> list[PlannedRun]:
@@ -259,7 +260,7 @@ def plan_models(
     ----------
     problem : Problem
         Problem with the recordings.
-    variants : sequence of Variant
+    variants : sequence of ModelVariant
         Models.
     method : str, optional
         Name of the method; the file's own by default.
@@ -273,28 +274,28 @@ def plan_models(
         wrenches.
     """
     for each in problem.experiments:
-        if not (each.validation or each.markers.samples or each.wrenches):
+        if not (each.validation or each.markers.sample_count or each.wrenches):
             raise InputError(
                 f"'{each.name}' has neither markers nor a measured wrench; expected one of these, "
                 "by which models are told apart: predictions are not compared with depth images or "
                 "readings"
             )
     planned = []
-    for held_out in ("", *recordings(problem)):
+    for held_out in ("", *fitted_recordings(problem)):
         for variant in variants:
             file, _ = read_problem_file(variant.path, variant.overrides)
             details = {"swept": {"model": variant.label}, "held_out": held_out}
             details |= {"allow_code": allow_code}
-            planned.append(_planned(variant.path, file, method, variant.overrides, **details))
+            planned.append(_planned_run(variant.path, file, method, variant.overrides, **details))
     return planned
 
 
-def recordings(problem: Problem) -> list[str]:
+def fitted_recordings(problem: Problem) -> list[str]:
     """Return the names of the recordings that are fitted."""
     return [e.name for e in problem.experiments if not e.validation]
 
 
-def _planned(
+def _planned_run(
     path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
 ) -> PlannedRun:
     """Return the run of a file with its overrides.
@@ -326,7 +327,7 @@ def _planned(
     content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
     content["solver"]["method"] = method
     of_study = start if more.get("held_out") is None else f"without {more['held_out']}"
-    hashes = _hashes_of_files(content, path.parent)
+    hashes = _file_hashes(content, path.parent)
     decisive = [content, of_study, hashes, version("collocation-sysid")]
     text = json.dumps(decisive, sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
@@ -335,7 +336,7 @@ def _planned(
     )
 
 
-def _hashes_of_files(content: Any, folder: Path) -> dict[str, str]:
+def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
     """Return hashes of the files that a problem names, so that changed data give another run."""
     hashes = {}
     for text in _texts(content):

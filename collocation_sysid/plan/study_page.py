@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from ..display import Items, Line, Section, Shown, Table, as_markdown
-from ..fem.constants import symbol_of, unit_of, with_unit
+from ..fem.constants import symbol_of, symbol_with_unit, unit_of
 from ..files import SCHEMA, whole_file, write_whole
 from ..tree import as_json
-from .choice import advice, law_disagreements, model_notes, model_rows, shown_in
+from .choice import advice, display_unit, law_disagreements, model_notes, model_rows
 from .laws import law_table
 from .plots import comparison_plots, sweep_plots
 from .process import Record, RunStore
-from .study import PlannedRun, short_keys
-from .table import COLUMNS, Column, Row, Yardstick, method_rows, parameters_in, run_row
+from .study import PlannedRun, shortened_keys
+from .table import COLUMNS, NumberColumn, Row, SuccessCriterion, method_rows, parameters_in, run_row
 
 RESOLUTION_DPI = 150
 SHOWN_FAILURES = 8
@@ -54,7 +54,7 @@ class StudyReport:
         Runs of the study.
     records : mapping of str to Record
         Records of finished runs by key.
-    yardstick : Yardstick
+    yardstick : SuccessCriterion
         Criterion of success.
     """
 
@@ -62,7 +62,7 @@ class StudyReport:
     kind: str
     planned: tuple[PlannedRun, ...]
     records: Mapping[str, Record]
-    yardstick: Yardstick
+    yardstick: SuccessCriterion
 
     @property
     def rows(self) -> list[Row]:
@@ -121,12 +121,12 @@ def load_report(
     kind: str,
     planned: Sequence[PlannedRun],
     store: RunStore,
-    yardstick: Yardstick | None = None,
+    yardstick: SuccessCriterion | None = None,
 ) -> StudyReport:
     """Return the report of planned runs from their stored records."""
     loaded = {run.key: store.load(run.key) for run in planned}
     records = {key: record for key, record in loaded.items() if record is not None}
-    return StudyReport(title, kind, tuple(planned), records, yardstick or Yardstick())
+    return StudyReport(title, kind, tuple(planned), records, yardstick or SuccessCriterion())
 
 
 # In the terminal ---------------------------------------------------------------------------------
@@ -250,28 +250,30 @@ def comparison_views(summaries: Sequence[Row]) -> list[Table]:
         "success": lambda row: f"{row['successes']}/{row['runs']}",
         "95 %": lambda row: f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f} %",
     }
-    success |= _errors(summaries)
+    success |= _error_cells(summaries)
     quality = ["violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m"]
     cost = ["iterations", "evaluations", "build_s", "evaluations_s", "linear_algebra_s", "total_s"]
     if all(row["evaluations"] is None for row in summaries):
         cost.remove("evaluations")
     return [
-        _view("Success", {"method": _text("method")}, success, summaries),
-        _view("Quality", {"method": _text("method")}, _numbers(*quality), summaries),
-        _view("Cost", {"method": _text("method")}, _numbers(*cost), summaries),
+        _table_view("Success", {"method": _text_cell("method")}, success, summaries),
+        _table_view(
+            "Quality", {"method": _text_cell("method")}, _number_cells(*quality), summaries
+        ),
+        _table_view("Cost", {"method": _text_cell("method")}, _number_cells(*cost), summaries),
     ]
 
 
 def run_view(rows: Sequence[Row]) -> Table:
     """Return a table of every run of a comparison."""
-    names = {"start": _text("start"), "method": _text("method")}
+    names = {"start": _text_cell("start"), "method": _text_cell("method")}
     cells: dict[str, Cell] = {
-        "ended": _text("status"),
+        "ended": _text_cell("status"),
         "succeeded": lambda row: "yes" if row["success"] else "no",
     }
-    cells |= _errors(rows) | _numbers("rms_m", "rollout_rms_m", "iterations", "total_s")
+    cells |= _error_cells(rows) | _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
     ordered = sorted(rows, key=lambda row: row["start"])
-    view = _view("Runs", names, cells, ordered)
+    view = _table_view("Runs", names, cells, ordered)
     return replace(view, heads=tuple(map(_in_words, view.heads)))
 
 
@@ -304,45 +306,45 @@ def sweep_sentences(rows: Sequence[Row]) -> list[str]:
 
 def sweep_views(rows: Sequence[Row], swept: Sequence[str]) -> list[Table]:
     """Return tables of estimates and quality by swept values."""
-    places = {short: _swept(key) for key, short in short_keys(swept)}
+    places = {short: _swept_cell(key) for key, short in shortened_keys(swept)}
     estimates: dict[str, Cell] = {}
     for name in parameters_in(rows):
-        estimates[with_unit(name)] = _estimate(name)
-    numbers = _numbers("rms_m", "rollout_rms_m", "iterations", "total_s")
-    quality = {"status": _text("status"), **numbers}
+        estimates[symbol_with_unit(name)] = _estimate_cell(name)
+    numbers = _number_cells("rms_m", "rollout_rms_m", "iterations", "total_s")
+    quality = {"status": _text_cell("status"), **numbers}
     return [
-        _view("Estimates ± standard error", places, estimates, rows),
-        _view("Quality and cost", places, quality, rows),
+        _table_view("Estimates ± standard error", places, estimates, rows),
+        _table_view("Quality and cost", places, quality, rows),
     ]
 
 
 def model_views(rows: Sequence[Row]) -> list[Table]:
     """Return tables of fit, prediction and small-strain moduli of every model."""
-    factor, unit = shown_in(rows[0]["unit"])
+    factor, unit = display_unit(rows[0]["unit"])
     numbers: dict[str, Cell] = {
-        "free": _number("free", 1, "d"),
-        f"fit {unit}": _number("rms", factor, ".3g"),
-        "ΔAIC": _number("delta_aic", 1, ".1f"),
-        f"held out {unit}": _number("held_out_rms", factor, ".3g"),
-        "times best": lambda row: _times(row),
-        "total s": _number("total_s"),
+        "free": _number_cell("free", 1, "d"),
+        f"fit {unit}": _number_cell("rms", factor, ".3g"),
+        "ΔAIC": _number_cell("delta_aic", 1, ".1f"),
+        f"held out {unit}": _number_cell("held_out_rms", factor, ".3g"),
+        "times best": lambda row: _ratio_text(row),
+        "total s": _number_cell("total_s"),
     }
     moduli: dict[str, Cell] = {}
     names = dict.fromkeys(name for row in rows for name in row["parameters"])
     for name in names:
-        moduli[with_unit(name)] = _number(name, 1, ".4g", "parameters")
-    model = {"": lambda row: "→" if row["chosen"] else "", "model": _text("model")}
-    views = [_view("Models", model, numbers, rows)]
+        moduli[symbol_with_unit(name)] = _number_cell(name, 1, ".4g", "parameters")
+    model = {"": lambda row: "→" if row["chosen"] else "", "model": _text_cell("model")}
+    views = [_table_view("Models", model, numbers, rows)]
     held = {
-        f"'{n}' {unit}": _number(n, factor, ".3g", "predictions")
+        f"'{n}' {unit}": _number_cell(n, factor, ".3g", "predictions")
         for n in dict.fromkeys(n for r in rows for n in r["predictions"])
     }
     if len(held) > 1:
-        views.append(_view("Recordings held out", {"model": _text("model")}, held, rows))
-    return [*views, _turned("Parameters", {"model": _text("model")}, moduli, rows)]
+        views.append(_table_view("Recordings held out", {"model": _text_cell("model")}, held, rows))
+    return [*views, _transposed_view("Parameters", {"model": _text_cell("model")}, moduli, rows)]
 
 
-def _turned(
+def _transposed_view(
     title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
     """Return a table with a line for each cell and a column for each row."""
@@ -351,7 +353,7 @@ def _turned(
     return Table(title, ("", *(name(row) for row in rows)), lines)
 
 
-def _times(row: Row) -> str:
+def _ratio_text(row: Row) -> str:
     """Return the ratio of a model's prediction error to the best one as text."""
     if row["log_ratio"] is None:
         return "–"
@@ -360,7 +362,7 @@ def _times(row: Row) -> str:
     return f"{times:{form}} ± {times * row['log_ratio_error']:{form}}"
 
 
-def _view(
+def _table_view(
     title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
     """Return a table of rows, with a column for each cell."""
@@ -369,12 +371,12 @@ def _view(
     return Table(title, tuple(columns), cells, len(names))
 
 
-def _text(name: str) -> Cell:
+def _text_cell(name: str) -> Cell:
     """Return the cell of a text."""
     return lambda row: str(row[name])
 
 
-def _swept(key: str) -> Cell:
+def _swept_cell(key: str) -> Cell:
     """Return the cell of a swept value, with numbers shortened."""
 
     def cell(row: Row) -> str:
@@ -387,24 +389,26 @@ def _swept(key: str) -> Cell:
     return cell
 
 
-def _number(name: str, factor: float = 1.0, form: str = ".2g", among: str = "") -> Cell:
+def _number_cell(name: str, factor: float = 1.0, form: str = ".2g", among: str = "") -> Cell:
     """Return the cell of a number."""
-    shown = Column(factor=factor, form=form)
-    return lambda row: shown(row[among].get(name) if among else row[name])
+    shown = NumberColumn(factor=factor, form=form)
+    return lambda row: shown.format(row[among].get(name) if among else row[name])
 
 
-def _errors(rows: Sequence[Row]) -> dict[str, Cell]:
+def _error_cells(rows: Sequence[Row]) -> dict[str, Cell]:
     """Return a cell for each parameter whose true value is known."""
     names = parameters_in(rows, "error_")
-    return {f"Δ{symbol_of(name)} %": _number(f"error_{name}", 100) for name in names}
+    return {f"Δ{symbol_of(name)} %": _number_cell(f"error_{name}", 100) for name in names}
 
 
-def _numbers(*names: str) -> dict[str, Cell]:
+def _number_cells(*names: str) -> dict[str, Cell]:
     """Return cells of quality and cost."""
-    return {COLUMNS[name].head: lambda row, name=name: COLUMNS[name](row[name]) for name in names}
+    return {
+        COLUMNS[name].head: lambda row, name=name: COLUMNS[name].format(row[name]) for name in names
+    }
 
 
-def _estimate(name: str) -> Cell:
+def _estimate_cell(name: str) -> Cell:
     """Return the cell of an estimate."""
 
     def cell(row: Row) -> str:

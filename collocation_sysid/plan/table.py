@@ -19,7 +19,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Column:
+class NumberColumn:
     """Number of a run, with its heading and format.
 
     Attributes
@@ -32,9 +32,9 @@ class Column:
         Factor before display, for example 1000 for millimetres.
     form : str
         Format specification.
-    of : callable, optional
+    from_result : callable, optional
         Function that returns the number from a result; None if it comes from elsewhere.
-    summed_up : bool
+    has_median : bool
         Whether the summary of a method contains the median over its runs.
     """
 
@@ -42,10 +42,10 @@ class Column:
     words: str = ""
     factor: float = 1.0
     form: str = ".2g"
-    of: Callable[[Result], float | None] | None = None
-    summed_up: bool = True
+    from_result: Callable[[Result], float | None] | None = None
+    has_median: bool = True
 
-    def __call__(self, value: float | None) -> str:
+    def format(self, value: float | None) -> str:
         """Return a number as text; a dash for None."""
         if value is None:
             return "–"
@@ -55,37 +55,43 @@ class Column:
 
 # Quality and cost of a run.
 COLUMNS = {
-    "loss": Column(of=lambda r: r.history[-1].loss if r.history else None, summed_up=False),
-    "rms_m": Column("markers mm", "markers, RMS [mm]", 1e3, of=lambda r: r.fit.rms_m),
-    "violation_n": Column(
+    "loss": NumberColumn(
+        from_result=lambda r: r.history[-1].loss if r.history else None, has_median=False
+    ),
+    "rms_m": NumberColumn(
+        "markers mm", "markers, RMS [mm]", 1e3, from_result=lambda r: r.fit.rms_m
+    ),
+    "violation_n": NumberColumn(
         "violation N",
         "equations of motion violated by [N]",
         1,
         ".1e",
         lambda r: r.dynamics.max_violation_n,
     ),
-    "violation_relative": Column(
+    "violation_relative": NumberColumn(
         "relative", "of the largest force", 1, ".1e", lambda r: r.dynamics.max_violation_relative
     ),
-    "rollout_rms_m": Column(
-        "forward mm", "forward simulation, RMS [mm]", 1e3, of=lambda r: r.rollout.rms_m
+    "rollout_rms_m": NumberColumn(
+        "forward mm", "forward simulation, RMS [mm]", 1e3, from_result=lambda r: r.rollout.rms_m
     ),
-    "rollout_max_m": Column(of=lambda r: r.rollout.max_m, summed_up=False),
-    "tip_max_m": Column("tip mm", "tip, at most [mm]", 1e3),
-    "iterations": Column("iter.", "iterations", 1, ".4g", lambda r: r.iterations),
-    "evaluations": Column("evals", "evaluations", 1, ".4g", lambda r: r.evaluations),
-    "build_s": Column("build s", "set-up [s]", of=lambda r: r.timing_s.build),
-    "evaluations_s": Column("evaluate s", "evaluations [s]", of=lambda r: r.timing_s.evaluations),
-    "linear_algebra_s": Column(
-        "solve s", "linear algebra [s]", of=lambda r: r.timing_s.linear_algebra
+    "rollout_max_m": NumberColumn(from_result=lambda r: r.rollout.max_m, has_median=False),
+    "tip_max_m": NumberColumn("tip mm", "tip, at most [mm]", 1e3),
+    "iterations": NumberColumn("iter.", "iterations", 1, ".4g", lambda r: r.iterations),
+    "evaluations": NumberColumn("evals", "evaluations", 1, ".4g", lambda r: r.evaluations),
+    "build_s": NumberColumn("build s", "set-up [s]", from_result=lambda r: r.timing_s.build),
+    "evaluations_s": NumberColumn(
+        "evaluate s", "evaluations [s]", from_result=lambda r: r.timing_s.evaluations
     ),
-    "total_s": Column("total s", "in all [s]", of=lambda r: r.timing_s.total),
+    "linear_algebra_s": NumberColumn(
+        "solve s", "linear algebra [s]", from_result=lambda r: r.timing_s.linear_algebra
+    ),
+    "total_s": NumberColumn("total s", "in all [s]", from_result=lambda r: r.timing_s.total),
 }
 NORMAL_975 = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class Yardstick(Options):
+class SuccessCriterion(Options):
     """Criterion of success.
 
     Attributes
@@ -128,7 +134,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 # Runs ---------------------------------------------------------------------------------------------
 
 
-def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row:
+def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion) -> Row:
     """Return one run as a flat row; values are None if they are not known.
 
     Columns ``guess_*``, ``value_*``, ``std_error_*``, ``low_*``, ``high_*`` and ``error_*``
@@ -140,20 +146,20 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
         Run.
     record : Record or None
         Its record; None if it was not executed.
-    yardstick : Yardstick
+    yardstick : SuccessCriterion
         Criterion of success.
     """
     record = record or {"outcome": "missing", "message": "not run yet"}
     result: Result | None = read(Result | None, record.get("result"))
     is_timeout = record["outcome"] == TIMEOUT
     converged = result is not None and result.converged and not is_timeout
-    parameters = _parameters(run, result, yardstick.truth)
+    parameters = _parameter_columns(run, result, yardstick.truth)
     errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
     is_accurate = all(error is not None and error <= yardstick.within for error in errors)
     numbers = {
-        name: None if result is None else column.of(result)
+        name: None if result is None else column.from_result(result)
         for name, column in COLUMNS.items()
-        if column.of is not None
+        if column.from_result is not None
     }
     row = {
         "key": run.key,
@@ -173,7 +179,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: Yardstick) -> Row
     return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
 
 
-def _parameters(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
+def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
     """Return the columns of the parameters."""
     row: Row = {}
     estimates = {} if result is None else result.parameters
@@ -206,17 +212,18 @@ def method_rows(rows: Sequence[Row]) -> list[Row]:
     """Return a summary of each method, in the order of their first runs."""
     methods = dict.fromkeys(row["method"] for row in rows)
     return [
-        _summary(method, [row for row in rows if row["method"] == method]) for method in methods
+        _method_summary(method, [row for row in rows if row["method"] == method])
+        for method in methods
     ]
 
 
-def _summary(method: str, rows: Sequence[Row]) -> Row:
+def _method_summary(method: str, rows: Sequence[Row]) -> Row:
     """Return the summary of the runs of one method."""
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
     low, high = wilson_interval(successes, len(done))
     errors = [f"error_{name}" for name in parameters_in(rows, "error_")]
-    medians = [name for name, column in COLUMNS.items() if column.summed_up]
+    medians = [name for name, column in COLUMNS.items() if column.has_median]
     known = {n: [row[n] for row in done if row[n] is not None] for n in (*errors, *medians)}
     return {
         "method": method,
@@ -245,7 +252,7 @@ def best_run(rows: Sequence[Row]) -> Row | None:
     return min(answered, key=rank, default=None)
 
 
-def reference(rows: Sequence[Row], yardstick: Yardstick) -> dict[str, float]:
+def reference_parameters(rows: Sequence[Row], yardstick: SuccessCriterion) -> dict[str, float]:
     """Return the parameters from which guesses are measured: the truth, or those of the best run.
 
     Empty if the best run did not converge.
@@ -259,7 +266,7 @@ def reference(rows: Sequence[Row], yardstick: Yardstick) -> dict[str, float]:
     return {name: best[f"value_{name}"] for name in names}
 
 
-def distance(row: Row, centre: Mapping[str, float]) -> float:
+def guess_distance(row: Row, centre: Mapping[str, float]) -> float:
     """Return the largest ratio between a guess and the reference; NaN without a reference."""
     logs = [abs(np.log(row[f"guess_{name}"] / value)) for name, value in centre.items()]
     return float(np.exp(max(logs))) if logs else nan

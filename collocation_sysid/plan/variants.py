@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, require_among
-from ..fem.constants import bare, usual_value
+from ..fem.constants import usual_value, without_region
 from ..fem.materials import DAMPINGS, MATERIALS
 from ..fem.moduli import ELASTIC, elastic_names
 from ..problem import Problem
 from ..problem.reading import read_problem_file
-from .arguments import each_once
+from .arguments import unique_items
 
 # Where a branch's share starts; time constants start evenly between a sample and the recording.
 SHARE = 0.1
@@ -36,7 +36,7 @@ LESS = 0.1
 
 
 @dataclass(frozen=True)
-class Variant:
+class ModelVariant:
     """One model.
 
     Attributes
@@ -62,7 +62,7 @@ def parse_materials(text: str) -> tuple[str, ...]:
     InputError
         For an unknown name, with the most similar known one.
     """
-    return _each_among(text, MATERIALS, "--materials")
+    return _parse_names(text, MATERIALS, "--materials")
 
 
 def parse_dampings(text: str) -> tuple[str, ...]:
@@ -73,10 +73,10 @@ def parse_dampings(text: str) -> tuple[str, ...]:
     InputError
         For an unknown name, with the most similar known one.
     """
-    return _each_among(text, DAMPINGS, "--damping")
+    return _parse_names(text, DAMPINGS, "--damping")
 
 
-def _each_among(text: str, known: Iterable[str], option: str) -> tuple[str, ...]:
+def _parse_names(text: str, known_rows: Iterable[str], option: str) -> tuple[str, ...]:
     """Return names from text separated by commas, each once.
 
     Raises
@@ -84,9 +84,9 @@ def _each_among(text: str, known: Iterable[str], option: str) -> tuple[str, ...]
     InputError
         For an unknown name or none; it refers to the command-line option.
     """
-    names = each_once(text)
+    names = unique_items(text)
     for name in names or ("",):
-        require_among(name, known, None, option, "some")
+        require_among(name, known_rows, None, option, "some")
     return names
 
 
@@ -113,7 +113,7 @@ def models(
     branches: Sequence[int] = (),
     region: str | None = None,
     dampings: Sequence[str] = (),
-) -> list[Variant]:
+) -> list[ModelVariant]:
     """Every problem file with every material, law of damping and number of branches.
 
     Parameters
@@ -161,7 +161,7 @@ def variants(
     times_s: tuple[float, float],
     region: str | None = None,
     dampings: Sequence[str] = (),
-) -> list[Variant]:
+) -> list[ModelVariant]:
     """Every material with every law of damping and every number of branches.
 
     Parameters
@@ -185,7 +185,7 @@ def variants(
     file, _ = read_problem_file(path, overrides)
     content = file.model_dump(mode="json", exclude_unset=True)
     body = content["object"]
-    _refuse_region(body, region, bool(branches), path)
+    _require_region(body, region, bool(branches), path)
     varied = []
     for material, damping, count in product(
         materials or (None,), dampings or (None,), branches or (None,)
@@ -195,31 +195,31 @@ def variants(
         parameters = content["parameters"]
         if material is not None:
             label.append(material)
-            changes |= _with_law(body, {"material": material}, region)
-            parameters = _of_material(parameters, material, region)
+            changes |= _law_changes(body, {"material": material}, region)
+            parameters = _with_material(parameters, material, region)
         if damping is not None:
             label.append(damping)
             laws = {"damping": damping} | ({} if material is None else {"material": material})
-            changes |= _with_law(body, laws, region)
+            changes |= _law_changes(body, laws, region)
             for name in DAMPING_ASSUMPTIONS:
                 changes[f"uncertainty.assumptions.{name}"] = "none"
         if count is not None:
             label.append("no memory" if count == 0 else f"{count} branch{'es' * (count > 1)}")
             own = [t for t in body.get("prony", []) if t.get("region") == region]
             others = [t for t in body.get("prony", []) if t.get("region") != region]
-            tables = _branches(own, count, {t["name"] for t in others}, region)
+            tables = _branch_tables(own, count, {t["name"] for t in others}, region)
             if tables or body.get("prony"):
                 changes["object.prony"] = [*others, *tables]
             old = [each["name"] for each in own]
             parameters = _with_memory(parameters, old, tables, times_s)
         changes["parameters"] = parameters
-        settings = tuple(f"{key}={toml(value)}" for key, value in changes.items())
+        settings = tuple(f"{key}={as_inline_toml(value)}" for key, value in changes.items())
         said = f"{region}: " * (region is not None) + ", ".join(label)
-        varied.append(Variant(said, (*overrides, *settings), path))
+        varied.append(ModelVariant(said, (*overrides, *settings), path))
     return varied
 
 
-def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list[Variant]:
+def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list[ModelVariant]:
     """Return problem files of the same recordings as models, named after the files.
 
     Raises
@@ -228,11 +228,11 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
         If the files do not fit the same recordings and samples, so that neither predictions nor AIC
         could be compared, or a file is given twice.
     """
-    first, *others = map(_measured, problems)
+    first, *others = map(_measured_counts, problems)
     for problem, measured in zip(problems[1:], others, strict=True):
         if measured != first:
             raise InputError(
-                f"it fits {_listed(measured)}, but {problems[0].path} {_listed(first)}; expected "
+                f"it fits {_measured_text(measured)}, but {problems[0].path} {_measured_text(first)}; expected "
                 "the same recordings and samples",
                 problem.path,
             )
@@ -241,25 +241,29 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
         raise InputError("this file is given twice; expected another", paths[-1], "--with")
     stems = [path.stem for path in paths]
     distinct = len(set(stems)) == len(stems)
-    return [Variant(path.stem if distinct else str(path), tuple(overrides), path) for path in paths]
+    return [
+        ModelVariant(path.stem if distinct else str(path), tuple(overrides), path) for path in paths
+    ]
 
 
-def _measured(problem: Problem) -> dict[str, int]:
+def _measured_counts(problem: Problem) -> dict[str, int]:
     """Return how many numbers are measured in each fitted recording."""
     return {
-        e.name: 3 * e.markers.samples
+        e.name: 3 * e.markers.sample_count
         + sum(int(np.isfinite(wrench.values).sum()) for wrench in e.wrenches)
         for e in problem.experiments
         if not e.validation
     }
 
 
-def _listed(measured: Mapping[str, int]) -> str:
+def _measured_text(measured: Mapping[str, int]) -> str:
     """Return the recordings with their numbers in words."""
     return " and ".join(f"'{name}' ({numbers} numbers)" for name, numbers in measured.items())
 
 
-def _refuse_region(body: Mapping[str, Any], region: str | None, branches: bool, path: Path) -> None:
+def _require_region(
+    body: Mapping[str, Any], region: str | None, branches: bool, path: Path
+) -> None:
     """Raise `InputError` for an unknown region, or for branches that belong to other regions."""
     names = [each["name"] for each in body.get("region", [])]
     if region is not None and not names:
@@ -275,7 +279,7 @@ def _refuse_region(body: Mapping[str, Any], region: str | None, branches: bool, 
         raise InputError(f"found branches of {whose}; expected {expected}", path, "object.prony")
 
 
-def _with_law(
+def _law_changes(
     body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
 ) -> dict[str, Any]:
     """Return the object's keys with a material or damping for a region, or for all parts."""
@@ -292,7 +296,7 @@ def _with_law(
     return changes | {f"object.{key}": law for key, law in laws.items()}
 
 
-def _of_material(
+def _with_material(
     parameters: Mapping[str, Any], material: str, region: str | None
 ) -> dict[str, Any]:
     """Return the parameters for a body with another material in all parts, or in one region.
@@ -300,48 +304,50 @@ def _of_material(
     A part with its own constants keeps constants of its own; the others share theirs.
     """
     of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {*ELASTIC}
-    fronts = {name[: -len(bare(name))] for name in parameters if bare(name) in of_any}
+    fronts = {
+        name[: -len(without_region(name))] for name in parameters if without_region(name) in of_any
+    }
     if region is not None:
         fronts = {f"{region}."}
     for front in sorted(fronts):  # what is shared is first
-        parameters = _of_part(parameters, front, material, of_any)
+        parameters = _with_part_material(parameters, front, material, of_any)
     return dict(parameters)
 
 
-def _of_part(
-    parameters: Mapping[str, Any], front: str, material: str, of_any: set[str]
+def _with_part_material(
+    parameters: Mapping[str, Any], prefix: str, material: str, of_any: set[str]
 ) -> dict[str, Any]:
     """Return the parameters with another material in the part whose constants have this prefix."""
     own = [constant.name for constant in MATERIALS[material].constants]
     possible = {*own, *elastic_names(MATERIALS[material])}
-    mine = {front + name for name in of_any}
-    kept = {n: v for n, v in parameters.items() if n not in mine or bare(n) in possible}
+    mine = {prefix + name for name in of_any}
+    kept = {n: v for n, v in parameters.items() if n not in mine or without_region(n) in possible}
     alone = any(name in mine for name in parameters)
-    elastic = {bare(name) for name in kept if name in (mine if alone else of_any)}
-    shear_pa = _shear_pa(parameters, front)
+    elastic = {without_region(name) for name in kept if name in (mine if alone else of_any)}
+    shear_pa = _shear_pa(parameters, prefix)
     if "mu_pa" in own and not elastic & {"mu_pa", "young_pa"}:
-        kept[f"{front}mu_pa"] = _start("mu_pa", shear_pa)
-    needed = [name for name in own if name not in ELASTIC and front + name not in kept]
-    return kept | {front + name: _start(name, shear_pa) for name in needed}
+        kept[f"{prefix}mu_pa"] = _starting_guess("mu_pa", shear_pa)
+    needed = [name for name in own if name not in ELASTIC and prefix + name not in kept]
+    return kept | {prefix + name: _starting_guess(name, shear_pa) for name in needed}
 
 
-def _shear_pa(parameters: Mapping[str, Any], front: str) -> float | None:
+def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
     """Return the shear modulus at small strain [Pa] from the guesses of a part; None if unknown."""
 
-    def value(name: str) -> float:
+    def guess(name: str) -> float:
         """Return the guess or fixed value of a constant; NaN if it has none."""
-        stated = parameters.get(front + name, parameters.get(name))
+        stated = parameters.get(prefix + name, parameters.get(name))
         if isinstance(stated, Mapping):
             stated = stated.get("fixed", stated.get("guess"))
         return float("nan") if stated is None else float(stated)
 
-    linear = 0.0 if math.isnan(value("c01_pa")) else value("c01_pa")
-    poisson = USUAL_POISSON if math.isnan(value("poisson")) else value("poisson")
-    ways = value("mu_pa"), 2 * (value("c10_pa") + linear), value("young_pa") / (2 * (1 + poisson))
+    linear = 0.0 if math.isnan(guess("c01_pa")) else guess("c01_pa")
+    poisson = USUAL_POISSON if math.isnan(guess("poisson")) else guess("poisson")
+    ways = guess("mu_pa"), 2 * (guess("c10_pa") + linear), guess("young_pa") / (2 * (1 + poisson))
     return next((each for each in ways if each > 0), None)
 
 
-def _start(name: str, shear_pa: float | None) -> dict[str, Any]:
+def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
     """Return the table of a constant: with a guess as stiff as the file's, or empty for a scan."""
     if shear_pa is None:
         return {}
@@ -351,7 +357,7 @@ def _start(name: str, shear_pa: float | None) -> dict[str, Any]:
     return {"guess": usual} if usual else {"guess": usual, "typical": LESS * shear_pa}
 
 
-def _branches(
+def _branch_tables(
     own: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
 ) -> list[dict[str, Any]]:
     """Return the first `count` branches of the file, followed by new ones if there are fewer."""
@@ -385,7 +391,9 @@ def _with_memory(
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
     kept = {
-        n: v for n, v in parameters.items() if n.removesuffix(f".{bare(n)}") not in removed_names
+        n: v
+        for n, v in parameters.items()
+        if n.removesuffix(f".{without_region(n)}") not in removed_names
     }
     shortest, longest = times_s
     for k, name in enumerate(names, start=1):
@@ -395,12 +403,16 @@ def _with_memory(
     return kept
 
 
-def toml(value: Any) -> str:
+def as_inline_toml(value: Any) -> str:
     """Return a value in TOML's inline syntax."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(f"{json.dumps(k)} = {as_inline_toml(v)}" for k, v in value.items())
+            + "}"
+        )
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(toml, value)) + "]"
+        return "[" + ", ".join(map(as_inline_toml, value)) + "]"
     if isinstance(value, (str, bool)):
         return json.dumps(value)
     return repr(value)

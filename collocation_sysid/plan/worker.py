@@ -20,11 +20,11 @@ from ..errors import InputError, SimulationError
 from ..files import write_whole
 from ..pipeline import Run, run
 from ..problem import Problem
-from ..recording.grasp import held_nodes
-from ..runs.forward_simulation import Rollout
+from ..recording.grasp import prescribed_nodes
+from ..runs.forward_simulation import ForwardSimulation
 from ..starting import heed_interrupts, leave
 from ..tree import as_json
-from .choice import model_record
+from .choice import fit_record
 from .process import ERROR, FINISHED
 
 
@@ -32,12 +32,12 @@ def main() -> None:
     """Entry point: read the run, execute it, and write its record."""
     heed_interrupts()
     planned = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=_end_with_the_study, daemon=True).start()
-    write_whole(Path(sys.argv[1]), as_json(attempt(planned)))
+    threading.Thread(target=_end_with_study, daemon=True).start()
+    write_whole(Path(sys.argv[1]), as_json(record_of_run(planned)))
     leave(0)
 
 
-def attempt(planned: dict[str, Any]) -> dict[str, Any]:
+def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
     """Execute a planned run and return its record; errors become part of the record.
 
     Parameters
@@ -49,14 +49,14 @@ def attempt(planned: dict[str, Any]) -> dict[str, Any]:
         problem = Problem.read(planned["problem"], planned["overrides"], planned["allow_code"])
         held_out = planned.get("held_out")
         if held_out is not None:
-            fit = model_record(problem, planned["method"], held_out)
+            fit = fit_record(problem, planned["method"], held_out)
             return {"outcome": FINISHED, "message": fit["status"], "model": fit}
         finished = run(problem, planned["method"])
         return {
             "outcome": FINISHED,
             "message": finished.solution.message,
             "result": finished.result,
-            "tip": _tip(finished),
+            "tip": _tip_record(finished),
         }
     except (InputError, SimulationError) as error:
         return {"outcome": ERROR, "message": str(error)}
@@ -65,23 +65,25 @@ def attempt(planned: dict[str, Any]) -> dict[str, Any]:
         return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
 
 
-def _tip(finished: Run) -> dict[str, Any] | None:
+def _tip_record(finished: Run) -> dict[str, Any] | None:
     """Return measured and simulated track of the marker farthest from the grasp; None
     without markers.
     """
-    experiment = finished.solution.collocation.segments[0].experiment
+    experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers
     nodes_m = experiment.body.nodes_m
-    grasped_nodes = held_nodes(experiment.grasps)
+    grasped_nodes = prescribed_nodes(experiment.grasps)
     if not markers.names:
         return None
     centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0)
-    tip = int(np.linalg.norm(markers.observe(nodes_m) - centre, axis=1).argmax())
+    tip = int(np.linalg.norm(markers.predict_positions(nodes_m) - centre, axis=1).argmax())
     measured = markers.positions_m[:, tip]
     rollout = finished.rollouts[experiment.name]
-    rolled = rollout.trajectory.markers_m[:, tip] if isinstance(rollout, Rollout) else None
+    rolled = (
+        rollout.trajectory.markers_m[:, tip] if isinstance(rollout, ForwardSimulation) else None
+    )
     error = None
-    if rolled is not None and markers.present[:, tip].any():
+    if rolled is not None and markers.is_present[:, tip].any():
         error = float(np.nanmax(np.linalg.norm(rolled - measured, axis=1)))
     return {
         "experiment": experiment.name,
@@ -93,7 +95,7 @@ def _tip(finished: Run) -> dict[str, Any] | None:
     }
 
 
-def _end_with_the_study() -> None:
+def _end_with_study() -> None:
     """Wait until stdin is closed, and end the process."""
     os.read(0, 1)  # returns when the other end is closed
     os._exit(1)

@@ -13,7 +13,7 @@ from ..files import require_possible, whole_file, write_whole
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def begin(folder: Path, kind: str | None = None) -> list[Path]:
+def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     """Write problem.toml, and data for it, to a folder; the title is the folder's name.
 
     Parameters

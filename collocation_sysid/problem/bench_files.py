@@ -18,9 +18,9 @@ from ..fem.body import Body
 from ..recording import Experiment, Grasp
 from ..recording.formats.columns import (
     DISPLACEMENT,
+    DISPLACEMENTS,
     FORCE,
     FORCES,
-    SHIFTS,
     STRAIN,
     STRESS,
     TIME,
@@ -36,18 +36,18 @@ from .recording_schema import DisplacementSection, ExperimentSection, TableSecti
 OTHER_TIME = "Time (s)"
 
 
-def length_m(table: DisplacementSection, body: Body) -> float | None:
+def strain_length_m(table: DisplacementSection, body: Body) -> float | None:
     """Return the undeformed length [m] by which a strain is multiplied; None for displacements."""
     if table.length_m != "body":
         return table.length_m
     return float(np.ptp(body.nodes_m[:, "xyz".index(table.axis)]))
 
 
-def is_bench(section: ExperimentSection) -> bool:
+def has_displacement_table(section: ExperimentSection) -> bool:
     """Return whether a grasp or an obstacle of an experiment is moved by a table of
     displacements.
     """
-    return any(moved.displacement is not None for moved in section.moved)
+    return any(moved.displacement is not None for moved in section.moved_sections)
 
 
 def table_name(section: ExperimentSection, table: TableSection) -> str:
@@ -74,7 +74,7 @@ class BenchTable:
     columns: dict[str, Array] = field(default_factory=dict)
 
     def add(
-        self, layout: TableSection, values: Mapping[str, Array], known: Sequence[Quantity]
+        self, layout: TableSection, values: Mapping[str, Array], known_rows: Sequence[Quantity]
     ) -> None:
         """Add columns of quantities, by key, in the file's units and under the file's names.
 
@@ -84,7 +84,7 @@ class BenchTable:
             The names of its columns.
         values : mapping of key to (T,) array
             In SI; the time is added to these.
-        known : sequence of Quantity
+        known_rows : sequence of Quantity
             What the keys mean.
 
         Raises
@@ -92,7 +92,7 @@ class BenchTable:
         InputError
             If a column of that name has other values.
         """
-        quantities = {quantity.key: quantity for quantity in (TIME, *known)}
+        quantities = {quantity.key: quantity for quantity in (TIME, *known_rows)}
         time = {TIME.key: self.t_s}
         for key, column in (time | dict(values)).items():
             quantity = quantities[key]
@@ -122,8 +122,8 @@ def add_displacement(
     if rest_length_m is not None:
         values["strain"] = along / rest_length_m
         usual = ["strain"]
-    chosen = _mapped(layout) or usual
-    known = (*SHIFTS, DISPLACEMENT, STRAIN)
+    chosen = _named_quantities(layout) or usual
+    known = (*DISPLACEMENTS, DISPLACEMENT, STRAIN)
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 
@@ -151,12 +151,12 @@ def add_wrench(table: BenchTable, layout: WrenchSection, at_s: Array, wrench: Ar
     if layout.area_m2 is not None:
         values["stress"] = values[along] / layout.area_m2
         usual = ["stress"]
-    chosen = _mapped(layout) or usual
+    chosen = _named_quantities(layout) or usual
     known = (*FORCES, *TORQUES, FORCE, STRESS)
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 
-def _mapped(layout: TableSection) -> list[str]:
+def _named_quantities(layout: TableSection) -> list[str]:
     """Return the quantities whose columns the problem names."""
     return [key for key in layout.columns if key != TIME.key]
 
@@ -179,15 +179,17 @@ def bench_tables(
     InputError
         If two grasps read the same column.
     """
-    moved = list(zip(section.moved, experiment.grasps, strict=True))
-    stated_tables = [t for each in section.moved for t in (each.displacement, each.wrench) if t]
+    moved = list(zip(section.moved_sections, experiment.grasps, strict=True))
+    stated_tables = [
+        t for each in section.moved_sections for t in (each.displacement, each.wrench) if t
+    ]
     time = OTHER_TIME if any(table.columns for table in stated_tables) else TIME.column
     tables: dict[str, BenchTable] = {}
     for stated, grasp in moved:
         if (layout := stated.displacement) is not None:
             name = table_name(section, layout)
             table = tables.setdefault(name, BenchTable(grasp.poses.t_s, time))
-            add_displacement(table, layout, grasp, length_m(layout, experiment.body))
+            add_displacement(table, layout, grasp, strain_length_m(layout, experiment.body))
     measured = iter(wrenches)
     for stated, grasp in moved:
         if (sensed := stated.wrench) is not None and grasp.wrench is not None:

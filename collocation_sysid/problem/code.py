@@ -17,8 +17,8 @@ from ..fem.node_force import NodeForce
 from ..files import reason, require_regular
 from ..recording.formats.logs import stored_files
 from ..recording.nuisance import NuisanceRow
-from ..recording.selected import selection
-from .nuisance_schema import OwnRow
+from ..recording.selected import selection_from_section
+from .nuisance_schema import CustomNuisanceSection
 from .schema import CodeSection, NodeForceSection
 
 
@@ -42,19 +42,19 @@ def existing_file(folder: Path, name: str, key: str) -> Path:
 
 
 @dataclass(frozen=True)
-class Code:
+class CodeLoader:
     """Loader of Python files, which runs them only if that is allowed.
 
     Attributes
     ----------
     folder : Path
         Folder that contains the files.
-    allowed : bool
+    is_allowed : bool
         Whether files may be run.
     """
 
     folder: Path
-    allowed: bool
+    is_allowed: bool
 
     def material(self, section: CodeSection, key: str) -> Material:
         """Return a custom material.
@@ -62,13 +62,13 @@ class Code:
         Raises
         ------
         InputError
-            See `function`; also if the function is no energy density, see `Material.of`.
+            See `function`; also if the function is no energy density, see `Material.from_energy`.
         """
         file, loaded = self.function(section.file, section.function, f"{key}.file")
         if isinstance(loaded, Material):
             return loaded
         with located(file):
-            return Material.of(cast(Energy, loaded), section.function)
+            return Material.from_energy(cast(Energy, loaded), section.function)
 
     def force(self, section: NodeForceSection, key: str) -> NodeForce:
         """Return a custom force on nodes.
@@ -76,30 +76,32 @@ class Code:
         Raises
         ------
         InputError
-            See `function`; also if the function is no force, see `NodeForce.of`.
+            See `function`; also if the function is no force, see `NodeForce.from_law`.
         """
         file, loaded = self.function(section.file, section.function, f"{key}.file")
-        nodes = None if section.nodes is None else selection(section.nodes)
+        nodes = None if section.nodes is None else selection_from_section(section.nodes)
         name = section.function
         carries = section.carries
         if isinstance(loaded, NodeForce):
-            if carries not in (0, loaded.carries):
+            if carries not in (0, loaded.internal_variable_count):
                 message = f"found {carries}, but the force {name!r} says that it carries"
-                message += f" {loaded.carries}; expected the key to be left out"
+                message += f" {loaded.internal_variable_count}; expected the key to be left out"
                 raise InputError(message, where=f"{key}.carries")
             return loaded if nodes is None else replace(loaded, nodes=nodes)
         with located(file):
-            return NodeForce.of(loaded, nodes=nodes, name=name, on=section.on, carries=carries)
+            return NodeForce.from_law(
+                loaded, nodes=nodes, name=name, on=section.on, carries=carries
+            )
 
-    def row(self, section: OwnRow) -> NuisanceRow:
+    def nuisance_row(self, section: CustomNuisanceSection) -> NuisanceRow:
         """Return a custom nuisance parameter; see `function` for the errors."""
 
-        def fits(value: Any) -> bool:
+        def is_row(value: Any) -> bool:
             """Return whether a value of the file is a nuisance parameter."""
             return isinstance(value, NuisanceRow)
 
         key = "nuisance.own.file"
-        return self._named(section.file, section.row, key, "NuisanceRow", fits)[1]
+        return self._load(section.file, section.row, key, "NuisanceRow", is_row)[1]
 
     def function(self, file: str, name: str, key: str) -> tuple[Path, Callable[..., Any]]:
         """Return the path of a file and a function in it.
@@ -120,14 +122,14 @@ class Code:
             fails.
         """
 
-        def fits(value: Any) -> bool:
+        def is_function(value: Any) -> bool:
             """Return whether a value of the file is a function or a force."""
             return callable(value) or isinstance(value, NodeForce)
 
-        return self._named(file, name, key, "function", fits)
+        return self._load(file, name, key, "function", is_function)
 
-    def _named(
-        self, name: str, wanted: str, key: str, what: str, fits: Callable[[Any], bool]
+    def _load(
+        self, name: str, value_name: str, key: str, kind: str, is_kind: Callable[[Any], bool]
     ) -> tuple[Path, Any]:
         """Run a file, and return its path and the value with a name.
 
@@ -135,13 +137,13 @@ class Code:
         ----------
         name : str
             Name of the file.
-        wanted : str
+        value_name : str
             Name of the value.
         key : str
             Key of the problem file, for messages.
-        what : str
+        kind : str
             Kind of value, for messages.
-        fits : callable
+        is_kind : callable
             Function that returns whether a value is of this kind.
 
         Raises
@@ -149,7 +151,7 @@ class Code:
         InputError
             See `function`.
         """
-        if not self.allowed:
+        if not self.is_allowed:
             message = (
                 f"found the file {name}, which would be run as Python code; allow that with "
                 "--allow-code (allow_code=True from Python) if you trust it"
@@ -160,8 +162,10 @@ class Code:
             names = runpy.run_path(str(file))
         except (Exception, SystemExit) as error:
             raise InputError(f"running it failed: {reason(error)}", file) from error
-        if not fits(names.get(wanted)):
-            known_names = [n for n, value in names.items() if fits(value) and not n.startswith("_")]
-            known = f"{', '.join(known_names) or 'none'}{hint_at(wanted, known_names)}"
-            raise InputError(f"there is no {what} {wanted!r}; expected one of {known}", file)
-        return file, names[wanted]
+        if not is_kind(names.get(value_name)):
+            known_names = [
+                n for n, value in names.items() if is_kind(value) and not n.startswith("_")
+            ]
+            known = f"{', '.join(known_names) or 'none'}{hint_at(value_name, known_names)}"
+            raise InputError(f"there is no {kind} {value_name!r}; expected one of {known}", file)
+        return file, names[value_name]

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import DENSITY, MASS, bare, is_density
+from ..fem.constants import DENSITY, MASS, is_density, without_region
 from .schema import ObjectSection, ParameterSection, RegionSection
 
 Sections = Mapping[str, ParameterSection | float]
 
 
-def completed(section: ObjectSection, parameters: Sections) -> ObjectSection:
+def with_guessed_densities(section: ObjectSection, parameters: Sections) -> ObjectSection:
     """Return [object] with missing densities taken from guesses of parameters.
 
     Raises
@@ -22,7 +22,7 @@ def completed(section: ObjectSection, parameters: Sections) -> ObjectSection:
     InputError
         If neither states the body's mass.
     """
-    regions = [_weighed(region, parameters) for region in section.region]
+    regions = [_with_guessed_density(region, parameters) for region in section.region]
     changes: dict[str, object] = {"region": regions}
     if section.mass_kg is None and section.density_kg_m3 is None:
         guesses = {name: _guess(parameters, name) for name in (DENSITY.name, MASS.name)}
@@ -37,10 +37,10 @@ def completed(section: ObjectSection, parameters: Sections) -> ObjectSection:
     return section.model_copy(update=changes)
 
 
-def guessed(parameters: Sections, body: Body) -> dict[str, ParameterSection | float]:
+def with_stated_densities(parameters: Sections, body: Body) -> dict[str, ParameterSection | float]:
     """Return [parameters] with missing guesses of densities taken from the body."""
     return {
-        name: section.model_copy(update={"guess": _stated(body, name)})
+        name: section.model_copy(update={"guess": _stated_density(body, name)})
         if isinstance(section, ParameterSection)
         and is_density(name)
         and section.fixed is None
@@ -51,7 +51,7 @@ def guessed(parameters: Sections, body: Body) -> dict[str, ParameterSection | fl
     }
 
 
-def _weighed(region: RegionSection, parameters: Sections) -> RegionSection:
+def _with_guessed_density(region: RegionSection, parameters: Sections) -> RegionSection:
     """Return a region with its density; if it has none, the guess of its parameter."""
     if region.density_kg_m3 is not None:
         return region
@@ -69,13 +69,13 @@ def _guess(parameters: Sections, name: str) -> float | None:
     return section.fixed if section.guess is None else section.guess
 
 
-def _stated(body: Body, name: str) -> float | None:
+def _stated_density(body: Body, name: str) -> float | None:
     """Return the mass [kg] or density [kg/m³] that the body states for a parameter; None if
     it has none.
     """
-    if bare(name) == MASS.name:
+    if without_region(name) == MASS.name:
         return body.mass_kg
     region = name.rpartition(".")[0]
     fitting = [part.density_kg_m3 for part in body.parts if part.name == region]
-    shared = [part.density_kg_m3 for part in body.parts if not part.own_density]
+    shared = [part.density_kg_m3 for part in body.parts if not part.has_own_density]
     return next(iter(fitting or shared), None)

@@ -15,15 +15,20 @@ from ..fem.field import Field
 from ..fem.mesh import TetMesh
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
-from ..fem.structured import box_of_edge, counts_of_box, counts_of_cylinder, cylinder_of_edge
+from ..fem.structured import (
+    box_of_edge,
+    count_box_elements,
+    count_cylinder_elements,
+    cylinder_of_edge,
+)
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Experiment
-from ..recording.selected import selection
+from ..recording.selected import selection_from_section
 from ..section import Section, stated_in
 from ..stated import keys_of, tables_of
-from ..statistics.plausible import SIZES_M, oddities
-from .code import Code, existing_file
-from .densities import completed, guessed
+from ..statistics.plausible import SIZES_M, size_and_density_hypotheses
+from .code import CodeLoader, existing_file
+from .densities import with_guessed_densities, with_stated_densities
 from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
 from .recording import RecordingReader
@@ -34,7 +39,7 @@ from .size import Say, Size, announce_reading, require_feasible
 AIR_KEY = "air_density_kg_m3"
 
 
-def contents_of(
+def problem_arguments(
     path: Path,
     overrides: Sequence[str],
     allow_code: bool,
@@ -53,10 +58,10 @@ def contents_of(
         )
     folder = path.parent if folder is None else Path(folder)
     unknowns = file.parameters
-    code = Code(folder, allow_code)
+    code = CodeLoader(folder, allow_code)
     if say is not None:
         announce_reading({*_named_files(file, folder)}, say)
-    with _in_table(path, "object"):
+    with _locate_in_table(path, "object"):
         with _lengths_checked(file.object):
             generated = _generated_counts(file.object)
             if counts := generated:
@@ -66,14 +71,16 @@ def contents_of(
         counts = len(mesh.points_m), len(mesh.tetrahedra)
         size = _smallest_size(file, *counts, simulation=simulation)
         require_feasible(replace(size, substeps=1), None if generated else say)
-        body = _load_body(completed(file.object, unknowns), mesh, code)
-        body = body.with_free_densities(body.weighed_by(unknowns))
-        mesh_warnings = [oddity.sentence for oddity in oddities(body)]
-    with _in_table(path, "parameters"):
+        body = _load_body(with_guessed_densities(file.object, unknowns), mesh, code)
+        body = body.with_free_densities(body.parts_with_free_density(unknowns))
+        mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
+    with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
-        sections = guessed(unknowns, body_with_friction)
-        parameters = Parameters.of({name: _stated(name, each) for name, each in sections.items()})
-        parameters.fit([body_with_friction])
+        sections = with_stated_densities(unknowns, body_with_friction)
+        parameters = Parameters.from_mapping(
+            {name: _as_parameter(name, each) for name, each in sections.items()}
+        )
+        parameters.require_constants_of([body_with_friction])
     experiments = []
     notes = []
     for section in file.experiment:
@@ -88,7 +95,7 @@ def contents_of(
             size=size,
             say=say,
         )
-        with _in_table(path, f"experiment '{section.name}'", mesh_warnings):
+        with _locate_in_table(path, f"experiment '{section.name}'", mesh_warnings):
             experiments.append(reader.read())
         notes += reader.notes
     return {
@@ -114,9 +121,11 @@ def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
     if length_m is None:
         return None
     if section.box_m is not None:
-        return counts_of_box(section.box_m, length_m)
+        return count_box_elements(section.box_m, length_m)
     if (shape := section.cylinder) is not None:
-        return counts_of_cylinder(shape.diameter_m, shape.height_m, length_m, quarter=shape.quarter)
+        return count_cylinder_elements(
+            shape.diameter_m, shape.height_m, length_m, quarter=shape.quarter
+        )
     return None
 
 
@@ -144,7 +153,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     names = [file.object.mesh, file.object.surface]
     for section in file.experiment:
         names += [section.markers.file, *(each.file for each in (*section.reading, *section.depth))]
-        for grasp in section.moved:
+        for grasp in section.moved_sections:
             displacement_file = section.file_of(grasp.displacement)
             wrench_file = section.file_of(grasp.wrench)
             names += [grasp.poses or displacement_file, wrench_file]
@@ -155,7 +164,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
 
 
 @contextmanager
-def _in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
+def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
     """Context that adds file and table to errors without them, and begins with warnings on
     the body.
     """
@@ -216,7 +225,7 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
         raise InputError(message, None, key) from error
 
 
-def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
+def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
     """Return the body with its materials, regions, forces and fields."""
 
     def material(law: str | CodeSection | None, key: str) -> Any:
@@ -231,7 +240,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
     regions = [
         Region(
             region.name,
-            selection(region.cells),
+            selection_from_section(region.cells),
             material(region.material, f"region.{k}.material"),
             region.density_kg_m3,
             region.damping,
@@ -259,7 +268,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: Code) -> Body:
 def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"] | None:
     """Return the stated stress-free shape; None if the file states none."""
     if section.scan is not None:
-        return UnderGravity(selection(section.scan.nodes), section.scan.gravity_m_s2)
+        return UnderGravity(selection_from_section(section.scan.nodes), section.scan.gravity_m_s2)
     return "stress_free" if section.rest_shape is not None else None
 
 
@@ -270,7 +279,7 @@ def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
     return tuple(dict.fromkeys(map(constant_named, named)))
 
 
-def _stated(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
+def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
     """Return one parameter from its table, or from its fixed value."""
     if not isinstance(section, ParameterSection):
         return section

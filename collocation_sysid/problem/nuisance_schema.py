@@ -14,16 +14,16 @@ from pydantic import AfterValidator, Field, create_model, model_validator
 
 from ..checked import Positive, Text
 from ..recording import Nuisance
-from ..recording.nuisance import ROWS, SCOPE, SCOPES, NuisanceRow
+from ..recording.nuisance import KINDS, SCOPE, SCOPE_TEXT, NuisanceRow
 from ..section import ByForm, Section, given_keys
 
-KEYS = {key: list(rows) for key, rows in groupby(ROWS, key=lambda row: row.key)}
+KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)}
 
 
-def _scope(word: str) -> str:
+def _require_scope(word: str) -> str:
     """Return a scope if it is valid; raise `ValueError` otherwise."""
     if word != "recording" and not re.fullmatch(SCOPE, word):
-        raise ValueError(f'found {word!r}; expected "recording", {SCOPES}')
+        raise ValueError(f'found {word!r}; expected "recording", {SCOPE_TEXT}')
     return word
 
 
@@ -38,10 +38,10 @@ class Scoped(Section):
         several groups.
     """
 
-    scope: Annotated[str, AfterValidator(_scope)] = "recording"
+    scope: Annotated[str, AfterValidator(_require_scope)] = "recording"
 
 
-class OwnRow(Scoped):
+class CustomNuisanceSection(Scoped):
     """A custom nuisance parameter: a NuisanceRow in a Python file.
 
     Attributes
@@ -56,7 +56,7 @@ class OwnRow(Scoped):
     row: Text
 
 
-class Prior(Scoped):
+class NuisancePriorSection(Scoped):
     """Standard deviations of nuisance parameters; of several, those that are missing mean
     exact values.
     """
@@ -64,7 +64,7 @@ class Prior(Scoped):
     usual: ClassVar[bool] = False
 
     @model_validator(mode="after")
-    def _some(self) -> Prior:
+    def _require_one_prior(self) -> NuisancePriorSection:
         """Raise `ValueError` if no prior is given and the scope alone is not sufficient."""
         priors = [key for key in type(self).model_fields if key != "scope"]
         if not given_keys(self, *priors) and (self.scope == "recording" or not self.usual):
@@ -73,7 +73,7 @@ class Prior(Scoped):
         return self
 
 
-def _prior(key: str, rows: list[NuisanceRow]) -> type[Section]:
+def _prior_section(key: str, rows: list[NuisanceRow]) -> type[Section]:
     """Return the generated table of a key."""
     # What another prior goes with has to be there.
     needed = any(row.beside is not None for row in rows)
@@ -85,24 +85,27 @@ def _prior(key: str, rows: list[NuisanceRow]) -> type[Section]:
         fields[row.prior] = (kind, Field(known, description=description))
     name = "".join(word.title() for word in key.split("_")) + "Prior"
     description = f"How well it is known: {rows[0].said}."
-    section = create_model(name, __base__=Prior, __doc__=description, **fields)
+    section = create_model(name, __base__=NuisancePriorSection, __doc__=description, **fields)
     section.usual = any(row.sigma is not None for row in rows)
     return section
 
 
-def _section() -> type[Section]:
+def _nuisance_section() -> type[Section]:
     """Return the generated table [experiment.nuisance]."""
     fields: dict[str, Any] = {}
     for key, rows in KEYS.items():
         description = " ".join(
-            f"{row.said[0].upper()}{row.said[1:]}: {_said(row)}." for row in rows
+            f"{row.said[0].upper()}{row.said[1:]}: {_described_prior(row)}." for row in rows
         )
-        kind: Any = Annotated[Literal["none"] | _prior(key, rows), ByForm(str)]
+        kind: Any = Annotated[Literal["none"] | _prior_section(key, rows), ByForm(str)]
         fields[key] = (kind | None, Field(None, description=description))
     description = (
         "[[experiment.nuisance.own]] tables: what a Python file makes of markers' readings."
     )
-    fields["own"] = (list[OwnRow], Field(default_factory=list, description=description))
+    fields["own"] = (
+        list[CustomNuisanceSection],
+        Field(default_factory=list, description=description),
+    )
     description = (
         "What is estimated of this recording alone, each with a prior around zero.\n\n"
         'What has a prior by default is estimated unless it is "none".'
@@ -110,20 +113,20 @@ def _section() -> type[Section]:
     return create_model("NuisanceSection", __base__=Section, __doc__=description, **fields)
 
 
-def _said(row: NuisanceRow) -> str:
+def _described_prior(row: NuisanceRow) -> str:
     """Return the name of a prior, with its default."""
     return row.prior if row.sigma is None else f"{row.prior}, {row.usual} by default"
 
 
-NuisanceSection = _section()
+NuisanceSection = _nuisance_section()
 if TYPE_CHECKING:
     NuisanceOrNone = Section | Literal["none"]
 else:
     NuisanceOrNone = Annotated[Literal["none"] | NuisanceSection, ByForm(str)]
 
 
-def nuisance_of(
-    section: Section | Literal["none"], row_of: Callable[[OwnRow], NuisanceRow]
+def nuisance_from_section(
+    section: Section | Literal["none"], row_of: Callable[[CustomNuisanceSection], NuisanceRow]
 ) -> Nuisance:
     """Return the nuisance parameters of a recording: the defaults with the changes of the table.
 
@@ -149,7 +152,7 @@ def nuisance_of(
             deviations |= known if any(known.values()) else {}
             if prior.scope != "recording":
                 scope |= {row.name: prior.scope for row in rows}
-    tables: list[OwnRow] = vars(section)["own"]
+    tables: list[CustomNuisanceSection] = vars(section)["own"]
     custom_rows = [row_of(each) for each in tables]
     scopes_by_name = {row.name: each.scope for row, each in zip(custom_rows, tables, strict=True)}
     scope |= {name: word for name, word in scopes_by_name.items() if word != "recording"}

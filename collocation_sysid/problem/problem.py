@@ -20,18 +20,18 @@ from ..methods.solution import Method
 from ..model.parameters import Parameters, Tied, Unknown
 from ..model.schemes import Scheme, as_scheme
 from ..program.collocation import Collocation
-from ..program.sharing import locals_of
+from ..program.sharing import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
 from ..stated import key, stated
-from ..statistics.plausible import oddities
-from ..statistics.scale import scale_concerns, stillness_concerns
+from ..statistics.plausible import size_and_density_hypotheses
+from ..statistics.scale import scale_concerns, static_concerns
 from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
 def _as_parameters(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
     """Return the parameters; a mapping by name is converted."""
-    return parameters if isinstance(parameters, Parameters) else Parameters.of(parameters)
+    return parameters if isinstance(parameters, Parameters) else Parameters.from_mapping(parameters)
 
 
 @stated
@@ -94,14 +94,16 @@ class Problem:
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
-        vars(self)["experiments"] = _weighed(self.experiments, self.parameters)
+        vars(self)["experiments"] = _with_free_densities(self.experiments, self.parameters)
         vars(self)["parameters"] = self.parameters.with_fields(self.bodies)
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
-        odd = (oddity.sentence for body in self.bodies for oddity in oddities(body))
-        still = (c.sentence for c in stillness_concerns(self.experiments, self.parameters))
+        odd = (
+            oddity.message for body in self.bodies for oddity in size_and_density_hypotheses(body)
+        )
+        still = (c.message for c in static_concerns(self.experiments, self.parameters))
         vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *self.notes)))
-        self._check()
-        unscaled = (c.sentence for c in scale_concerns(self.experiments, self.parameters))
+        self._validate()
+        unscaled = (c.message for c in scale_concerns(self.experiments, self.parameters))
         vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:
@@ -143,10 +145,10 @@ class Problem:
         InputError
             For the first mistake in the file, or if this machine's memory is too small.
         """
-        from .loading import contents_of  # the schema is only built to read a file
+        from .loading import problem_arguments  # the schema is only built to read a file
 
         path = Path(path)
-        contents = contents_of(path, overrides, allow_code, simulation, folder, say)
+        contents = problem_arguments(path, overrides, allow_code, simulation, folder, say)
         with located(path):
             return cls(**contents)
 
@@ -163,13 +165,13 @@ class Problem:
     @property
     def lengths_m(self) -> dict[str, float]:
         """Correlation lengths of spatially varying constants [m], by name of the constant."""
-        return {name: each for body in self.bodies for name, each in body.lengths_m.items()}
+        return {name: each for body in self.bodies for name, each in body.field_lengths_m.items()}
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
         """Return the problem with other correlation lengths [m] of spatially varying constants."""
         if dict(lengths_m) == self.lengths_m:
             return self
-        bodies = {id(body): body.with_lengths(lengths_m) for body in self.bodies}
+        bodies = {id(body): body.with_field_lengths(lengths_m) for body in self.bodies}
         return replace(
             self, experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments]
         )
@@ -192,8 +194,12 @@ class Problem:
         fields are added.
         """
         bodies = {id(body): body.with_fields(fields) for body in self.bodies}
-        removed_names = {n for b in self.bodies for n in (*b.mode_names, *b.contrasts)}
-        removed_names -= {n for b in bodies.values() for n in (*b.mode_names, *b.contrasts)}
+        removed_names = {
+            n for b in self.bodies for n in (*b.field_coefficient_names, *b.contrast_deviations)
+        }
+        removed_names -= {
+            n for b in bodies.values() for n in (*b.field_coefficient_names, *b.contrast_deviations)
+        }
         return replace(
             self,
             experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments],
@@ -237,7 +243,7 @@ class Problem:
             chosen.require(each for each in self.experiments if not each.validation)
         return chosen
 
-    def _check(self) -> None:
+    def _validate(self) -> None:
         """Raise `InputError` if experiments, parameters and options do not fit together."""
         names = [experiment.name for experiment in self.experiments]
         if not names:
@@ -249,16 +255,16 @@ class Problem:
                 f"found {self.substeps!r}; expected a whole number or 'auto'",
                 where="transcription.substeps",
             )
-        if self.first_substeps != 1 and all(each.static for each in self.experiments):
+        if self.first_substeps != 1 and all(each.is_static for each in self.experiments):
             raise InputError(
                 f"found {self.substeps}, but every experiment is static, and between equilibria "
                 "there are no steps; expected none",
                 where="transcription.substeps",
             )
-        self.parameters.fit(self.bodies)
+        self.parameters.require_constants_of(self.bodies)
         _require_rest_shapes(self.bodies, self.parameters)
-        _require_one_of_each_field(self.bodies)
-        locals_of([each for each in self.experiments if not each.validation], 0)
+        _require_equal_fields(self.bodies)
+        nuisance_indices([each for each in self.experiments if not each.validation], 0)
         for experiment in self.experiments:
             with located(where=f"experiment '{experiment.name}'"):
                 as_scheme(self.scheme, experiment.start_rule)
@@ -282,12 +288,12 @@ def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None
     if any(item.guess is None for item in parameters.items if item.tied is None):
         return
     for body in bodies:
-        theta = body.theta(parameters.values(parameters.guess_q))
-        if (unreachable := body.unreachable(theta)) is not None:
+        theta = body.theta_from_values(parameters.values(parameters.guess_q))
+        if (unreachable := body.rest_shape_failure(theta)) is not None:
             raise InputError(unreachable, where="object.rest_shape")
 
 
-def _require_one_of_each_field(bodies: Iterable[Body]) -> None:
+def _require_equal_fields(bodies: Iterable[Body]) -> None:
     """Raise `InputError` if two bodies have fields of the same constant with different shapes."""
     shapes_by_name: dict[str, Array] = {}
     for part in (part for body in bodies for part in body.parts if part.field):
@@ -300,12 +306,14 @@ def _require_one_of_each_field(bodies: Iterable[Body]) -> None:
             )
 
 
-def _weighed(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[Experiment, ...]:
+def _with_free_densities(
+    experiments: Iterable[Experiment], parameters: Parameters
+) -> tuple[Experiment, ...]:
     """Return the experiments with bodies whose densities are free if parameters refer to them."""
     bodies = {}
     experiments = tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():
-        bodies[id(body)] = body.with_free_densities(body.weighed_by(parameters.names))
+        bodies[id(body)] = body.with_free_densities(body.parts_with_free_density(parameters.names))
     return tuple(
         e if bodies[id(e.body)] is e.body else replace(e, body=bodies[id(e.body)])
         for e in experiments

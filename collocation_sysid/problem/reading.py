@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from ..errors import InputError, excerpt, located
 from ..files import require_regular
-from .explaining import explain
+from .explaining import explain_validation_error
 from .schema import ProblemFile
 
 # Levels of tables and lists that a problem file may have: it needs seven.
@@ -56,13 +56,13 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
     content = parse_toml(text, path)
     with located("--set"):
         for override in overrides:
-            _apply(content, override)
+            _apply_override(content, override)
     if overrides:
         text = tomli_w.dumps(content)
     try:
         return ProblemFile.model_validate(content), text
     except ValidationError as error:
-        raise explain(error, content, path) from error
+        raise explain_validation_error(error, content, path) from error
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 # Overrides ----------------------------------------------------------------------------------------
 
 
-def _apply(content: dict[str, Any], override: str) -> None:
+def _apply_override(content: dict[str, Any], override: str) -> None:
     """Set one value of the content, in place, from "key=value".
 
     Raises
@@ -165,19 +165,19 @@ def _apply(content: dict[str, Any], override: str) -> None:
         raise InputError(f"found {override!r}, {expected}")
     table: Any = content
     shared: Any = content.get("experiment_defaults")
-    *leading, last = _as_written(content, parts)
+    *leading, last = _join_dotted_names(content, parts)
     for depth, part in enumerate(leading):
-        item: Any = _place(table, part, key)
+        item: Any = _item_key(table, part, key)
         if isinstance(table, dict):
             # An experiment gets a default of its own, a part of which is to be overridden.
             has_default = depth == 2 and leading[0] == "experiment" and isinstance(shared, dict)
             table.setdefault(item, deepcopy(shared[item]) if has_default and item in shared else {})
         table = table[item]
-    item = _place(table, last, key)
-    table[item] = _value(value, key)
+    item = _item_key(table, last, key)
+    table[item] = _parse_value(value, key)
 
 
-def _as_written(content: Any, parts: list[str]) -> list[str]:
+def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
     """Return the parts of a key, with names that contain dots joined, such as "core.mu_pa"."""
     joined = []
     table = content
@@ -192,7 +192,7 @@ def _as_written(content: Any, parts: list[str]) -> list[str]:
     return joined
 
 
-def _place(place: Any, part: str, key: str) -> str | int:
+def _item_key(place: Any, iterate: str, key: str) -> str | int:
     """Return the key in a table, or the index in a list, that a part of a dotted key refers to.
 
     Raises
@@ -201,20 +201,20 @@ def _place(place: Any, part: str, key: str) -> str | int:
         If the list has no such item, or the value is neither table nor list.
     """
     if isinstance(place, dict):
-        return part
+        return iterate
     if not isinstance(place, list):
         raise InputError(f"{key} leads into the plain value {place!r}; expected a key of a table")
     names = [item.get("name") if isinstance(item, dict) else None for item in place]
-    if part in names:
-        return names.index(part)
-    if part.isascii() and part.isdecimal() and int(part) < len(place):
-        return int(part)
+    if iterate in names:
+        return names.index(iterate)
+    if iterate.isascii() and iterate.isdecimal() and int(iterate) < len(place):
+        return int(iterate)
     expected = f"a number from 0 to {len(place) - 1}"
     expected += "".join(f" or {name}" for name in names if name)
-    raise InputError(f"found {part!r} in {key}; expected {expected}")
+    raise InputError(f"found {iterate!r} in {key}; expected {expected}")
 
 
-def _value(text: str, key: str) -> Any:
+def _parse_value(text: str, key: str) -> Any:
     """Return a value in TOML syntax; words without quotes are strings."""
     try:
         return tomllib.loads(f"value = {text}")["value"]

@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, hint_at, located
 from ..fem.body import Body
-from ..methods.scan import usual_constants
+from ..methods.scan import typical_constants
 from ..model.parameters import Parameters
 from ..recording import (
     Depth,
@@ -30,25 +30,25 @@ from ..recording import (
     Wrench,
     align,
     displaced_axes,
-    held_dofs,
+    prescribed_dofs,
     read_displacement,
     read_poses,
     read_wrench,
 )
-from ..recording.arrays import triple
+from ..recording.arrays import point_text
 from ..recording.clock import TIME_TOLERANCE_S
-from ..recording.depth import outlined_samples, points_of
-from ..recording.formats.depth_files import DepthFile, read_depth
+from ..recording.depth import points_from_image, samples_with_outlines
+from ..recording.formats.depth_files import DepthFileContent, read_depth
 from ..recording.formats.logs import stored_files
 from ..recording.formats.units import METRES_PER_UNIT
-from ..recording.poses import refuse_untold
-from ..recording.tables import read_gauge, within
+from ..recording.poses import require_determined_motion
+from ..recording.tables import is_within_experiment, read_custom_sensor
 from ..section import stated_in
 from ..stated import keys_of, tables_of
-from ..statistics.modal import doubts
-from .bench_files import length_m
-from .code import Code, existing_file
-from .nuisance_schema import nuisance_of
+from ..statistics.modal import find_misspecifications_by_modes
+from .bench_files import strain_length_m
+from .code import CodeLoader, existing_file
+from .nuisance_schema import nuisance_from_section
 from .recording_schema import (
     ExperimentSection,
     GraspSection,
@@ -58,7 +58,12 @@ from .recording_schema import (
     WrenchSection,
 )
 from .size import MOST_SAMPLES, Say, Size, require_feasible
-from .tracking import gripper_markers, into_body_frame, poses_from_markers, read_recorded
+from .tracking import (
+    gripper_markers,
+    poses_from_markers,
+    read_marker_tracks,
+    transform_to_body_frame,
+)
 
 Moved = GraspSection | ObstacleSection
 
@@ -86,7 +91,7 @@ class RecordingReader:
         Parameters, from which markers' plausibility is judged.
     simulation : bool
         Whether files of measurements may be missing.
-    code : Code
+    code : CodeLoader
         Loader of Python files.
     air_density_kg_m3 : float or "none"
         Density of the air.
@@ -103,7 +108,7 @@ class RecordingReader:
     body: Body
     parameters: Parameters
     simulation: bool
-    code: Code
+    code: CodeLoader
     air_density_kg_m3: float | Literal["none"]
     notes: list[str] = field(default_factory=list)
     size: Size | None = None
@@ -120,14 +125,14 @@ class RecordingReader:
         section = self.section
         t_s, poses, table = self._align([*map(self._poses, range(len(section.moved)))])
         grasps = [self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)]
-        if len(held_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
+        if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
                 f"the selected nodes are all {n} there are, so nothing can move; select fewer, and "
                 "check length_unit of the object"
             )
             raise InputError(message, where="grasp")
         loads: dict[str, Any] = {
-            name: [self._made(kind, word, k) for k in range(len(getattr(section, word)))]
+            name: [self._from_table(kind, word, k) for k in range(len(getattr(section, word)))]
             for name, word, kind in tables_of(Experiment)
         }
         experiment = Experiment(
@@ -135,50 +140,52 @@ class RecordingReader:
             body=self.body,
             t_s=t_s,
             grasps=grasps,
-            readings=[self._reading(k, each, t_s) for k, each in enumerate(section.reading)],
+            readings=[self._custom_sensor(k, each, t_s) for k, each in enumerate(section.reading)],
             depths=[self._depth(k, t_s) for k in range(len(section.depth))],
             markers=self._markers(t_s, table),
-            nuisance=nuisance_of(section.nuisance, self.code.row),
+            nuisance=nuisance_from_section(section.nuisance, self.code.nuisance_row),
             air_density_kg_m3=self.air_density_kg_m3,
             **stated_in(section, Experiment, ""),
             **loads,
         )
-        if section.marked and not self.simulation:
-            refuse_other_scale(experiment, usual_constants(self.parameters))
+        if section.has_markers and not self.simulation:
+            require_plausible_markers(experiment, typical_constants(self.parameters))
         return experiment
 
     @property
-    def _static(self) -> bool:
+    def _is_static(self) -> bool:
         """Whether the samples are equilibria."""
         return self.section.kind == "static"
 
-    def _note(self, *notes: str) -> None:
+    def _add_notes(self, *notes: str) -> None:
         """Add notes, which begin with the experiment's name."""
         self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
 
     # Files ----------------------------------------------------------------------------------------
 
-    def _is_there(self, name: str | None) -> bool:
+    def _must_read(self, name: str | None) -> bool:
         """Return whether a file is to be read: always, unless it is missing and the problem
         is simulated.
         """
         return not self.simulation or bool(name and stored_files(self.folder / name))
 
-    def _existing(self, name: str | None, key: str, what: str = "a file") -> Path:
+    def _require_existing(self, name: str | None, key: str, what: str = "a file") -> Path:
         """Return the path of a file; raise `InputError` if none is named or it does not exist."""
         if name is None:
             raise InputError(f"missing; expected {what}", where=key)
         return existing_file(self.folder, name, key)
 
-    def _file(self, table: TableSection, key: str) -> Path:
+    def _table_file(self, table: TableSection, key: str) -> Path:
         """Return the file of a displacement or a wrench, its own or that of the experiment."""
         key = "file" if table.file is None and self.section.file else key
-        return self._existing(self.section.file_of(table), key, "a file here, or of the experiment")
+        return self._require_existing(
+            self.section.file_of(table), key, "a file here, or of the experiment"
+        )
 
     @property
-    def _timed(self) -> bool:
+    def _requires_times(self) -> bool:
         """Whether files must contain times: not for equilibria of bodies without memory."""
-        return not self._static or self.body.remembers
+        return not self._is_static or self.body.has_memory
 
     # Grasps ---------------------------------------------------------------------------------------
 
@@ -195,10 +202,10 @@ class RecordingReader:
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
         if grasp.displacement is not None:
-            file = self._file(grasp.displacement, self._grasp_key(k, "displacement"))
+            file = self._table_file(grasp.displacement, self._grasp_key(k, "displacement"))
             layout = grasp.displacement.layout
-            layout |= {"length_m": length_m(grasp.displacement, self.body)}
-            poses = read_displacement(file, **layout, timed=self._timed)
+            layout |= {"length_m": strain_length_m(grasp.displacement, self.body)}
+            poses = read_displacement(file, **layout, timed=self._requires_times)
         elif grasp.poses is None:
             return PoseSequence.fixed()
         else:
@@ -214,13 +221,13 @@ class RecordingReader:
 
     def _poses_from_markers(self, grasp: Moved, key: str) -> PoseSequence:
         """Return the poses of a grasp fitted to its markers, and add notes on the fit."""
-        if self._recorded is None:
+        if self._marker_tracks is None:
             message = "there are no tracks to fit the poses to; expected markers.file, or poses"
             raise InputError(message, where=key)
-        _refuse_unknown(grasp.markers or (), self._recorded.names, key)
+        _require_known_markers(grasp.markers or (), self._marker_tracks.names, key)
         with located(where=key):
-            poses, notes = poses_from_markers(grasp, self._recorded, self.section.window_s)
-        self._note(*(f"{key}: {note}" for note in notes))
+            poses, notes = poses_from_markers(grasp, self._marker_tracks, self.section.window_s)
+        self._add_notes(*(f"{key}: {note}" for note in notes))
         return poses
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
@@ -228,8 +235,8 @@ class RecordingReader:
         section = self.section.moved[k]
         zero = ""
         if (table := section.displacement) is not None:
-            file = self._file(table, self._grasp_key(k, "displacement"))
-            rest_m = length_m(table, self.body)
+            file = self._table_file(table, self._grasp_key(k, "displacement"))
+            rest_m = strain_length_m(table, self.body)
             zero = displaced_axes(file, table.columns, table.axis, rest_m)
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
@@ -242,15 +249,15 @@ class RecordingReader:
         if is_obstacle:
             return grasp
         with located(where=self._grasp_key(k, "nodes")):
-            return grasp.on(self.body, t_s)
+            return grasp.on_body(self.body, t_s)
 
     # What is measured, and what acts --------------------------------------------------------------
 
     def _read_wrench(self, section: WrenchSection, key: str) -> tuple[Array, Array]:
         """Return times (S,) [s] and values (S, 6) of a wrench's file."""
-        file = self._file(section, f"{key}.file")
+        file = self._table_file(section, f"{key}.file")
         layout = section.layout
-        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._timed)
+        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
 
     def _wrench(self, section: WrenchSection, key: str, t_s: Array) -> Wrench:
         """Return the measured wrench within the experiment's time; zeros if a simulation
@@ -261,18 +268,18 @@ class RecordingReader:
         for sigma in {"sigma_n", "sigma_nm"} & arguments.keys():
             arguments[sigma] /= section.symmetry
         with located(where=key):
-            if not self._is_there(name):
+            if not self._must_read(name):
                 return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
             at_s, values = self._read_wrench(section, key)
-            is_used = within(at_s, t_s, str(name), self._static)
-            if self._static and not self.section.marked:
+            is_used = is_within_experiment(at_s, t_s, str(name), self._is_static)
+            if self._is_static and not self.section.has_markers:
                 # Between equilibria it would be read off their chord, unless all of it is.
                 is_at_sample = np.abs(at_s[:, None] - t_s).min(axis=1) <= TIME_TOLERANCE_S
                 is_used &= is_at_sample if is_at_sample.any() else True
-            self._note(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
+            self._add_notes(f"{name}: {is_used.sum()} of {len(at_s)} samples are used")
             return Wrench(at_s[is_used], values[is_used], **arguments)
 
-    def _reading(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
+    def _custom_sensor(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
         """Return custom sensor number k, from 0, with its values within the experiment's time.
 
         Values are None if a simulation has no file.
@@ -286,15 +293,15 @@ class RecordingReader:
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")
         with located(where=key):
-            if not self._is_there(section.file):
+            if not self._must_read(section.file):
                 return Gauge(t_s=t_s, values=None, **arguments)
-            file = self._existing(section.file, f"{key}.file")
-            at_s, values, arguments["columns"] = read_gauge(file, section.columns)
-            is_used = within(at_s, t_s, str(section.file), self._static)
-            self._note(f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used")
+            file = self._require_existing(section.file, f"{key}.file")
+            at_s, values, arguments["columns"] = read_custom_sensor(file, section.columns)
+            is_used = is_within_experiment(at_s, t_s, str(section.file), self._is_static)
+            self._add_notes(f"{section.file}: {is_used.sum()} of {len(at_s)} samples are used")
             return Gauge(t_s=at_s[is_used], values=values[is_used], **arguments)
 
-    def _seen(self, k: int) -> tuple[DepthFile, Array]:
+    def _depth_images(self, k: int) -> tuple[DepthFileContent, Array]:
         """Return the images or clouds of depth camera number k, from 0, and their times [s]."""
         section = self.section.depth[k]
         file = self.folder / section.file
@@ -305,7 +312,7 @@ class RecordingReader:
         depth_file = read_depth(file, section.count_m, unit_m, stated_keys)
         count = len(depth_file.images_m) or len(depth_file.clouds_m)
         t_s = section.t_s if section.t_s is not None else depth_file.t_s
-        if t_s is None and count > 1 and not self._static:
+        if t_s is None and count > 1 and not self._is_static:
             message = f"{section.file} says no times of its {count} images; expected them here"
             raise InputError(message, where=f"depth.{k}.t_s")
         times = np.arange(float(count)) if t_s is None else np.array(t_s, dtype=float).ravel()
@@ -320,7 +327,7 @@ class RecordingReader:
         """
         section = self.section.depth[k]
         where = f"depth.{k}"
-        depth_file, at_s = self._seen(k)
+        depth_file, at_s = self._depth_images(k)
         names = ("matrix", "pose", "distortion")
         camera_arguments: dict[str, Any] = {name: getattr(depth_file, name) for name in names}
         camera_arguments |= stated_in(section.camera, DepthCamera, f"{where}.camera")
@@ -332,37 +339,37 @@ class RecordingReader:
                 **{name: value for name, value in camera_arguments.items() if value is not None}
             )
         with located(where=where):
-            is_used = within(at_s, t_s, section.file, self._static)
+            is_used = is_within_experiment(at_s, t_s, section.file, self._is_static)
             used = np.flatnonzero(is_used).tolist()
             clouds = [depth_file.clouds_m[k] for k in used] if depth_file.clouds_m else []
             images = []
-            outlined = outlined_samples(len(used))
+            outlined = samples_with_outlines(len(used))
             for number, sample in enumerate(used if len(depth_file.images_m) else ()):
                 image = depth_file.images_m[sample]
-                clouds.append(points_of(image, camera))
+                clouds.append(points_from_image(image, camera))
                 images.append(image if number in outlined else None)
             arguments = {"name": section.name, **stated_in(section, Depth, where)}
             depth = Depth(
                 t_s=at_s[is_used], clouds=clouds, camera=camera, images_m=images, **arguments
             )
-        self._note(f"{section.file}: {len(clouds)} of {len(at_s)} images are used")
+        self._add_notes(f"{section.file}: {len(clouds)} of {len(at_s)} images are used")
         return depth
 
-    def _made(self, kind: type, word: str, k: int) -> Any:
+    def _from_table(self, kind: type, list_key: str, k: int) -> Any:
         """Return the object of a table in a list, such as a tendon or a pressure, on the body.
 
         Parameters
         ----------
         kind : type
             Class of the object.
-        word : str
+        list_key : str
             Key of the list.
         k : int
             Index of the table in it.
         """
-        table = getattr(self.section, word)[k]
-        where = f"{word}.{k}"
-        defaults = {"name": f"{word}_{k + 1}"} if "name" in type(table).model_fields else {}
+        table = getattr(self.section, list_key)[k]
+        where = f"{list_key}.{k}"
+        defaults = {"name": f"{list_key}_{k + 1}"} if "name" in type(table).model_fields else {}
         arguments = defaults | stated_in(table, kind, where)
         for name, key in keys_of(kind):
             if key.constant and key.read and (file_name := getattr(table, key.name)):
@@ -374,29 +381,29 @@ class RecordingReader:
     # Markers --------------------------------------------------------------------------------------
 
     @cached_property
-    def _recorded(self) -> MarkerTable | None:
+    def _marker_tracks(self) -> MarkerTable | None:
         """Tracks of all markers that are used, in the body's frame; None if a simulation
         has no file.
         """
         markers = self.section.markers
-        if not self.section.marked or not self._is_there(markers.file):
+        if not self.section.has_markers or not self._must_read(markers.file):
             return None
-        file = self._existing(markers.file, "markers.file", "a file of marker tracks")
-        table = read_recorded(self.section, file)
-        self._note(*(f"{markers.file}: {note}" for note in table.notes))
-        _refuse_unknown(markers.template_m or (), table.names, "markers.template_m")
+        file = self._require_existing(markers.file, "markers.file", "a file of marker tracks")
+        table = read_marker_tracks(self.section, file)
+        self._add_notes(*(f"{markers.file}: {note}" for note in table.notes))
+        _require_known_markers(markers.template_m or (), table.names, "markers.template_m")
         with located(where="markers.template_m"):
-            table, notes = into_body_frame(markers, table)
-        self._note(*notes)
+            table, notes = transform_to_body_frame(markers, table)
+        self._add_notes(*notes)
         return table
 
-    def _table(self, poses: Sequence[PoseSequence]) -> MarkerTable:
+    def _fitted_tracks(self, poses: Sequence[PoseSequence]) -> MarkerTable:
         """Return the tracks to fit; zeros at the times of the poses if a simulation has no file."""
-        if not self.section.marked:
-            times = self._times(poses)
+        if not self.section.has_markers:
+            times = self._sample_times(poses)
             return MarkerTable(times, (), np.zeros((len(times), 0, 3)))
-        if self._recorded is not None:
-            return self._fitted(self._recorded)
+        if self._marker_tracks is not None:
+            return self._select_tracks(self._marker_tracks)
         markers = self.section.markers
         names = tuple(markers.names or markers.reference_m)
         names_without_position = [name for name in names if name not in markers.reference_m]
@@ -407,10 +414,10 @@ class RecordingReader:
                 "to simulate, expected an entry name = [x, y, z] for each marker"
             )
             raise InputError(message, where="markers.reference_m")
-        times = self._times(poses)
-        return self._fitted(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
+        times = self._sample_times(poses)
+        return self._select_tracks(MarkerTable(times, names, np.zeros((len(times), len(names), 3))))
 
-    def _times(self, poses: Sequence[PoseSequence]) -> Array:
+    def _sample_times(self, poses: Sequence[PoseSequence]) -> Array:
         """Return the sample times [s] without a marker file: those of a wrench, a camera,
         or the poses.
         """
@@ -418,19 +425,21 @@ class RecordingReader:
         wrench_sections = [
             (k, grasp.wrench) for k, grasp in enumerate(section.moved) if grasp.wrench
         ]
-        if not (wrench_sections or section.marked or section.reading or section.depth):
+        if not (wrench_sections or section.has_markers or section.reading or section.depth):
             message = "nothing is measured: expected markers, a wrench, a reading, or depth"
             raise InputError(message, where="markers")
         existing_wrenches = [
             s for s in wrench_sections if stored_files(self.folder / str(section.file_of(s[1])))
         ]
-        if existing_wrenches and not section.marked:
+        if existing_wrenches and not section.has_markers:
             k, sensor = existing_wrenches[0]
             return self._read_wrench(sensor, self._grasp_key(k, "wrench"))[0]
-        if self._static and section.depth and max(len(each.t_s) for each in poses) < 2:
-            return np.unique(np.concatenate([self._seen(k)[1] for k in range(len(section.depth))]))
+        if self._is_static and section.depth and max(len(each.t_s) for each in poses) < 2:
+            return np.unique(
+                np.concatenate([self._depth_images(k)[1] for k in range(len(section.depth))])
+            )
         times = max((sequence.t_s for sequence in poses), key=len, default=np.zeros(0))
-        fewest = 1 if self._static else 3
+        fewest = 1 if self._is_static else 3
         if len(times) < fewest:
             message = (
                 f"neither markers.file nor poses with at least {fewest} times are there; "
@@ -439,7 +448,7 @@ class RecordingReader:
             raise InputError(message, where="grasp")
         return times
 
-    def _fitted(self, table: MarkerTable) -> MarkerTable:
+    def _select_tracks(self, table: MarkerTable) -> MarkerTable:
         """Return the tracks to fit, without markers of the gripper alone and those of weight 0.
 
         Raises
@@ -450,10 +459,10 @@ class RecordingReader:
         markers = self.section.markers
         for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
             if isinstance(by_name := getattr(markers, key), dict):
-                _refuse_unknown(by_name, table.names, f"markers.{key}")
+                _require_known_markers(by_name, table.names, f"markers.{key}")
         unweighted = [name for name in table.names if markers.weights.get(name) == 0]
         if unweighted:
-            self._note(f"left out, with the weight 0: {', '.join(unweighted)}")
+            self._add_notes(f"left out, with the weight 0: {', '.join(unweighted)}")
         # Markers that only the gripper or the template needs are read, and not fitted.
         fitted_names = set(markers.names or set(table.names) - gripper_markers(self.section))
         indices = [
@@ -473,8 +482,8 @@ class RecordingReader:
     ) -> tuple[Array, tuple[PoseSequence, ...], MarkerTable]:
         """Return times [s], poses and tracks on one clock and time grid."""
         section = self.section
-        table = self._table(poses)
-        static = self._static
+        table = self._fitted_tracks(poses)
+        static = self._is_static
         intervals = [each.model_dump(include={"from_s", "until_s"}) for each in section.moved]
         held_s = [
             (-np.inf if first is None else first, np.inf if last is None else last)
@@ -486,7 +495,7 @@ class RecordingReader:
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]
         for name, sequence, held in zip(pose_files, poses, held_s, strict=True):
             if name is not None and len(t_s) and not static:
-                refuse_untold(sequence, t_s, held, self.folder / name)
+                require_determined_motion(sequence, t_s, held, self.folder / name)
         rate_hz = section.resample_hz
         # The files that a simulation writes are thinned when they are read.
         every = 1 if self.simulation else section.every
@@ -500,9 +509,9 @@ class RecordingReader:
         except InputError as error:
             files = dict.fromkeys(name for name in (*pose_files, section.markers.file) if name)
             raise InputError(error.message, where=" and ".join(files)) from error
-        self._note(*aligned.notes)
+        self._add_notes(*aligned.notes)
         if rate_hz and rate_hz > 1.01 / np.median(np.diff(table.t_s)):
-            self._note(
+            self._add_notes(
                 "resample_hz is above the markers' own rate; interpolated samples count as "
                 "measured, so error bars come out too small"
             )
@@ -510,11 +519,11 @@ class RecordingReader:
 
     def _markers(self, t_s: Array, table: MarkerTable) -> Markers:
         """Return the markers; positions on the body are NaN where they are to be estimated."""
-        if not self.section.marked:
+        if not self.section.has_markers:
             return Markers.none(t_s)
         section = self.section.markers
         names = table.names
-        sigma_m = _each(section.sigma_m, names, np.nan)
+        sigma_m = _by_marker(section.sigma_m, names, np.nan)
         known_m = section.reference_sigma_m
         if np.isnan(sigma_m).any():
             missing_name = names[int(np.isnan(sigma_m).argmax())]
@@ -524,30 +533,30 @@ class RecordingReader:
         return Markers(
             t_s,
             table.positions_m,
-            sigma_m / np.sqrt(_each(section.weights, names, 1.0)),
+            sigma_m / np.sqrt(_by_marker(section.weights, names, 1.0)),
             names,
             places_m=np.array([section.reference_m.get(name, [np.nan] * 3) for name in names]),
-            places_sigma_m=None if known_m is None else _each(known_m, names, np.nan),
+            places_sigma_m=None if known_m is None else _by_marker(known_m, names, np.nan),
             **arguments,
         )
 
 
-def _each(values: Mapping[str, float] | float, names: Sequence[str], usual: float) -> Array:
+def _by_marker(values: Mapping[str, float] | float, names: Sequence[str], default: float) -> Array:
     """Return values (M,) of the markers, given for all or by name, with a default."""
     by_name = values if isinstance(values, Mapping) else dict.fromkeys(names, values)
-    return np.array([by_name.get(name, usual) for name in names])
+    return np.array([by_name.get(name, default) for name in names])
 
 
-def _refuse_unknown(asked: Iterable[str], names: Sequence[str], key: str) -> None:
+def _require_known_markers(requested: Iterable[str], names: Sequence[str], key: str) -> None:
     """Raise `InputError` if a name is not that of a marker."""
     present = set(names)
-    for name in asked:
+    for name in requested:
         if name not in present:
             known = f"{', '.join(names)}{hint_at(name, names)}"
             raise InputError(f"found {name!r}; expected names of the markers {known}", where=key)
 
 
-def refuse_other_scale(experiment: Experiment, constants: Mapping[str, float]) -> None:
+def require_plausible_markers(experiment: Experiment, constants: Mapping[str, float]) -> None:
     """Raise `InputError` if the tracks cannot belong to this body, because of a wrong unit or
     frame.
 
@@ -558,18 +567,21 @@ def refuse_other_scale(experiment: Experiment, constants: Mapping[str, float]) -
     constants : mapping of str to float
         Physical values by name, to find the likely cause.
     """
-    if (message := _other_scale(experiment)) is None:
+    if (message := _implausible_markers(experiment)) is None:
         return
-    likeliest = "".join(f"; likely {cause.sentence}" for cause in doubts(experiment, constants)[:1])
+    likeliest = "".join(
+        f"; likely {cause.message}"
+        for cause in find_misspecifications_by_modes(experiment, constants)[:1]
+    )
     raise InputError(message + likeliest, where="markers")
 
 
-def _other_scale(experiment: Experiment) -> str | None:
+def _implausible_markers(experiment: Experiment) -> str | None:
     """Return why the tracks cannot belong to this body; None if they can."""
     markers = experiment.markers
     body_m = _diagonal(experiment.body.nodes_m)
-    k = int(markers.present.sum(axis=1).argmax())
-    is_measured = markers.present[k]
+    k = int(markers.is_present.sum(axis=1).argmax())
+    is_measured = markers.is_present[k]
     measured = markers.positions_m[k, is_measured]
     span_m = _diagonal(measured)
     if len(measured) > 1 and not LEAST_SPAN * body_m <= span_m <= LARGEST_SPAN * body_m:
@@ -577,9 +589,9 @@ def _other_scale(experiment: Experiment) -> str | None:
             f"at t = {experiment.t_s[k]:.6g} s the markers span {span_m:.3g} m, but the body "
             f"{body_m:.3g} m; check length_unit of the markers and of the object"
         )
-    if not experiment.gripping:
+    if not experiment.body_grasps:
         return None
-    rigid_positions = markers.observe(experiment.rigid_positions(experiment.t_s[[k]]))[
+    rigid_positions = markers.predict_positions(experiment.rigid_positions(experiment.t_s[[k]]))[
         0, is_measured
     ]
     miss_m = np.linalg.norm(measured - rigid_positions, axis=1)
@@ -588,8 +600,8 @@ def _other_scale(experiment: Experiment) -> str | None:
         name = markers.names[np.flatnonzero(is_measured)[worst]]
         return (
             f"at t = {experiment.t_s[k]:.6g} s marker {name!r} is measured at "
-            f"{triple(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp carries its "
-            f"place on the body, {triple(rigid_positions[worst])} m; check length_unit, the "
+            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp carries its "
+            f"place on the body, {point_text(rigid_positions[worst])} m; check length_unit, the "
             "marker's reference_m, that poses and markers share frame and clock, and that "
             "the poses map undeformed to current positions"
         )

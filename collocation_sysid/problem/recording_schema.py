@@ -141,7 +141,7 @@ class MovedSection(Section):
     interpolation: Literal["smooth", "linear", "hold"] = "smooth"
 
     @model_validator(mode="after")
-    def _one_source_of_poses(self) -> MovedSection:
+    def _require_one_source(self) -> MovedSection:
         """Raise `ValueError` for several sources of poses, or keys without the source they
         belong to.
         """
@@ -160,7 +160,7 @@ class MovedSection(Section):
             given_names = [key for key in keys if getattr(self, key)]
             if given_names and getattr(self, owner) is None:
                 raise ValueError(f"found {given_names[0]} without {owner}; it belongs to {owner}")
-        _at_least_three(self.markers, "markers")
+        _require_three(self.markers, "markers")
         for name in self.weights:
             if name not in (names := self.markers or ()):
                 raise ValueError(
@@ -252,7 +252,7 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
     reference_sigma_m: ReferenceSigma | None = None
 
     @model_validator(mode="after")
-    def _template(self) -> MarkersSection:
+    def _require_template(self) -> MarkersSection:
         """Raise `ValueError` for an incomplete template."""
         given_names = given_keys(self, "template_m", "template_window_s", "max_template_residual_m")
         if given_names and not {"template_m", "template_window_s"} <= set(given_names):
@@ -260,7 +260,7 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
                 f"found {', '.join(given_names)}; expected template_m and template_window_s, both "
                 "or neither"
             )
-        _at_least_three(self.template_m, "template_m")
+        _require_three(self.template_m, "template_m")
         if (window := self.template_window_s) is not None and not window[0] <= window[1]:
             raise ValueError(
                 f"found template_window_s = {list(window)}; expected [start, end] with start <= end"
@@ -268,7 +268,7 @@ class MarkersSection(section_of(Markers, "MarkersSection")):
         return self
 
 
-def _file_name(name: str) -> str:
+def _require_file_name(name: str) -> str:
     """Return a name that can be part of a file name; raise `ValueError` for others."""
     if (
         not name.isprintable()
@@ -288,7 +288,7 @@ Grasps = Annotated[list[GraspSection] | GraspSection, ByForm(list)]
 class NamedSection(Section):
     """Table with a name that is also part of file names."""
 
-    name: Annotated[str, AfterValidator(_file_name)]
+    name: Annotated[str, AfterValidator(_require_file_name)]
 
 
 class ReadingSection(section_of(Gauge, "ReadingSection", NamedSection)):
@@ -345,7 +345,7 @@ class DepthSection(section_of(Depth, "DepthSection", NamedSection)):
         Unit of clouds.
     """
 
-    name: Annotated[str, AfterValidator(_file_name)] = "depth"
+    name: Annotated[str, AfterValidator(_require_file_name)] = "depth"
     file: Text
     camera: DepthCameraSection = Field(default_factory=lambda: DepthCameraSection.model_construct())
     t_s: list[Finite] | None = None
@@ -394,7 +394,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
     nuisance: NuisanceOrNone = Field(default_factory=lambda: NuisanceSection.model_construct())
 
     @property
-    def marked(self) -> bool:
+    def has_markers(self) -> bool:
         """Whether the table contains markers."""
         return "markers" in self.model_fields_set
 
@@ -403,17 +403,17 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
         return table and (table.file or self.file)
 
     @property
-    def grasps(self) -> list[GraspSection]:
+    def grasp_list(self) -> list[GraspSection]:
         """Grasps as a list, also if the file has a single table."""
         return self.grasp if isinstance(self.grasp, list) else [self.grasp]
 
     @property
-    def moved(self) -> list[GraspSection | ObstacleSection]:
+    def moved_sections(self) -> list[GraspSection | ObstacleSection]:
         """Grasps, followed by the obstacles."""
-        return [*self.grasps, *self.obstacle]
+        return [*self.grasp_list, *self.obstacle]
 
     @model_validator(mode="after")
-    def _window(self) -> ExperimentSection:
+    def _require_window(self) -> ExperimentSection:
         """Raise `ValueError` if the window does not begin before it ends."""
         if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
             raise ValueError(
@@ -422,7 +422,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
         return self
 
     @model_validator(mode="after")
-    def _static(self) -> ExperimentSection:
+    def _require_static_keys(self) -> ExperimentSection:
         """Raise `ValueError` for keys that make no sense for equilibria."""
         if self.kind == "dynamic":
             return self
@@ -438,7 +438,7 @@ class ExperimentSection(section_of(Experiment, "ExperimentSection", NamedSection
         return self
 
 
-def _at_least_three(places: dict[str, Any] | None, key: str) -> None:
+def _require_three(places: dict[str, Any] | None, key: str) -> None:
     """Raise `ValueError` for fewer than three positions, which do not determine a rotation."""
     if places is not None and len(places) < 3:
         raise ValueError(

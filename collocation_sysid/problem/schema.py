@@ -62,7 +62,7 @@ class NodeForceSection(CodeSection):
     ----------
     function : str
         Name of the function of the force in it.
-    nodes : Nodes, optional
+    nodes : ElementNodes, optional
         Selection of nodes; all by default.
     on : str
         What it acts on: these nodes, or faces of the surface that have all of theirs among them.
@@ -86,7 +86,7 @@ class RegionSection(Section):
     ----------
     name : str
         Letters, digits, - and _.
-    cells : Nodes
+    cells : ElementNodes
         Selection of cells, by their centres: a table of box_m, ball_m or indices, or the name of a
         cell array or of a physical group.
     field : FieldSection, optional
@@ -135,7 +135,7 @@ class ScanSection(Section):
 
     Attributes
     ----------
-    nodes : Nodes
+    nodes : ElementNodes
         Selection of the nodes that were held: those in a clamp or on a table.
     gravity_m_s2 : list
         Gravity in the axes of the mesh; its direction is the pose of the scan.
@@ -209,7 +209,7 @@ class ObjectSection(Section):
     evaluator: Literal["auto", "simd", "casadi"] = "auto"
 
     @model_validator(mode="after")
-    def _one_of_each(self) -> ObjectSection:
+    def _require_consistent(self) -> ObjectSection:
         """Raise `ValueError` for keys that exclude or require each other."""
         require_one(self, "mesh", "surface", "cylinder", "box_m")
         if (self.mesh is None) != (self.edge_length_m is not None):
@@ -249,7 +249,7 @@ class PriorSection(Section):
     deviation: Positive | None = None
 
     @model_validator(mode="after")
-    def _one(self) -> PriorSection:
+    def _require_one_deviation(self) -> PriorSection:
         """Raise `ValueError` unless exactly one of both deviations is given."""
         require_one(self, "relative", "deviation")
         return self
@@ -274,7 +274,7 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
     ratio: Finite | None = None
 
     @model_validator(mode="after")
-    def _one_kind(self) -> ParameterSection:
+    def _require_one_kind(self) -> ParameterSection:
         """Raise `ValueError` for keys that do not belong together."""
         if len(given_kinds := given_keys(self, "guess", "fixed", "tied_to")) > 1:
             raise ValueError(f"found {' and '.join(given_kinds)}; expected one of them, or none")
@@ -293,7 +293,7 @@ class ParameterSection(section_of(Unknown, "ParameterSection")):
         return self
 
 
-def _flat(tables: Any, *, front: str = "") -> Any:
+def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
     """Return parameters by their full names, such as ``core.mu_pa``, from tables nested by
     region.
     """
@@ -302,8 +302,12 @@ def _flat(tables: Any, *, front: str = "") -> Any:
     flat: dict[str, Any] = {}
     for name, value in tables.items():
         nested = isinstance(value, dict) and not set(value) & set(ParameterSection.model_fields)
-        full_name = f"{front}{name}"
-        inner = _flat(value, front=f"{full_name}.") if nested and value else {full_name: value}
+        full_name = f"{prefix}{name}"
+        inner = (
+            _flatten_parameters(value, prefix=f"{full_name}.")
+            if nested and value
+            else {full_name: value}
+        )
         if twice := [key for key in inner if key in flat]:
             raise ValueError(f"{twice[0]!r} is given twice; expected one value")
         flat.update(inner)
@@ -311,7 +315,7 @@ def _flat(tables: Any, *, front: str = "") -> Any:
 
 
 OneParameter = Annotated[ParameterSection | Finite, ByForm((dict, ParameterSection))]
-Parameters = Annotated[dict[str, OneParameter], BeforeValidator(_flat)]
+Parameters = Annotated[dict[str, OneParameter], BeforeValidator(_flatten_parameters)]
 Substeps = Annotated[int, Field(strict=True, ge=1, le=MOST_STEPS)]
 
 
@@ -374,12 +378,12 @@ class ProblemFile(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _completed(cls, content: Any) -> Any:
+    def _merge_defaults(cls, content: Any) -> Any:
         """Insert [experiment_defaults] before validation."""
-        return completed(content)
+        return with_experiment_defaults(content)
 
 
-def completed(content: Any) -> Any:
+def with_experiment_defaults(content: Any) -> Any:
     """Return the content of a problem file with [experiment_defaults] inserted into each
     experiment.
     """

@@ -14,9 +14,9 @@ from pydantic_core.core_schema import no_info_plain_validator_function
 
 from ..checked import Positive
 from ..errors import InputError
-from ..methods import METHODS, options_schema
-from ..methods.comparison.casadi_nlp import why_not
-from ..methods.options import built
+from ..methods import METHODS, method_options_schema
+from ..methods.comparison.casadi_nlp import refusal_reason
+from ..methods.options import method_from_options
 from ..methods.solution import Method
 from ..section import Among, Section
 
@@ -24,17 +24,17 @@ OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in ME
 DEFAULT = "reduced-space"
 
 
-def _offered(name: Any) -> Any:
+def _require_offered(name: Any) -> Any:
     """Return the name of a method; raise `ValueError` with the reason if CasADi's solver is
     not offered.
     """
-    reason = why_not(name) if isinstance(name, str) else None
+    reason = refusal_reason(name) if isinstance(name, str) else None
     if reason is not None:
         raise ValueError(reason)
     return name
 
 
-MethodName = Annotated[str, Among(tuple(METHODS)), BeforeValidator(_offered)]
+MethodName = Annotated[str, Among(tuple(METHODS)), BeforeValidator(_require_offered)]
 
 
 class MethodSection(Section):
@@ -52,11 +52,13 @@ class MethodSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _options_are_in_tables(cls, table: Any) -> Any:
+    def _require_option_tables(cls, table: Any) -> Any:
         """Raise `ValueError` if options of a method are outside the method's table."""
-        outside = [name for name in table if _owners(name)] if isinstance(table, Mapping) else []
+        outside = (
+            [name for name in table if _methods_with(name)] if isinstance(table, Mapping) else []
+        )
         if outside:
-            remedy = f"move {_moves(outside, table.get('method', DEFAULT))}"
+            remedy = f"move {_advice_on_tables(outside, table.get('method', DEFAULT))}"
             raise ValueError(f"the options of a method have a table of their own: {remedy}")
         return table
 
@@ -66,7 +68,7 @@ class MethodSection(Section):
         return {name: getattr(self, name) for name in METHODS}
 
 
-def _read(method: str, table: Any) -> Any:
+def _method_from_table(method: str, table: Any) -> Any:
     """Return the method with the options of its table.
 
     Raises
@@ -78,51 +80,53 @@ def _read(method: str, table: Any) -> Any:
     if not isinstance(table, Mapping):
         raise InputError(f"found {table!r}; expected a table of options", None, where)
     for name in table:
-        owners = _owners(name)
+        owners = _methods_with(name)
         if owners and method not in owners:
             owned = f"{name} is an option of {', '.join(owners)}"
             has = f"{method} has {', '.join(OPTIONS[method])}"
             raise InputError(f"{owned}; {has}", None, where)
-    return built(METHODS[method], table, where)
+    return method_from_options(METHODS[method], table, where)
 
 
-def _owners(option: str) -> list[str]:
+def _methods_with(option: str) -> list[str]:
     """Return the names of the methods that have an option."""
     return [method for method in METHODS if option in OPTIONS[method]]
 
 
-def _moves(options: Sequence[str], chosen: Any) -> str:
+def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
     """Return advice in words which options belong to which tables."""
     options_by_method: dict[str, list[str]] = {}
     for option in options:
-        owners = _owners(option)
+        owners = _methods_with(option)
         options_by_method.setdefault(chosen if chosen in owners else owners[0], []).append(option)
     return " and ".join(
-        f"{', '.join(names)} to {heading(to)}" for to, names in options_by_method.items()
+        f"{', '.join(names)} to {table_heading(to)}" for to, names in options_by_method.items()
     )
 
 
-def heading(method: str) -> str:
+def table_heading(method: str) -> str:
     """Return the heading of a method's table in the file."""
     return f'[solver."{method}"]' if ":" in method else f"[solver.{method}]"
 
 
 @dataclass(frozen=True)
-class _Options:
+class _MethodType:
     """Pydantic type of a method's key."""
 
     method: str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return no_info_plain_validator_function(partial(_read, self.method))
+        return no_info_plain_validator_function(partial(_method_from_table, self.method))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        return options_schema(self.method)
+        return method_options_schema(self.method)
 
 
-def _table(method: str) -> tuple[Any, Any]:
+def _method_field(method: str) -> tuple[Any, Any]:
     """Return type and default of a method's key."""
-    return Annotated[Any, _Options(method)], Field(default_factory=partial(_read, method, {}))
+    return Annotated[Any, _MethodType(method)], Field(
+        default_factory=partial(_method_from_table, method, {})
+    )
 
 
 if TYPE_CHECKING:
@@ -132,5 +136,5 @@ else:
         "SolverSection",
         __base__=MethodSection,
         __doc__=MethodSection.__doc__,
-        **{method: _table(method) for method in METHODS},
+        **{method: _method_field(method) for method in METHODS},
     )

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..recording import MarkerTable, PoseSequence, align_to_template, fit_poses, read_markers
-from ..recording.rigid import loosest_marker
+from ..recording.rigid import least_rigid_marker
 from .recording_schema import ExperimentSection, MarkersSection, MovedSection
 
 # A frame is reported if its residual exceeds the median by this factor.
@@ -21,10 +21,10 @@ ROUNDING = 1e-6
 
 def gripper_markers(section: ExperimentSection) -> set[str]:
     """Return the names of the markers from which poses of grasps and obstacles are computed."""
-    return {name for moved in section.moved for name in moved.markers or ()}
+    return {name for moved in section.moved_sections for name in moved.markers or ()}
 
 
-def read_recorded(section: ExperimentSection, file: Path) -> MarkerTable:
+def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
     """Return the tracks of the markers that an experiment uses, gripper included, in the
     file's frame.
     """
@@ -42,7 +42,9 @@ def read_recorded(section: ExperimentSection, file: Path) -> MarkerTable:
     )
 
 
-def into_body_frame(markers: MarkersSection, table: MarkerTable) -> tuple[MarkerTable, list[str]]:
+def transform_to_body_frame(
+    markers: MarkersSection, table: MarkerTable
+) -> tuple[MarkerTable, list[str]]:
     """Return the tracks moved rigidly so that the template fits, and notes on the residuals.
 
     The tracks are unchanged if there is no template.
@@ -107,14 +109,14 @@ def poses_from_markers(
     residual_m = np.where(is_in_window, fit.residual_m, np.nan)
     if np.isfinite(residual_m).any():
         notes.append(
-            _rigidity(names, reference_m, tracks, table.t_s, residual_m, grasp.max_residual_m)
+            _rigidity_note(names, reference_m, tracks, table.t_s, residual_m, grasp.max_residual_m)
         )
     return poses, notes
 
 
-def _rigidity(
+def _rigidity_note(
     names: list[str],
-    places: Array,
+    reference_m: Array,
     tracks: Array,
     t_s: Array,
     residual_m: Array,
@@ -126,7 +128,7 @@ def _rigidity(
     ----------
     names : list of str
         Names of the M markers.
-    places : (M, 3) array
+    reference_m : (M, 3) array
         Positions on the undeformed body [m].
     tracks : (T, M, 3) array
         Measured positions [m].
@@ -139,7 +141,7 @@ def _rigidity(
     """
     median_m = float(np.nanmedian(residual_m))
     worst = int(np.nanargmax(residual_m))
-    size_m = float(np.linalg.norm(np.ptp(places, axis=0)))
+    size_m = float(np.linalg.norm(np.ptp(reference_m, axis=0)))
     limit_m = max_residual_m or max(UNUSUAL * median_m, ROUNDING * size_m)
     fit_sentence = (
         f"{', '.join(names)} fit a rigid motion to {_mm(median_m)} (median over the frames)"
@@ -147,7 +149,7 @@ def _rigidity(
     count = int((residual_m > limit_m).sum())
     if not count:
         return f"{fit_sentence}, at worst {_mm(residual_m[worst])}"
-    worst_marker = names[loosest_marker(places, tracks[worst])]
+    worst_marker = names[least_rigid_marker(reference_m, tracks[worst])]
     frames = "1 frame is" if count == 1 else f"{count} frames are"
     return (
         f"{fit_sentence}, but {frames} above {_mm(limit_m)}, the worst with "

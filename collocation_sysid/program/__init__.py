@@ -20,14 +20,18 @@ Measurements
     cameras.
 Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time, `factorisation`
-    factorises one time step (with `lapack` and `supernodal`), `least_squares` accumulates normal
+    factorises one time step (with `lapack` and `supernodal`), `least_squares_of_fit` accumulates
+    normal
     equations in square-root form, `stopwatch` measures time.
 Simulation
-    `simulation` simulates an experiment by `marching` (collocation schemes) or `newmark`, with
+    `simulation` simulates an experiment by `marching` (collocation schemes) or `simulate_newmark`,
+    with
     Newton's method of `newton`, `retraction` and `near_contact`, from the equilibrium of `rest`.
 Analyses of a motion
-    `reaction` (reaction forces), `modes` (natural modes), `stability` and `lost_stability`,
-    `touches` (contact), `any_stiffness` (rough predictions while the stiffness is unknown).
+    `reaction` (reaction forces), `modes` (natural modes), `stability` and `find_lost_stability`,
+    `contact_summaries` (contact), `any_stiffness` (rough predictions while the stiffness is
+    unknown).
 
-Methods use `Collocation`; statistics use `Segment`, `Part` and `Sweep`; predictions use `simulate`.
+Methods use `Collocation`; statistics use `Transcription`, `ExperimentIterate` and `Sweep`;
+predictions use `simulate`.
 """

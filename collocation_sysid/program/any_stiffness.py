@@ -36,7 +36,7 @@ MOST_SAMPLES = 300
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
+class StatedMotion:
     """Statements of an experiment about poses, markers, mesh size and gravity, each of which may be
     wrong.
 
@@ -70,13 +70,13 @@ class Described:
     name: str = ""
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Described | None:
+    def from_experiment(cls, experiment: Experiment) -> StatedMotion | None:
         """Return the statements of an experiment for its first samples.
 
         None if the experiment is static, or no single rigid motion carries the body at all times.
         """
-        grasp = carrying(experiment)
-        if grasp is None or experiment.static:
+        grasp = carrying_grasp(experiment)
+        if grasp is None or experiment.is_static:
             return None
         t_s = experiment.t_s[:MOST_SAMPLES]
         rotations, translations = grasp.poses.at(t_s)
@@ -85,32 +85,32 @@ class Described:
         gravity_m_s2 = experiment.gravity_m_s2
         return cls(t_s, rotations, translations, tracks, gravity_m_s2, name=name)
 
-    def carry(self, points_m: Array) -> Array:
+    def to_world(self, points_m: Array) -> Array:
         """Return points (..., T, M, 3) of the grasp's frame in the world [m]."""
         turned = np.einsum("tij,...tmj->...tmi", self.rotations, points_m)
         return turned + self.translations_m[:, None]
 
-    def pulled_back(self, points_m: Array) -> Array:
+    def to_grasp_frame(self, points_m: Array) -> Array:
         """Return points (T, M, 3) of the world in the grasp's frame [m]."""
         return np.einsum("tji,tmj->tmi", self.rotations, points_m - self.translations_m[:, None])
 
-    def after(self, rotation: Array, translation_m: Array) -> Described:
+    def with_prior_motion(self, rotation: Array, translation_m: Array) -> StatedMotion:
         """Return the statements with another rigid motion C before the poses U: x → U(Cx)."""
         shifted = self.translations_m + self.rotations @ translation_m
         return replace(self, rotations=self.rotations @ rotation, translations_m=shifted)
 
 
-def carrying(experiment: Experiment) -> Grasp | None:
+def carrying_grasp(experiment: Experiment) -> Grasp | None:
     """Return the grasp that carries the body at all times, or None.
 
     All other grasps must move with it. A grasp that prescribes some axes only does not carry the
     body.
     """
-    holding = [grasp for grasp in experiment.grasps if grasp.holds(experiment.t_s).any()]
+    holding = [grasp for grasp in experiment.grasps if grasp.is_active(experiment.t_s).any()]
     holding.sort(key=lambda grasp: grasp.axes != "xyz")
     if not holding or holding[0].axes != "xyz":
         return None
-    if not all(grasp.holds(experiment.t_s).all() for grasp in holding):
+    if not all(grasp.is_active(experiment.t_s).all() for grasp in holding):
         return None
     motions = [grasp.poses.at(experiment.t_s) for grasp in holding]
     together = all(
@@ -122,108 +122,121 @@ def carrying(experiment: Experiment) -> Grasp | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Sway:
+class ModalResponse:
     """Natural modes of a body in its grasp, evaluated at its markers.
 
     Attributes
     ----------
     places_m : (M, 3) array
         Markers on the undeformed body [m].
-    omega : (K,) array
+    relative_frequencies : (K,) array
         Angular frequencies relative to the lowest.
     shapes : (K, M, 3) array
         Displacements of the markers.
-    pushed : (K, 3) array
+    translation_loads : (K, 3) array
         Modal loads φᵀM of a uniform acceleration.
-    turned : (K, 3, 3) array
+    rotation_loads : (K, 3, 3) array
         Modal loads φᵀM xᵀ of an acceleration that is linear in the place.
     size_m : float
         Diagonal of the body [m].
-    from_rest : bool
+    is_initially_at_rest : bool
         Whether the body starts in equilibrium; otherwise undeformed.
     """
 
     places_m: Array
-    omega: Array
+    relative_frequencies: Array
     shapes: Array
-    pushed: Array
-    turned: Array
+    translation_loads: Array
+    rotation_loads: Array
     size_m: float
-    from_rest: bool
+    is_initially_at_rest: bool
 
     @classmethod
-    def of(cls, experiment: Experiment, constants: Mapping[str, float]) -> Sway:
+    def from_experiment(
+        cls, experiment: Experiment, constants: Mapping[str, float]
+    ) -> ModalResponse:
         """Compute the modes of an experiment; only ratios of the constants matter."""
         body = experiment.body
         markers = experiment.markers
-        forces = Forces.of(experiment, experiment.t_s[:1], body.theta(constants)).undriven()
+        forces = Forces.from_experiment(
+            experiment, experiment.t_s[:1], body.theta_from_values(constants)
+        ).only_loads()
         modes = natural_modes(forces, body.nodes_m, experiment.free_dofs, MODES)
-        weighted = modes.shapes * forces.mass.kg[0, ::3, None]
+        weighted = modes.shapes * forces.mass.inertia_kg[0, ::3, None]
         omega = modes.angular_frequencies_rad_s
         return cls(
-            markers.observe(body.nodes_m),
+            markers.predict_positions(body.nodes_m),
             omega / omega[:1],
-            markers.observe(modes.shapes),
+            markers.predict_positions(modes.shapes),
             weighted.sum(axis=1),
             np.einsum("kni,nj->kij", weighted, body.nodes_m),
             float(np.linalg.norm(np.ptp(body.nodes_m, axis=0))),
             experiment.start == "equilibrium",
         )
 
-    def predicted(self, described: Described) -> Array:
+    def predict(self, stated: StatedMotion) -> Array:
         """Return predictions (S, T, M, 3) of the markers for S combinations of stiffness
         and damping, the last for a rigid body [m].
         """
-        scale = described.mesh_scale
-        loads = self._loads(described)
-        step_s = float(described.t_s[1] - described.t_s[0])
-        omega = self._omega(scale)
+        scale = stated.mesh_scale
+        loads = self._modal_loads(stated)
+        step_s = float(stated.t_s[1] - stated.t_s[0])
+        omega = self._frequencies(scale)
         states = [
-            _responses(omega, ratio, loads, step_s, self.from_rest) for ratio in DAMPING_RATIOS
+            _oscillator_responses(omega, ratio, loads, step_s, self.is_initially_at_rest)
+            for ratio in DAMPING_RATIOS
         ]
         q = np.concatenate([*states, np.zeros((1, *loads.shape))])
         swayed = np.tensordot(q, self.shapes, axes=1)
         limit = scale * self.size_m
         # Small strains are assumed: what sways farther than the body is long, stays there.
         relative_size = np.linalg.norm(swayed, axis=3, keepdims=True) / limit
-        predictions = described.carry(
+        predictions = stated.to_world(
             scale * self.places_m + swayed / np.maximum(relative_size, 1.0)
         )
         return (
-            later(predictions, described.t_s, described.lag_s) if described.lag_s else predictions
+            delayed_tracks(predictions, stated.t_s, stated.lag_s) if stated.lag_s else predictions
         )
 
-    def _omega(self, scale: float) -> Array:
+    def _frequencies(self, scale: float) -> Array:
         """Return the angular frequencies (S, K) [rad/s] of the assumed stiffnesses for a
         mesh scale.
         """
         softest = np.sqrt(STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m))
         stiffnesses = softest * np.geomspace(1.0, STIFFEST, STIFFNESSES)
-        return np.asarray(np.outer(stiffnesses, self.omega), dtype=np.float64)
+        return np.asarray(np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64)
 
-    def _loads(self, described: Described) -> Array:
+    def _modal_loads(self, stated_motion: StatedMotion) -> Array:
         """Return the modal loads (T, K) of gravity and the grasp's acceleration."""
-        inverse = described.rotations.transpose(0, 2, 1)
-        step_s = float(described.t_s[1] - described.t_s[0])
-        lift = described.gravity_m_s2 - _acceleration(described.translations_m, step_s)
+        inverse = stated_motion.rotations.transpose(0, 2, 1)
+        step_s = float(stated_motion.t_s[1] - stated_motion.t_s[0])
+        lift = stated_motion.gravity_m_s2 - _second_differences(
+            stated_motion.translations_m, step_s
+        )
         pushed = np.einsum("tij,tj->ti", inverse, lift)
-        rotated = inverse @ _acceleration(described.rotations, step_s) * described.mesh_scale
-        return pushed @ self.pushed.T - np.einsum("tij,kij->tk", rotated, self.turned)
+        rotated = (
+            inverse
+            @ _second_differences(stated_motion.rotations, step_s)
+            * stated_motion.mesh_scale
+        )
+        return pushed @ self.translation_loads.T - np.einsum(
+            "tij,kij->tk", rotated, self.rotation_loads
+        )
 
 
-def later(seen: Array, t_s: Array, lag_s: float) -> Array:
+def delayed_tracks(predictions: Array, t_s: Array, lag_s: float) -> Array:
     """Return predictions (S, T, M, 3) delayed by `lag_s` (linear interpolation); NaN beyond
     their range.
     """
     at = np.arange(len(t_s)) - lag_s / (t_s[1] - t_s[0])
     low = np.clip(np.floor(at).astype(int), 0, len(t_s) - 2)
     share = (at - low)[:, None, None]
-    shifted = (1 - share) * seen[:, low] + share * seen[:, low + 1]
+    shifted = (1 - share) * predictions[:, low] + share * predictions[:, low + 1]
     shifted[:, (at < 0) | (at > len(t_s) - 1)] = np.nan
     return shifted
 
 
-def _acceleration(x: Array, step_s: float) -> Array:
+def _second_differences(x: Array, step_s: float) -> Array:
     """Return second differences of (T, ...) over the step; the motion is at rest before the
     first sample.
     """
@@ -233,7 +246,9 @@ def _acceleration(x: Array, step_s: float) -> Array:
     return second
 
 
-def _responses(omega: Array, ratio: float, loads: Array, step_s: float, from_rest: bool) -> Array:
+def _oscillator_responses(
+    omega: Array, ratio: float, loads: Array, step_s: float, is_initially_at_rest: bool
+) -> Array:
     """Return the coordinates (S, T, K) of oscillators (S, K), exact for loads that are linear
     between samples.
 
@@ -249,7 +264,7 @@ def _responses(omega: Array, ratio: float, loads: Array, step_s: float, from_res
         Modal loads.
     step_s : float
         Time between samples [s].
-    from_rest : bool
+    is_initially_at_rest : bool
         Whether to start in equilibrium with the first load; otherwise at zero.
     """
     damped = omega * np.sqrt(1 - ratio**2)
@@ -259,7 +274,7 @@ def _responses(omega: Array, ratio: float, loads: Array, step_s: float, from_res
     of_rise = (of_constant - step_s) / (root * step_s)
     pushes = of_constant * loads[:-1, None] + of_rise * np.diff(loads, axis=0)[:, None]
     at_rest = -root.conj() * loads[0] / omega**2
-    coordinates = [at_rest if from_rest else np.zeros_like(root)]
+    coordinates = [at_rest if is_initially_at_rest else np.zeros_like(root)]
     for push in pushes:
         coordinates.append(fading * coordinates[-1] + push)
     return np.imag(np.stack(coordinates, axis=1)) / damped[:, None]

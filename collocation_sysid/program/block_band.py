@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..fem.kernels import in_slices, make_combiner
+from ..fem.kernels import make_combiner, run_in_slices
 from ..fem.pattern import SymmetricPattern
 
 
@@ -53,20 +53,20 @@ class BandBlock:
         Row block minus column block.
     rows, columns : (e,) arrays
         Entries within the block.
-    source : (e,) array
+    lower_positions : (e,) array
         Position of each entry in the lower triangle; −1 where only constants are stored.
     terms : sequence of BlockTerm
         Terms whose sum is the block.
-    whole : (e,) array
+    full_positions : (e,) array
         Position of each entry in both triangles, see `pattern.full`.
     """
 
     offset: int
     rows: Index
     columns: Index
-    source: Index
+    lower_positions: Index
     terms: Sequence[BlockTerm]
-    whole: Index
+    full_positions: Index
 
 
 class BlockBand:
@@ -100,7 +100,7 @@ class BlockBand:
         columns: int,
         row_starts: Index,
         blocks: Sequence[BandBlock],
-        top: int = 0,
+        top_rows: int = 0,
         adds: bool = False,
     ) -> None:
         count = len(row_starts)
@@ -111,12 +111,12 @@ class BlockBand:
                 for t in range(count)
             ]
         )
-        self._slabs: dict[tuple[bool, ...], _Slab] = {}
+        self._slabs: dict[tuple[bool, ...], _ColumnBlock] = {}
         for present in map(tuple, np.unique(exists, axis=0)):
             chosen = [b for b, here in zip(blocks, present, strict=True) if here]
-            self._slabs[present] = _Slab.of(columns, chosen, top)
+            self._slabs[present] = _ColumnBlock.from_blocks(columns, chosen, top_rows)
         kinds = [self._slabs[tuple(present)] for present in exists]
-        starts = np.concatenate([[0], np.cumsum([slab.entries for slab in kinds])])
+        starts = np.concatenate([[0], np.cumsum([slab.entry_count for slab in kinds])])
         self.starts = starts
         self.nnz = int(starts[-1])
         self.indptr = np.concatenate(
@@ -129,7 +129,7 @@ class BlockBand:
             [slab.top_positions + starts[t] for t, slab in enumerate(kinds)]
         )
         self._kinds = kinds
-        self._fill = make_combiner(_plan(kinds, starts[:-1], count, adds))
+        self._fill = make_combiner(_make_plan(kinds, starts[:-1], count, adds))
 
     def positions(self, times: Index, offset: int, rows: Index, columns: Index) -> Index:
         """Return the positions (len(times), len(rows)) in the values of entries of the blocks (t +
@@ -169,7 +169,7 @@ class BlockBand:
         threads : int
             Number of threads.
         """
-        in_slices(
+        run_in_slices(
             lambda start, stop: self._fill(start, stop, a, b, values),
             len(self._kinds),
             threads if len(self._kinds) > 4 * threads else 1,
@@ -177,7 +177,7 @@ class BlockBand:
 
 
 @dataclass(frozen=True, eq=False)
-class _Slab:
+class _ColumnBlock:
     """Structure of one column block: entries sorted by column, then row.
 
     Attributes
@@ -188,15 +188,15 @@ class _Slab:
         Rows above all blocks.
     blocks : sequence of BandBlock
         Blocks that exist in it.
-    entries : int
+    entry_count : int
         Number of entries.
     column_ends : (columns,) array
         End of each column.
     top_positions : (columns, top) array
         Positions of the top rows' entries.
-    order : (entries,) array
+    sorted_positions : (entries,) array
         Sorted position of each entry, blocks stacked after the top rows.
-    offsets : (entries,) array
+    block_indices : (entries,) array
         Index of the block of each stacked entry, −1 for top rows.
     rows : (entries,) array
         Row of each stacked entry within its block.
@@ -205,15 +205,15 @@ class _Slab:
     columns: int
     top: int
     blocks: Sequence[BandBlock]
-    entries: int
+    entry_count: int
     column_ends: Index
     top_positions: Index
-    order: Index  # sorted place of each entry, blocks stacked after the top rows
-    offsets: Index  # row offset of each stacked entry
+    sorted_positions: Index  # sorted place of each entry, blocks stacked after the top rows
+    block_indices: Index  # row offset of each stacked entry
     rows: Index
 
     @classmethod
-    def of(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _Slab:
+    def from_blocks(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _ColumnBlock:
         """Build the structure of a column block of `columns` columns."""
         top_rows = np.tile(np.arange(top), columns)
         top_columns = np.repeat(np.arange(columns), top)
@@ -241,16 +241,16 @@ class _Slab:
     def row_indices(self, row_starts: Index, t: int) -> Index:
         """Return the row in the matrix of every entry, for column block t."""
         base = np.array([row_starts[t + b.offset] for b in self.blocks] + [0])
-        result = np.empty(self.entries, dtype=np.int64)
-        result[self.order] = base[self.offsets] + self.rows
+        result = np.empty(self.entry_count, dtype=np.int64)
+        result[self.sorted_positions] = base[self.block_indices] + self.rows
         return result
 
-    def places(self, block: int) -> Index:
+    def positions_of_block(self, block: int) -> Index:
         """Return the position in the column block of each entry of block number `block` (an
         index).
         """
         first = self.top * self.columns + sum(len(b.rows) for b in self.blocks[:block])
-        return self.order[first : first + len(self.blocks[block].rows)]
+        return self.sorted_positions[first : first + len(self.blocks[block].rows)]
 
     def locate(self, offset: int, rows: Index, columns: Index) -> Index:
         """Return the positions in the column block of given entries of the block at
@@ -267,7 +267,7 @@ class _Slab:
         ]
         if (codes[entries] != requested).any():
             raise IndexError("an entry lies outside the block")
-        return self.places(k)[entries]
+        return self.positions_of_block(k)[entries]
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +296,7 @@ class CombinePlan:
     sources: NDArray[np.int32]
 
 
-def _plan(kinds: Sequence[_Slab], starts: Index, count: int, adds: bool) -> CombinePlan:
+def _make_plan(kinds: Sequence[_ColumnBlock], starts: Index, count: int, adds: bool) -> CombinePlan:
     """Return the tasks that fill the column blocks."""
     targets = []
     sources = []
@@ -309,11 +309,11 @@ def _plan(kinds: Sequence[_Slab], starts: Index, count: int, adds: bool) -> Comb
         for k, block in enumerate(slab.blocks):
             if (id(slab), k) not in maps:
                 # Sorted by target, so that the writes run through memory.
-                places = slab.places(k)
+                places = slab.positions_of_block(k)
                 order = np.argsort(places)
                 maps[id(slab), k] = (used, len(places))
                 targets.append(places[order])
-                sources.append(np.maximum(block.source[order], 0))
+                sources.append(np.maximum(block.lower_positions[order], 0))
                 used += len(places)
             start, length = maps[id(slab), k]
             active = [m for m in block.terms if m.a[t] != 0 or m.b[t] != 0]
@@ -331,7 +331,7 @@ def _plan(kinds: Sequence[_Slab], starts: Index, count: int, adds: bool) -> Comb
     )
 
 
-def signs_by_column(pattern: SymmetricPattern) -> Array:
+def skew_signs(pattern: SymmetricPattern) -> Array:
     """Return the signs (nnz,) of a skew matrix's lower triangle in the entries of
     `pattern.full`.
     """
@@ -339,14 +339,14 @@ def signs_by_column(pattern: SymmetricPattern) -> Array:
     return np.sign(rows - columns).astype(float)
 
 
-def skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
+def full_skew_values(pattern: SymmetricPattern, skew: Array) -> Array:
     """Return the entries (…, nnz) of the complete skew matrix in the order of
     `pattern.full`; empty input gives empty output.
     """
     if not skew.size:
         return skew
     # Rows contiguous, which fancy indices would not leave so.
-    return np.take(skew, pattern.full[2], axis=-1) * signs_by_column(pattern)
+    return np.take(skew, pattern.full[2], axis=-1) * skew_signs(pattern)
 
 
 class Submatrix:
@@ -374,7 +374,7 @@ class Submatrix:
         is_selected = (place[along] >= 0) & (number[across] >= 0)
         self._source = source[is_selected]
         self._in_both = source[is_selected] + np.where(
-            (along > across)[is_selected], 0, pattern.entries
+            (along > across)[is_selected], 0, pattern.entry_count
         )
         ends = np.cumsum(np.bincount(place[along[is_selected]], minlength=len(rows)))
         parts = (
@@ -384,7 +384,7 @@ class Submatrix:
         )
         self._matrix = sp.csr_array(parts, shape=(len(rows), count))
 
-    def of(self, lower: Array, skew: Array) -> sp.csr_array:
+    def extract(self, lower: Array, skew: Array) -> sp.csr_array:
         """Return the submatrix (k, c); it is overwritten by the next call.
 
         Parameters
@@ -402,26 +402,26 @@ class Submatrix:
         return self._matrix
 
 
-def whole(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
+def full_matrix(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
     """Return the sparse matrix (3n, 3n) of the symmetric part `lower` (m,) and the skew
     part `skew`, (m,) or (0,).
     """
     matrix = pattern.matrix(lower)
     if skew.size:
-        matrix.data += skew_values(pattern, skew)
+        matrix.data += full_skew_values(pattern, skew)
     return matrix
 
 
-def adding_skew(
+def skew_block_band(
     columns: int,
     row_starts: Index,
     blocks: Sequence[BandBlock],
-    top: int = 0,
+    top_rows: int = 0,
     by_velocity: bool = False,
 ) -> BlockBand:
     """Return the structure that adds skew parts to the entries of blocks of symmetric parts.
 
-    Fill it with values in the order of `skew_values`. Other arguments as in `BlockBand`.
+    Fill it with values in the order of `full_skew_values`. Other arguments as in `BlockBand`.
 
     Parameters
     ----------
@@ -431,9 +431,9 @@ def adding_skew(
     own = [
         replace(
             block,
-            source=block.whole,
+            lower_positions=block.full_positions,
             terms=[BlockTerm(t.shift, t.a, t.b if by_velocity else 0.0 * t.b) for t in block.terms],
         )
         for block in blocks
     ]
-    return BlockBand(columns, row_starts, own, top, adds=True)
+    return BlockBand(columns, row_starts, own, top_rows, adds=True)

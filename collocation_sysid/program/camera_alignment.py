@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from .skin import GRAZING, Skin
-from .view import View
+from .skin import GRAZING, VisibleSurface
+from .view import DepthCameraModel
 
 # Points of the surface that are associated with the cloud.
 SAMPLES = 250
@@ -40,7 +40,9 @@ def thinned(cloud: Array) -> Array:
     return cloud[:: 1 + len(cloud) // ENOUGH]
 
 
-def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Array]:
+def align_camera(
+    camera: DepthCameraModel, surface: VisibleSurface, x: Array, image: int
+) -> tuple[Array, Array]:
     """Return the rotation vector (3,) [rad] and translation (3,) [m] of the camera error that align
     its points with a shape.
 
@@ -50,27 +52,27 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
 
     Parameters
     ----------
-    view : View
+    camera : DepthCameraModel
         Model of the camera.
-    skin : Skin
+    surface : VisibleSurface
         Surface of the body.
     x : (n, 3) array
         Surface nodes [m].
-    sample : int
+    image : int
         Index of the image.
     """
-    rotations, translations = view.motion
-    corners = ((x - translations[sample]) @ rotations[sample])[skin.flat]
+    rotations, translations = camera.poses
+    corners = ((x - translations[image]) @ rotations[image])[surface.flat_triangles]
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(sides, axis=1)
-    selected_area = area * np.repeat(skin.chosen, len(area) // len(skin.faces))
+    selected_area = area * np.repeat(surface.is_selected, len(area) // len(surface.faces))
     rng = np.random.default_rng(0)
     chosen = rng.choice(len(area), SAMPLES, p=selected_area / selected_area.sum())
     places = np.einsum("pc,pci->pi", rng.dirichlet(np.ones(3), SAMPLES), corners[chosen])
     normals = sides[chosen] / area[chosen, None]
     size_m = float(np.linalg.norm(np.ptp(x, axis=0)))
-    tree = KDTree(thinned(view.depth.points_m[sample]))
-    gates = np.geomspace(REACH * size_m, view.depth.gate_m, ITERATIONS)
+    tree = KDTree(thinned(camera.depth.points_m[image]))
+    gates = np.geomspace(REACH * size_m, camera.depth.gate_m, ITERATIONS)
     rotation_vectors = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
     near_cloud = np.asarray(tree.data)[KDTree(places).query(tree.data)[0] < gates[0]]
     shifts = [
@@ -82,27 +84,28 @@ def alignment(view: View, skin: Skin, x: Array, sample: int) -> tuple[Array, Arr
     ]
     for half in np.array_split(gates, 2):
         candidates = [
-            _aligned(view, tree, places, normals, half, *start) for _, *start in candidates
+            _iterate_alignment(camera, tree, places, normals, half, *start)
+            for _, *start in candidates
         ]
         candidates = sorted(candidates, key=lambda each: each[0])[:KEPT]
     _, turn, shift = candidates[0]
     return turn.as_rotvec(), shift
 
 
-def _aligned(
-    view: View,
+def _iterate_alignment(
+    camera: DepthCameraModel,
     tree: KDTree,
     places: Array,
     normals: Array,
     gates: Array,
-    turn: Rotation,
-    shift: Array,
+    rotation: Rotation,
+    translation_m: Array,
 ) -> tuple[float, Rotation, Array]:
     """Iterate the alignment from one start.
 
     Parameters
     ----------
-    view : View
+    camera : DepthCameraModel
         Model of the camera.
     tree : KDTree
         Points of the cloud in the camera's frame.
@@ -110,9 +113,9 @@ def _aligned(
         Points of the surface with their normals, in the camera's stated frame.
     gates : array
         Gate of each iteration [m].
-    turn : Rotation
+    rotation : Rotation
         Initial rotation.
-    shift : (3,) array
+    translation_m : (3,) array
         Initial translation [m].
 
     Returns
@@ -120,17 +123,17 @@ def _aligned(
     (float, Rotation, (3,) array)
         Mean squared distance over the gate, limited to one per point; rotation; and translation.
     """
-    pivot = view.pivot_m
-    prior = np.concatenate([view.prior(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
+    pivot = camera.pivot_m
+    prior = np.concatenate([camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
     mismatch = 1.0
     for gate in gates:
         # Cloud points p are at R (p − c) + c + d: the surface looks for them in their own frame.
-        _, nearest = tree.query(turn.inv().apply(places - pivot - shift) + pivot)
-        aligned = turn.apply(np.asarray(tree.data)[nearest] - pivot) + pivot + shift
+        _, nearest = tree.query(rotation.inv().apply(places - pivot - translation_m) + pivot)
+        aligned = rotation.apply(np.asarray(tree.data)[nearest] - pivot) + pivot + translation_m
         distances = aligned - places
         is_facing = np.ones(len(places), dtype=bool)
-        if view.depth.camera.matrix is not None:
-            ways = turn.apply(-pivot) + pivot + shift - places
+        if camera.depth.camera.matrix is not None:
+            ways = rotation.apply(-pivot) + pivot + translation_m - places
             is_facing = np.sum(normals * ways, axis=1) > GRAZING * np.linalg.norm(ways, axis=1)
         squares = np.sum(distances**2, axis=1)
         mismatch = (
@@ -139,7 +142,11 @@ def _aligned(
         weight = np.sqrt(INDEPENDENT / max(is_facing.sum(), 1)) * is_facing / gate
         weight /= 1 + squares / (gate / 2) ** 2
         by = np.concatenate(
-            [-_skew(aligned - pivot - shift), np.tile(np.eye(3), (len(places), 1, 1))], axis=2
+            [
+                -_cross_product_matrices(aligned - pivot - translation_m),
+                np.tile(np.eye(3), (len(places), 1, 1)),
+            ],
+            axis=2,
         )
         projected = np.einsum("pi,pij->pj", normals, by), np.sum(normals * distances, axis=1)
         rows = [
@@ -147,16 +154,16 @@ def _aligned(
             *(SLIDING * by * weight[:, None, None]).swapaxes(0, 1),
         ]
         right = [projected[1] * weight, *(SLIDING * distances * weight[:, None]).T]
-        prior_residual = prior * np.concatenate([turn.as_rotvec(), shift])
+        prior_residual = prior * np.concatenate([rotation.as_rotvec(), translation_m])
         step = np.linalg.lstsq(
             np.concatenate([*rows, np.diag(prior)]), -np.concatenate([*right, prior_residual])
         )[0]
-        turn = Rotation.from_rotvec(step[:3]) * turn
-        shift = shift + step[3:]
-    return mismatch, turn, shift
+        rotation = Rotation.from_rotvec(step[:3]) * rotation
+        translation_m = translation_m + step[3:]
+    return mismatch, rotation, translation_m
 
 
-def _skew(vectors: Array) -> Array:
+def _cross_product_matrices(vectors: Array) -> Array:
     """Return the matrices (P, 3, 3) of cross products with vectors (P, 3)."""
     x, y, z = vectors.T
     none = np.zeros_like(x)

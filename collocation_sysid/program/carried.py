@@ -1,8 +1,10 @@
 """Lifted variables: variables of the program that follow from the others, each with an equation.
 
-By default they are eliminated; `Collocation.explicit` adds them so that exact matrices stay sparse.
+By default they are eliminated; `Collocation.has_lifted_variables` adds them so that exact matrices
+stay sparse.
 Their equations come after all other constraints, and the variables after all other variables.
-Subclass `Carried` to lift another quantity; most subclasses only declare `patterns` of small
+Subclass `LiftedVariables` to lift another quantity; most subclasses only declare `patterns` of
+small
 expressions, see `pattern_rows`.
 """
 
@@ -17,13 +19,13 @@ from typing import ClassVar
 import numpy as np
 
 from ..arrays import Array, Index
-from .part import Part
-from .pattern_rows import Pattern
-from .segment import RowWeights, Segment, Weighed
+from .part import ExperimentIterate
+from .pattern_rows import ExpressionPattern
+from .segment import RowWeights, Transcription, Weighed
 
 
 @dataclass(frozen=True)
-class Places:
+class LiftedOffsets:
     """Offsets of a group of lifted variables in the program.
 
     Attributes
@@ -39,28 +41,28 @@ class Places:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried(ABC):
+class LiftedVariables(ABC):
     """A group of lifted variables of one experiment, and as many equations.
 
     Attributes
     ----------
-    segment : Segment
+    segment : Transcription
         Transcription of the experiment.
-    number : int
+    segment_index : int
         Index of the segment.
     first_phi : int
         Index in z where the nuisance parameters of all experiments begin.
-    places : Places
+    offsets : LiftedOffsets
         Offsets of the variables and equations.
-    called : {"memory", "force", "pressure", "wrench"}
+    kind : {"memory", "force", "pressure", "wrench"}
         Kind of quantity.
     """
 
-    segment: Segment
-    number: int
+    segment: Transcription
+    segment_index: int
     first_phi: int
-    places: Places
-    called: ClassVar[str]
+    offsets: LiftedOffsets
+    kind: ClassVar[str]
 
     @property
     @abstractmethod
@@ -73,59 +75,61 @@ class Carried(ABC):
         return int(np.prod(self.shape))
 
     @property
-    def variables(self) -> slice:
+    def columns(self) -> slice:
         """Slice of the variables in z."""
-        return slice(self.places.variable, self.places.variable + self.count)
+        return slice(self.offsets.variable, self.offsets.variable + self.count)
 
     @property
     def rows(self) -> slice:
         """Slice of the equations in g."""
-        return slice(self.places.row, self.places.row + self.count)
+        return slice(self.offsets.row, self.offsets.row + self.count)
 
     @property
-    def after(self) -> Places:
+    def next_offsets(self) -> LiftedOffsets:
         """Offsets of the group that follows."""
-        return Places(self.variables.stop, self.rows.stop)
+        return LiftedOffsets(self.columns.stop, self.rows.stop)
 
     @property
     def phi_columns(self) -> Index:
         """Indices (k,) in z of the experiment's nuisance parameters."""
-        return self.first_phi + self.segment.local.places - self.segment.nq
+        return self.first_phi + self.segment.nuisance_indices.indices - self.segment.nq
 
     @property
-    def least(self) -> float:
+    def lower_bound(self) -> float:
         """Lower bound of the variables."""
         return -np.inf
 
-    def given(self, part: Part, z: Array) -> Part:
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
         """Return the part with those quantities replaced that these variables of z determine."""
-        return part
+        return iterate
 
     @abstractmethod
-    def following(self, part: Part) -> Array:
+    def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled variables (count,) that satisfy the equations at the part's
         positions and parameters.
         """
 
     @cached_property
-    def patterns(self) -> tuple[Pattern, ...]:
+    def patterns(self) -> tuple[ExpressionPattern, ...]:
         """Expressions whose sum is the equations; row indices count from the group's first
         equation.
         """
         return ()
 
-    def values(self, part: Part, z: Array) -> Array:
+    def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,) at the part and z."""
-        return np.sum([pattern.values(z, self.count) for pattern in self.patterns], axis=0)
+        return np.sum([pattern.residuals(z, self.count) for pattern in self.patterns], axis=0)
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
         values.
         """
-        rows, columns = together(pattern.jacobian_entries() for pattern in self.patterns)
-        return self.places.row + rows, columns
+        rows, columns = concatenated_entries(
+            pattern.jacobian_entries() for pattern in self.patterns
+        )
+        return self.offsets.row + rows, columns
 
-    def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the equations (count,), and the values of `jacobian_entries`."""
         evaluated = [pattern.jacobian_values(z, self.count) for pattern in self.patterns]
         values, slopes = zip(*evaluated, strict=True)
@@ -135,16 +139,21 @@ class Carried(ABC):
         """Return rows and columns of the additional entries of the Lagrangian's Hessian,
         upper triangle.
         """
-        return together(pattern.hessian_entries() for pattern in self.patterns)
+        return concatenated_entries(pattern.hessian_entries() for pattern in self.patterns)
 
     def hessian_values(
-        self, part: Part, z: Array, loss_weight: float, multipliers: Array, weights: RowWeights
+        self,
+        iterate: ExperimentIterate,
+        z: Array,
+        loss_weight: float,
+        multipliers: Array,
+        weights: RowWeights,
     ) -> Array:
         """Return the values of `hessian_entries`.
 
         Parameters
         ----------
-        part : Part
+        iterate : ExperimentIterate
             The experiment at z.
         z : array
             All variables of the program.
@@ -161,24 +170,24 @@ class Carried(ABC):
 
     # What the loss has of the variables ---------------------------------------------------------
 
-    def gradient(self, part: Part) -> Array:
+    def loss_gradient(self, iterate: ExperimentIterate) -> Array:
         """Return the gradient of the loss by these variables (count,)."""
         return np.zeros(self.count)
 
     # What multipliers weigh ---------------------------------------------------------------------
 
-    def row_weights(self, multipliers: Array) -> Array | float:
+    def residual_weights(self, multipliers: Array) -> Array | float:
         """Return the derivative (N, 3n) of multipliers · equations by the residual c in
         newtons [1/N]; 0 if there is none.
         """
         return 0.0
 
     @property
-    def history(self) -> int | None:
+    def history_index(self) -> int | None:
         """Index of the history among those of the motion, or None if the group is no history."""
         return None
 
-    def weighed(self, part: Part, multipliers: Array) -> Weighed:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> Weighed:
         """Return the history, and the weights of each h_k in multipliers · equations.
 
         Raises
@@ -189,13 +198,13 @@ class Carried(ABC):
         raise NotImplementedError
 
     @property
-    def nonzeros(self) -> tuple[int, int]:
+    def entry_counts(self) -> tuple[int, int]:
         """Numbers of additional entries of the Jacobian and of the Hessian."""
         return len(self.jacobian_entries()[0]), len(self.hessian_entries()[0])
 
 
-def together(parts: Iterable[tuple[Index, Index]]) -> tuple[Index, Index]:
+def concatenated_entries(groups: Iterable[tuple[Index, Index]]) -> tuple[Index, Index]:
     """Concatenate rows, and columns, of several groups of entries; no group gives empty arrays."""
     none = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    rows, columns = zip(none, *parts, strict=True)
+    rows, columns = zip(none, *groups, strict=True)
     return np.concatenate(rows), np.concatenate(columns)

@@ -2,8 +2,10 @@
 clock.
 
 The place X of a marker on the undeformed body and the shift τ of its clock are estimated.
-Predictions are smooth functions of them within one element and around one sample; a `Chart` states
-which. When estimates leave it, `Chart.following` returns another chart, and the problem stays the
+Predictions are smooth functions of them within one element and around one sample; a
+`MarkerAssociation` states
+which. When estimates leave it, `MarkerAssociation.follow_estimates` returns another chart, and the
+problem stays the
 same up to the tolerances below. A chart also contains the surface correspondences of depth cameras,
 see `sighting`.
 """
@@ -19,8 +21,8 @@ import numpy as np
 from ..arrays import Array, Index
 from ..fem.body import Body
 from ..recording.experiment import Experiment
-from ..recording.placement import Placement, Shape
-from .sighting import Sighting, sightings_of
+from ..recording.placement import LocatedBody, Placement
+from .sighting import SurfaceCorrespondences, initial_correspondences
 
 # A place leaves its element when another contains it better by this barycentric coordinate, so that
 # it cannot alternate between two.
@@ -40,19 +42,19 @@ class ShapeFunctions(NamedTuple):
     ----------
     weights : (M, npe) array
         Shape functions, npe being the nodes per element.
-    slopes : (M, npe, k) array
+    gradients : (M, npe, k) array
         First derivatives.
-    curvatures : (M, npe, k, k) array
+    hessians : (M, npe, k, k) array
         Second derivatives.
     """
 
     weights: Array
-    slopes: Array
-    curvatures: Array
+    gradients: Array
+    hessians: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Chart:
+class MarkerAssociation:
     """Element of each marker, directions in which its place may move, and the clock's sample.
 
     Attributes
@@ -61,7 +63,7 @@ class Chart:
         The body.
     sigma_m : (M,) array
         Prior standard deviation of each place [m], zero where it is exact.
-    given_m : (M, 3) array
+    prior_places_m : (M, 3) array
         Places at the centres of the priors [m].
     on_surface : bool
         Whether places move in the plane of the nearest face (k = 2) or freely (k = 3).
@@ -69,47 +71,47 @@ class Chart:
         Nodes and shape functions of exact places.
     cells : (M,) array
         Elements of estimated places.
-    points_m : (M, 3) array
+    centre_places_m : (M, 3) array
         Places at the centre of the chart [m].
     axes : (M, 3, k) array
         Orthonormal directions in which places may move.
-    crossed : (M, 2, 3) array
+    crossed_edges : (M, 2, 3) array
         Point and direction of the edge across which each place last left the surface; NaN if it did
         not.
-    again : (M,) array
+    crossing_counts : (M,) array
         How often in succession it left the surface across this edge before.
-    samples : int
+    clock_samples : int
         Whole samples of the clock's shift.
-    sightings : tuple of Sighting
+    correspondences : tuple of SurfaceCorrespondences
         Surface correspondences of depth cameras.
     """
 
     body: Body
     sigma_m: Array
-    given_m: Array
+    prior_places_m: Array
     on_surface: bool
     nodes: Index
     weights: Array
     cells: Index
-    points_m: Array
+    centre_places_m: Array
     axes: Array
-    crossed: Array
-    again: Index
-    samples: int = 0
-    sightings: tuple[Sighting, ...] = ()
+    crossed_edges: Array
+    crossing_counts: Index
+    clock_samples: int = 0
+    correspondences: tuple[SurfaceCorrespondences, ...] = ()
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Chart:
+    def from_experiment(cls, experiment: Experiment) -> MarkerAssociation:
         """Build the chart of the stated places of an experiment's markers and depth cameras.
 
         Markers without a stated place get the place where their first sample lies on the undeformed
-        body in its grasp; `Segment.placed` replaces it before a solve.
+        body in its grasp; `Transcription.place_unknown_markers` replaces it before a solve.
         """
         body = experiment.body
         markers = experiment.markers
         placement = markers.placement
         sigma_m = experiment.place_sigma_m
-        points = markers.observe(body.nodes_m)
+        points = markers.predict_positions(body.nodes_m)
         k = 2 if markers.on_surface else 3
         chart = cls(
             body,
@@ -123,30 +125,32 @@ class Chart:
             np.zeros((len(points), 3, k)),
             np.full((len(points), 2, 3), np.nan),
             np.zeros(len(points), dtype=np.int64),
-            sightings=sightings_of(experiment),
+            correspondences=initial_correspondences(experiment),
         )
-        return chart.about(points)
+        return chart.centred_at(points)
 
     @classmethod
-    def exact(cls, body: Body, placement: Placement, points_m: Array) -> Chart:
+    def from_exact_places(
+        cls, body: Body, placement: Placement, points_m: Array
+    ) -> MarkerAssociation:
         """Build the chart of places (M, 3) [m] that are not estimated."""
         count = len(points_m)
         none = np.zeros(count, dtype=np.int64)
         return cls(
             body=body,
             sigma_m=np.zeros(count),
-            given_m=points_m,
+            prior_places_m=points_m,
             on_surface=False,
             nodes=placement.nodes,
             weights=placement.weights,
             cells=none,
-            points_m=points_m,
+            centre_places_m=points_m,
             axes=np.zeros((count, 3, 3)),
-            crossed=np.full((count, 2, 3), np.nan),
-            again=none,
+            crossed_edges=np.full((count, 2, 3), np.nan),
+            crossing_counts=none,
         )
 
-    def suits(self, experiment: Experiment) -> bool:
+    def matches(self, experiment: Experiment) -> bool:
         """Whether the chart belongs to the experiment's body, and has the same priors and
         cameras.
         """
@@ -154,7 +158,7 @@ class Chart:
             self.body is experiment.body
             and self.on_surface == experiment.markers.on_surface
             and np.array_equal(self.sigma_m, experiment.place_sigma_m)
-            and [s.view.depth for s in self.sightings] == [*experiment.depths]
+            and [s.camera.depth for s in self.correspondences] == [*experiment.depths]
         )
 
     @cached_property
@@ -163,21 +167,21 @@ class Chart:
         return np.flatnonzero(self.sigma_m > 0)
 
     @cached_property
-    def centre(self) -> Array:
+    def centre_coordinates(self) -> Array:
         """Coordinates φ (M, k) of the places at the centre of the chart."""
-        return self._coordinates(self.points_m)
+        return self._coordinates(self.centre_places_m)
 
     def _coordinates(self, points_m: Array) -> Array:
         """Return φ (M, k) of places (M, 3) [m]; zero for exact places."""
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
-        return np.einsum("mik,mi->mk", self.axes, points_m - self.given_m) / sigma
+        return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
 
     def places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) on the undeformed body at φ (M, k) [m]."""
-        moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre)
-        return self.points_m + self.sigma_m[:, None] * moved
+        moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre_coordinates)
+        return self.centre_places_m + self.sigma_m[:, None] * moved
 
-    def reading(self, phi: Array) -> tuple[Index, ShapeFunctions]:
+    def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
         """Return the nodes (M, npe) of each marker's element and their shape functions at φ
         (M, k).
         """
@@ -191,7 +195,7 @@ class Chart:
         if len(estimated):
             cells = self.cells[estimated]
             local = self._shape.barycentric(self.places_m(phi)[estimated], cells)
-            gradients = self._shape.gradients(cells) @ (
+            gradients = self._shape.barycentric_gradients(cells) @ (
                 self.sigma_m[estimated, None, None] * self.axes[estimated]
             )
             nodes[estimated] = self.body.cells[cells]
@@ -203,14 +207,15 @@ class Chart:
         return nodes, ShapeFunctions(weights, slopes, curvatures)
 
     @cached_property
-    def _shape(self) -> Shape:
+    def _shape(self) -> LocatedBody:
         """Geometry of the undeformed body."""
-        return Shape(self.body.nodes_m, self.body)
+        return LocatedBody(self.body.nodes_m, self.body)
 
     # Following the estimates ------------------------------------------------------------------
 
-    def about(self, points_m: Array) -> Chart:
-        """Return the chart with its centre at places (M, 3) [m]; with `on_surface` at the
+    def centred_at(self, points_m: Array) -> MarkerAssociation:
+        """Return the chart with its centre at places (M, 3) [m]; with `surface_gaps_and_pressures`
+        at the
         nearest points of the surface.
         """
         points = points_m.copy()
@@ -218,13 +223,13 @@ class Chart:
         axes = self.axes.copy()
         for m in self.estimated:
             if self.on_surface:
-                points[m], axes[m] = self._shape.on_surface(points[m])
+                points[m], axes[m] = self._shape.nearest_surface_point(points[m])
             else:
                 axes[m] = np.eye(3)
-            cells[m], _ = self._shape.cell_of(points[m])
-        return replace(self, points_m=points, cells=cells, axes=axes)
+            cells[m], _ = self._shape.nearest_cell(points[m])
+        return replace(self, centre_places_m=points, cells=cells, axes=axes)
 
-    def following(self, phi: Array, shift_samples: float) -> tuple[Chart, Array]:
+    def follow_estimates(self, phi: Array, shift_samples: float) -> tuple[MarkerAssociation, Array]:
         """Return a chart for estimates that have left this one, and φ in it.
 
         Parameters
@@ -243,29 +248,31 @@ class Chart:
         has_left = False
         for m in self.estimated:
             has_left = has_left or self._has_left(points[m], int(self.cells[m]))
-        samples = self.samples
+        samples = self.clock_samples
         if abs(shift_samples - samples) > SAMPLES_OFF:
             samples = round(shift_samples)
         if not has_left:
-            return (self if samples == self.samples else replace(self, samples=samples)), phi
-        chart = replace(self._settled(points), samples=samples)
-        return chart, chart.centre
+            return (
+                self if samples == self.clock_samples else replace(self, clock_samples=samples)
+            ), phi
+        chart = replace(self._without_alternation(points), clock_samples=samples)
+        return chart, chart.centre_coordinates
 
-    def _settled(self, points_m: Array) -> Chart:
+    def _without_alternation(self, points_m: Array) -> MarkerAssociation:
         """Return the chart about places (M, 3) such that none alternates between two faces for
         ever.
 
         Where a marker stands off an edge, the plane of each face may lead back to the other. Such a
         place stays in one of the planes, even outside the surface.
         """
-        centred = self.about(points_m)
+        centred = self.centred_at(points_m)
         if not self.on_surface:
             return centred
-        points = centred.points_m.copy()
+        points = centred.centre_places_m.copy()
         axes = centred.axes.copy()
         cells = centred.cells.copy()
-        crossed = self.crossed.copy()
-        again = self.again.copy()
+        crossed = self.crossed_edges.copy()
+        again = self.crossing_counts.copy()
         same_m = SAME * self._shape.mean_edge_m
         for m in self.estimated:
             beyond = points_m[m] - points[m]
@@ -277,9 +284,14 @@ class Chart:
             if again[m] == AGAIN:
                 points[m] = points_m[m]
                 axes[m] = self.axes[m]
-                cells[m], _ = self._shape.cell_of(points_m[m])
+                cells[m], _ = self._shape.nearest_cell(points_m[m])
         return replace(
-            centred, points_m=points, axes=axes, cells=cells, crossed=crossed, again=again
+            centred,
+            centre_places_m=points,
+            axes=axes,
+            cells=cells,
+            crossed_edges=crossed,
+            crossing_counts=again,
         )
 
     def _has_left(self, point: Array, cell: int) -> bool:
@@ -290,13 +302,13 @@ class Chart:
             return False
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
             return False  # none holds it better
-        best, _ = self._shape.cell_of(point)
+        best, _ = self._shape.nearest_cell(point)
         depth = self._shape.barycentric(np.stack([point, point]), np.array([cell, best])).min(
             axis=1
         )
         return bool(depth[1] > depth[0] + BETTER)
 
-    def at_markers(self, nodes_m: Array, points_m: Array) -> Array:
+    def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:
         """Return the places (M, 3) on the undeformed body of points (M, 3) measured in another
         configuration.
 
@@ -314,11 +326,11 @@ class Chart:
         (M, 3) array
             Places [m]; NaN where a point is not finite.
         """
-        shape = Shape(nodes_m, self.body)
+        shape = LocatedBody(nodes_m, self.body)
         places_m = np.full(points_m.shape, np.nan)
         for m, point in enumerate(points_m):
             if np.isfinite(point).all():
-                nodes, weights = shape.nearest(point)
+                nodes, weights = shape.weights_at_nearest_point(point)
                 places_m[m] = weights @ self.body.nodes_m[nodes]
         return places_m
 

@@ -15,7 +15,8 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 =================  =========================================================================
 
 Lifted variables (history variables, reaction forces, wrenches, contact pressures) are eliminated by
-default; with `Collocation.explicit` they follow at the end of z, and their equations at the end of
+default; with `Collocation.has_lifted_variables` they follow at the end of z, and their equations at
+the end of
 g.
 
 Constraints g, in this order:
@@ -25,7 +26,7 @@ c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start 
                    equilibrium) or 1, free dofs i ascending; f_e is the mean of
                    |∂c_t/∂x_t| ℓ_e at the guess
 (x − u x̄) / ℓ_e    prescribed displacements, in place of c: of dofs grasped for a part of the
-                   time; with `explicit_grasps` of all grasped dofs, so that every dof has a
+                   time; with `has_grasp_constraints` of all grasped dofs, so that every dof has a
                    constraint
 =================  =========================================================================
 """
@@ -45,26 +46,26 @@ from ..errors import InputError
 from ..model.parameters import Parameters
 from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
-from .carried import Carried, Places
-from .charts import Chart
-from .entries import OffBand
-from .explicit import carried_by
-from .part import Part
-from .segment import First, RowWeights, Segment
-from .sharing import locals_of, shared_charts
+from .carried import LiftedOffsets, LiftedVariables
+from .charts import MarkerAssociation
+from .entries import SparseAssembly
+from .explicit import lift_variables
+from .part import ExperimentIterate
+from .segment import RowWeights, SegmentOffsets, Transcription
+from .sharing import nuisance_indices, shared_charts
 
 
-def carried_over(z: Array, of: Collocation, to: Collocation) -> Array:
+def convert_variables(z: Array, source: Collocation, target: Collocation) -> Array:
     """Convert the variables z of a program to those of the same program with or without lifted
     variables.
 
     Parameters
     ----------
     z : (variables,) array
-        Variables of the program `of`.
-    of : Collocation
+        Variables of the program `source`.
+    source : Collocation
         The program that z belongs to.
-    to : Collocation
+    target : Collocation
         The same program, with or without lifted variables.
 
     Returns
@@ -72,7 +73,7 @@ def carried_over(z: Array, of: Collocation, to: Collocation) -> Array:
     (to.variables,) array
         Variables; lifted ones follow from positions and parameters.
     """
-    return z if len(z) == to.variables else to.pack(*of.unpack(z))
+    return z if len(z) == target.variable_count else target.pack(*source.unpack(z))
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class Violation:
         Index of the node.
     axis : str
         "x", "y" or "z".
-    newtons : float
+    residual_n : float
         Residual [N].
     """
 
@@ -97,12 +98,12 @@ class Violation:
     time_s: float
     node: int
     axis: str
-    newtons: float
+    residual_n: float
 
     def __str__(self) -> str:
         return (
             f"{self.experiment}: t = {self.time_s:.4g} s, node {self.node}, {self.axis}: "
-            f"{self.newtons:+.3g} N"
+            f"{self.residual_n:+.3g} N"
         )
 
 
@@ -120,18 +121,19 @@ class Collocation:
         Time discretisation.
     substeps : int, default 1
         Grid steps between samples; static experiments have one.
-    explicit_grasps : bool, default False
+    has_grasp_constraints : bool, default False
         If true, prescribed displacements are constraints instead of bounds.
     huber : float, optional
-        Threshold of Huber's loss in standard deviations, see `Instrument`; None means a quadratic
+        Threshold of Huber's loss in standard deviations, see `ResidualExpression`; None means a
+        quadratic
         loss.
-    charts : mapping of experiment name to Chart
+    associations : mapping of experiment name to MarkerAssociation
         Elements, clock samples and correspondences of the measurements. Experiments that are
         missing, or whose chart belongs to another body or other priors, get the chart of the stated
         places.
-    explicit : bool, default False
+    has_lifted_variables : bool, default False
         If true, keep history variables, measured wrenches and contact pressures as variables with
-        constraints (lifted variables, see `carried`), so that the exact matrices are sparse. If
+        constraints (lifted variables, see `lifted`), so that the exact matrices are sparse. If
         false, they are eliminated. The optimum and the multipliers of the other constraints are the
         same.
 
@@ -145,10 +147,10 @@ class Collocation:
     parameters: Parameters
     scheme: str | Scheme = "midpoint"
     substeps: int = 1
-    explicit_grasps: bool = False
+    has_grasp_constraints: bool = False
     huber: float | None = None
-    charts: Mapping[str, Chart] = field(default_factory=dict)
-    explicit: bool = False
+    associations: Mapping[str, MarkerAssociation] = field(default_factory=dict)
+    has_lifted_variables: bool = False
 
     def __post_init__(self) -> None:
         if all(experiment.validation for experiment in self.experiments):
@@ -157,52 +159,62 @@ class Collocation:
             raise InputError(f"substeps = {self.substeps}, expected at least 1")
         if self.huber is not None and not self.huber > 0:
             raise InputError(f"huber = {self.huber:g}, expected a positive number", None, "solver")
-        self.parameters.fit({id(s.body): s.body for s in self.segments}.values())
+        self.parameters.require_constants_of(
+            {id(s.body): s.body for s in self.transcriptions}.values()
+        )
 
     # Sizes and layout -------------------------------------------------------------------------
 
     @cached_property
-    def segments(self) -> tuple[Segment, ...]:
+    def transcriptions(self) -> tuple[Transcription, ...]:
         """Transcriptions of the experiments that are fitted."""
         fitted = [each for each in self.experiments if not each.validation]
-        segments = list[Segment]()
-        for experiment, local in zip(fitted, locals_of(fitted, self.nq), strict=True):
-            chart = self.charts.get(experiment.name)
-            if chart is None or not chart.suits(experiment):
-                chart = Chart.of(experiment)
+        segments = list[Transcription]()
+        for experiment, local in zip(fitted, nuisance_indices(fitted, self.nq), strict=True):
+            chart = self.associations.get(experiment.name)
+            if chart is None or not chart.matches(experiment):
+                chart = MarkerAssociation.from_experiment(experiment)
             segments.append(
-                Segment(
+                Transcription(
                     experiment,
                     self.parameters,
                     scheme=self.scheme,
-                    substeps=1 if experiment.static else self.substeps,
-                    explicit_grasps=self.explicit_grasps,
+                    substeps=1 if experiment.is_static else self.substeps,
+                    has_grasp_constraints=self.has_grasp_constraints,
                     huber=self.huber,
-                    first=segments[-1].after if segments else First(self.nq, 0),
-                    local=local,
-                    chart=chart,
+                    offsets=segments[-1].next_offsets if segments else SegmentOffsets(self.nq, 0),
+                    nuisance_indices=local,
+                    association=chart,
                 )
             )
-        return _read_alike(segments, [segment.chart for segment in segments])
+        return _with_shared_associations(segments, [segment.association for segment in segments])
 
     @cached_property
-    def carried(self) -> tuple[Carried, ...]:
-        """Lifted variables, experiment by experiment; empty unless `explicit`."""
-        if not self.explicit:
+    def lifted(self) -> tuple[LiftedVariables, ...]:
+        """Lifted variables, experiment by experiment; empty unless `has_lifted_variables`."""
+        if not self.has_lifted_variables:
             return ()
-        last = self.segments[-1].after
-        return carried_by(self.segments, self.of_phi.start, Places(self.of_phi.stop, last.row))
+        last = self.transcriptions[-1].next_offsets
+        return lift_variables(
+            self.transcriptions,
+            self.phi_columns.start,
+            LiftedOffsets(self.phi_columns.stop, last.row),
+        )
 
-    def made_explicit(self) -> Collocation:
+    def with_lifted_variables(self) -> Collocation:
         """Return the program with lifted variables, or self if it has them already or
         nothing can be lifted.
         """
-        has_sensors = any(len(s.sensed_dofs) for s in self.segments)
-        has_complementarity = any(s.dynamics.forces.pressing for s in self.segments)
-        if self.explicit or not (self.remembers or has_sensors or has_complementarity):
+        has_sensors = any(len(s.sensed_dofs) for s in self.transcriptions)
+        has_complementarity = any(
+            s.dynamics.forces.complementarity_terms for s in self.transcriptions
+        )
+        if self.has_lifted_variables or not (
+            self.has_eliminated_histories or has_sensors or has_complementarity
+        ):
             return self
-        other = replace(self, explicit=True)
-        vars(other)["segments"] = self.segments
+        other = replace(self, has_lifted_variables=True)
+        vars(other)["transcriptions"] = self.transcriptions
         return other
 
     @property
@@ -213,47 +225,47 @@ class Collocation:
     @property
     def nphi(self) -> int:
         """Number of nuisance parameters φ of all experiments; shared ones count once."""
-        return int(np.concatenate(self.places).max(initial=self.nq - 1)) + 1 - self.nq
+        return int(np.concatenate(self.parameter_indices).max(initial=self.nq - 1)) + 1 - self.nq
 
     @property
-    def variables(self) -> int:
+    def variable_count(self) -> int:
         """Number of variables z."""
-        return self.of_phi.stop + self.added()
+        return self.phi_columns.stop + self.lifted_count()
 
     @property
-    def constraints(self) -> int:
+    def constraint_count(self) -> int:
         """Number of constraints g."""
-        return self.segments[-1].after.row + self.added()
+        return self.transcriptions[-1].next_offsets.row + self.lifted_count()
 
-    def added(self, called: str | None = None) -> int:
+    def lifted_count(self, kind: str | None = None) -> int:
         """Return the number of lifted variables, which is also that of their equations.
 
         Parameters
         ----------
-        called : {"memory", "force", "pressure", "wrench"}, optional
+        kind : {"memory", "force", "pressure", "wrench"}, optional
             Kind of lifted variables; None means all.
         """
-        return sum(each.count for each in self.carried if called in (None, each.called))
+        return sum(each.count for each in self.lifted if kind in (None, each.kind))
 
     @property
-    def carried_nonzeros(self) -> tuple[int, int]:
+    def lifted_nonzeros(self) -> tuple[int, int]:
         """Numbers of entries of lifted variables in the Jacobian and in the Hessian."""
-        both = [each.nonzeros for each in self.carried]
+        both = [each.entry_counts for each in self.lifted]
         return sum(each for each, _ in both), sum(each for _, each in both)
 
     @property
-    def measurements(self) -> int:
+    def measurement_count(self) -> int:
         """Number of scalar measurements that are compared."""
         return sum(
-            int(reading.components.sum())
-            for segment in self.segments
-            for reading in segment.readings
+            int(reading.is_compared.sum())
+            for segment in self.transcriptions
+            for reading in segment.residuals
         )
 
     @property
     def loss_scale(self) -> float:
         """Factor of the loss in the objective: one over the number of measurements."""
-        return 1.0 / max(1, self.measurements)
+        return 1.0 / max(1, self.measurement_count)
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
         """Return the variables z.
@@ -270,13 +282,13 @@ class Collocation:
         (variables,) array
             Scaled variables; lifted ones follow from positions and parameters.
         """
-        parts = self.parts_at(p, positions) if self.carried else []
-        lifted = [each.following(parts[each.number]) for each in self.carried]
-        return np.concatenate([self._packed(p, positions), *lifted])
+        parts = self.iterates_at(p, positions) if self.lifted else []
+        lifted = [each.consistent_values(parts[each.segment_index]) for each in self.lifted]
+        return np.concatenate([self._pack_without_lifted(p, positions), *lifted])
 
-    def _packed(self, p: Array, positions: Sequence[Array]) -> Array:
+    def _pack_without_lifted(self, p: Array, positions: Sequence[Array]) -> Array:
         """Return z without lifted variables."""
-        pairs = zip(self.segments, positions, strict=True)
+        pairs = zip(self.transcriptions, positions, strict=True)
         scaled = [np.ravel(x) / segment.length_m for segment, x in pairs]
         return np.concatenate([p[: self.nq], *scaled, p[self.nq :]])
 
@@ -284,86 +296,90 @@ class Collocation:
         """Return the parameters p (nq + nphi,) and the positions (N, 3n) of each experiment
         [m] from z.
         """
-        return self.parameters_of(z), [
-            z[segment.columns].reshape(segment.grid_rows, segment.dofs) * segment.length_m
-            for segment in self.segments
+        return self.parameters_from(z), [
+            z[segment.columns].reshape(segment.grid_times, segment.dof_count) * segment.length_m
+            for segment in self.transcriptions
         ]
 
-    def parameters_of(self, z: Array) -> Array:
+    def parameters_from(self, z: Array) -> Array:
         """Return all estimated parameters p = (q, φ_1, φ_2, …) from z."""
-        return np.concatenate([z[: self.nq], z[self.of_phi]])
+        return np.concatenate([z[: self.nq], z[self.phi_columns]])
 
     @property
-    def of_phi(self) -> slice:
+    def phi_columns(self) -> slice:
         """Slice of the nuisance parameters in z."""
-        first = self.segments[-1].after.x
+        first = self.transcriptions[-1].next_offsets.position
         return slice(first, first + self.nphi)
 
-    def parts(self, z: Array) -> list[Part]:
+    def iterates(self, z: Array) -> list[ExperimentIterate]:
         """Return every experiment at the variables z, with lifted variables taken from z."""
-        parts = self.parts_at(*self.unpack(z))
-        for each in self.carried:
-            parts[each.number] = each.given(parts[each.number], z)
+        parts = self.iterates_at(*self.unpack(z))
+        for each in self.lifted:
+            parts[each.segment_index] = each.with_lifted(parts[each.segment_index], z)
         return parts
 
     @cached_property
-    def places(self) -> list[Index]:
+    def parameter_indices(self) -> list[Index]:
         """Indices of (q, φ) of each experiment in p."""
-        return [segment.places for segment in self.segments]
+        return [segment.parameter_indices for segment in self.transcriptions]
 
     @property
     def threads(self) -> int:
         """Number of threads that all bodies may use."""
-        return min(segment.body.threads for segment in self.segments)
+        return min(segment.body.threads for segment in self.transcriptions)
 
-    def parts_at(self, p: Array, positions: Sequence[Array]) -> list[Part]:
+    def iterates_at(self, p: Array, positions: Sequence[Array]) -> list[ExperimentIterate]:
         """Return every experiment at parameters p and positions (N, 3n) [m], or their first rows.
 
         Lifted quantities follow from positions and parameters.
         """
         return [
-            Part(segment, p[: self.nq], p[segment.local.places], x)
-            for segment, x in zip(self.segments, positions, strict=True)
+            ExperimentIterate(segment, p[: self.nq], p[segment.nuisance_indices.indices], x)
+            for segment, x in zip(self.transcriptions, positions, strict=True)
         ]
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def parameter_names(self) -> tuple[str, ...]:
         """Name of each entry of p: the parameters' names, then the labels of the nuisance
         parameters.
         """
         found = [item.name for item in self.parameters.free] + [""] * self.nphi
-        for segment in self.segments:
-            for place, name in zip(segment.local.places, segment.nuisance.names, strict=True):
+        for segment in self.transcriptions:
+            for place, name in zip(
+                segment.nuisance_indices.indices, segment.nuisance.names, strict=True
+            ):
                 found[place] = name
         return tuple(found)
 
-    def prior(self, p: Array) -> tuple[Array, Array]:
+    def prior_residuals(self, p: Array) -> tuple[Array, Array]:
         """Return residuals (nq + nphi,) of the priors at p and their derivatives, both in standard
         deviations.
 
         A parameter without a prior has the residual 0.
         """
-        residuals, slopes = self.parameters.prior(p[: self.nq])
+        residuals, slopes = self.parameters.prior_residuals(p[: self.nq])
         return (
             np.concatenate([residuals, p[self.nq :]]),
             np.concatenate([slopes, np.ones(self.nphi)]),
         )
 
     @property
-    def bounds_p(self) -> tuple[Array, Array]:
+    def parameter_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of p."""
         lower, upper = self.parameters.bounds_q
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
-        for segment in self.segments:
-            indices = segment.local.places - self.nq
-            least, most = segment.nuisance.limits(segment.chart.samples)
+        for segment in self.transcriptions:
+            indices = segment.nuisance_indices.indices - self.nq
+            least, most = segment.nuisance.bounds(segment.association.clock_samples)
             low[indices] = np.maximum(low[indices], least)
             high[indices] = np.minimum(high[indices], most)
         return np.concatenate([lower, low]), np.concatenate([upper, high])
 
     # Where recordings are read ----------------------------------------------------------------
 
-    def following(self, p: Array, positions: Sequence[Array] = ()) -> tuple[Collocation, Array]:
+    def follow_estimates(
+        self, p: Array, positions: Sequence[Array] = ()
+    ) -> tuple[Collocation, Array]:
         """Update the charts where the estimates p have left them.
 
         Parameters
@@ -379,15 +395,23 @@ class Collocation:
         (Collocation, array)
             The program with the new charts, which is self if no chart has changed, and p in it.
         """
-        rows = positions or [np.zeros((0, segment.dofs)) for segment in self.segments]
-        pairs = zip(self.segments, rows, strict=True)
-        updates = [s.following(p[s.local.places], x) for s, x in pairs]
-        if all(chart is s.chart for (chart, _), s in zip(updates, self.segments, strict=True)):
+        rows = positions or [np.zeros((0, segment.dof_count)) for segment in self.transcriptions]
+        pairs = zip(self.transcriptions, rows, strict=True)
+        updates = [s.follow_estimates(p[s.nuisance_indices.indices], x) for s, x in pairs]
+        if all(
+            chart is s.association
+            for (chart, _), s in zip(updates, self.transcriptions, strict=True)
+        ):
             return self, p
-        return self._read_in([chart for chart, _ in updates], p, [phi for _, phi in updates])
+        return self._with_associations(
+            [chart for chart, _ in updates], p, [phi for _, phi in updates]
+        )
 
-    def placed(self, p: Array, positions: Sequence[Array]) -> tuple[Collocation, Array]:
-        """Initialise unknown marker places and depth cameras before a solve, see `Segment.placed`.
+    def place_unknown_markers(
+        self, p: Array, positions: Sequence[Array]
+    ) -> tuple[Collocation, Array]:
+        """Initialise unknown marker places and depth cameras before a solve, see
+        `Transcription.place_unknown_markers`.
 
         Parameters
         ----------
@@ -401,89 +425,104 @@ class Collocation:
         (Collocation, array)
             The program with the new charts, which is self if everything is stated, and p in it.
         """
-        if not any(segment.rows_to_place for segment in self.segments):
+        if not any(segment.rows_to_place for segment in self.transcriptions):
             return self, p
-        updates = [part.segment.placed(part.phi, part.x) for part in self.parts_at(p, positions)]
-        return self._read_in([chart for chart, _ in updates], p, [phi for _, phi in updates])
+        updates = [
+            part.segment.place_unknown_markers(part.phi, part.x)
+            for part in self.iterates_at(p, positions)
+        ]
+        return self._with_associations(
+            [chart for chart, _ in updates], p, [phi for _, phi in updates]
+        )
 
-    def placed_at(self, places_m: Sequence[Array]) -> Collocation:
+    def with_marker_places(self, places_m: Sequence[Array]) -> Collocation:
         """Return the program with charts about given marker places, (M, 3) for each
         experiment [m].
         """
-        charts = [s.chart.about(m) for s, m in zip(self.segments, places_m, strict=True)]
-        segments = [s.with_chart(c) for s, c in zip(self.segments, charts, strict=True)]
-        return self._read_in(charts, self.guess_p, [s.guess_phi for s in segments])[0]
+        charts = [
+            s.association.centred_at(m) for s, m in zip(self.transcriptions, places_m, strict=True)
+        ]
+        segments = [s.with_association(c) for s, c in zip(self.transcriptions, charts, strict=True)]
+        return self._with_associations(charts, self.guess_p, [s.guess_phi for s in segments])[0]
 
-    def _read_in(
-        self, charts: Sequence[Chart], p: Array, phis: Sequence[Array]
+    def _with_associations(
+        self, charts: Sequence[MarkerAssociation], p: Array, phis: Sequence[Array]
     ) -> tuple[Collocation, Array]:
         """Return the program with other charts, and p with the φ of each experiment in them."""
         other = copy(self)
-        updated = self._put_together(p[: self.nq], phis)
-        segments = _read_alike(self.segments, charts)
-        by_name = {s.experiment.name: s.chart for s in segments}
-        vars(other).update(charts=by_name, segments=segments)
-        for stale in ("_hessian", "hessian_diagonals", "carried"):
+        updated = self._combine_parameters(p[: self.nq], phis)
+        segments = _with_shared_associations(self.transcriptions, charts)
+        by_name = {s.experiment.name: s.association for s in segments}
+        vars(other).update(associations=by_name, transcriptions=segments)
+        for stale in ("_hessian", "hessian_diagonals", "lifted"):
             vars(other).pop(stale, None)
         return other, updated
 
     @property
     def guess_p(self) -> Array:
         """Guess of p: that of q, and φ at the centres of the charts."""
-        return self._put_together(self.parameters.guess_q, [s.guess_phi for s in self.segments])
+        return self._combine_parameters(
+            self.parameters.guess_q, [s.guess_phi for s in self.transcriptions]
+        )
 
-    def _put_together(self, q: Array, phis: Sequence[Array]) -> Array:
+    def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
         """Return p from q and the φ of each experiment; shared entries are those of the
         first experiment.
         """
         p = np.concatenate([q, np.zeros(self.nphi)])
-        for segment, phi in reversed([*zip(self.segments, phis, strict=True)]):
-            p[segment.local.places] = phi
+        for segment, phi in reversed([*zip(self.transcriptions, phis, strict=True)]):
+            p[segment.nuisance_indices.indices] = phi
         return p
 
     @property
     def reach_p(self) -> Array:
         """Scale of p: the change of each entry that a trust region of radius one allows."""
-        return self._put_together(np.ones(self.nq), [s.nuisance.reach for s in self.segments])
+        return self._combine_parameters(
+            np.ones(self.nq), [s.nuisance.step_limits for s in self.transcriptions]
+        )
 
     def bounds(self) -> tuple[Array, Array]:
         """Return lower and upper bounds of z; equal where a value is prescribed."""
-        lower, upper = self.bounds_p
-        lows, highs = zip(*(segment.bounds() for segment in self.segments), strict=True)
-        least = [np.full(each.count, each.least) for each in self.carried]
+        lower, upper = self.parameter_bounds
+        lows, highs = zip(*(segment.bounds() for segment in self.transcriptions), strict=True)
+        least = [np.full(each.count, each.lower_bound) for each in self.lifted]
         return (
-            np.concatenate([self._packed(lower, lows), *least]),
-            np.concatenate([self._packed(upper, highs), np.full(self.added(), np.inf)]),
+            np.concatenate([self._pack_without_lifted(lower, lows), *least]),
+            np.concatenate(
+                [self._pack_without_lifted(upper, highs), np.full(self.lifted_count(), np.inf)]
+            ),
         )
 
     # Objective --------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
         """Return the objective: loss and priors, divided by the number of measurements."""
-        residuals, _ = self.prior(self.parameters_of(z))
-        loss = sum(part.loss for part in self.parts(z))
+        residuals, _ = self.prior_residuals(self.parameters_from(z))
+        loss = sum(part.loss for part in self.iterates(z))
         return self.loss_scale * float(residuals @ residuals + loss)
 
     def gradient(self, z: Array) -> Array:
         """Return the gradient of the objective by z."""
-        parts = self.parts(z)
-        residuals, slopes = self.prior(self.parameters_of(z))
+        parts = self.iterates(z)
+        residuals, slopes = self.prior_residuals(self.parameters_from(z))
         by_p = 2 * residuals * slopes
         by_x = []
         for part in parts:
             of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.segment.length_m)
-            by_p[part.segment.places] += of_p
-        further = [each.gradient(parts[each.number]) for each in self.carried]
+            by_p[part.segment.parameter_indices] += of_p
+        further = [each.loss_gradient(parts[each.segment_index]) for each in self.lifted]
         return self.loss_scale * np.concatenate([by_p[: self.nq], *by_x, by_p[self.nq :], *further])
 
     # Constraints ------------------------------------------------------------------------------
 
     def constraint_values(self, z: Array) -> Array:
         """Return the scaled constraints g."""
-        parts = self.parts(z)
-        rows = [part.segment.constraint_values(part.x, part.setting, part.along) for part in parts]
-        further = [each.values(parts[each.number], z) for each in self.carried]
+        parts = self.iterates(z)
+        rows = [
+            part.segment.constraint_values(part.x, part.equations, part.histories) for part in parts
+        ]
+        further = [each.residuals(parts[each.segment_index], z) for each in self.lifted]
         return np.concatenate([*rows, *further])
 
     @property
@@ -492,22 +531,24 @@ class Collocation:
         return self._jacobian.structure
 
     @cached_property
-    def _jacobian(self) -> OffBand:
+    def _jacobian(self) -> SparseAssembly:
         """Structure of ∂g/∂z: columns of q and x, then those of φ and of the lifted variables."""
-        own = self.segments[-1].after.row
+        own = self.transcriptions[-1].next_offsets.row
         indptr = [np.arange(self.nq + 1) * own]
         indices = [np.tile(np.arange(own), self.nq)]
         of_phi = []
-        for segment in self.segments:
+        for segment in self.transcriptions:
             indptr.append(indptr[-1][-1] + segment.jacobian.indptr[1:])
-            indices.append(segment.first.row + segment.jacobian.indices)
-            moving = segment.local.places[segment.nuisance.moving] - self.nq
-            rows = segment.first.row + np.arange(segment.constraints)
-            columns = self.of_phi.start + np.repeat(moving, len(rows))
+            indices.append(segment.offsets.row + segment.jacobian.indices)
+            moving = segment.nuisance_indices.indices[segment.nuisance.motion_indices] - self.nq
+            rows = segment.offsets.row + np.arange(segment.constraint_count)
+            columns = self.phi_columns.start + np.repeat(moving, len(rows))
             of_phi.append((np.tile(rows, len(moving)), columns))
         structure = np.concatenate(indptr), np.concatenate(indices)
-        further = [each.jacobian_entries() for each in self.carried]
-        return OffBand.of(structure, (self.constraints, self.variables), of_phi + further)
+        further = [each.jacobian_entries() for each in self.lifted]
+        return SparseAssembly.from_groups(
+            structure, (self.constraint_count, self.variable_count), of_phi + further
+        )
 
     def jacobian_values(self, z: Array, out: Array | None = None) -> Array:
         """Return the values of ∂g/∂z in the order of `jacobian_structure`.
@@ -531,10 +572,10 @@ class Collocation:
         out : array, optional
             Overwritten with the values of ∂g/∂z.
         """
-        parts = self.parts(z)
-        height = self.segments[-1].after.row
-        count = self.nq * height + sum(s.jacobian.nnz for s in self.segments)
-        values, own = self._jacobian.values(out, count)
+        parts = self.iterates(z)
+        height = self.transcriptions[-1].next_offsets.row
+        count = self.nq * height + sum(s.jacobian.nnz for s in self.transcriptions)
+        values, own = self._jacobian.allocate(out, count)
         columns = own[: self.nq * height].reshape(self.nq, height)
         rows = np.empty(height)
         further = []
@@ -543,14 +584,14 @@ class Collocation:
             segment = part.segment
             here = own[used : used + segment.jacobian.nnz]
             constraints, by_p = segment.constraints_and_jacobian(
-                part.x, part.setting, part.forces, here
+                part.x, part.equations, part.forces, here
             )
             rows[segment.rows] = constraints
             columns[:, segment.rows] = by_p[:, : self.nq].T
             further.append(by_p[:, self.nq :].T.ravel())
             used += segment.jacobian.nnz
-        added = [each.jacobian_values(parts[each.number], z) for each in self.carried]
-        self._jacobian.fill(values, own, further + [entries for _, entries in added])
+        added = [each.jacobian_values(parts[each.segment_index], z) for each in self.lifted]
+        self._jacobian.assemble(values, own, further + [entries for _, entries in added])
         return np.concatenate([rows, *(equations for equations, _ in added)]), values
 
     def jacobian(self, z: Array) -> sp.csc_array:
@@ -558,27 +599,29 @@ class Collocation:
         treated as constant.
         """
         indptr, indices = self.jacobian_structure
-        shape = (self.constraints, self.variables)
+        shape = (self.constraint_count, self.variable_count)
         return sp.csc_array((self.jacobian_values(z), indices, indptr), shape=shape)
 
     @property
-    def remembers(self) -> bool:
+    def has_eliminated_histories(self) -> bool:
         """Whether history variables are eliminated, so that ∂g/∂z has more entries than
         `jacobian`.
         """
-        return not self.explicit and any(segment.carries for segment in self.segments)
+        return not self.has_lifted_variables and any(
+            segment.has_histories for segment in self.transcriptions
+        )
 
-    def pulled_back(self, z: Array, multipliers: Array) -> Array:
+    def jacobian_vjp(self, z: Array, multipliers: Array) -> Array:
         """Return the vector–Jacobian product (∂g/∂z)ᵀ multipliers, including eliminated
         history variables.
         """
         slope = self.jacobian(z).T @ multipliers
-        for part in self.parts(z) if self.remembers else ():
+        for part in self.iterates(z) if self.has_eliminated_histories else ():
             segment = part.segment
-            weights = segment.weights(multipliers[segment.rows]).forces
-            by_x, by_p = segment.pulled_through(part.x, part.setting, weights)
+            weights = segment.lagrangian_weights(multipliers[segment.rows]).forces
+            by_x, by_p = segment.history_vjp(part.x, part.equations, weights)
             slope[segment.columns] += segment.length_m * by_x.ravel()
-            slope[segment.moving_in(self.of_phi.start)] += by_p
+            slope[segment.dynamic_columns(self.phi_columns.start)] += by_p
         return slope
 
     # Lagrangian -------------------------------------------------------------------------------
@@ -591,7 +634,7 @@ class Collocation:
         return self._hessian.structure
 
     @cached_property
-    def _hessian(self) -> OffBand:
+    def _hessian(self) -> SparseAssembly:
         """Structure of the Hessian: columns of q, those of x from the motion, then all
         other entries.
         """
@@ -599,14 +642,18 @@ class Collocation:
         further = []
         indptr = [counts * (counts + 1) // 2]
         indices = [np.concatenate([np.arange(k) for k in counts])]
-        for segment in self.segments:
+        for segment in self.transcriptions:
             indptr.append(indptr[-1][-1] + segment.hessian.indptr[1:])
-            shift = np.where(segment.hessian.indices < self.nq, 0, segment.first.x - self.nq)
+            shift = np.where(
+                segment.hessian.indices < self.nq, 0, segment.offsets.position - self.nq
+            )
             indices.append(segment.hessian.indices + shift)
-            further += segment.further_entries(self.of_phi.start)
-        further += [each.hessian_entries() for each in self.carried]
+            further += segment.additional_hessian_entries(self.phi_columns.start)
+        further += [each.hessian_entries() for each in self.lifted]
         structure = np.concatenate(indptr), np.concatenate(indices)
-        return OffBand.of(structure, (self.variables, self.variables), further)
+        return SparseAssembly.from_groups(
+            structure, (self.variable_count, self.variable_count), further
+        )
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
@@ -614,10 +661,10 @@ class Collocation:
         of_q = np.cumsum(np.arange(1, self.nq + 1)) - 1
         of_x = []
         used = self.nq * (self.nq + 1) // 2
-        for segment in self.segments:
-            of_x.append(used + segment.hessian_diagonal)
+        for segment in self.transcriptions:
+            of_x.append(used + segment.hessian_diagonal_positions)
             used += segment.hessian.nnz
-        return of_q, self._hessian.places_of(np.concatenate(of_x))
+        return of_q, self._hessian.positions_of(np.concatenate(of_x))
 
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
@@ -638,11 +685,11 @@ class Collocation:
             Overwritten with the result and returned.
         """
         bent = multipliers is not None
-        parts = [replace(part, bent=bent) for part in self.parts(z)]
-        multipliers = np.zeros(self.constraints) if multipliers is None else multipliers
+        parts = [replace(part, has_observation_curvature=bent) for part in self.iterates(z)]
+        multipliers = np.zeros(self.constraint_count) if multipliers is None else multipliers
         used = self.nq * (self.nq + 1) // 2
-        count = used + sum(segment.hessian.nnz for segment in self.segments)
-        values, own = self._hessian.values(out, count)
+        count = used + sum(segment.hessian.nnz for segment in self.transcriptions)
+        values, own = self._hessian.allocate(out, count)
         by_q = np.zeros((self.nq, self.nq))
         further = list[Array]()
         weights = list[RowWeights]()
@@ -650,41 +697,43 @@ class Collocation:
         for number, part in enumerate(parts):
             segment = part.segment
             here = own[used : used + segment.hessian.nnz]
-            mine = [each for each in self.carried if each.number == number]
-            of_rows = sum((each.row_weights(multipliers) for each in mine), start=0.0)
-            weights.append(segment.weights(multipliers[segment.rows], of_rows))
+            mine = [each for each in self.lifted if each.segment_index == number]
+            of_rows = sum((each.residual_weights(multipliers) for each in mine), start=0.0)
+            weights.append(segment.lagrangian_weights(multipliers[segment.rows], of_rows))
             lifted_histories = [
-                each.weighed(part, multipliers) for each in mine if each.history is not None
+                each.weighted_history(part, multipliers)
+                for each in mine
+                if each.history_index is not None
             ]
             by_q_own, further_own = segment.hessian_values(
                 part.x,
                 part.phi,
-                part.setting,
+                part.equations,
                 weights=weights[number],
                 loss_weight=weight,
                 values=here,
-                carried=lifted_histories,
-                bent=bent,
+                lifted_histories=lifted_histories,
+                has_observation_curvature=bent,
             )
             by_q = by_q + by_q_own
             further = further + further_own
             used = used + len(here)
-        for each in self.carried:
+        for each in self.lifted:
             further.append(
                 each.hessian_values(
-                    parts[each.number],
+                    parts[each.segment_index],
                     z,
                     loss_weight=weight,
                     multipliers=multipliers,
-                    weights=weights[each.number],
+                    weights=weights[each.segment_index],
                 )
             )
-        _, slopes = self.parameters.prior(parts[0].q)
+        _, slopes = self.parameters.prior_residuals(parts[0].q)
         by_q += np.diag(2 * weight * slopes**2)
         rows, columns = np.triu_indices(self.nq)
         order = np.lexsort((rows, columns))
         own[: len(rows)] = by_q[rows[order], columns[order]]
-        self._hessian.fill(values, own, further)
+        self._hessian.assemble(values, own, further)
         return values
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
@@ -695,11 +744,11 @@ class Collocation:
         bound, the gradient may point outwards), and feasibility.
         """
         rows = self.constraint_values(z)
-        slope = self.gradient(z) + self.pulled_back(z, multipliers)
+        slope = self.gradient(z) + self.jacobian_vjp(z, multipliers)
         lower, upper = self.bounds()
         slope[lower == upper] = 0
         tolerance = 1e-6
-        for part in (slice(self.nq), self.of_phi):
+        for part in (slice(self.nq), self.phi_columns):
             at_lower = (z - lower)[part] < tolerance
             at_upper = (upper - z)[part] < tolerance
             slope[part][at_lower] = np.minimum(slope[part][at_lower], 0)
@@ -719,17 +768,17 @@ class Collocation:
 
     # Reading a point --------------------------------------------------------------------------
 
-    def violations_n(self, z: Array) -> list[Array]:
+    def residuals_n(self, z: Array) -> list[Array]:
         """Return the residuals of the equations of motion (N, free dofs) of each experiment [N]."""
-        return [part.residual_n for part in self.parts(z)]
+        return [part.residual_n for part in self.iterates(z)]
 
     def largest_force_n(self, z: Array) -> float:
         """Return the largest internal or external force on a dof [N], as a scale for violations."""
         largest = 0.0
-        for part in self.parts(z):
-            dynamics = part.setting.dynamics
-            total = dynamics.force(part.x, part.along)
-            external = dynamics.evaluated.weight.external_n
+        for part in self.iterates(z):
+            dynamics = part.equations.dynamics
+            total = dynamics.force(part.x, part.histories)
+            external = dynamics.evaluated_forces.weight.external_n
             for force in (total - external, external):
                 # What a grasp bears counts too: where nothing else acts, all other forces vanish.
                 largest = max(largest, float(np.abs(force).max()))
@@ -738,7 +787,7 @@ class Collocation:
     def largest_violations(self, z: Array, count: int = 5) -> list[Violation]:
         """Return the `count` largest residuals of the equations of motion, in descending order."""
         violations = []
-        for part in self.parts(z):
+        for part in self.iterates(z):
             segment = part.segment
             residual = part.residual_n
             worst = np.argsort(-np.abs(residual), axis=None)[:count]
@@ -755,26 +804,28 @@ class Collocation:
                 )
         return sorted(violations, key=lambda violation: -abs(violation.newtons))[:count]
 
-    def rms_m(self, z: Array) -> float:
+    def rms_marker_distance_m(self, z: Array) -> float:
         """Return the root mean square distance of the markers from their measurements [m];
         0 without markers.
         """
         squares = samples = 0.0
-        for part in self.parts(z):
+        for part in self.iterates(z):
             squares_m2 = part.segment.markers.squared_distances_m2(part.x, part.phi)
             squares = squares + float(squares_m2.sum())
             samples = samples + len(squares_m2)
         return float(np.sqrt(squares / max(1.0, samples)))
 
-    def values(self, z: Array) -> dict[str, float]:
+    def parameter_values(self, z: Array) -> dict[str, float]:
         """Return the shared parameters of z by the user's names, in SI units."""
         return self.parameters.values(z[: self.nq])
 
 
-def _read_alike(segments: Sequence[Segment], charts: Sequence[Chart]) -> tuple[Segment, ...]:
+def _with_shared_associations(
+    transcriptions: Sequence[Transcription], charts: Sequence[MarkerAssociation]
+) -> tuple[Transcription, ...]:
     """Return the segments with the given charts, made equal where nuisance parameters are
     shared.
     """
-    parts = zip(segments, charts, strict=True)
-    same = shared_charts((s.local, s.nuisance, chart) for s, chart in parts)
-    return tuple(s.with_chart(chart) for s, chart in zip(segments, same, strict=True))
+    parts = zip(transcriptions, charts, strict=True)
+    same = shared_charts((s.nuisance_indices, s.nuisance, chart) for s, chart in parts)
+    return tuple(s.with_association(chart) for s, chart in zip(transcriptions, same, strict=True))

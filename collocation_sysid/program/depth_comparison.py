@@ -13,8 +13,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ..arrays import Array, root_mean
-from .depth import HUBER, DepthReading
-from .sighting import Sighting, wide_m
+from .depth import HUBER, DepthResidual
+from .sighting import SurfaceCorrespondences, initial_gate_m
 
 # Fewest samples of a motion between which a cubic spline is drawn; lines between fewer.
 FEWEST_FOR_SPLINE = 4
@@ -71,49 +71,54 @@ class SurfaceComparison:
 
     Attributes
     ----------
-    sighting : Sighting
+    correspondences : SurfaceCorrespondences
         Correspondences of the points with the surface.
     shapes_m : (S, n, 3) array
         Surface nodes at the images [m].
-    apart_m : (S, E) array
+    signed_distances_m : (S, E) array
         Distances of points behind the surface [m]; NaN where they are not compared.
     phi : (k,) array
         Nuisance parameters.
     """
 
-    sighting: Sighting
+    correspondences: SurfaceCorrespondences
     shapes_m: Array
-    apart_m: Array
+    signed_distances_m: Array
     phi: Array
 
     @classmethod
     def from_fit(
-        cls, reading: DepthReading, x: Array, looked: Array, phi: Array
+        cls, residual: DepthResidual, x: Array, values: Array, phi: Array
     ) -> SurfaceComparison:
         """Compare the points with the correspondences of a fit.
 
         Parameters
         ----------
-        reading : DepthReading
+        residual : DepthResidual
             Measurement model of the camera.
         x : (N, 3n) array
             Positions of the fit [m].
-        looked : (n, e, 3) array
-            Values of the observable, see `Part.sights`.
+        values : (n, e, 3) array
+            Values of the observable, see `ExperimentIterate.depth_residuals`.
         phi : (k,) array
             Nuisance parameters.
         """
-        return cls(reading.sighting, reading.shapes(x, phi), reading.apart_m(looked, phi), phi)
+        return cls(
+            residual.correspondences,
+            residual.surface_shapes(x, phi),
+            residual.signed_distances_m(values, phi),
+            phi,
+        )
 
     @classmethod
     def from_motion(
-        cls, reading: DepthReading, t_s: Array, positions_m: Array, phi: Array
+        cls, residual: DepthResidual, t_s: Array, positions_m: Array, phi: Array
     ) -> SurfaceComparison:
         """Associate the points with a motion and compare them.
 
         Parameters
         ----------
-        reading : DepthReading
+        residual : DepthResidual
             Measurement model of the camera.
         t_s : (T,) array
             Times of the motion [s].
@@ -122,20 +127,24 @@ class SurfaceComparison:
         phi : (k,) array
             Nuisance parameters.
         """
-        shapes_m = reading.shapes(_at_rows(reading, t_s, positions_m), phi)
-        view = reading.sighting.view
-        body = reading.sighting.body
-        widest_m = max(wide_m(body.nodes_m), view.depth.gate_m)
-        first = Sighting.of(view, body, shapes_m, phi, widest_m)
+        shapes_m = residual.surface_shapes(
+            _positions_at_observable(residual, t_s, positions_m), phi
+        )
+        view = residual.correspondences.camera
+        body = residual.correspondences.body
+        widest_m = max(initial_gate_m(body.nodes_m), view.depth.gate_m)
+        first = SurfaceCorrespondences.from_shapes(view, body, shapes_m, phi, widest_m)
         reach_m = first.next_gate_m(shapes_m, phi)
-        sighting = Sighting.of(view, body, shapes_m, phi, reach_m, settled=True)
-        return cls(sighting, shapes_m, sighting.apart_m(shapes_m, phi), phi)
+        sighting = SurfaceCorrespondences.from_shapes(
+            view, body, shapes_m, phi, reach_m, settled=True
+        )
+        return cls(sighting, shapes_m, sighting.signed_distances_m(shapes_m, phi), phi)
 
     @cached_property
     def error(self) -> DepthError:
         """Distances summarised as numbers, see `DepthError`."""
-        depth = self.sighting.view.depth
-        distances_m = np.abs(self.apart_m[np.isfinite(self.apart_m)])
+        depth = self.correspondences.camera.depth
+        distances_m = np.abs(self.signed_distances_m[np.isfinite(self.signed_distances_m)])
         within_m = distances_m[distances_m <= depth.gate_m]
         sigmas = distances_m / depth.sigma_m
         shortened = np.where(sigmas > HUBER, HUBER * sigmas, sigmas**2)
@@ -143,7 +152,7 @@ class SurfaceComparison:
             points=len(distances_m),
             seen=sum(map(len, depth.clouds)),
             rms_m=root_mean(distances_m**2) if len(distances_m) else None,
-            reach_m=max(self.sighting.gate_m, depth.gate_m),
+            reach_m=max(self.correspondences.gate_m, depth.gate_m),
             gate_m=depth.gate_m,
             share_beyond_gate=1 - len(within_m) / len(distances_m) if len(distances_m) else 0.0,
             rms_within_gate_m=root_mean(within_m**2) if len(within_m) else None,
@@ -152,12 +161,12 @@ class SurfaceComparison:
         )
 
 
-def _at_rows(reading: DepthReading, t_s: Array, positions_m: Array) -> Array:
+def _positions_at_observable(residual: DepthResidual, t_s: Array, positions_m: Array) -> Array:
     """Return positions (N, 3n) of a motion at the times of a measurement's observable,
     interpolated.
     """
     flat = positions_m.reshape(len(t_s), -1)
-    at_s = np.clip(reading.at_s, t_s[0], t_s[-1])
+    at_s = np.clip(residual.observable_s, t_s[0], t_s[-1])
     if len(t_s) >= FEWEST_FOR_SPLINE:
         return np.asarray(CubicSpline(t_s, flat)(at_s))
     return np.array([np.interp(at_s, t_s, each) for each in flat.T]).T

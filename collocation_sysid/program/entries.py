@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 
 
-class Outer(NamedTuple):
+class EntryBlock(NamedTuple):
     """Entries whose rows and columns are sums of arrays that broadcast.
 
     Attributes
@@ -31,14 +31,14 @@ class Outer(NamedTuple):
         """Number of entries."""
         return int(np.prod(np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))))
 
-    def laid_out(self) -> tuple[Index, Index]:
+    def indices(self) -> tuple[Index, Index]:
         """Return row and column index of each entry, flat."""
         rows, columns = np.broadcast_arrays(sum(self.rows), sum(self.columns))
         return rows.ravel(), columns.ravel()
 
 
 @dataclass(frozen=True, eq=False)
-class OffBand:
+class SparseAssembly:
     """Structure of a sparse matrix, and positions of the values of its contributions.
 
     Attributes
@@ -47,28 +47,28 @@ class OffBand:
         Column pointers.
     indices : array
         Row indices.
-    kept : array or None
+    initial_positions : array or None
         Position of each value of the initial structure; None if they all come first, in their
         order.
-    places : tuple of arrays
+    group_positions : tuple of arrays
         Positions of the entries of each group.
-    repeats : tuple of bool
+    has_duplicates : tuple of bool
         Whether several entries of a group have the same position.
     """
 
     indptr: Index
     indices: Index
-    kept: Index | None
-    places: tuple[Index, ...]
-    repeats: tuple[bool, ...]
+    initial_positions: Index | None
+    group_positions: tuple[Index, ...]
+    has_duplicates: tuple[bool, ...]
 
     @classmethod
-    def of(
+    def from_groups(
         cls,
         structure: tuple[Index, Index],
         shape: tuple[int, int],
         groups: Iterable[tuple[Index, Index]],
-    ) -> OffBand:
+    ) -> SparseAssembly:
         """Add groups of entries to a structure; entries may exist already, or belong to several
         groups.
 
@@ -85,7 +85,7 @@ class OffBand:
         height, width = shape
         group_codes = [columns * height + rows for rows, columns in groups]
         codes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *group_codes]))
-        before, absent = _found(structure, height, codes)
+        before, absent = _locate(structure, height, codes)
         own = before + np.cumsum(absent) - absent
         added = own[absent]
         columns = codes[absent] // height
@@ -110,13 +110,13 @@ class OffBand:
         """Column pointers and row indices."""
         return self.indptr, self.indices
 
-    def places_of(self, positions: Index) -> Index:
+    def positions_of(self, positions: Index) -> Index:
         """Return the positions of values of the initial structure, given by their positions
         there.
         """
-        return positions if self.kept is None else self.kept[positions]
+        return positions if self.initial_positions is None else self.initial_positions[positions]
 
-    def values(self, out: Array | None, count: int) -> tuple[Array, Array]:
+    def allocate(self, out: Array | None, count: int) -> tuple[Array, Array]:
         """Return arrays for all values, and for the `count` values of the initial structure.
 
         The second array is a view of the first where possible. Neither is initialised.
@@ -129,33 +129,36 @@ class OffBand:
             Number of values of the initial structure.
         """
         values = np.empty(len(self.indices)) if out is None else out
-        return values, values[:count] if self.kept is None else np.empty(count)
+        return values, values[:count] if self.initial_positions is None else np.empty(count)
 
-    def fill(self, values: Array, smaller: Array, groups: Sequence[Array]) -> None:
+    def assemble(self, values: Array, initial: Array, groups: Sequence[Array]) -> None:
         """Compute all values in place.
 
         Parameters
         ----------
         values : array
-            All values, overwritten; the initial values may be stored in them already, see `values`.
-        smaller : array
+            All values, overwritten; the initial values may be stored in them already, see
+            `allocate`.
+        initial : array
             Values of the initial structure.
         groups : sequence of arrays
             Values of each group; duplicates are added up.
         """
-        if self.kept is None:
-            values[len(smaller) :] = 0.0
+        if self.initial_positions is None:
+            values[len(initial) :] = 0.0
         else:
             values[:] = 0.0
-            values[self.kept] = smaller
-        for places, repeats, more in zip(self.places, self.repeats, groups, strict=True):
+            values[self.initial_positions] = initial
+        for places, repeats, more in zip(
+            self.group_positions, self.has_duplicates, groups, strict=True
+        ):
             if repeats:
                 np.add.at(values, places, more)
             else:
                 values[places] += more
 
 
-def _found(
+def _locate(
     structure: tuple[Index, Index], height: int, codes: Index
 ) -> tuple[Index, NDArray[np.bool_]]:
     """Find entries in a structure.

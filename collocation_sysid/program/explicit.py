@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .carried import Carried, Places
-from .force_rows import ForceRows
-from .pressure_rows import PressureRows
-from .reaction_rows import Reactions
-from .segment import Segment
-from .viscoelastic_rows import Overstress
-from .wrench_rows import WrenchRows
+from .carried import LiftedOffsets, LiftedVariables
+from .force_rows import LiftedForceHistory
+from .pressure_rows import LiftedContactPressure
+from .reaction_rows import LiftedReactions
+from .segment import Transcription
+from .viscoelastic_rows import LiftedMemory
+from .wrench_rows import LiftedWrench
 
 
-def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> tuple[Carried, ...]:
+def lift_variables(
+    transcriptions: Sequence[Transcription], first_phi: int, offsets: LiftedOffsets
+) -> tuple[LiftedVariables, ...]:
     """Create the groups of lifted variables of all experiments.
 
     For each experiment, in this order: reaction forces of instrumented grasps, memory of the
@@ -22,52 +24,62 @@ def carried_by(segments: Sequence[Segment], first_phi: int, places: Places) -> t
 
     Parameters
     ----------
-    segments : sequence of Segment
+    transcriptions : sequence of Transcription
         Transcriptions of the experiments.
     first_phi : int
         Index in z where the nuisance parameters of all experiments begin.
-    places : Places
+    offsets : LiftedOffsets
         Offsets of the first group.
     """
-    groups: list[Carried] = []
-    for number, segment in enumerate(segments):
+    groups: list[LiftedVariables] = []
+    for number, segment in enumerate(transcriptions):
         reactions = None
-        lift = {"segment": segment, "number": number, "first_phi": first_phi}
+        lift = {"segment": segment, "segment_index": number, "first_phi": first_phi}
         wrenches = [
             (k, reading)
-            for k, reading in enumerate(segment.readings)
-            if reading.channel.local is None and reading.channel.count
+            for k, reading in enumerate(segment.residuals)
+            if reading.observable.local is None and reading.observable.count
         ]
         if wrenches:
-            reactions = Reactions(**lift, places=places)
+            reactions = LiftedReactions(**lift, offsets=offsets)
             groups.append(reactions)
-            places = reactions.after
+            offsets = reactions.next_offsets
         histories = 0
-        if segment.body.remembers:
-            groups.append(Overstress(**lift, places=places, reactions=reactions))
-            places = groups[-1].after
+        if segment.body.has_memory:
+            groups.append(LiftedMemory(**lift, offsets=offsets, reactions=reactions))
+            offsets = groups[-1].next_offsets
             histories = 1
-        for history, force in enumerate(segment.dynamics.forces.carrying, histories):
+        for history, force in enumerate(
+            segment.dynamics.forces.terms_with_internal_variables, histories
+        ):
             groups.append(
-                ForceRows(
-                    **lift, places=places, along=history, force_number=force, reactions=reactions
+                LiftedForceHistory(
+                    **lift,
+                    offsets=offsets,
+                    history_index=history,
+                    force_index=force,
+                    reactions=reactions,
                 )
             )
-            places = groups[-1].after
+            offsets = groups[-1].next_offsets
             histories = history + 1
-        for history, force in enumerate(segment.dynamics.forces.pressing, histories):
+        for history, force in enumerate(segment.dynamics.forces.complementarity_terms, histories):
             groups.append(
-                PressureRows(
-                    **lift, places=places, along=history, force_number=force, reactions=reactions
+                LiftedContactPressure(
+                    **lift,
+                    offsets=offsets,
+                    history_index=history,
+                    force_index=force,
+                    reactions=reactions,
                 )
             )
-            places = groups[-1].after
+            offsets = groups[-1].next_offsets
         for k, reading in wrenches:
             assert reactions is not None
             groups.append(
-                WrenchRows(
-                    **lift, places=places, reading_number=k, reading=reading, reactions=reactions
+                LiftedWrench(
+                    **lift, offsets=offsets, residual_index=k, residual=reading, reactions=reactions
                 )
             )
-            places = groups[-1].after
+            offsets = groups[-1].next_offsets
     return tuple(groups)

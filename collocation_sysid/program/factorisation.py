@@ -24,13 +24,13 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import SuperLU, splu
 
 from ..arrays import Array, Index
-from ..fem.kernels import in_slices, make_skyline
+from ..fem.kernels import make_skyline, run_in_slices
 from ..fem.pattern import SymmetricPattern
 from .lapack import cholesky_in_place
-from .supernodal import Pardiso, SupernodalFactor, library
+from .supernodal import Pardiso, SupernodalFactor, load_mkl
 
 if TYPE_CHECKING:
-    from ..fem.kernels.skyline import Room, Skyline
+    from ..fem.kernels.skyline import FactorMemory, SkylineFactorisation
 
 Choice = Literal["auto", "band", "sparse", "supernodal"]
 
@@ -109,7 +109,7 @@ class _SkylineFactor:
 
     Attributes
     ----------
-    skyline : Skyline
+    skyline : SkylineFactorisation
         Structure and kernels.
     sides : array
         L and U; one of them for a symmetric matrix.
@@ -121,7 +121,7 @@ class _SkylineFactor:
         Always true.
     """
 
-    skyline: Skyline
+    skyline: SkylineFactorisation
     sides: Array
     pivots: Array
     order: Index
@@ -147,24 +147,24 @@ class _RefinedFactor:
         Factor of S.
     skew : sparse array
         K.
-    whole : callable
+    factorise_whole : callable
         Returns the factor of S + K, which is used if the series does not converge.
     positive_definite : bool
         Always true.
-    diverged : list of bool
+    divergence_flags : list of bool
         Not empty after the series has failed once.
     """
 
     symmetric: Factor
     skew: sp.csc_array
-    whole: Callable[[], Factor]
+    factorise_whole: Callable[[], Factor]
     positive_definite: bool = True
-    diverged: list[bool] = field(default_factory=list)
+    divergence_flags: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Solve for right-hand sides (k,) or (k, m)."""
-        if self.diverged:
-            return self.whole().solve(right, transposed)
+        if self.divergence_flags:
+            return self.factorise_whole().solve(right, transposed)
         solution = correction = self.symmetric.solve(right)
         size = last = np.abs(solution).max(axis=0, initial=TINY)
         shrinks = 1.0
@@ -175,8 +175,8 @@ class _RefinedFactor:
             length = np.abs(correction).max(axis=0, initial=TINY)
             shrinks = float((length / last).max(initial=0.0))
             if not shrinks <= CONTRACTION:
-                self.diverged.append(True)
-                return self.whole().solve(right, transposed)
+                self.divergence_flags.append(True)
+                return self.factorise_whole().solve(right, transposed)
             solution = solution + correction
             last = length
         return solution
@@ -244,32 +244,32 @@ class Factoriser:
         self._full_source = np.concatenate([self._kept, self._kept[strict]])
         # Whether an entry has the skew part's own sign; none on the diagonal.
         self._signs = np.concatenate([strict.astype(float), -np.ones(strict.sum())])
-        self._entries = pattern.entries
+        self._entries = pattern.entry_count
         self._pool: list[Pardiso] = []
         if choice == "supernodal":
             self._pool.append(self._pardiso())
 
     @classmethod
-    def of(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
+    def cached(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
         """Return the analysis of a pattern; the last few are cached."""
-        return _analysed(pattern, free.tobytes(), choice)
+        return _cached_analysis(pattern, free.tobytes(), choice)
 
     @cached_property
-    def banded(self) -> bool:
+    def is_banded(self) -> bool:
         """Whether banded Cholesky is chosen."""
         if self.choice != "auto":
             return self.choice == "band"
-        if self.supernodal:
+        if self.is_supernodal:
             return False
         return self._band_work <= max(LITTLE_WORK, BAND_SPEED * self._sparse_work)
 
     @cached_property
-    def supernodal(self) -> bool:
+    def is_supernodal(self) -> bool:
         """Whether supernodal Cholesky is chosen."""
         if self.choice != "auto":
             return self.choice == "supernodal"
         wide = self.half_bandwidth > NARROW and self._band_work > MUCH_WORK
-        return wide and library() is not None
+        return wide and load_mkl() is not None
 
     @property
     def _band_work(self) -> int:
@@ -277,24 +277,24 @@ class Factoriser:
         return self._size * self.half_bandwidth**2
 
     @property
-    def numbers(self) -> int:
+    def factor_size(self) -> int:
         """Number of floating-point numbers in the factor of a symmetric matrix."""
-        if self.banded:
+        if self.is_banded:
             width = self.skyline.shape[1] if self.skyline else self.half_bandwidth + 1
             return self._size * width
-        if self.supernodal:
-            return self._supernodal_numbers
+        if self.is_supernodal:
+            return self._supernodal_size
         return 3 * int(self._column_counts.sum())  # L, U, and their row numbers at half the size
 
     @property
-    def unsymmetric_numbers(self) -> int:
+    def unsymmetric_factor_size(self) -> int:
         """Number of floating-point numbers in the factor of an unsymmetric matrix."""
-        return (2 if self.skyline else 1) * self.numbers
+        return (2 if self.skyline else 1) * self.factor_size
 
     @cached_property
-    def skyline(self) -> Skyline | None:
+    def skyline(self) -> SkylineFactorisation | None:
         """Skyline factorisation for narrow bands; None for others."""
-        if not self.banded or self.half_bandwidth > NARROW:
+        if not self.is_banded or self.half_bandwidth > NARROW:
             return None
         return make_skyline(self._size, *self._ranks, self._kept)
 
@@ -311,7 +311,9 @@ class Factoriser:
         values[self._full_source[self._full_rows == self._full_columns]] = degree
         return np.diff(self._superlu(values, pivot_below=0.0).L.indptr)
 
-    def factorise(self, values: Array, skew: Array = NONE, room: Room | None = None) -> Factor:
+    def factorise(
+        self, values: Array, skew: Array = NONE, buffer: FactorMemory | None = None
+    ) -> Factor:
         """Factorise a matrix.
 
         Parameters
@@ -320,7 +322,7 @@ class Factoriser:
             Lower triangle of the symmetric part.
         skew : (m,) or (0,) array
             Lower triangle of the skew part; empty if the matrix is symmetric.
-        room : Room, optional
+        buffer : FactorMemory, optional
             Memory for the factor; the factor is valid until it is used again.
 
         Raises
@@ -329,41 +331,41 @@ class Factoriser:
             If the matrix is singular or not finite.
         """
         skew = skew if skew.any() else NONE
-        skyline_factor = self._within(values, skew, room)
+        skyline_factor = self._factorise_in_skyline(values, skew, buffer)
         if skyline_factor:
             return skyline_factor
         if not (np.isfinite(values).all() and np.isfinite(skew).all()):
             raise np.linalg.LinAlgError("the matrix has entries that are not finite")
-        definite = (self._within(values, NONE, room) if skew.size else None) or self._definite(
-            values
-        )
+        definite = (
+            self._factorise_in_skyline(values, NONE, buffer) if skew.size else None
+        ) or self._factorise_definite(values)
         if not skew.size:
             # Without pivoting the factor of an indefinite matrix can be arbitrarily wrong.
             return definite or _SparseFactor(self._superlu(values, pivot_below=0.1), False)
         if not definite:
             # Where a body slides under friction it never is: the pivots of the whole tell then.
             lu = self._superlu(values, pivot_below=0.1, skew=skew)
-            return _SparseFactor(lu, _positive(lu))
+            return _SparseFactor(lu, _has_positive_pivots(lu))
 
         @cache
         def whole() -> Factor:
             return _SparseFactor(self._superlu(values, pivot_below=1.0, skew=skew), True)
 
         entries = self._signs * skew[self._full_source]
-        return _RefinedFactor(definite, self._matrix(entries), whole)
+        return _RefinedFactor(definite, self._sparse_matrix(entries), whole)
 
-    def _definite(self, values: Array) -> Factor | None:
+    def _factorise_definite(self, values: Array) -> Factor | None:
         """Return the factor of a symmetric matrix, or None if it is not positive definite."""
-        if self.supernodal:
+        if self.is_supernodal:
             try:
                 pardiso = self._pool.pop()
             except IndexError:  # not asked for beforehand: other threads take from it too
                 pardiso = self._pardiso()
             factor = SupernodalFactor(pardiso, self._pool)
             return factor if pardiso.factorise(values[self._upper[2]]) else None
-        if not self.banded:
+        if not self.is_banded:
             lu = self._superlu(values, pivot_below=0.0)
-            return _SparseFactor(lu, positive_definite=True) if _positive(lu) else None
+            return _SparseFactor(lu, positive_definite=True) if _has_positive_pivots(lu) else None
         if self.skyline:
             return None
         band = np.zeros((self.half_bandwidth + 1, self._size), order="F")
@@ -375,11 +377,11 @@ class Factoriser:
         return Pardiso(*self._upper[:2])
 
     @cached_property
-    def _supernodal_numbers(self) -> int:
+    def _supernodal_size(self) -> int:
         """Number of floating-point numbers in a supernodal factor."""
         if not self._pool:
             self._pool.append(self._pardiso())
-        return self._pool[-1].numbers
+        return self._pool[-1].factor_size
 
     @cached_property
     def _upper(self) -> tuple[Index, Index, Index]:
@@ -393,7 +395,7 @@ class Factoriser:
         starts = np.searchsorted(rows[order], np.arange(self._size + 1))
         return starts, columns[order], self._full_source[here][order]
 
-    def room(self, sides: int) -> Room | None:
+    def allocate(self, sides: int) -> FactorMemory | None:
         """Return memory for a factor within the skyline, or None if other methods are used.
 
         Parameters
@@ -401,9 +403,11 @@ class Factoriser:
         sides : int
             2 for unsymmetric matrices, else 1.
         """
-        return self.skyline.room(sides) if self.skyline else None
+        return self.skyline.allocate(sides) if self.skyline else None
 
-    def _within(self, values: Array, skew: Array, room: Room | None) -> Factor | None:
+    def _factorise_in_skyline(
+        self, values: Array, skew: Array, buffer: FactorMemory | None
+    ) -> Factor | None:
         """Return the factor within the skyline, or None if there is no skyline or the
         matrix needs row exchanges.
         """
@@ -411,19 +415,19 @@ class Factoriser:
         if skyline is None:
             return None
         count = 2 if skew.size else 1
-        room = room or skyline.room(count)
-        pivots, growth = skyline.factorise(room, values, skew)
+        buffer = buffer or skyline.allocate(count)
+        pivots, growth = skyline.factorise(buffer, values, skew)
         # What is not finite in the matrix is not in its pivots.
         if not (pivots.min() > 0 and pivots.max() < np.inf and growth.max() < GROWTH):
             return None
-        return _SkylineFactor(skyline, room.sides[:count], pivots, self._order, self._rank)
+        return _SkylineFactor(skyline, buffer.sides[:count], pivots, self._order, self._rank)
 
     def factorise_each(
         self,
         matrix: Callable[[int], tuple[Array, Array]],
         count: int,
         threads: int,
-        rooms: Sequence[Room | None] = (),
+        buffers: Sequence[FactorMemory | None] = (),
     ) -> list[Factor]:
         """Factorise several matrices in parallel.
 
@@ -435,7 +439,7 @@ class Factoriser:
             Number of matrices.
         threads : int
             Number of threads.
-        rooms : sequence of Room or None
+        buffers : sequence of FactorMemory or None
             Memory for each factor; empty to allocate.
 
         Raises
@@ -447,12 +451,12 @@ class Factoriser:
 
         def run(start: int, stop: int) -> None:
             for k in range(start, stop):
-                factors[k] = self.factorise(*matrix(k), rooms[k] if rooms else None)
+                factors[k] = self.factorise(*matrix(k), buffers[k] if buffers else None)
 
-        in_slices(run, count, threads)
+        run_in_slices(run, count, threads)
         return [factors[k] for k in range(count)]
 
-    def _matrix(self, entries: Array) -> sp.csc_array:
+    def _sparse_matrix(self, entries: Array) -> sp.csc_array:
         """Return the sparse matrix (k, k) of entries in the order of both triangles."""
         places = self._full_rows, self._full_columns
         return sp.csc_array((entries, places), shape=(self._size, self._size))
@@ -466,7 +470,7 @@ class Factoriser:
             entries += self._signs * skew[self._full_source]
         try:
             return splu(
-                self._matrix(entries),
+                self._sparse_matrix(entries),
                 permc_spec="MMD_AT_PLUS_A",
                 options={"SymmetricMode": True},
                 diag_pivot_thresh=pivot_below,
@@ -475,12 +479,12 @@ class Factoriser:
             raise np.linalg.LinAlgError(str(error)) from error
 
 
-def _positive(lu: SuperLU) -> bool:
+def _has_positive_pivots(lu: SuperLU) -> bool:
     """Whether SuperLU took the pivots in their order, and all are positive."""
     return bool((lu.perm_r == lu.perm_c).all() and (lu.U.diagonal() > 0).all())
 
 
 @lru_cache(maxsize=8)
-def _analysed(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
+def _cached_analysis(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
     """Return the analysis of a pattern; `free` are the bytes of an array of int64."""
     return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice)

@@ -22,10 +22,17 @@ from ..recording.experiment import Experiment
 from ..recording.gauge import Gauge
 from ..recording.nuisance import GAUGE
 from ..recording.placement import place_markers
-from .channel import Motion, Points
-from .charts import Chart
-from .reading import GROUP, Channel, Reading, Window, lagrange_weights, times_around
-from .wrench_channel import GraspWrench, Grid
+from .channel import ObservedMotion, PointPositions
+from .charts import MarkerAssociation
+from .reading import (
+    GROUP,
+    Channel,
+    MeasurementResidual,
+    RowStencil,
+    lagrange_weights,
+    neighbouring_times,
+)
+from .wrench_channel import GraspWrench, ReactionGrid
 
 # Grid times around a sample, for positions, velocities and accelerations.
 NEIGHBOURS = 5
@@ -34,47 +41,47 @@ STATIC_NEIGHBOURS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class GaugeReading(Reading):
+class CustomSensorResidual(MeasurementResidual):
     """Measurement model of one custom sensor.
 
     Attributes
     ----------
-    gauge : Gauge
+    sensor : Gauge
         The user's sensor with its samples.
-    at_s : (n,) array
+    observable_s : (n,) array
         Times of the observable [s].
-    static : bool
+    is_static : bool
         Whether the experiment is static: there are no velocities, and two times around a sample are
         used.
     """
 
-    gauge: Gauge
-    at_s: Array
-    static: bool
+    sensor: Gauge
+    observable_s: Array
+    is_static: bool
 
     stated = "sigma"
     has_offsets = True
 
     @classmethod
-    def of(
+    def from_sensor(
         cls,
-        gauge: Gauge,
+        sensor: Gauge,
         number: int,
-        channel: Channel,
+        observable: Channel,
         at_s: Array,
         nuisance: NuisanceMap,
         huber: float | None,
         static: bool,
-    ) -> GaugeReading:
+    ) -> CustomSensorResidual:
         """Build the measurement model of a custom sensor.
 
         Parameters
         ----------
-        gauge : Gauge
+        sensor : Gauge
             The user's sensor with its samples.
         number : int
             Index of the sensor in the experiment.
-        channel : Channel
+        observable : Channel
             Observable.
         at_s : (n,) array
             Times of the observable [s]; samples outside are not compared.
@@ -85,101 +92,105 @@ class GaugeReading(Reading):
         static : bool
             Whether the experiment is static.
         """
-        count = gauge.measured.shape[1]
+        count = sensor.measured_values.shape[1]
         groups = -(-count // GROUP)
-        padded = np.full((len(gauge.times), 1, GROUP * groups), np.nan)
-        padded[:, 0, :count] = gauge.measured
-        is_compared = np.isfinite(padded) & _within(gauge.times, at_s)[:, None, None]
+        padded = np.full((len(sensor.sample_times_s), 1, GROUP * groups), np.nan)
+        padded[:, 0, :count] = sensor.measured_values
+        is_compared = np.isfinite(padded) & _is_within(sensor.sample_times_s, at_s)[:, None, None]
         which = [f" {k + 1}" if groups > 1 else "" for k in range(groups)]
         return cls(
-            channel=channel,
+            observable=observable,
             nuisance=nuisance,
             huber=huber,
-            names=tuple(f"{gauge.name}{each}" for each in which),
-            t_s=gauge.times,
-            sigmas=np.full(groups, gauge.sigma),
+            names=tuple(f"{sensor.name}{each}" for each in which),
+            t_s=sensor.sample_times_s,
+            sigmas=np.full(groups, sensor.sigma),
             measured=padded,
-            components=is_compared.reshape(len(padded), groups, GROUP),
-            own=nuisance.places(GAUGE, of=number)[None],
-            gauge=gauge,
-            at_s=at_s,
-            static=static,
+            is_compared=is_compared.reshape(len(padded), groups, GROUP),
+            own_parameters=nuisance.indices_of_rows(GAUGE, component=number)[None],
+            sensor=sensor,
+            observable_s=at_s,
+            is_static=static,
         )
 
-    def of_some(self, known_s: Array, t_s: Array, numbers: Array, **changes: Any) -> GaugeReading:
-        """Return the model of other samples, see `Reading.of_some`."""
-        return super().of_some(known_s, t_s, numbers, at_s=known_s, **changes)
+    def with_samples(
+        self, known_s: Array, t_s: Array, indices: Array, **changes: Any
+    ) -> CustomSensorResidual:
+        """Return the model of other samples, see `MeasurementResidual.with_samples`."""
+        return super().with_samples(known_s, t_s, indices, observable_s=known_s, **changes)
 
     @cached_property
-    def _window(self) -> Window:
+    def _stencil(self) -> RowStencil:
         """Stencil of all samples: indices of the neighbouring times, and the data of the
         expression.
         """
-        used = min(STATIC_NEIGHBOURS if self.static else NEIGHBOURS, len(self.at_s))
-        times = times_around(self.at_s, self.t_s + TIME_TOLERANCE_S, used)
-        each = np.arange(self.channel.each)
-        places = (times[..., None] * self.channel.each + each).reshape(len(times), 1, -1)
-        data = np.column_stack([self.at_s[times] - self.t_s[:, None], self.t_s])
-        return Window(places, data.T[..., None])
+        used = min(STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS, len(self.observable_s))
+        times = neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, used)
+        each = np.arange(self.observable.vector_count)
+        places = (times[..., None] * self.observable.vector_count + each).reshape(len(times), 1, -1)
+        data = np.column_stack([self.observable_s[times] - self.t_s[:, None], self.t_s])
+        return RowStencil(places, data.T[..., None])
 
-    def window(self, phi: Array, known: int) -> Window:
+    def stencil(self, phi: Array, known: int) -> RowStencil:
         """Return the stencil of those first samples whose times are among the first `known`
         ones.
         """
-        last = self._window.places[:, 0, -1] // self.channel.each
+        last = self._stencil.indices[:, 0, -1] // self.observable.vector_count
         samples = int(np.count_nonzero(last < known))
-        return Window(self._window.places[:samples], self._window.data[:, :samples])
+        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     @property
-    def begins_s(self) -> float:
+    def first_needed_s(self) -> float:
         """Last time [s] that the first compared sample is computed from."""
-        first = int(self.components.any(axis=(1, 2)).argmax())
-        return float(self.at_s[self._window.places[first, 0, -1] // self.channel.each])
+        first = int(self.is_compared.any(axis=(1, 2)).argmax())
+        return float(
+            self.observable_s[self._stencil.indices[first, 0, -1] // self.observable.vector_count]
+        )
 
-    def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the user's expression, padded with zeros to a multiple of three numbers."""
         *places, t_s = ca.vertsplit(data)
         late = ca.SX.sym("late")
-        each = self.channel.each
-        by_time = ca.reshape(looked, GROUP * each, -1)
+        each = self.observable.vector_count
+        by_time = ca.reshape(values, GROUP * each, -1)
         weights = ca.vertcat(*lagrange_weights(late, places))
         at = []
         for _ in range(3):
             now = by_time @ ca.substitute(weights, late, ca.SX(0))
             at.append(ca.reshape(now, GROUP, each))
             weights = ca.jacobian(weights, late)
-        if self.gauge.grasp is not None:
+        if self.sensor.grasp is not None:
             at = ca.horzsplit(at[0])
-        unknowns = ca.vertsplit(phi * self.nuisance.scales[self.own[0]][:, None])
-        predicted = self.gauge.read(t_s, at, unknowns)
+        unknowns = ca.vertsplit(phi * self.nuisance.scales[self.own_parameters[0]][:, None])
+        predicted = self.sensor.read(t_s, at, unknowns)
         return ca.vertcat(predicted, ca.SX.zeros(self.measured.shape[2] - predicted.numel()))
 
     @cached_property
-    def looked_sigmas(self) -> Array:
+    def observable_sigmas(self) -> Array:
         """Standard deviations (3 e,) of the observable as one sample determines it, from
         the derivatives at zero.
         """
-        nothing = np.zeros((self.channel.count, self.channel.each, GROUP))
-        _, _, by_u = self._read(nothing, np.zeros(self.nuisance.size))
-        by_looked = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own.shape[1]])
-        each = GROUP * self.channel.each
-        squares = np.sum(by_looked.reshape(-1, each) ** 2, axis=0) / max(1, self.components.sum())
+        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
+        _, _, by_u = self._evaluate(nothing, np.zeros(self.nuisance.size))
+        by_looked = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]])
+        each = GROUP * self.observable.vector_count
+        squares = np.sum(by_looked.reshape(-1, each) ** 2, axis=0) / max(1, self.is_compared.sum())
         with np.errstate(divide="ignore"):
             return 1 / np.sqrt(squares)
 
-    def of_motion(self, motion: Motion, phi: Array) -> Array:
+    def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
         """Return predictions (S, G, 3) for a motion at the observable's times; NaN for
         samples outside.
         """
-        predicted = self.predicted(self.channel.values(motion, phi), phi)
-        return np.where(_within(self.t_s, self.at_s)[:, None, None], predicted, np.nan)
+        predicted = self.predict(self.observable.evaluate(motion, phi), phi)
+        return np.where(_is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
 
-    def said(self, read: Array) -> Array:
+    def without_padding(self, predicted_m: Array) -> Array:
         """Return the m numbers (S, m) of the sensor from predictions (S, G, 3)."""
-        return read.reshape(len(read), -1)[:, : self.gauge.measured.shape[1]]
+        return predicted_m.reshape(len(predicted_m), -1)[:, : self.sensor.measured_values.shape[1]]
 
 
-def _within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
+def _is_within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
     """Return the mask (S,) of samples within the range of ascending times; none if there
     are no times.
     """
@@ -188,13 +199,13 @@ def _within(t_s: Array, at_s: Array) -> NDArray[np.bool_]:
     return (t_s >= at_s[0] - TIME_TOLERANCE_S) & (t_s <= at_s[-1] + TIME_TOLERANCE_S)
 
 
-def gauge_readings(
+def custom_sensor_residuals(
     experiment: Experiment,
     t_s: Array,
-    grid: Grid,
+    grid: ReactionGrid,
     nuisance: NuisanceMap,
     huber: float | None = None,
-) -> tuple[GaugeReading, ...]:
+) -> tuple[CustomSensorResidual, ...]:
     """Build the measurement models of all custom sensors of an experiment.
 
     Parameters
@@ -203,7 +214,7 @@ def gauge_readings(
         The experiment.
     t_s : (N,) array
         Times of the rows of x [s].
-    grid : Grid
+    grid : Table
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
@@ -213,32 +224,34 @@ def gauge_readings(
     models = []
     for number, gauge in enumerate(experiment.readings):
         if gauge.grasp is None:
-            channel = points_of(experiment, gauge, len(t_s))
+            channel = observed_points(experiment, gauge, len(t_s))
             at_s = t_s
         else:
             grasp = experiment.grasps[gauge.grasp - 1]
             origin = np.zeros(3)
-            channel = GraspWrench.of(experiment, grasp, gauge.frame, origin, grid, nuisance)
+            channel = GraspWrench.from_experiment(
+                experiment, grasp, gauge.frame, origin, grid, nuisance
+            )
             at_s = channel.t_s
         models.append(
-            GaugeReading.of(
+            CustomSensorResidual.from_sensor(
                 gauge,
                 number,
-                channel=channel,
+                observable=channel,
                 at_s=at_s,
                 nuisance=nuisance,
                 huber=huber,
-                static=experiment.static,
+                static=experiment.is_static,
             )
         )
     return tuple(models)
 
 
-def points_of(experiment: Experiment, gauge: Gauge, rows: int) -> Points:
+def observed_points(experiment: Experiment, sensor: Gauge, rows: int) -> PointPositions:
     """Return the points of a custom sensor as an observable at the first `rows` grid times."""
     body = experiment.body
-    points = np.asarray(gauge.points_m)
-    names = [f"{gauge.name} {k + 1}" for k in range(len(points))]
+    points = np.asarray(sensor.points_m)
+    names = [f"{sensor.name} {k + 1}" for k in range(len(points))]
     placement = place_markers(points, body.nodes.points_m, body, names=names)
-    chart = Chart.exact(body, placement, points)
-    return Points(np.arange(rows), chart, np.full((len(points), 3), -1))
+    chart = MarkerAssociation.from_exact_places(body, placement, points)
+    return PointPositions(np.arange(rows), chart, np.full((len(points), 3), -1))

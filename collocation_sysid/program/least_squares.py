@@ -30,59 +30,65 @@ ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSquares:
+class SquareRootInformation:
     """Triangle of a linear least-squares problem in P parameters.
 
     Attributes
     ----------
     triangle : (at most P + 1, P + 1) array
         Derivatives by p, and in the last column residuals at p = 0.
-    rows : int
+    row_count : int
         Number of rows that it represents.
     """
 
     triangle: Array
-    rows: int = 0
+    row_count: int = 0
 
     @classmethod
-    def none(cls, size: int) -> LeastSquares:
+    def empty(cls, size: int) -> SquareRootInformation:
         """Return the problem in P = `size` parameters without rows."""
         return cls(np.zeros((0, size + 1)))
 
-    def add(self, residual: Array, slope: Array, at: Array | None = None) -> LeastSquares:
+    def with_rows(
+        self, residual: Array, jacobian: Array, parameters: Array | None = None
+    ) -> SquareRootInformation:
         """Return the problem with further rows.
 
         Parameters
         ----------
         residual : (k,) array
-            Residuals at `at`.
-        slope : (k, P) array
+            Residuals at `parameters`.
+        jacobian : (k, P) array
             Derivatives by p.
-        at : (P,) array, optional
+        parameters : (P,) array, optional
             Parameters of the residuals; zero by default.
         """
-        right = residual if at is None else residual - slope @ at
-        return self._with(np.column_stack([slope, right]), len(residual))
+        right = residual if parameters is None else residual - jacobian @ parameters
+        return self._with_augmented_rows(np.column_stack([jacobian, right]), len(residual))
 
-    def joined(self, other: LeastSquares, places: Index | slice = slice(None)) -> LeastSquares:
-        """Return the problem with all rows of another, whose parameters are at `places`
+    def with_problem(
+        self, other: SquareRootInformation, indices: Index | slice = slice(None)
+    ) -> SquareRootInformation:
+        """Return the problem with all rows of another, whose parameters are at `indices`
         among these.
         """
         rows = np.zeros((len(other.triangle), self.triangle.shape[1]))
-        rows[:, :-1][:, places] = other.slope
+        rows[:, :-1][:, indices] = other.jacobian
         rows[:, -1] = other.residual
-        return self._with(rows, other.rows)
+        return self._with_augmented_rows(rows, other.row_count)
 
-    def _with(self, rows: Array, count: int) -> LeastSquares:
+    def _with_augmented_rows(self, rows: Array, count: int) -> SquareRootInformation:
         """Return the problem with rows of derivatives and residuals at p = 0, which count
         as `count` rows.
         """
         if not count:
             return self
-        return LeastSquares(_rotated(np.concatenate([self.triangle, rows])), self.rows + count)
+        return SquareRootInformation(
+            _triangularise(np.concatenate([self.triangle, rows])), self.row_count + count
+        )
 
     @property
-    def slope(self) -> Array:
+    def jacobian(self) -> Array:
         """Derivatives S by p, as the triangle represents them."""
         return self.triangle[:, :-1]
 
@@ -94,24 +100,24 @@ class LeastSquares:
     @property
     def information(self) -> Array:
         """Information matrix (P, P), SᵀS."""
-        return self.slope.T @ self.slope
+        return self.jacobian.T @ self.jacobian
 
     @property
     def score(self) -> Array:
         """Score (P,), Sᵀ r: half the gradient of the sum of squares at p = 0."""
-        return self.slope.T @ self.residual
+        return self.jacobian.T @ self.residual
 
     def loss(self, p: Array) -> float:
         """Return the sum of squares at p."""
         residual = self.triangle @ np.append(p, 1.0)
         return float(residual @ residual)
 
-    def best(self, lower: Array, upper: Array) -> Array:
+    def minimiser(self, lower: Array, upper: Array) -> Array:
         """Return the p with the least sum of squares between bounds (P,); without active
         bounds, the shortest of several.
         """
         size = len(lower)
-        square = self.slope[:size]
+        square = self.jacobian[:size]
         right = -self.residual[:size]
         regular = len(square) == size > 0 and _trcon(square)[0] > ROUNDING
         p = _trtrs(square, right)[0] if regular else np.linalg.lstsq(square, right)[0]
@@ -119,32 +125,32 @@ class LeastSquares:
             return np.asarray(p, dtype=np.float64)
         return np.clip(lsq_linear(square, right, (lower, upper), method="bvls").x, lower, upper)
 
-    def marginal(self, first: int) -> LeastSquares:
+    def marginal(self, count: int) -> SquareRootInformation:
         """Return the problem in the first parameters alone, with the others eliminated at
         their optimum.
         """
         size = self.triangle.shape[1]
-        others = np.arange(first, size - 1)
-        order = np.concatenate([others, np.arange(first), [size - 1]])
-        triangle = _rotated(self.triangle[:, order])[len(others) :, len(others) :]
-        return LeastSquares(triangle, self.rows)
+        others = np.arange(count, size - 1)
+        order = np.concatenate([others, np.arange(count), [size - 1]])
+        triangle = _triangularise(self.triangle[:, order])[len(others) :, len(others) :]
+        return SquareRootInformation(triangle, self.row_count)
 
     @cached_property
     def root(self) -> Array:
         """Matrix L (P, r) with SᵀS = (L Lᵀ)⁻¹ in the r directions that the rows determine."""
-        return self._split[0]
+        return self._root_and_undetermined[0]
 
     @cached_property
-    def undetermined(self) -> NDArray[np.bool_]:
+    def is_undetermined(self) -> NDArray[np.bool_]:
         """Mask (P,) of the parameters that a direction with zero information contains."""
-        return self._split[1]
+        return self._root_and_undetermined[1]
 
     @cached_property
-    def _split(self) -> tuple[Array, NDArray[np.bool_]]:
-        """Matrix of `root` and mask of `undetermined`, computed together."""
-        units = np.linalg.norm(self.slope, axis=0)
+    def _root_and_undetermined(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Matrix of `root` and mask of `is_undetermined`, computed together."""
+        units = np.linalg.norm(self.jacobian, axis=0)
         units[units == 0] = 1.0
-        square = (self.slope / units)[: len(units)]
+        square = (self.jacobian / units)[: len(units)]
         size = len(units)
         # So that no eigenvalue is zero up to rounding; much faster.
         if len(square) == size > 0 and _trcon(square)[0] > size * np.sqrt(SINGULAR):
@@ -156,33 +162,33 @@ class LeastSquares:
         root = vectors[is_determined].T / values[is_determined] / units[:, None]
         return root, np.asarray((np.abs(vectors[~is_determined]) > NEGLIGIBLE).any(axis=0))
 
-    def covariance(self, of_score: Array | None = None) -> Array:
+    def covariance(self, score_covariance: Array | None = None) -> Array:
         """Return the covariance (P, P) of p.
 
         Undetermined parameters have infinite variance, and NaN covariances.
 
         Parameters
         ----------
-        of_score : (r, r) array, optional
+        score_covariance : (r, r) array, optional
             Lᵀ B L for errors e whose score Sᵀe has the covariance B; by default errors are
             independent with unit variance.
         """
         root = self.root
-        is_undetermined = self.undetermined
-        matrix = root @ root.T if of_score is None else root @ of_score @ root.T
+        is_undetermined = self.is_undetermined
+        matrix = root @ root.T if score_covariance is None else root @ score_covariance @ root.T
         matrix[is_undetermined] = matrix[:, is_undetermined] = np.nan
         matrix[is_undetermined, is_undetermined] = np.inf
         return matrix
 
     @cached_property
-    def errors(self) -> Array:
+    def standard_errors(self) -> Array:
         """Standard deviations (P,) of p for independent errors of unit variance; infinite
         where undetermined.
         """
         return np.sqrt(np.diag(self.covariance()))
 
 
-def _rotated(rows: Array) -> Array:
+def _triangularise(rows: Array) -> Array:
     """Return the triangle of a QR factorisation of rows (k, P + 1)."""
     size = rows.shape[1]
     factors, *_ = _geqrf(rows, lwork=64 * size)

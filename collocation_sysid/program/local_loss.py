@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, Index
-from .channel import Entries, Points
-from .reading import Reading
+from .channel import PointPositions, SparseEntries
+from .reading import MeasurementResidual
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,28 +23,28 @@ class LocalLoss:
 
     Attributes
     ----------
-    readings : tuple of (Reading, Points)
+    residuals : tuple of (MeasurementResidual, PointPositions)
         Measurements with their local observables.
-    variables : int
+    position_count : int
         Number of position variables, all of which precede φ.
-    size : int
+    nuisance_count : int
         Number of nuisance parameters φ.
-    dofs : int
+    dof_count : int
         Number of dofs of the body.
     """
 
-    readings: tuple[tuple[Reading, Points], ...]
-    variables: int
-    size: int
-    dofs: int
+    residuals: tuple[tuple[MeasurementResidual, PointPositions], ...]
+    position_count: int
+    nuisance_count: int
+    dof_count: int
 
     @cached_property
     def structure(self) -> tuple[Index, Index]:
         """Rows and columns among (x, φ) of the entries, upper triangle, sorted by column."""
-        none = np.zeros(self.size)
+        none = np.zeros(self.nuisance_count)
         codes = [np.zeros(0, dtype=np.int64)]
-        for reading, points in self.readings:
-            slopes = points.slopes(None, none, self.variables)
+        for reading, points in self.residuals:
+            slopes = points.derivative_matrix(None, none, self.position_count)
             codes.append(self._codes(*reading.hessian_structure(slopes)))
         unique_codes = np.unique(np.concatenate(codes))
         return unique_codes % self._height, unique_codes // self._height
@@ -52,13 +52,13 @@ class LocalLoss:
     @property
     def _height(self) -> int:
         """Number of rows and columns."""
-        return self.variables + self.size
+        return self.position_count + self.nuisance_count
 
     def _codes(self, rows: Index, columns: Index) -> Index:
         """Return one number for each entry, ascending in the order of `structure`."""
         return columns * self._height + rows
 
-    def hessian(self, x: Array, phi: Array, bent: bool = True) -> Array:
+    def hessian(self, x: Array, phi: Array, has_observation_curvature: bool = True) -> Array:
         """Return the values of the entries.
 
         Parameters
@@ -67,37 +67,50 @@ class LocalLoss:
             Positions [m].
         phi : (k,) array
             Nuisance parameters.
-        bent : bool
+        has_observation_curvature : bool
             If false, neglect the curvature of the observations (Gauss–Newton).
         """
-        return self._constant if self._is_quadratic else self._at(x, phi, bent)
+        return (
+            self._constant
+            if self._is_quadratic
+            else self._evaluate_at(x, phi, has_observation_curvature)
+        )
 
     @property
     def _is_quadratic(self) -> bool:
         """Whether the values do not depend on x and φ."""
-        return all(reading.is_quadratic and points.is_linear for reading, points in self.readings)
+        return all(reading.is_quadratic and points.is_linear for reading, points in self.residuals)
 
     @cached_property
     def _constant(self) -> Array:
         """Values of the entries at zero positions."""
-        rows = max((points.rows[-1] + 1 for _, points in self.readings), default=1)
-        return self._at(np.zeros((rows, self.dofs)), np.zeros(self.size), True)
+        rows = max((points.rows[-1] + 1 for _, points in self.residuals), default=1)
+        return self._evaluate_at(
+            np.zeros((rows, self.dof_count)), np.zeros(self.nuisance_count), True
+        )
 
-    def _at(self, x: Array, phi: Array, bent: bool) -> Array:
+    def _evaluate_at(self, x: Array, phi: Array, has_observation_curvature: bool) -> Array:
         """Return the values of the entries at x and φ."""
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))
-        for entries in self._entries(x, phi, bent):
+        for entries in self._entries(x, phi, has_observation_curvature):
             np.add.at(values, np.searchsorted(codes, self._codes(*entries[:2])), entries.values)
         return values
 
-    def _entries(self, x: Array, phi: Array, bent: bool) -> Iterator[Entries]:
+    def _entries(
+        self, x: Array, phi: Array, has_observation_curvature: bool
+    ) -> Iterator[SparseEntries]:
         """Iterate over the contributions of the measurements, and of the curvature of
         observables.
         """
-        for reading, points in self.readings:
-            values = points.of(x, phi)
-            yield reading.hessian(values, phi, points.slopes(x, phi, self.variables), bent)
-            if bent and not points.is_linear:
-                by_values, _ = reading.loss_slopes(values, phi)
-                yield points.curvature(x, phi, by_values, self.variables)
+        for reading, points in self.residuals:
+            values = points.evaluate_positions(x, phi)
+            yield reading.hessian(
+                values,
+                phi,
+                points.derivative_matrix(x, phi, self.position_count),
+                has_observation_curvature,
+            )
+            if has_observation_curvature and not points.is_linear:
+                by_values, _ = reading.loss_gradient(values, phi)
+                yield points.curvature(x, phi, by_values, self.position_count)

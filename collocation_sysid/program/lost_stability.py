@@ -53,7 +53,7 @@ class LostStability:
         Corners of the surface's triangles.
     place_m : (3,) array
         Undeformed place of the decisive face [m].
-    stretch, across : float
+    smaller_stretch, larger_stretch : float
         Principal stretches of the surface there, the smaller first.
     critical_stretch : float
         Smaller stretch at which a neo-Hookean surface is unstable, for the same relation of both
@@ -66,26 +66,26 @@ class LostStability:
     mode: Array
     faces: Index
     place_m: Array
-    stretch: float
-    across: float
+    smaller_stretch: float
+    larger_stretch: float
     critical_stretch: float
     wavelength_m: float
 
     @property
-    def is_of_surface(self) -> bool:
+    def is_surface_instability(self) -> bool:
         """Whether the stretch is near the one at which surfaces wrinkle."""
-        return self.stretch < 1 and self.stretch <= NEAR * self.critical_stretch
+        return self.smaller_stretch < 1 and self.smaller_stretch <= NEAR * self.critical_stretch
 
     @property
-    def sentence(self) -> str:
+    def message(self) -> str:
         """Message for the user: the mode, where it is largest, and what to change."""
         x, y, z = (1e3 * self.place_m).tolist()
         where = (
             f"it moves most at ({x:.4g}, {y:.4g}, {z:.4g}) mm, where the stretches of the surface "
-            f"are {self.stretch:.3g} and {self.across:.3g}, with a wavelength of "
+            f"are {self.smaller_stretch:.3g} and {self.larger_stretch:.3g}, with a wavelength of "
             f"{1e3 * self.wavelength_m:.3g} mm"
         )
-        if self.is_of_surface:
+        if self.is_surface_instability:
             return (
                 f"the body loses its stability: {where}. Rubber wrinkles at a surface stretch of "
                 f"{self.critical_stretch:.3g} there (Biot): a physical instability of the surface, "
@@ -99,24 +99,26 @@ class LostStability:
         )
 
 
-def explained(experiment: Experiment, theta: Array, error: SimulationError) -> SimulationError:
+def explain_failure(
+    experiment: Experiment, theta: Array, error: SimulationError
+) -> SimulationError:
     """Return the error with the mode, if a static path ended by a loss of stability;
     otherwise the same error.
     """
     if error.state_m is None:
         return error
     try:
-        instability = lost_stability(experiment, theta, error.state_m, error.time_s)
+        instability = find_lost_stability(experiment, theta, error.state_m, error.time_s)
     except (ArpackError, RuntimeError, np.linalg.LinAlgError):
         return error
     if instability is None:
         return error
-    explained_error = SimulationError(instability.sentence, error.time_s, error.element)
+    explained_error = SimulationError(instability.message, error.time_s, error.element)
     explained_error.lost_stability = instability
     return explained_error
 
 
-def lost_stability(
+def find_lost_stability(
     experiment: Experiment, theta: Array, x: Array, time_s: float
 ) -> LostStability | None:
     """Return the mode in which a body is about to lose its stability, or None.
@@ -135,8 +137,8 @@ def lost_stability(
     time_s : float
         Time of loads and poses [s].
     """
-    forces = Forces.of(experiment, time_s, theta)
-    is_prescribed = experiment.held([time_s])[0].ravel()
+    forces = Forces.from_experiment(experiment, time_s, theta)
+    is_prescribed = experiment.is_prescribed([time_s])[0].ravel()
     free = np.flatnonzero(~is_prescribed)
     reference, _ = _lowest(forces, experiment.rigid_positions([time_s])[0].ravel(), free, 0.0)
     if not reference > 0:
@@ -154,14 +156,14 @@ def lost_stability(
     return _on_surface(nodes.points_m, positions_m, mode, experiment.body.mesh.surface)
 
 
-def _lowest(forces: Forces, x: Array, free: Index, shift: float) -> tuple[float, Array]:
+def _lowest(forces: Forces, x: Array, free: Index, translation_m: float) -> tuple[float, Array]:
     """Return the lowest eigenvalue [1/s²] of K φ = λ M φ near a shift, and φ (free,)."""
     state = x.reshape(1, -1)
     stiffness = -forces.linearise(state, np.zeros_like(state)).by_position[0]
-    root = sp.diags_array(1 / np.sqrt(forces.mass.kg[0, free]))
+    root = sp.diags_array(1 / np.sqrt(forces.mass.inertia_kg[0, free]))
     matrix = sp.csc_array(root @ forces.pattern.matrix(stiffness)[:, free][free] @ root)
     start = np.random.default_rng(0).normal(size=len(free))
-    values, vectors = eigsh(matrix, 1, sigma=-shift, which="LM", v0=start)
+    values, vectors = eigsh(matrix, 1, sigma=-translation_m, which="LM", v0=start)
     return float(values[0]), np.asarray(root @ vectors[:, 0])
 
 
@@ -193,8 +195,8 @@ def _on_surface(points_m: Array, positions_m: Array, mode: Array, surface: Index
         mode=mode,
         faces=surface,
         place_m=points_m[surface[face]].mean(axis=0),
-        stretch=small,
-        across=large,
+        smaller_stretch=small,
+        larger_stretch=large,
         critical_stretch=critical,
         wavelength_m=float(2 * np.pi * np.sqrt(share)),
     )

@@ -12,26 +12,26 @@ import numpy as np
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.rest_shape import RestShapeError
-from ..model.dynamics import Dynamics, StencilRow, weighted
-from ..model.histories import AnyLeft, ahead, following
+from ..model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
+from ..model.histories import PreviousState, advance_states, insert_previous_states
 from ..recording.experiment import Experiment
 from .lapack import one_blas_thread
-from .near_contact import NearContact
+from .near_contact import StepContact
 from .newton import (
     NewtonFailure,
     NewtonOptions,
-    Solver,
-    Solvers,
-    followed,
+    NewtonSolver,
+    NewtonSolvers,
+    follow_path,
     simulation_error,
 )
-from .rest import start_state
+from .rest import initial_state
 from .stopwatch import Stopwatch
 
 Progress = Callable[[float], None]
 
 
-def march(
+def simulate_scheme(
     experiment: Experiment,
     dynamics: Dynamics,
     options: NewtonOptions | None = None,
@@ -60,21 +60,21 @@ def march(
     SimulationError
         If a step fails; names its time and element.
     """
-    x, failure = march_on(experiment, dynamics, None, options, progress)
+    x, failure = continue_simulation(experiment, dynamics, None, options, progress)
     if failure is not None:
         raise failure
     return x
 
 
 @one_blas_thread()
-def march_on(
+def continue_simulation(
     experiment: Experiment,
     dynamics: Dynamics,
     known: Array | None = None,
     options: NewtonOptions | None = None,
     progress: Progress | None = None,
     stopwatch: Stopwatch | None = None,
-    near: Array | None = None,
+    near_solution: Array | None = None,
 ) -> tuple[Array, SimulationError | None]:
     """Continue a trajectory until its end or until a step fails.
 
@@ -92,7 +92,7 @@ def march_on(
         Called with the share of the rows done.
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
-    near : (N, 3n) array, optional
+    near_solution : (N, 3n) array, optional
         Trajectory at other parameters, as the first guess of equilibria.
 
     Returns
@@ -102,23 +102,23 @@ def march_on(
     SimulationError or None
         Why the simulation stopped early.
     """
-    if (massless := dynamics.body.massless(dynamics.theta)) is not None:
+    if (massless := dynamics.body.mass_problem(dynamics.theta)) is not None:
         failure = SimulationError(massless, float(dynamics.t_s[0]))
         return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
-    if (unreachable := dynamics.body.unreachable(dynamics.theta)) is not None:
+    if (unreachable := dynamics.body.rest_shape_failure(dynamics.theta)) is not None:
         failure = RestShapeError(unreachable)
         return np.zeros((0, dynamics.body.pattern.size)) if known is None else known, failure
-    solvers = Solvers(experiment, options, stopwatch)
-    is_prescribed = ~np.isnan(dynamics.goals_m)
-    x = np.zeros((dynamics.rows, dynamics.body.pattern.size))
+    solvers = NewtonSolvers(experiment, options, stopwatch)
+    is_prescribed = ~np.isnan(dynamics.prescribed_m)
+    x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
     v0 = np.zeros(x.shape[1])
     if known is None:
         try:
-            at_start = dynamics.forces.rows(slice(1))
-            start_guess = None if near is None else near[0]
-            solver = solvers.holding(is_prescribed[0])
-            goals_m = dynamics.goals_m[0]
-            x[0], v0 = start_state(experiment, at_start, solver, start_guess, goals_m)
+            at_start = dynamics.forces.at_times(slice(1))
+            start_guess = None if near_solution is None else near_solution[0]
+            solver = solvers.for_prescribed(is_prescribed[0])
+            goals_m = dynamics.prescribed_m[0]
+            x[0], v0 = initial_state(experiment, at_start, solver, start_guess, goals_m)
         except SimulationError as failure:
             return x[:0], failure
         known = x[:1]
@@ -129,45 +129,45 @@ def march_on(
     first = dynamics.first_row
     known_evaluations = done - dynamics.first_row
     histories = dynamics.histories(x[:done])
-    intervals = dynamics.until_next_s
+    intervals = dynamics.interval_to_next_s
     if known_evaluations > 0:
         known_rows = slice(first, done)
-        forces[known_rows] = dynamics.forces_along(histories, known_rows).total(
+        forces[known_rows] = dynamics.forces_with_histories(histories, known_rows).total(
             xi[:known_evaluations], nu[:known_evaluations]
         )
-    dynamics.without_taken(forces)
-    previous_histories = tuple(history.last for history in histories)
-    for t in range(done, dynamics.rows):
+    dynamics.zero_held_forces(forces)
+    previous_histories = tuple(history.final_state for history in histories)
+    for t in range(done, dynamics.row_count):
         row = RowEquations(dynamics, x, forces, t, previous_histories)
-        solver = solvers.holding(is_prescribed[t])
-        goal = dynamics.goals_m[t, solver.held]
-        if not dynamics.static:
-            guess = extrapolated(x[:t], dynamics.step_s * v0)
-        elif near is None:
-            guess = _carried_on(x[:t], solver.held, goal)
+        solver = solvers.for_prescribed(is_prescribed[t])
+        goal = dynamics.prescribed_m[t, solver.is_prescribed]
+        if not dynamics.is_static:
+            guess = extrapolate(x[:t], dynamics.step_s * v0)
+        elif near_solution is None:
+            guess = _extrapolate_static(x[:t], solver.is_prescribed, goal)
         else:
-            guess = near[t]
+            guess = near_solution[t]
         try:
             x[t] = solve_row(solver, row, guess, x[t - 1], goal)
         except NewtonFailure as failure:
             time_s = float(dynamics.t_s[t])
-            static = dynamics.static
+            static = dynamics.is_static
             return x[:t], simulation_error(
                 solver, failure, time_s, f"the step at row {t}", static=static
             )
         forces[t] = row.force(x[t])
-        forces[t, dynamics.taken[t]] = 0
+        forces[t, dynamics.is_temporarily_held[t]] = 0
         if previous_histories:
             (xi_t,), (nu_t,) = row.states(x[t])
-            previous_histories = following(
+            previous_histories = advance_states(
                 row.forces, previous_histories, xi_t, nu_t, intervals[t - 1]
             )
         if progress:
-            progress(t / (dynamics.rows - 1))
+            progress(t / (dynamics.row_count - 1))
     return x, None
 
 
-def extrapolated(x: Array, first_step: Array) -> Array:
+def extrapolate(x: Array, first_step: Array) -> Array:
     """Return an extrapolation of the next row from rows x (k, 3n); with one row, by
     `first_step` (3n,).
     """
@@ -176,14 +176,14 @@ def extrapolated(x: Array, first_step: Array) -> Array:
     return x[-1] + (x[-1] - x[-2] if len(x) > 1 else first_step)
 
 
-def _carried_on(x: Array, held: Index, goal: Array) -> Array:
+def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
     """Return an extrapolation of the next equilibrium: the last increment, scaled by that
     of the prescribed dofs.
     """
     if len(x) < 2:
         return x[-1]
-    before = x[-1, held] - x[-2, held]
-    way = goal - x[-1, held]
+    before = x[-1, prescribed] - x[-2, prescribed]
+    way = goal - x[-1, prescribed]
     share = float(before @ way) / max(float(before @ before), np.finfo(float).tiny)
     return x[-1] + share * (x[-1] - x[-2])
 
@@ -211,37 +211,41 @@ class RowEquations:
         x: Array,
         forces: Array,
         t: int,
-        left: Sequence[AnyLeft] = (),
+        previous: Sequence[PreviousState] = (),
     ) -> None:
         self.dynamics = dynamics
-        self.row = StencilRow.of(dynamics, t)
-        self.forces = dynamics.forces.rows(slice(t, t + 1))
-        if left:
-            self.forces = ahead(self.forces, left, float(dynamics.until_next_s[t - 1]))
-        self.forces_before = dynamics.forces.rows(slice(t - 1, t)) if dynamics.static else None
+        self.row = StencilRow.from_dynamics(dynamics, t)
+        self.forces = dynamics.forces.at_times(slice(t, t + 1))
+        if previous:
+            self.forces = insert_previous_states(
+                self.forces, previous, float(dynamics.interval_to_next_s[t - 1])
+            )
+        self.forces_before = (
+            dynamics.forces.at_times(slice(t - 1, t)) if dynamics.is_static else None
+        )
         self.rest = self.forces
         contacts = []
-        if not dynamics.static:
+        if not dynamics.is_static:
             self.rest, contacts = self.forces.without_contact()
-        self.contact = NearContact(contacts, self.rest.theta, self.rest.pattern)
+        self.contact = StepContact(contacts, self.rest.theta, self.rest.pattern)
         row = self.row
-        first = max(0, t - dynamics.reach)
+        first = max(0, t - dynamics.largest_lag)
         shape = x.shape[1:]
         past = x[first:t][::-1]
         past_forces = forces[first:t][::-1]
-        self.xi = weighted(row.p, past, shape)
-        self.nu = weighted(row.q, past, shape)
-        self.known = weighted(row.w, past_forces, shape)
-        self.known -= row.mass_kg * weighted(row.s, past, shape)
+        self.xi = weighted_sum_of_past(row.p, past, shape)
+        self.nu = weighted_sum_of_past(row.q, past, shape)
+        self.known = weighted_sum_of_past(row.w, past_forces, shape)
+        self.known -= row.mass_kg * weighted_sum_of_past(row.s, past, shape)
         self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
 
-    def under(self, share: float) -> RowEquations:
+    def with_load_step(self, share: float) -> RowEquations:
         """Return the row at a share of the change of a static load; other rows keep the
         full load.
         """
         scaled = copy(self)
         if self.forces_before is not None:
-            scaled.rest = self.forces_before.towards(self.forces, share)
+            scaled.rest = self.forces_before.interpolate(self.forces, share)
         return scaled
 
     def force(self, x: Array) -> Array:
@@ -254,14 +258,14 @@ class RowEquations:
         """Return ξ_t [m] and ν_t [m/s], each (1, 3n), from x_t (3n,)."""
         return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
 
-    def balanced(self, force: Array, x: Array) -> Array:
+    def residual_from(self, force: Array, x: Array) -> Array:
         """Return c_t (3n,) from the force F_t and x_t."""
         row = self.row
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
     def residual(self, x: Array) -> Array:
         """Return c_t (3n,) [N]."""
-        return self.balanced(self.force(x), x)
+        return self.residual_from(self.force(x), x)
 
     def linearise(self, x: Array) -> tuple[Array, Array, Array]:
         """Return c_t (3n,), and lower triangles of the symmetric and the skew part of
@@ -273,16 +277,16 @@ class RowEquations:
         matrix = row.block(at.by_position[0], at.by_velocity[0], self.rest.pattern)
         skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
         if not self.contact.acts:
-            return self.balanced(at.force[0], x), matrix, skew
+            return self.residual_from(at.force[0], x), matrix, skew
         force, symmetric, askew = self.contact.linearise(*states, (row.p[0], row.q[0]))
         matrix -= row.w[0] * symmetric
         if askew.size:
             skew -= row.w[0] * askew
-        return self.balanced(at.force[0] + force, x), matrix, skew
+        return self.residual_from(at.force[0] + force, x), matrix, skew
 
 
 def solve_row(
-    solver: Solver, row: RowEquations, guess: Array, previous: Array, held: Array
+    solver: NewtonSolver, row: RowEquations, guess: Array, previous: Array, prescribed_m: Array
 ) -> Array:
     """Solve one row; where Newton's method fails, apply the grasps' displacement (and a static
     load) in smaller increments.
@@ -291,7 +295,7 @@ def solve_row(
 
     Parameters
     ----------
-    solver : Solver
+    solver : NewtonSolver
         Newton's method for the dofs prescribed at this time.
     row : RowEquations
         The row.
@@ -299,7 +303,7 @@ def solve_row(
         First guess [m].
     previous : (3n,) array
         Positions of the row before [m].
-    held : (h,) array
+    prescribed_m : (h,) array
         Prescribed positions of the prescribed dofs [m].
 
     Raises
@@ -307,16 +311,16 @@ def solve_row(
     NewtonFailure
         If an increment fails after all halvings.
     """
-    origin = previous[solver.held]
+    origin = previous[solver.is_prescribed]
 
-    def solve(near: Array, share: float) -> Array:
-        start = near.copy()
-        step = row.under(share)
+    def solve(guess: Array, share: float) -> Array:
+        start = guess.copy()
+        step = row.with_load_step(share)
         # To the last digit at the end: bounds hold it there.
-        goal = held if share == 1 else origin + share * (held - origin)
-        if row.dynamics.static:
-            return solver.newton(start, step.residual, step.linearise, True, goal)
-        start[solver.held] = goal
-        return solver.newton(start, step.residual, step.linearise)
+        goal = prescribed_m if share == 1 else origin + share * (prescribed_m - origin)
+        if row.dynamics.is_static:
+            return solver.solve(start, step.residual, step.linearise, True, goal)
+        start[solver.is_prescribed] = goal
+        return solver.solve(start, step.residual, step.linearise)
 
-    return followed(solve, previous, solver.options.halvings, guess)
+    return follow_path(solve, previous, solver.options.max_halvings, guess)

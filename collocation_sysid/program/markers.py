@@ -21,47 +21,47 @@ from ..arrays import Array, Index
 from ..model.nuisance import NuisanceMap
 from ..recording.markers import Markers
 from ..recording.nuisance import PLACE
-from .channel import Points
-from .charts import Chart
-from .reading import Reading, Window, lagrange_weights
+from .channel import PointPositions
+from .charts import MarkerAssociation
+from .reading import MeasurementResidual, RowStencil, lagrange_weights
 
 # Samples that a time-shifted marker is interpolated from: an error of (ωΔt)⁵ / 3500 of a swing.
 NEIGHBOURS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class MarkerReading(Reading):
+class MarkerResidual(MeasurementResidual):
     """Measurement model of the tracks of all markers of an experiment.
 
     Attributes
     ----------
-    channel : Points
+    observable : PointPositions
         Places of the markers on the body at the samples.
     markers : Markers
         Measured tracks.
-    from_rest : bool
+    is_initially_at_rest : bool
         Whether the body rests in its first state before the first time; then a shifted marker is
         predicted there, otherwise such samples are not compared.
-    earlier : int
+    earlier_times : int
         Number of the channel's times before the first sample.
     """
 
-    channel: Points
+    observable: PointPositions
     markers: Markers
-    from_rest: bool
-    earlier: int
+    is_initially_at_rest: bool
+    earlier_times: int
 
     @classmethod
-    def of(
+    def from_markers(
         cls,
         markers: Markers,
         rows: Index,
         nuisance: NuisanceMap,
-        chart: Chart,
+        association: MarkerAssociation,
         huber: float | None = None,
-        from_rest: bool = True,
-        earlier: int = 0,
-    ) -> MarkerReading:
+        is_initially_at_rest: bool = True,
+        earlier_times: int = 0,
+    ) -> MarkerResidual:
         """Build the measurement model of the markers of an experiment.
 
         Parameters
@@ -69,141 +69,145 @@ class MarkerReading(Reading):
         markers : Markers
             Measured tracks.
         rows : (T,) array
-            Grid times of the observable, one for each sample and `earlier` ones before.
+            Grid times of the observable, one for each sample and `earlier_times` ones before.
         nuisance : NuisanceMap
             Nuisance parameters of the experiment.
-        chart : Chart
+        association : MarkerAssociation
             Elements of the markers.
         huber : float or None
             Threshold of Huber's loss in standard deviations; None means a quadratic loss.
-        from_rest : bool
+        is_initially_at_rest : bool
             Whether the body is at rest before the first time.
-        earlier : int
+        earlier_times : int
             Number of `rows` before the first sample.
         """
-        places = np.full((len(markers.names), chart.axes.shape[2]), -1)
-        places[chart.estimated] = nuisance.places(PLACE).reshape(-1, places.shape[1])
-        shifted = earlier + np.arange(len(markers.t_s)) + chart.samples
-        covered = (shifted < len(rows)) & ((shifted >= 0) | from_rest)
-        is_compared = markers.present & covered[:, None]
+        places = np.full((len(markers.names), association.axes.shape[2]), -1)
+        places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(-1, places.shape[1])
+        shifted = earlier_times + np.arange(len(markers.t_s)) + association.clock_samples
+        covered = (shifted < len(rows)) & ((shifted >= 0) | is_initially_at_rest)
+        is_compared = markers.is_present & covered[:, None]
         return cls(
-            channel=Points(rows, chart, places),
+            observable=PointPositions(rows, association, places),
             nuisance=nuisance,
             huber=huber,
             names=markers.names,
             t_s=markers.t_s,
             sigmas=markers.sigma_m,
             measured=markers.positions_m,
-            components=np.repeat(is_compared[..., None], 3, axis=2),
-            own=nuisance.of_markers(len(markers.names)),
+            is_compared=np.repeat(is_compared[..., None], 3, axis=2),
+            own_parameters=nuisance.marker_indices(len(markers.names)),
             markers=markers,
-            from_rest=from_rest,
-            earlier=earlier,
+            is_initially_at_rest=is_initially_at_rest,
+            earlier_times=earlier_times,
         )
 
     @property
-    def grid_rows(self) -> Index:
+    def sample_rows(self) -> Index:
         """Grid time (T,) of each sample."""
-        return self.channel.rows
+        return self.observable.rows
 
     @property
-    def place_places(self) -> Index:
+    def coordinate_parameters(self) -> Index:
         """Indices (M, k) in φ of the markers' places; −1 for exact ones."""
-        return self.channel.places
+        return self.observable.coordinate_parameters
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def is_compared(self) -> NDArray[np.bool_]:
         """Mask (T, M) of the samples that are compared."""
-        return self.components[..., 0]
+        return self.is_compared[..., 0]
 
     # One sample -------------------------------------------------------------------------------
 
     @property
-    def _times(self) -> Index:
+    def _sample_indices(self) -> Index:
         """Index (T,) of each sample among the channel's times."""
-        return self.earlier + np.arange(len(self.t_s))
+        return self.earlier_times + np.arange(len(self.t_s))
 
     @cached_property
-    def _neighbours(self) -> int:
+    def _neighbour_count(self) -> int:
         """Number of samples that a marker is interpolated from; 1 if no clock is estimated."""
-        return min(NEIGHBOURS, self.channel.count) if len(self.nuisance.of_clock) else 1
+        return min(NEIGHBOURS, self.observable.count) if len(self.nuisance.clock_indices) else 1
 
     @cached_property
     def _first_neighbour(self) -> Index:
         """Index (T,) of the first sample that each one is interpolated from; negative
         before the start.
         """
-        first = self._times + self.channel.chart.samples - self._neighbours // 2
-        first = np.minimum(first, self.channel.count - self._neighbours)
-        return first if self.from_rest else np.maximum(first, 0)
+        first = (
+            self._sample_indices
+            + self.observable.association.clock_samples
+            - self._neighbour_count // 2
+        )
+        first = np.minimum(first, self.observable.count - self._neighbour_count)
+        return first if self.is_initially_at_rest else np.maximum(first, 0)
 
     @cached_property
-    def _around(self) -> Index:
+    def _neighbour_indices(self) -> Index:
         """Indices (T, neighbours) of the samples that each one is interpolated from."""
-        return np.maximum(self._first_neighbour[:, None] + np.arange(self._neighbours), 0)
+        return np.maximum(self._first_neighbour[:, None] + np.arange(self._neighbour_count), 0)
 
     @cached_property
-    def _window(self) -> Window:
+    def _stencil(self) -> RowStencil:
         """Stencil of all samples: indices of the neighbouring places, and the data of the
         expression.
         """
         count = len(self.markers.names)
-        place = np.array([self._times - self._first_neighbour, self.t_s], dtype=np.float64)
-        places = self._around[:, None] * count + np.arange(count)[:, None]
-        return Window(places, np.repeat(place[..., None], count, axis=2))
+        place = np.array([self._sample_indices - self._first_neighbour, self.t_s], dtype=np.float64)
+        places = self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
+        return RowStencil(places, np.repeat(place[..., None], count, axis=2))
 
-    def window(self, phi: Array, known: int) -> Window:
+    def stencil(self, phi: Array, known: int) -> RowStencil:
         """Return the stencil of those first samples for which `known` times of the channel
         suffice.
         """
-        samples = int(np.count_nonzero(self._around[:, -1] < known))
-        return Window(self._window.places[:samples], self._window.data[:, :samples])
+        samples = int(np.count_nonzero(self._neighbour_indices[:, -1] < known))
+        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
-    def later(self, by_s: float) -> MarkerReading:
+    def shifted(self, by_s: float) -> MarkerResidual:
         """Return the model of samples taken `by_s` seconds later, at the same stencil; self
         if time does not matter.
         """
-        if not self._first.residual.takes(1):
+        if not self._full_expression.residual.depends_on_datum(1):
             return self
         other = copy(self)
-        data = self._window.data.copy()
-        instruments = self._instruments
+        data = self._stencil.data.copy()
+        instruments = self._expressions
         data[1] += by_s
-        shifted = self._window._replace(data=data)
-        vars(other).update(_window=shifted, _instruments=instruments)
+        shifted = self._stencil._replace(data=data)
+        vars(other).update(_stencil=shifted, _expressions=instruments)
         return other
 
-    def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the prediction y (3,) of one marker from its places (3, neighbours), its
         φ, and the data.
         """
         place, t_s = ca.vertsplit(data)
-        own = self.own[0] if len(self.own) else np.zeros(0, dtype=np.int64)
-        reading = looked[:, 0]
-        if len(self.nuisance.of_clock):
-            late = self.nuisance.late_s(phi, own, t_s) / self.nuisance.interval_s
-            places = [ca.SX(k) for k in range(self._neighbours)]
-            reading = looked @ ca.vertcat(*lagrange_weights(place + late, places))
-        return self.nuisance.read(reading, phi, own, t_s)
+        own = self.own_parameters[0] if len(self.own_parameters) else np.zeros(0, dtype=np.int64)
+        reading = values[:, 0]
+        if len(self.nuisance.clock_indices):
+            late = self.nuisance.marker_delay_s(phi, own, t_s) / self.nuisance.interval_s
+            places = [ca.SX(k) for k in range(self._neighbour_count)]
+            reading = values @ ca.vertcat(*lagrange_weights(place + late, places))
+        return self.nuisance.marker_measurement(reading, phi, own, t_s)
 
     # Of positions -----------------------------------------------------------------------------
 
-    def of_samples(self, positions_m: Array, phi: Array) -> Array:
+    def predict_samples(self, positions_m: Array, phi: Array) -> Array:
         """Return predictions (T, M, 3) [m] from the body's positions (T, n, 3) at the samples."""
-        plain = replace(self, channel=replace(self.channel, rows=np.arange(len(positions_m))))
-        return plain.of_positions(positions_m.reshape(len(positions_m), -1), phi)
+        plain = replace(self, observable=replace(self.observable, rows=np.arange(len(positions_m))))
+        return plain.predict_positions(positions_m.reshape(len(positions_m), -1), phi)
 
-    def of_positions(self, x: Array, phi: Array) -> Array:
+    def predict_positions(self, x: Array, phi: Array) -> Array:
         """Return predictions (t, M, 3) [m] from the first grid positions x (rows, 3n), for
         samples that they suffice for.
         """
-        return self.predicted(self.channel.of(x, phi), phi)
+        return self.predict(self.observable.evaluate_positions(x, phi), phi)
 
     def squared_distances_m2(self, x: Array, phi: Array) -> Array:
         """Return the squared distances [m²] of predictions from all samples that are
         present, flat.
         """
-        predicted = self.of_positions(x, phi)
+        predicted = self.predict_positions(x, phi)
         tracks = self.markers.positions_m[: len(predicted)]
-        present = self.present[: len(predicted)]
+        present = self.is_compared[: len(predicted)]
         return np.sum((predicted - tracks) ** 2, axis=2)[present]

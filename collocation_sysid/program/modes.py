@@ -43,7 +43,7 @@ class Modes:
         Damping ratios ζ; modes with 1 and above do not oscillate.
     shapes : (k, n, 3) array
         Displacements with φᵀ M φ = 1 kg (unit m); zero at prescribed dofs.
-    not_oscillating : int
+    omitted_count : int
         Number of modes left out because they have no restoring force: six rigid ones of a body
         without grasp, and those in which a state is unstable.
     """
@@ -51,7 +51,7 @@ class Modes:
     frequencies_hz: Array
     damping_ratios: Array
     shapes: Array
-    not_oscillating: int = 0
+    omitted_count: int = 0
 
     @property
     def angular_frequencies_rad_s(self) -> Array:
@@ -65,7 +65,7 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     Parameters
     ----------
     forces : Forces
-        Forces on the body at one time, see `Forces.of`.
+        Forces on the body at one time, see `Forces.from_experiment`.
     x : (n, 3) or (3n,) array
         The state [m], which should be an equilibrium.
     free_dofs : (k,) array
@@ -73,7 +73,7 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     count : int
         Number of modes; there may be fewer.
     """
-    mass = forces.mass.kg[0, free_dofs]
+    mass = forces.mass.inertia_kg[0, free_dofs]
     pattern = forces.pattern
     state = np.asarray(x, dtype=float).reshape(1, -1)
     at = forces.linearise(state, np.zeros_like(state))
@@ -83,11 +83,11 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     largest = float((stiffness.diagonal() / mass).max(initial=0.0))
     requested = count + RIGID_MOTIONS
     if len(free_dofs) <= max(DENSE, 3 * requested):
-        squares, vectors = _dense(stiffness, mass, requested)
+        squares, vectors = _dense_modes(stiffness, mass, requested)
     else:
         lower[pattern.diagonal[free_dofs]] += SHIFT * largest * mass
-        factor = Factoriser.of(pattern, free_dofs).factorise(lower)
-        squares, vectors = _lanczos(stiffness, mass, factor, -SHIFT * largest, requested)
+        factor = Factoriser.cached(pattern, free_dofs).factorise(lower)
+        squares, vectors = _lanczos_modes(stiffness, mass, factor, -SHIFT * largest, requested)
     oscillating = squares > RIGID * largest
     shapes = np.zeros((int(oscillating.sum()), pattern.size))
     shapes[:, free_dofs] = vectors[:, oscillating].T
@@ -102,16 +102,16 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
     )
 
 
-def _dense(stiffness: sp.csc_array, mass: Array, wanted: int) -> tuple[Array, Array]:
+def _dense_modes(stiffness: sp.csc_array, mass: Array, requested: int) -> tuple[Array, Array]:
     """Return the lowest eigenvalues and eigenvectors by a dense solver."""
     root = np.sqrt(mass)
     scaled = stiffness.toarray() / np.outer(root, root)
-    last = min(wanted, len(mass)) - 1
+    last = min(requested, len(mass)) - 1
     squares, vectors = scipy.linalg.eigh(scaled, subset_by_index=(0, last))
     return squares, vectors / root[:, None]
 
 
-class _Inverse(LinearOperator):
+class _ShiftedInverse(LinearOperator):
     """Operator (K − shift · M)⁻¹ of a factorised matrix."""
 
     def __init__(self, factor: Factor, size: int) -> None:
@@ -122,18 +122,18 @@ class _Inverse(LinearOperator):
         return self.factor.solve(np.ravel(x))
 
 
-def _lanczos(
-    stiffness: sp.csc_array, mass: Array, factor: Factor, shift: float, wanted: int
+def _lanczos_modes(
+    stiffness: sp.csc_array, mass: Array, factor: Factor, translation_m: float, requested: int
 ) -> tuple[Array, Array]:
-    """Return the eigenvalues and eigenvectors nearest to `shift`, just below zero, by
+    """Return the eigenvalues and eigenvectors nearest to `translation_m`, just below zero, by
     shift-invert Lanczos iterations.
     """
     squares, vectors = eigsh(
         stiffness,
-        wanted,
+        requested,
         M=sp.diags_array(mass, format="csc"),
-        sigma=shift,
-        OPinv=_Inverse(factor, len(mass)),
+        sigma=translation_m,
+        OPinv=_ShiftedInverse(factor, len(mass)),
         v0=np.random.default_rng(0).normal(size=len(mass)),
     )
     order = np.argsort(squares)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..fem.pattern import SymmetricPattern, dofs_of
-from ..fem.touching import VECTORS
+from ..fem.touching import VECTORS_PER_POINT
 from ..model.contact import Contact, ContactLaw
 
 # Distance within which points are candidates, in edges of the surface.
@@ -25,14 +25,14 @@ CHANGE = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
-class NearPoints:
+class ContactCandidates:
     """Contact points that an obstacle may touch in a time step.
 
     Attributes
     ----------
     law : ContactLaw
         Contact law of the obstacle.
-    chosen : (i,) array
+    point_indices : (i,) array
         Indices of the points among all contact points.
     nodes : (i, k) array
         Nodes of the face of each point.
@@ -42,22 +42,24 @@ class NearPoints:
         Dofs of these nodes.
     entries : (i, 3k, 3k) array
         Positions of the pairs of dofs in the pattern.
-    symmetric, skew : (i, 3k, 3k) arrays
+    symmetric_factors, skew_factors : (i, 3k, 3k) arrays
         Factors of the entries in the symmetric and the skew part of a matrix.
     """
 
     law: ContactLaw
-    chosen: Index
+    point_indices: Index
     nodes: Index
     weights: Array
     dofs: Index
     entries: Index
-    symmetric: Array
-    skew: Array
+    symmetric_factors: Array
+    skew_factors: Array
 
     @staticmethod
     @lru_cache(maxsize=64)
-    def of(law: ContactLaw, pattern: SymmetricPattern, chosen: bytes) -> NearPoints:
+    def from_indices(
+        law: ContactLaw, pattern: SymmetricPattern, chosen: bytes
+    ) -> ContactCandidates:
         """Build the candidates of an obstacle; the last few are cached, because successive steps
         are similar.
 
@@ -72,16 +74,16 @@ class NearPoints:
         """
         some = np.frombuffer(chosen, dtype=np.int64)
         points = law.surface.points
-        nodes = points.nodes[some, :-VECTORS]
+        nodes = points.nodes[some, :-VECTORS_PER_POINT]
         dofs = dofs_of(nodes)
         row, column = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
-        return NearPoints(
+        return ContactCandidates(
             law,
             some,
             nodes,
-            points.mix[some, 0, :-VECTORS],
+            points.node_weights[some, 0, :-VECTORS_PER_POINT],
             dofs,
-            pattern.position(row, column),
+            pattern.positions_of(row, column),
             (1 + (row == column)) / 2,
             np.sign(row - column) / 2,
         )
@@ -99,21 +101,21 @@ class NearPoints:
             Constants of the body.
         """
         frame = self.law.obstacle.nodes
-        moving = [each.reshape(-1, 3) for each in (xi, nu)[: 1 + self.law.by_velocity]]
+        moving = [each.reshape(-1, 3) for each in (xi, nu)[: 1 + self.law.depends_on_velocity]]
         own = [np.einsum("ik,ikj->ji", self.weights, x[self.nodes] - x[frame[0]]) for x in moving]
         ends = [(x[frame[1:]] - x[frame[0]]).ravel() for x in moving]
-        same = np.concatenate([*ends, theta[self.law.columns]])
+        same = np.concatenate([*ends, theta[self.law.constant_columns]])
         data = np.broadcast_to(same[:, None], (len(same), len(self.nodes)))
-        return np.concatenate(own), np.concatenate([data, contact.data_of(self.chosen)])
+        return np.concatenate(own), np.concatenate([data, contact.data_of(self.point_indices)])
 
-    def summed(self, push: Array, size: int) -> Array:
+    def assemble(self, push: Array, size: int) -> Array:
         """Return forces (size,) on the dofs of a body from forces (3, i) on the points [N]."""
         on_nodes = self.weights[:, :, None] * push.T[:, None]
         summed = np.bincount(self.dofs.ravel(), weights=on_nodes.ravel(), minlength=size)
         return np.asarray(summed, dtype=float)
 
 
-class NearContact:
+class StepContact:
     """Contact in one time step of a body with constants θ (k,).
 
     Attributes
@@ -138,8 +140,8 @@ class NearContact:
         self._theta = theta
         self._pattern = pattern
         self._from = np.full((2, 1), np.nan)
-        self._near = list[tuple[Contact, NearPoints]]()
-        edges_m = [each.contact.surface.edge_m for each in contacts]
+        self._near = list[tuple[Contact, ContactCandidates]]()
+        edges_m = [each.law_of_contact.surface.edge_m for each in contacts]
         self.acts = bool(contacts)
         self._margin_m = MARGIN * min(edges_m, default=0.0)
         # A pressure that is averaged over a step depends on the states at both ends.
@@ -148,8 +150,8 @@ class NearContact:
     def force(self, xi: Array, nu: Array) -> Array:
         """Return the contact forces (3n,) [N] at ξ and ν, each (1, 3n)."""
         force = np.zeros(xi.size)
-        for near, u, data in self._at(xi[0], nu[0]):
-            force += near.summed(near.law.push.value(u, data), xi.size)
+        for near, u, data in self._candidates(xi[0], nu[0]):
+            force += near.assemble(near.law.point_force_function.evaluate(u, data), xi.size)
         return force
 
     def linearise(
@@ -174,28 +176,30 @@ class NearContact:
             Lower triangle of its skew part; empty without friction or other velocity dependence.
         """
         force = np.zeros(xi.size)
-        rubs = any(each.contact.by_velocity for each in self._contacts)
-        symmetric = np.zeros(self._pattern.entries)
-        skew = np.zeros(self._pattern.entries * rubs)
-        for near, u, data in self._at(xi[0], nu[0]):
-            push, slopes = near.law.push.slopes(u, data)
-            force += near.summed(push, xi.size)
+        rubs = any(each.law_of_contact.depends_on_velocity for each in self._contacts)
+        symmetric = np.zeros(self._pattern.entry_count)
+        skew = np.zeros(self._pattern.entry_count * rubs)
+        for near, u, data in self._candidates(xi[0], nu[0]):
+            push, slopes = near.law.point_force_function.evaluate_with_jacobian(u, data)
+            force += near.assemble(push, xi.size)
             (touch,) = np.nonzero(push.any(axis=0))
             by_way = rates[0] * slopes[:, :3, touch]
-            if near.law.by_velocity:
+            if near.law.depends_on_velocity:
                 by_way += rates[1] * slopes[:, 3:, touch]
             weights = near.weights[touch]
             here = near.entries[touch].ravel()
             blocks = np.einsum("pa,ijp,pb->paibj", weights, by_way, weights)
             blocks = blocks.reshape(near.entries[touch].shape)
-            counted = (near.symmetric, near.skew)[: 1 + near.law.by_velocity]
+            counted = (near.symmetric_factors, near.skew_factors)[
+                : 1 + near.law.depends_on_velocity
+            ]
             for part, counts in zip((symmetric, skew), counted, strict=False):
                 part += np.bincount(
                     here, weights=(counts[touch] * blocks).ravel(), minlength=len(part)
                 )
         return force, symmetric, skew
 
-    def _at(self, xi: Array, nu: Array) -> Iterator[tuple[NearPoints, Array, Array]]:
+    def _candidates(self, xi: Array, nu: Array) -> Iterator[tuple[ContactCandidates, Array, Array]]:
         """Iterate over the candidates of each contact, with inputs and data of its law; the
         search is repeated if the state has changed by more than the margin allows.
         """
@@ -204,10 +208,12 @@ class NearContact:
             self._from = ends
             self._near = []
             for each in self._contacts:
-                gaps = each.contact.gaps(each.points.vectors(ends)).min(axis=0)
-                (chosen,) = np.nonzero(gaps < each.contact.widths_m + self._margin_m)
+                gaps = each.law_of_contact.gaps(each.points.vectors(ends)).min(axis=0)
+                (chosen,) = np.nonzero(gaps < each.law_of_contact.widths_m + self._margin_m)
                 if len(chosen):
-                    near = NearPoints.of(each.contact, self._pattern, chosen.tobytes())
+                    near = ContactCandidates.from_indices(
+                        each.law_of_contact, self._pattern, chosen.tobytes()
+                    )
                     self._near.append((each, near))
         for contact, near in self._near:
             yield near, *near.inputs(contact, xi, nu, self._theta)

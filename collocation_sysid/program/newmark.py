@@ -21,14 +21,14 @@ from ..arrays import Array, Index
 from ..model.contact import Contact
 from ..model.force_term import States
 from ..model.forces import Forces
-from ..model.histories import AnyLeft, ahead, following, left_at_start
+from ..model.histories import PreviousState, advance_states, insert_previous_states, start_states
 from ..model.weight import Weight
 from ..recording.experiment import Experiment
-from .channel import Forced
+from .channel import ReactionForces
 from .lapack import one_blas_thread
-from .near_contact import NearContact
-from .newton import NewtonFailure, NewtonOptions, Solver, Solvers, simulation_error
-from .rest import start_state
+from .near_contact import StepContact
+from .newton import NewtonFailure, NewtonOptions, NewtonSolver, NewtonSolvers, simulation_error
+from .rest import initial_state
 
 Progress = Callable[[float], None]
 
@@ -43,7 +43,7 @@ class _State:
         Time [s].
     x, v, a : (3n,) arrays
         Positions [m], velocities [m/s] and accelerations without contact [m/s²].
-    left : tuple
+    previous_histories : tuple
         History variables after the step; empty if there are none.
     contact_n : (3n,) array or None
         Mean contact force over the step that led here [N]; None if there is no contact.
@@ -53,19 +53,19 @@ class _State:
     x: Array
     v: Array
     a: Array
-    left: tuple[AnyLeft, ...] = ()
+    previous_histories: tuple[PreviousState, ...] = ()
     contact_n: Array | None = None  # (3n,) mean over the step that led here, where there is contact
 
 
 @one_blas_thread()
-def newmark(
+def simulate_newmark(
     experiment: Experiment,
     theta: Array,
     steps_per_sample: int,
     options: NewtonOptions | None,
     progress: Progress | None,
     sensed: Index,
-) -> tuple[Array, Array, Forced]:
+) -> tuple[Array, Array, ReactionForces]:
     """Simulate an experiment by Newmark's method.
 
     Parameters
@@ -100,12 +100,12 @@ def newmark(
     stepper = _Stepper(experiment, theta, options)
     times = experiment.t_s
     x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
-    state = stepper.start()
+    state = stepper.initial_state()
     x[0] = state.x
     v[0] = state.v
     step = experiment.timestep_s / steps_per_sample
     reactions_and_positions = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
-    reactions_and_positions[:, 0] = stepper.felt(state, sensed)
+    reactions_and_positions[:, 0] = stepper.reactions_and_positions(state, sensed)
     means_n = np.zeros_like(reactions_and_positions[0])
     if state.contact_n is not None:
         means_n[0] = state.contact_n[sensed]
@@ -113,7 +113,7 @@ def newmark(
         for j in range(1, steps_per_sample + 1):
             state = stepper.advance(state, float(times[k - 1] + j * step))
             row = (k - 1) * steps_per_sample + j
-            reactions_and_positions[:, row] = stepper.felt(state, sensed)
+            reactions_and_positions[:, row] = stepper.reactions_and_positions(state, sensed)
             if state.contact_n is not None:
                 means_n[row] = state.contact_n[sensed]
         x[k] = state.x
@@ -123,7 +123,7 @@ def newmark(
     # Contact at a time is the mean over the steps before and after it.
     reactions_and_positions[0, 1:-1] -= (means_n[1:-1] + means_n[2:]) / 2
     reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
-    return x, v, Forced(*reactions_and_positions)
+    return x, v, ReactionForces(*reactions_and_positions)
 
 
 class _Stepper:
@@ -134,14 +134,14 @@ class _Stepper:
         self.theta = theta
         self.body = experiment.body
         self.options = options or NewtonOptions()
-        self.solvers = Solvers(experiment, options)
+        self.solvers = NewtonSolvers(experiment, options)
 
-    def start(self) -> _State:
+    def initial_state(self) -> _State:
         """Return the initial state of the experiment."""
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
-        x, v = start_state(self.experiment, self._forces(time_s), solver)
-        previous_histories = left_at_start(
+        x, v = initial_state(self.experiment, self._forces(time_s), solver)
+        previous_histories = start_states(
             self._forces(time_s), x, v, self.experiment.loaded_since_s
         )
         state = _State(time_s, x, v, np.zeros_like(x), previous_histories)
@@ -149,16 +149,16 @@ class _Stepper:
             state = replace(state, contact_n=self._contact_n(x, v, time_s))
         return self._balanced(state, time_s, solver.free)
 
-    def advance(self, state: _State, goal_s: float) -> _State:
-        """Return the state at `goal_s`, in shorter steps where Newton's method fails."""
-        step = goal_s - state.t_s
-        smallest = step * 0.5**self.options.halvings
-        state = self._after_a_change(state, goal_s)
-        while goal_s - state.t_s > 0.5 * smallest:
-            solver = self._solver(goal_s)
+    def advance(self, state: _State, target_s: float) -> _State:
+        """Return the state at `target_s`, in shorter steps where Newton's method fails."""
+        step = target_s - state.t_s
+        smallest = step * 0.5**self.options.max_halvings
+        state = self._after_release(state, target_s)
+        while target_s - state.t_s > 0.5 * smallest:
+            solver = self._solver(target_s)
             try:
-                end_s = goal_s if step >= goal_s - state.t_s else state.t_s + step
-                state = self._step(solver, state, end_s, goal_s)
+                end_s = target_s if step >= target_s - state.t_s else state.t_s + step
+                state = self._step(solver, state, end_s, target_s)
             except NewtonFailure as failure:
                 step /= 2
                 if step < smallest:
@@ -167,7 +167,7 @@ class _Stepper:
                     ) from failure
         return state
 
-    def felt(self, state: _State, dofs: Index) -> tuple[Array, Array]:
+    def reactions_and_positions(self, state: _State, dofs: Index) -> tuple[Array, Array]:
         """Return the reaction forces without contact on dofs [N], and their positions [m]."""
         if not len(dofs):
             return np.zeros(0), np.zeros(0)
@@ -177,15 +177,15 @@ class _Stepper:
     def _force(self, state: _State, load_s: float) -> Array:
         """Return all forces (3n,) but contact in a state, under the loads at a time [N]."""
         forces, _ = self._forces(load_s).without_contact()
-        for each in state.left:
-            forces = each.now(forces)
+        for each in state.previous_histories:
+            forces = each.insert_at_same_time(forces)
         return forces.total(state.x, state.v)[0]
 
     def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
         """Return the forces under the loads at a time; contact is averaged over a step of
         `step_s` if it is not zero.
         """
-        return Forces.of(self.experiment, load_s, self.theta, step_s=step_s)
+        return Forces.from_experiment(self.experiment, load_s, self.theta, step_s=step_s)
 
     def _contact_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
         """Return the contact forces (3n,) at a state [N], averaged over a step of `step_s`
@@ -193,20 +193,24 @@ class _Stepper:
         """
         forces = self._forces(load_s, step_s)
         total_n = np.zeros_like(x)
-        for term in forces.further:
-            if isinstance(term, Contact) and not term.relaxed:
+        for term in forces.external_terms:
+            if isinstance(term, Contact) and not term.is_complementarity:
                 total_n += term.force(States(x[None], v[None], self.theta))[0]
         return total_n
 
-    def _solver(self, time_s: float) -> Solver:
+    def _solver(self, time_s: float) -> NewtonSolver:
         """Return the solver with the dofs that are prescribed at a time."""
-        return self.solvers.holding(self.experiment.held(time_s)[0])
+        return self.solvers.for_prescribed(self.experiment.is_prescribed(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
         """Return the masses (3n,) at a time [kg]."""
-        return Weight.of(self.experiment, time_s).with_theta(self.theta).mass.kg[0]
+        return (
+            Weight.from_experiment(self.experiment, time_s)
+            .with_theta(self.theta)
+            .mass.inertia_kg[0]
+        )
 
-    def _after_a_change(self, state: _State, goal_s: float) -> _State:
+    def _after_release(self, state: _State, goal_s: float) -> _State:
         """Return the state with new accelerations at nodes that a grasp has released by
         `goal_s`.
         """
@@ -222,15 +226,17 @@ class _Stepper:
         acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
         return replace(state, a=acceleration)
 
-    def _step(self, solver: Solver, state: _State, end_s: float, load_s: float) -> _State:
+    def _step(self, solver: NewtonSolver, state: _State, end_s: float, load_s: float) -> _State:
         """Return the state after one step to `end_s`, with loads and grasps of the time
         `load_s`.
         """
         h = end_s - state.t_s
-        forces, touching = ahead(self._forces(load_s, step_s=h), state.left, h).without_contact()
-        contact = NearContact(touching, self.theta, forces.pattern)
-        mass = forces.mass.kg[0]
-        x_prescribed, v_prescribed, a_prescribed = self._held_motion(solver, end_s, h, load_s)
+        forces, touching = insert_previous_states(
+            self._forces(load_s, step_s=h), state.previous_histories, h
+        ).without_contact()
+        contact = StepContact(touching, self.theta, forces.pattern)
+        mass = forces.mass.inertia_kg[0]
+        x_prescribed, v_prescribed, a_prescribed = self._prescribed_motion(solver, end_s, h, load_s)
         slope = 2.0 / h
         known_v = -slope * state.x - state.v
         known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
@@ -239,8 +245,8 @@ class _Stepper:
             v = slope * x + known_v
             a = slope**2 * x + known_a
             # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-            v[solver.held] = v_prescribed
-            a[solver.held] = a_prescribed
+            v[solver.is_prescribed] = v_prescribed
+            a[solver.is_prescribed] = a_prescribed
             return v, a
 
         def middle(x: Array) -> tuple[Array, Array]:
@@ -270,11 +276,11 @@ class _Stepper:
         guess = state.x + h * state.v + 0.5 * h * h * state.a
         if state.contact_n is not None:
             guess += 0.5 * h * h * state.contact_n / np.where(mass > 0, mass, np.inf)
-        guess[solver.held] = x_prescribed
-        if not solver.is_upright(guess):
+        guess[solver.is_prescribed] = x_prescribed
+        if not solver.has_no_inverted_element(guess):
             guess = state.x.copy()
-            guess[solver.held] = x_prescribed
-        x = solver.newton(guess, residual, linearise)
+            guess[solver.is_prescribed] = x_prescribed
+        x = solver.solve(guess, residual, linearise)
         v, a = kinematics(x)
         contact_n = None
         if contact.acts:
@@ -283,11 +289,11 @@ class _Stepper:
             # Held dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= 2 * contact_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
-        previous_histories = following(forces, state.left, x, v, h)
+        previous_histories = advance_states(forces, state.previous_histories, x, v, h)
         return _State(end_s, x, v, a, previous_histories, contact_n)
 
-    def _held_motion(
-        self, solver: Solver, time_s: float, h: float, holding_s: float
+    def _prescribed_motion(
+        self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float
     ) -> tuple[Array, Array, Array]:
         """Return position, velocity and acceleration of the prescribed dofs by central
         differences over h.
@@ -296,17 +302,19 @@ class _Stepper:
         nodes_m = self.experiment.body.nodes_m
         motion = np.zeros((3, *nodes_m.shape))
         for grasp in experiment.grasps:
-            if not grasp.holds(holding_s):
+            if not grasp.is_active(holding_s):
                 continue
             # What it does before it holds and after it has let go means nothing.
             first = max(grasp.from_s, float(experiment.t_s[0]))
             last = min(grasp.until_s, float(experiment.t_s[-1]))
-            times = np.clip([time_s - h, time_s, time_s + h], first, last)
-            before, now, after = grasp.carry(nodes_m, times)[..., grasp.columns]
+            times = np.clip([time_s - step_s, time_s, time_s + step_s], first, last)
+            before, now, after = grasp.positions_at(nodes_m, times)[..., grasp.axis_indices]
             velocity = (after - before) / (times[2] - times[0])
-            is_central = times[2] - times[1] > 0.5 * h
-            acceleration = (after - 2 * now + before) / h**2 if is_central else np.zeros_like(now)
-            place = np.ix_(grasp.nodes, grasp.columns)
+            is_central = times[2] - times[1] > 0.5 * step_s
+            acceleration = (
+                (after - 2 * now + before) / step_s**2 if is_central else np.zeros_like(now)
+            )
+            place = np.ix_(grasp.nodes, grasp.axis_indices)
             motion[:, *place] = now, velocity, acceleration
-        now, velocity, acceleration = motion.reshape(3, -1)[:, solver.held]
+        now, velocity, acceleration = motion.reshape(3, -1)[:, solver.is_prescribed]
         return now, velocity, acceleration

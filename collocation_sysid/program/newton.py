@@ -14,7 +14,7 @@ from ..arrays import Array
 from ..errors import SimulationError
 from ..recording.experiment import Experiment
 from .factorisation import Factor, Factoriser
-from .retraction import Retraction, added
+from .retraction import Retraction, add_increment
 from .stopwatch import Stopwatch
 
 Residual = Callable[[Array], Array]
@@ -40,19 +40,19 @@ class NewtonOptions:
     ----------
     tolerance : float
         Length of the last Newton step over the body's size.
-    iterations : int
+    max_iterations : int
         Largest number of iterations.
-    backtracks : int
+    max_backtracks : int
         Largest number of halvings of a Newton step.
-    halvings : int
+    max_halvings : int
         Largest number of halvings of a time step (Newmark) or of the increment of the grasps in it
         (schemes).
     """
 
     tolerance: float = 1e-10
-    iterations: int = 30
-    backtracks: int = 25
-    halvings: int = 8
+    max_iterations: int = 30
+    max_backtracks: int = 25
+    max_halvings: int = 8
 
 
 class NewtonFailure(Exception):
@@ -75,12 +75,12 @@ class NewtonFailure(Exception):
         return self.reason
 
 
-class Solver:
+class NewtonSolver:
     """Newton's method with backtracking on the free dofs of a body, for one set of prescribed dofs.
 
     Attributes
     ----------
-    free, held : arrays
+    free, is_prescribed : arrays
         Indices of free and of prescribed dofs.
 
     Parameters
@@ -91,7 +91,7 @@ class Solver:
         Options; defaults otherwise.
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
-    held : (n, 3) array of bool, optional
+    is_prescribed : (n, 3) array of bool, optional
         Prescribed coordinates; by default those at the experiment's first time.
     """
 
@@ -100,29 +100,29 @@ class Solver:
         experiment: Experiment,
         options: NewtonOptions | None = None,
         stopwatch: Stopwatch | None = None,
-        held: NDArray[np.bool_] | None = None,
+        prescribed: NDArray[np.bool_] | None = None,
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.body = experiment.body
         # A retraction moves surfaces off the obstacles that hold them.
         self._is_free_of_contact = not experiment.obstacles
         self.options = options or NewtonOptions()
-        at_start = experiment.held(experiment.t_s[:1])[0]
-        holding = at_start if held is None else held
+        at_start = experiment.is_prescribed(experiment.t_s[:1])[0]
+        holding = at_start if prescribed is None else prescribed
         self.free = np.flatnonzero(~holding)
-        self.held = np.flatnonzero(holding)
-        self.pattern = experiment.pattern
-        self.factoriser = Factoriser.of(self.pattern, self.free)
+        self.is_prescribed = np.flatnonzero(holding)
+        self.pattern = experiment.sparsity
+        self.factoriser = Factoriser.cached(self.pattern, self.free)
         self._size_m = float(np.linalg.norm(np.ptp(self.body.nodes_m, axis=0)))
         self._kept: Factor | None = None
 
-    def newton(
+    def solve(
         self,
         x: Array,
         residual: Residual,
         linearise: Linearise,
         keep_definite: bool = False,
-        goal: Array | None = None,
+        prescribed_m: Array | None = None,
     ) -> Array:
         """Solve residual(x) = 0 for the free dofs.
 
@@ -134,7 +134,8 @@ class Solver:
         Parameters
         ----------
         x : (3n,) array
-            First guess [m]; not modified. Prescribed dofs keep their values unless `goal` is given.
+            First guess [m]; not modified. Prescribed dofs keep their values unless `prescribed_m`
+            is given.
         residual : callable
             Residual (3n,) of x.
         linearise : callable
@@ -143,7 +144,7 @@ class Solver:
         keep_definite : bool
             If true, solve for a stable equilibrium: accept states only while −∂residual/∂x is
             positive definite.
-        goal : (held,) array, optional
+        prescribed_m : (held,) array, optional
             Positions of the prescribed dofs [m]. The free dofs first follow to first order, because
             moving prescribed dofs alone would crush adjacent elements.
 
@@ -157,25 +158,27 @@ class Solver:
         NewtonFailure
             If the method does not converge.
         """
-        x = x.copy() if goal is None else self._moved(x, goal, linearise)
+        x = x.copy() if prescribed_m is None else self._with_prescribed(x, prescribed_m, linearise)
         self._require_upright(x)
         if not keep_definite:
             # What these lead to without end may be far off: the search then begins where they did.
-            nearer, done = self._chords(x, residual, linearise)
+            nearer, done = self._simplified_newton(x, residual, linearise)
             if done:
                 return nearer
         value, *matrix = self._timed(linearise, x)
         factor = self._factorise(matrix, x, keep_definite)
         step = self._step(factor, value)
-        for _ in range(self.options.iterations):
+        for _ in range(self.options.max_iterations):
             if self._is_last(step):
                 self._kept = factor
                 x[self.free] += step
                 return x
             x, factor, step = self._backtrack(x, step, factor, residual, linearise, keep_definite)
-        raise NewtonFailure(x, f"Newton took more than {self.options.iterations} iterations")
+        raise NewtonFailure(x, f"Newton took more than {self.options.max_iterations} iterations")
 
-    def _chords(self, x: Array, residual: Residual, linearise: Linearise) -> tuple[Array, bool]:
+    def _simplified_newton(
+        self, x: Array, residual: Residual, linearise: Linearise
+    ) -> tuple[Array, bool]:
         """Iterate with few factorisations (simplified Newton method).
 
         Returns
@@ -184,9 +187,9 @@ class Solver:
             Last state, and whether it is the solution.
         """
         is_own = False
-        for _ in range(self.options.iterations):
+        for _ in range(self.options.max_iterations):
             if self._kept is not None:
-                nearer, done = self._nearer(x, residual, self._kept)
+                nearer, done = self._chord_steps(x, residual, self._kept)
                 if done:
                     return nearer, True
                 if nearer is x and is_own:
@@ -200,7 +203,7 @@ class Solver:
                 break
         return x, False
 
-    def _nearer(self, x: Array, residual: Residual, kept: Factor) -> tuple[Array, bool]:
+    def _chord_steps(self, x: Array, residual: Residual, factor: Factor) -> tuple[Array, bool]:
         """Iterate with a given factor while steps shrink fast.
 
         Returns
@@ -213,7 +216,7 @@ class Solver:
         before = None
         done = False
         for _ in range(OFTEN):
-            step = self._step(kept, self._timed(residual, nearer))
+            step = self._step(factor, self._timed(residual, nearer))
             length = float(np.linalg.norm(step))
             rate = length / before if before else 1.0
             if not rate <= 1.0:
@@ -223,16 +226,16 @@ class Solver:
             if done or (before and rate > FAST):
                 break
             before = length
-        return (nearer, done) if self.is_upright(nearer) else (x, False)
+        return (nearer, done) if self.has_no_inverted_element(nearer) else (x, False)
 
-    def _moved(self, x: Array, goal: Array, linearise: Linearise) -> Array:
+    def _with_prescribed(self, x: Array, goal: Array, linearise: Linearise) -> Array:
         """Return the state with the prescribed dofs at `goal`, and free dofs in equilibrium
         to first order.
         """
         state = x.copy()
         way = np.zeros_like(x)
-        way[self.held] = goal - x[self.held]
-        state[self.held] = goal
+        way[self.is_prescribed] = goal - x[self.is_prescribed]
+        state[self.is_prescribed] = goal
         if not self._is_last(way):
             self._require_upright(x)
             value, *matrix = self._timed(linearise, x)
@@ -255,12 +258,12 @@ class Solver:
         """
         length = np.linalg.norm(step)
         share = 1.0
-        update = self._retraction if keep_definite and self._is_free_of_contact else added
-        for _ in range(self.options.backtracks):
+        update = self._retraction if keep_definite and self._is_free_of_contact else add_increment
+        for _ in range(self.options.max_backtracks):
             increment = np.zeros_like(x)
             increment[self.free] = share * step
             trial = update(x, increment)
-            if self.is_upright(trial):
+            if self.has_no_inverted_element(trial):
                 # A whole step is mostly taken: it is evaluated with its derivatives at once.
                 if share == 1:
                     value, *matrix = self._timed(linearise, trial)
@@ -285,7 +288,7 @@ class Solver:
     def _retraction(self) -> Retraction:
         """Retraction that applies increments towards an equilibrium."""
         prescribed = np.zeros(self.pattern.size, dtype=bool)
-        prescribed[self.held] = True
+        prescribed[self.is_prescribed] = True
         return Retraction(self.body, prescribed.reshape(-1, 3))
 
     def _is_last(self, step: Array, share: float = 1.0) -> bool:
@@ -316,13 +319,13 @@ class Solver:
         with self.stopwatch.evaluating():
             return function(x)
 
-    def is_upright(self, x: Array) -> bool:
+    def has_no_inverted_element(self, x: Array) -> bool:
         """Whether no element is inverted at x (3n,)."""
         return bool(self.body.volume_ratios(x).min() > 0)
 
     def _require_upright(self, x: Array) -> None:
         """Raise NewtonFailure if an element is inverted at x (3n,)."""
-        if not self.is_upright(x):
+        if not self.has_no_inverted_element(x):
             raise NewtonFailure(x, "an element is inverted before the first iteration")
 
     def worst_element(self, x: Array) -> int:
@@ -330,7 +333,7 @@ class Solver:
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
 
 
-def followed(
+def follow_path(
     solve: Callable[[Array, float], Array], x: Array, halvings: int, guess: Array | None = None
 ) -> Array:
     """Follow the solution x(s) from x(0) to x(1) in increments that shrink on failure, and grow
@@ -382,7 +385,7 @@ def followed(
     return x
 
 
-class Solvers:
+class NewtonSolvers:
     """Solvers of an experiment, one for each set of prescribed dofs; created on demand.
 
     Parameters
@@ -402,24 +405,24 @@ class Solvers:
         stopwatch: Stopwatch | None = None,
     ) -> None:
         self._arguments = (experiment, options, stopwatch)
-        self._known: dict[bytes, Solver] = {}
+        self._known: dict[bytes, NewtonSolver] = {}
 
-    def holding(self, held: NDArray[np.bool_]) -> Solver:
+    def for_prescribed(self, is_prescribed: NDArray[np.bool_]) -> NewtonSolver:
         """Return the solver with the prescribed coordinates (n, 3) bool."""
-        key = held.tobytes()
+        key = is_prescribed.tobytes()
         if key not in self._known:
-            self._known[key] = Solver(*self._arguments, held)
+            self._known[key] = NewtonSolver(*self._arguments, is_prescribed)
         return self._known[key]
 
 
 def simulation_error(
-    solver: Solver, failure: NewtonFailure, time_s: float, what: str, *, static: bool = False
+    solver: NewtonSolver, failure: NewtonFailure, time_s: float, what: str, *, static: bool = False
 ) -> SimulationError:
     """Return the error for the user: what failed, when, at which element, and what to change.
 
     Parameters
     ----------
-    solver : Solver
+    solver : NewtonSolver
         The solver that failed.
     failure : NewtonFailure
         The failure.
@@ -429,7 +432,7 @@ def simulation_error(
         Description of the step, as the subject of a sentence.
     static : bool
         If true, the error contains the state where the path of equilibria ended, see
-        `lost_stability.explained`.
+        `lost_stability.explain_failure`.
     """
     element = solver.worst_element(failure.x)
     ratio = float(solver.body.volume_ratios(failure.x)[0, element].min())

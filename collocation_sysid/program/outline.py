@@ -27,8 +27,8 @@ from scipy.spatial import KDTree
 from ..arrays import Array, Index
 from ..fem.body import Body
 from ..recording.depth import DepthCamera
-from .skin import Skin
-from .view import View
+from .skin import VisibleSurface
+from .view import DepthCameraModel
 
 # Distance to either side of the outline within which the edge is searched [pixels]; farther away it
 # may belong to another part of the body.
@@ -50,7 +50,7 @@ EMPTY = 2
 class Outline:
     """Points of a body's outline and planes through the camera that they should lie in.
 
-    Arrays have S samples of E points at most; those beyond are not `used`.
+    Arrays have S samples of E points at most; those beyond are not `is_compared`.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Outline:
     points, rays : (S, E, 3) a point of each plane in the camera's frame, and zeros
     pixel_m : (S, E) width of a pixel at the outline point, along the plane's normal [m]
     places_m : (S, E, 3) outline points on the undeformed body
-    used : (S, E) outline points whose edge is known
+    is_compared : (S, E) outline points whose edge is known
     """
 
     nodes: Index
@@ -69,18 +69,25 @@ class Outline:
     rays: Array
     pixel_m: Array
     places_m: Array
-    used: NDArray[np.bool_]
+    is_compared: NDArray[np.bool_]
 
     @classmethod
     def from_shapes(
-        cls, view: View, skin: Skin, body: Body, *, shapes_m: Array, phi: Array, gate_m: float
+        cls,
+        camera: DepthCameraModel,
+        surface: VisibleSurface,
+        body: Body,
+        *,
+        shapes_m: Array,
+        phi: Array,
+        gate_m: float,
     ) -> Outline:
         """Associate the outlines of shapes with the edges in the images of a camera.
 
         Parameters
         ----------
-        view : View
-        skin : Skin
+        camera : DepthCameraModel
+        surface : VisibleSurface
         body : Body
         shapes_m : (S, n, 3) array
             Positions of the surface's nodes at the times of the images [m].
@@ -89,26 +96,26 @@ class Outline:
         gate_m : float
             Pixels whose depth differs by less from that of the outline point may show the body [m].
         """
-        corners = skin.faces.shape[1]
+        corners = surface.faces.shape[1]
         edges = []
         for sample, shape_m in enumerate(shapes_m):
-            image_m = view.depth.images_m[sample] if len(view.depth.images_m) else None
+            image_m = camera.depth.images_m[sample] if len(camera.depth.images_m) else None
             points = None
             if image_m is not None:
-                points = _outline_points(view, skin, shape_m, phi=phi, sample=sample)
+                points = _outline_points(camera, surface, shape_m, phi=phi, sample=sample)
             if image_m is None or points is None:
                 edges.append(_no_edges(corners))
                 continue
-            edges.append(_edges(view, points, image_m, phi=phi, gate_m=gate_m, sample=sample))
-        most = max(1, *(len(each["used"]) for each in edges))
+            edges.append(_edges(camera, points, image_m, phi=phi, gate_m=gate_m, sample=sample))
+        most = max(1, *(len(each["is_compared"]) for each in edges))
 
         def together(name: str) -> NDArray:
             return np.stack([_padded(each[name], most) for each in edges])
 
         of_points = {name: together(name) for name in edges[0] if name not in ("faces",)}
         faces = together("faces")
-        nodes = skin.faces[faces]
-        rest_m = body.nodes_m[skin.nodes][nodes]
+        nodes = surface.faces[faces]
+        rest_m = body.nodes_m[surface.nodes][nodes]
         return cls(
             nodes=nodes,
             places_m=np.einsum("sea,seai->sei", of_points["weights"], rest_m),
@@ -150,16 +157,18 @@ def _no_edges(corners: int) -> dict[str, NDArray]:
         "normals": np.zeros((0, 3)),
         "points": np.zeros((0, 3)),
         "pixel_m": np.zeros(0),
-        "used": np.zeros(0, dtype=bool),
+        "is_compared": np.zeros(0, dtype=bool),
     }
 
 
-def no_depth_is_empty(view: View, image_m: Array, *, sample: int, size_m: float) -> bool:
+def no_depth_is_empty(
+    camera: DepthCameraModel, image_m: Array, *, sample: int, size_m: float
+) -> bool:
     """Return whether pixels without depth show that nothing is there.
 
     Parameters
     ----------
-    view : View
+    camera : DepthCameraModel
     image_m : (rows, columns) array
         Depths [m], NaN where missing.
     sample : int
@@ -167,43 +176,43 @@ def no_depth_is_empty(view: View, image_m: Array, *, sample: int, size_m: float)
     size_m : float
         Diagonal of the body [m]; what is farther behind its middle is background.
     """
-    if view.depth.background != "auto":
-        return view.depth.background == "empty"
+    if camera.depth.background != "auto":
+        return camera.depth.background == "empty"
     # The middle of the body as stated, which may move with the camera: a coarse measure suffices.
-    middle_m = float(view.middle_m(sample)[2])
+    middle_m = float(camera.body_middle_m(sample)[2])
     background = np.count_nonzero(image_m > middle_m + size_m)
     return bool(background < SEEN_BACKGROUND * np.count_nonzero(np.isnan(image_m)))
 
 
 def _outline_points(
-    view: View, skin: Skin, shape_m: Array, *, phi: Array, sample: int
+    camera_in: DepthCameraModel, surface: VisibleSurface, shape_m: Array, *, phi: Array, sample: int
 ) -> _OutlinePoints | None:
     """Return the points where a shape (n, 3) ends in a camera's view; None where there are none.
 
     They lie `spacing_m` apart on edges between a flat triangle that faces the camera and one that
     does not, and are not in front of or behind another part of the body.
     """
-    eye_m = view.eye_m(phi, sample)
-    camera = view.depth.camera
-    own_m = view.own_m(phi, shape_m, sample)
+    eye_m = camera_in.eye_m(phi, sample)
+    camera = camera_in.depth.camera
+    own_m = camera_in.to_camera_m(phi, shape_m, sample)
     if eye_m is None or (own_m[:, 2] <= 0).any():
         return None
-    facing = skin.facing(shape_m, eye_m)
-    ends, beside = skin.edges
+    facing = surface.is_facing(shape_m, eye_m)
+    ends, beside = surface.edges
     is_front = facing[beside]
     first, second = beside.T
     front_triangle = np.where(is_front[:, 0], first, second)
-    parts = len(skin.flat) // len(skin.faces)
+    parts = len(surface.flat_triangles) // len(surface.faces)
     outline_edges = np.flatnonzero(
-        (is_front[:, 0] != is_front[:, 1]) & skin.chosen[front_triangle // parts]
+        (is_front[:, 0] != is_front[:, 1]) & surface.is_selected[front_triangle // parts]
     )
     if not len(outline_edges):
         return None
     ends = ends[outline_edges]
     front_triangle = front_triangle[outline_edges]
-    corners = skin.flat[front_triangle]
+    corners = surface.flat_triangles[front_triangle]
     lengths_m = np.linalg.norm(np.diff(shape_m[ends], axis=1)[:, 0], axis=1)
-    counts = np.maximum(1, np.ceil(lengths_m / view.depth.spacing_m).astype(int))
+    counts = np.maximum(1, np.ceil(lengths_m / camera_in.depth.spacing_m).astype(int))
     edge = np.repeat(np.arange(len(outline_edges)), counts)
     number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (number + 0.5) / counts[edge]
@@ -211,8 +220,8 @@ def _outline_points(
     at_first = corners[edge] == ends[edge, :1]
     at_second = corners[edge] == ends[edge, 1:]
     shares = at_first * (1 - share)[:, None] + at_second * share[:, None]
-    faces, places = skin.at(front_triangle[edge], shares)
-    weights, points_m, _ = skin.points(shape_m, faces, places)
+    faces, places = surface.to_faces(front_triangle[edge], shares)
+    weights, points_m, _ = surface.evaluate(shape_m, faces, places)
     pixels = camera.distorted_pixels(own_m)
     tangents_px = pixels[ends[edge, 1]] - pixels[ends[edge, 0]]
     length_px = np.linalg.norm(tangents_px, axis=1)
@@ -221,12 +230,12 @@ def _outline_points(
         / np.maximum(length_px, 1e-9)[:, None]
     )
     centres = pixels[corners[edge]].mean(axis=1)
-    at_m = view.own_m(phi, points_m, sample)
+    at_m = camera_in.to_camera_m(phi, points_m, sample)
     places_px = camera.distorted_pixels(at_m)
     inwards = np.sum(normals * (places_px - centres), axis=1) < 0
     outwards = np.where(inwards[:, None], -normals, normals)
-    separate = _first_of_each_cube(points_m, view.depth.spacing_m)
-    alone = ~_covered(places_px + OUTSIDE_PX * outwards, pixels[skin.flat[facing]])
+    separate = _first_of_each_cube(points_m, camera_in.depth.spacing_m)
+    alone = ~_covered(places_px + OUTSIDE_PX * outwards, pixels[surface.flat_triangles[facing]])
     selected = separate[(alone & (length_px > 1e-6))[separate]]
     if not len(selected):
         return None
@@ -267,7 +276,7 @@ def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
 
 
 def _edges(
-    view: View,
+    camera_in: DepthCameraModel,
     points: _OutlinePoints,
     image_m: Array,
     *,
@@ -276,39 +285,44 @@ def _edges(
     sample: int,
 ) -> dict[str, NDArray]:
     """Return the planes through the edges in an image that belong to points of an outline."""
-    camera = view.depth.camera
-    empty = no_depth_is_empty(view, image_m, sample=sample, size_m=view.size_m)
+    camera = camera_in.depth.camera
+    empty = no_depth_is_empty(camera_in, image_m, sample=sample, size_m=camera_in.size_m)
     offsets = np.arange(-SEARCH_PX, SEARCH_PX + STEP_PX / 2, STEP_PX)
     across = points.pixels[:, None] + offsets[:, None] * points.outwards[:, None]
-    shown = _shown(image_m, across, points.depth_m[:, None], gate_m=gate_m, empty=empty)
+    shown = _classify_pixels(
+        image_m, across, points.depth_m[:, None], gate_m=gate_m, is_missing_empty=empty
+    )
     ends = (shown[:, :-1] == BODY) & (shown[:, 1:] == EMPTY)
     middles = (offsets[:-1] + offsets[1:]) / 2
     nearest = np.where(ends, np.abs(middles), np.inf).argmin(axis=1)
     has_edge = ends.any(axis=1)
     outwards = points.outwards.copy()
     edges = points.pixels + middles[nearest, None] * outwards
-    here = _shown(image_m, points.pixels, points.depth_m, gate_m=gate_m, empty=empty)
+    here = _classify_pixels(
+        image_m, points.pixels, points.depth_m, gate_m=gate_m, is_missing_empty=empty
+    )
     is_beyond = ~has_edge & (here == EMPTY)
     if is_beyond.any():
         is_nothing = (image_m > points.depth_m.max() + gate_m) | (np.isnan(image_m) & empty)
-        edges[is_beyond], outwards[is_beyond], has_nearest = _nearest_other(
+        edges[is_beyond], outwards[is_beyond], has_nearest = _nearest_edges(
             is_nothing, points.pixels[is_beyond]
         )
         is_beyond[is_beyond] = has_nearest
     return {
         "faces": points.faces,
         "weights": points.weights,
-        "used": has_edge | is_beyond,
-        **_planes(view, camera, edges, outwards, points.depth_m, phi=phi, sample=sample),
+        "is_compared": has_edge | is_beyond,
+        **_planes(camera_in, camera, edges, outwards, points.depth_m, phi=phi, sample=sample),
     }
 
 
-def _shown(
-    image_m: Array, pixels: Array, depth_m: Array, *, gate_m: float, empty: bool
+def _classify_pixels(
+    image_m: Array, pixels: Array, depth_m: Array, *, gate_m: float, is_missing_empty: bool
 ) -> NDArray[np.int64]:
     """Classify pixels (…, 2) of an image beside a body at given depths as BODY, UNKNOWN or EMPTY.
 
-    Pixels outside the image are UNKNOWN. `empty` states whether a missing depth (NaN) means that
+    Pixels outside the image are UNKNOWN. `is_missing_empty` states whether a missing depth (NaN)
+    means that
     nothing is there.
     """
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
@@ -317,12 +331,12 @@ def _shown(
     behind_m = depths_m - depth_m
     shown = np.full(depths_m.shape, UNKNOWN)
     shown[np.abs(behind_m) <= gate_m] = BODY
-    shown[(behind_m > gate_m) | (np.isnan(depths_m) & empty)] = EMPTY
+    shown[(behind_m > gate_m) | (np.isnan(depths_m) & is_missing_empty)] = EMPTY
     shown[~inside] = UNKNOWN
     return shown
 
 
-def _nearest_other(
+def _nearest_edges(
     nothing: NDArray[np.bool_], pixels: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return the edges nearest to pixels (P, 2) that show nothing.
@@ -349,7 +363,7 @@ def _nearest_other(
 
 
 def _planes(
-    view: View,
+    camera_in: DepthCameraModel,
     camera: DepthCamera,
     edges: Array,
     outwards: Array,
@@ -363,15 +377,15 @@ def _planes(
     Depths (P,) [m] tell how wide a pixel is, and where the point of each plane is chosen.
     """
     tangents_px = np.column_stack([-outwards[:, 1], outwards[:, 0]])
-    at, before, after, outside = _rays(
+    at, before, after, outside = _concatenated_rays(
         camera, [edges, edges - tangents_px, edges + tangents_px, edges + outwards]
     )
     normals = np.cross(before, after)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     pixel = np.sum(normals * (outside - at), axis=1)
     normals *= np.sign(pixel)[:, None]
-    corner = view.corrected_at(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)
-    ways = view.corrected_at(phi, normals, np.zeros_like(normals), sample) - corner
+    corner = camera_in.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)
+    ways = camera_in.to_world(phi, normals, np.zeros_like(normals), sample) - corner
     return {
         "normals": ways / np.linalg.norm(ways, axis=1)[:, None],
         "points": depth_m[:, None] * at,
@@ -379,6 +393,6 @@ def _planes(
     }
 
 
-def _rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
+def _concatenated_rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
     """Return the rays (P, 3) of several sets of pixels (P, 2), computed in one call."""
-    return np.split(camera.rays(np.concatenate(pixels)), len(pixels))
+    return np.split(camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels))

@@ -17,13 +17,13 @@ import numpy as np
 
 from ..arrays import Array
 from ..recording.nuisance import DEPTH_EDGE
-from .depth import DepthReading
+from .depth import DepthResidual
 from .outline import Outline
-from .reading import Instrument, Window
+from .reading import ResidualExpression, RowStencil
 
 
 @dataclass(frozen=True, eq=False)
-class OutlineReading(DepthReading):
+class OutlineResidual(DepthResidual):
     """Measurement model of a body's outline: distances of outline points from edges in a
     camera's images [pixels].
     """
@@ -32,56 +32,58 @@ class OutlineReading(DepthReading):
     noise_at_least_stated = True
 
     @classmethod
-    def from_depth(cls, depth: DepthReading) -> OutlineReading:
+    def from_depth(cls, depth: DepthResidual) -> OutlineResidual:
         """Build the measurement model of the outline for the camera of a depth measurement
         model.
         """
-        used = depth.sighting.outline.used
+        used = depth.correspondences.outline.is_compared
         samples, points = used.shape
-        view = depth.sighting.view
+        view = depth.correspondences.camera
         return cls(
-            channel=depth.channel,
+            observable=depth.observable,
             nuisance=depth.nuisance,
             huber=depth.huber,
             names=(f"{view.depth.name} outline",) * points,
             t_s=depth.t_s,
             sigmas=np.full(points, view.depth.outline_sigma_px),
             measured=np.zeros((samples, points, 1)),
-            components=used[..., None],
-            own=np.tile(view.own, (points, 1)),
-            sighting=depth.sighting,
-            at_s=depth.at_s,
+            is_compared=used[..., None],
+            own_parameters=np.tile(view.parameter_indices, (points, 1)),
+            correspondences=depth.correspondences,
+            observable_s=depth.observable_s,
         )
 
     @property
-    def pairs(self) -> Outline:
+    def correspondences_in_use(self) -> Outline:
         """Points of the outline, and planes through the edges in the images."""
-        return self.sighting.outline
+        return self.correspondences.outline
 
     @property
-    def _instruments(self) -> dict[tuple[int, int], Instrument]:
+    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
         """Generated functions by the numbers of vectors and of data, stored with the
         camera's model.
         """
-        return self.sighting.view.outline_instruments
+        return self.correspondences.camera.outline_expressions
 
     @cached_property
-    def _window(self) -> Window:
+    def _stencil(self) -> RowStencil:
         """Stencil of all images as for depth, with the width of a pixel as last datum."""
-        places, data = super()._window
-        width_m = np.where(self.pairs.used, self.pairs.pixel_m, 1.0)
-        return Window(places, np.concatenate([data, width_m[None]]))
+        places, data = super()._stencil
+        width_m = np.where(
+            self.correspondences_in_use.is_compared, self.correspondences_in_use.pixel_m, 1.0
+        )
+        return RowStencil(places, np.concatenate([data, width_m[None]]))
 
-    def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return how far an outline point is outside of its edge [pixels], with the
         estimated edge offset subtracted.
         """
         count = data.numel() - 1
-        outside_m = super().expression(looked, phi, data[:count])
-        inside_px = self.nuisance.by_row(phi, self.own[0]).get(DEPTH_EDGE, 0)
+        outside_m = super().expression(values, phi, data[:count])
+        inside_px = self.nuisance.values_by_row(phi, self.own_parameters[0]).get(DEPTH_EDGE, 0)
         return outside_m / data[count] - inside_px
 
-    def apart_px(self, values: Array, phi: Array) -> Array:
+    def signed_distances_px(self, values: Array, phi: Array) -> Array:
         """Return how far outline points (s, E) are outside of their edges [pixels]; NaN where there
         is no edge.
 
@@ -92,7 +94,7 @@ class OutlineReading(DepthReading):
         phi : (k,) array
             Nuisance parameters in units of their priors.
         """
-        return self.apart_m(values, phi)
+        return self.signed_distances_m(values, phi)
 
     def roughly(self, x: Array, phi: Array) -> Array:
         """Return no residual: before anything is fitted, distances to the points suffice."""

@@ -16,91 +16,95 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..model.generated import Generated
+from ..model.generated import GeneratedFunction
 from ..model.recursion import Recursion
 
 T = TypeVar("T", bound=np.generic)
 ONE = np.ones(1)
 
 
-class Numbers(NamedTuple):
+class AssemblyIndices(NamedTuple):
     """Variables or constraints of instances.
 
     Attributes
     ----------
-    places : (k, …) array
+    indices : (k, …) array
         Their indices in z or g.
     unit : array
-        Physical value of one unit of each; of the same shape as `places` or one that broadcasts to
+        Physical value of one unit of each; of the same shape as `indices` or one that broadcasts to
         it.
     """
 
-    places: Index
+    indices: Index
     unit: Array = ONE
 
 
 @dataclass(frozen=True, eq=False)
-class Pattern:
+class ExpressionPattern:
     """An expression at I instances.
 
     Attributes
     ----------
-    expression : Generated
+    expression : GeneratedFunction
         Function y(u, data) with derivatives.
     data : (d, I) array
         Data of the instances.
-    looked : Numbers, (k, I)
+    inputs : AssemblyIndices, (k, I)
         Variables that are the inputs u.
-    rows : Numbers, (m, I)
+    rows : AssemblyIndices, (m, I)
         Constraints that the values y are added to.
     """
 
-    expression: Generated
+    expression: GeneratedFunction
     data: Array
-    looked: Numbers
-    rows: Numbers
+    inputs: AssemblyIndices
+    rows: AssemblyIndices
 
     @classmethod
-    def of(
-        cls, expression: Generated, data: Array, looked: Sequence[Numbers], rows: Numbers
-    ) -> Pattern:
+    def from_arrays(
+        cls,
+        expression: GeneratedFunction,
+        data: Array,
+        inputs: Sequence[AssemblyIndices],
+        rows: AssemblyIndices,
+    ) -> ExpressionPattern:
         """Build a pattern of instances of any shape.
 
         Parameters
         ----------
-        expression : Generated
+        expression : GeneratedFunction
             Function y(u, data).
         data : (d, …) array
             Data; broadcast to the shape of the instances.
-        looked : sequence of Numbers, each (k, …)
+        inputs : sequence of AssemblyIndices, each (k, …)
             Inputs, concatenated along the first axis after broadcasting.
-        rows : Numbers, (m, …)
+        rows : AssemblyIndices, (m, …)
             Constraints.
         """
-        shapes = (data.shape, rows.places.shape, *(each.places.shape for each in looked))
+        shapes = (data.shape, rows.indices.shape, *(each.indices.shape for each in inputs))
         shape = np.broadcast_shapes(*(shape[1:] for shape in shapes))
 
         def flat(values: NDArray[T], length: int) -> NDArray[T]:
             broadcast = np.broadcast_to(values, (length, *shape))
             return broadcast.reshape(length, int(np.prod(shape)))
 
-        def joined(parts: Sequence[Numbers]) -> Numbers:
-            places = [flat(part.places, len(part.places)) for part in parts]
-            units = [flat(np.asarray(part.unit), len(part.places)) for part in parts]
-            return Numbers(np.concatenate(places), np.concatenate(units))
+        def joined(parts: Sequence[AssemblyIndices]) -> AssemblyIndices:
+            places = [flat(part.indices, len(part.indices)) for part in parts]
+            units = [flat(np.asarray(part.unit), len(part.indices)) for part in parts]
+            return AssemblyIndices(np.concatenate(places), np.concatenate(units))
 
-        return cls(expression, flat(data, len(data)), joined(looked), joined([rows]))
+        return cls(expression, flat(data, len(data)), joined(inputs), joined([rows]))
 
     @classmethod
-    def of_recursion(
+    def from_recursion(
         cls,
         recursion: Recursion,
         data: Array,
-        states: Numbers,
-        looked: Numbers,
-        constants: Numbers,
-        rows: Numbers,
-    ) -> Pattern:
+        states: AssemblyIndices,
+        input_indices: AssemblyIndices,
+        constants: AssemblyIndices,
+        rows: AssemblyIndices,
+    ) -> ExpressionPattern:
         """Build the pattern h_k − R(h_{k−1}, s_k, s_{k−1}; c) of a recursion R.
 
         At the first evaluation, the first states and inputs stand for those before; the recursion
@@ -112,77 +116,83 @@ class Pattern:
             The recursion R.
         data : array
             Data of the recursion.
-        states : Numbers, (n, N, I)
+        states : AssemblyIndices, (n, N, I)
             States h.
-        looked : Numbers, (i, N, I)
+        input_indices : AssemblyIndices, (i, N, I)
             Inputs s.
-        constants : Numbers
+        constants : AssemblyIndices
             Constants c.
-        rows : Numbers
+        rows : AssemblyIndices
             Constraints.
         """
 
         def gap(u: ca.SX, data: ca.SX) -> ca.SX:
-            own, inputs = ca.vertsplit(u, [0, recursion.state, u.numel()])
-            return own - recursion.step.expression(inputs, data)
+            own, inputs = ca.vertsplit(u, [0, recursion.state_size, u.numel()])
+            return own - recursion.step_function.expression(inputs, data)
 
-        before = np.maximum(np.arange(states.places.shape[1]) - 1, 0)
-        parts = [states, _at(states, before), looked, _at(looked, before), constants]
-        size = recursion.state + recursion.ends[-1]
-        return cls.of(Generated(gap, size, recursion.data), data, parts, rows)
+        before = np.maximum(np.arange(states.indices.shape[1]) - 1, 0)
+        parts = [
+            states,
+            _at_evaluations(states, before),
+            input_indices,
+            _at_evaluations(input_indices, before),
+            constants,
+        ]
+        size = recursion.state_size + recursion.input_offsets[-1]
+        return cls.from_arrays(GeneratedFunction(gap, size, recursion.data_size), data, parts, rows)
 
-    def _u(self, z: Array) -> Array:
+    def _input_values(self, z: Array) -> Array:
         """Return the inputs (k, I) in physical units."""
-        return self.looked.unit * z[self.looked.places]
+        return self.inputs.unit * z[self.inputs.indices]
 
-    def values(self, z: Array, count: int) -> Array:
+    def residuals(self, z: Array, count: int) -> Array:
         """Return the contributions to the constraints (count,)."""
-        return self._summed(self.expression.value(self._u(z), self.data), count)
+        return self._assemble(self.expression.evaluate(self._input_values(z), self.data), count)
 
-    def _summed(self, y: Array, count: int) -> Array:
+    def _assemble(self, y: Array, count: int) -> Array:
         """Add up values y (m, I) into constraints (count,)."""
         assembled = np.zeros(count)
-        np.add.at(assembled, self.rows.places, y / self.rows.unit)
+        np.add.at(assembled, self.rows.indices, y / self.rows.unit)
         return assembled
 
     def jacobian_entries(self) -> tuple[Index, Index]:
         """Return constraint, and index in z, of each derivative that may be non-zero."""
-        y, u = np.nonzero(self.expression.slope_pattern)
-        return self.rows.places[y].ravel(), self.looked.places[u].ravel()
+        y, u = np.nonzero(self.expression.jacobian_pattern)
+        return self.rows.indices[y].ravel(), self.inputs.indices[u].ravel()
 
     def jacobian_values(self, z: Array, count: int) -> tuple[Array, Array]:
         """Return the contributions to the constraints (count,), and the values of
         `jacobian_entries`.
         """
-        value, slopes = self.expression.slopes(self._u(z), self.data)
-        y, u = np.nonzero(self.expression.slope_pattern)
-        slopes = slopes[y, u] * self.looked.unit[u] / self.rows.unit[y]
-        return self._summed(value, count), slopes.ravel()
+        value, slopes = self.expression.evaluate_with_jacobian(self._input_values(z), self.data)
+        y, u = np.nonzero(self.expression.jacobian_pattern)
+        slopes = slopes[y, u] * self.inputs.unit[u] / self.rows.unit[y]
+        return self._assemble(value, count), slopes.ravel()
 
     @cached_property
-    def _crossing(self) -> tuple[Index, Index, NDArray[np.bool_]]:
+    def _hessian_pairs(self) -> tuple[Index, Index, NDArray[np.bool_]]:
         """Pairs (i, j) of inputs with second derivatives, and a mask of the instances where
         they are in the upper triangle.
         """
-        i, j = np.nonzero(self.expression.curvature_pattern)
-        return i, j, self.looked.places[i] <= self.looked.places[j]
+        i, j = np.nonzero(self.expression.hessian_pattern)
+        return i, j, self.inputs.indices[i] <= self.inputs.indices[j]
 
     def hessian_entries(self) -> tuple[Index, Index]:
         """Return rows and columns in z of the second derivatives, upper triangle."""
-        i, j, above = self._crossing
-        return self.looked.places[i][above], self.looked.places[j][above]
+        i, j, above = self._hessian_pairs
+        return self.inputs.indices[i][above], self.inputs.indices[j][above]
 
     def hessian_values(self, z: Array, multipliers: Array) -> Array:
         """Return the second derivatives of multipliers (count,) · constraints, in the order
         of `hessian_entries`.
         """
-        i, j, above = self._crossing
-        unit = self.looked.unit
-        weights = multipliers[self.rows.places] / self.rows.unit
-        curvature = self.expression.curvature(self._u(z), self.data, weights)
+        i, j, above = self._hessian_pairs
+        unit = self.inputs.unit
+        weights = multipliers[self.rows.indices] / self.rows.unit
+        curvature = self.expression.weighted_hessian(self._input_values(z), self.data, weights)
         return (curvature[i, j] * unit[i] * unit[j])[above]
 
 
-def _at(numbers: Numbers, evaluations: Index) -> Numbers:
+def _at_evaluations(indices: AssemblyIndices, evaluations: Index) -> AssemblyIndices:
     """Return the indices of other evaluations; units must be the same at all evaluations."""
-    return Numbers(numbers.places[:, evaluations], numbers.unit)
+    return AssemblyIndices(indices.indices[:, evaluations], indices.unit)

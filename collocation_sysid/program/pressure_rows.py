@@ -18,33 +18,33 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.contact import Contact
-from .entries import Outer
-from .force_rows import ForceRows
-from .part import Part
+from .entries import EntryBlock
+from .force_rows import LiftedForceHistory
+from .part import ExperimentIterate
 from .segment import Weighed
 
 
 @dataclass(frozen=True, eq=False)
-class PressureRows(ForceRows):
+class LiftedContactPressure(LiftedForceHistory):
     """Lifted pressure variables b of one obstacle of one experiment."""
 
     called = "pressure"
     least = 0.0  # type: ignore[override]
 
     @property
-    def first(self) -> int:
+    def first_evaluation(self) -> int:
         """Index of the evaluation that the first variables belong to."""
         return self.segment.dynamics.first_row
 
     @property
     def unit_m(self) -> float:
         """Unit of the variables and of the equations [m]: the width δ of the contact law."""
-        return self._contact.contact.width_m
+        return self._contact.law_of_contact.largest_width_m
 
     @property
     def _contact(self) -> Contact:
         """Contact force of the obstacle."""
-        term = self.segment.dynamics.forces.further[self.force_number]
+        term = self.segment.dynamics.forces.external_terms[self.force_index]
         assert isinstance(term, Contact)
         return term
 
@@ -53,47 +53,55 @@ class PressureRows(ForceRows):
         """Shape (1, evaluations, I) for I contact points."""
         return 1, self.segment.constraint_times, self._points.count
 
-    def following(self, part: Part) -> Array:
+    def consistent_values(self, iterate: ExperimentIterate) -> Array:
         """Return the scaled variables that satisfy the equations at the part's positions."""
-        xi, _ = part.setting.dynamics.evaluation_states(part.x)
-        return self._contact.pressing(xi).ravel() / self.unit_m
+        xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
+        return self._contact.scaled_pressures(xi).ravel() / self.unit_m
 
-    def given(self, part: Part, z: Array) -> Part:
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
         """Return the part with b taken from z; b is zero at a stated initial state."""
-        b = np.zeros((1, self.segment.grid_rows, self._points.count))
-        b[:, self.first :] = self.unit_m * z[self.variables].reshape(self.shape)
-        return replace(part, pressed={**part.pressed, self.force_number: b})
+        b = np.zeros((1, self.segment.grid_times, self._points.count))
+        b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(self.shape)
+        return replace(iterate, lifted_pressures={**iterate.lifted_pressures, self.force_index: b})
 
-    def values(self, part: Part, z: Array) -> Array:
+    def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,)."""
-        return self._of(part).left(slice(self.first, None)).ravel() / self.unit_m
+        return (
+            self._history_of(iterate).internal_variables(slice(self.first_evaluation, None)).ravel()
+            / self.unit_m
+        )
 
-    def weighed(self, part: Part, multipliers: Array) -> Weighed:
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> Weighed:
         """Return the history, and μ (1, N, I) such that multipliers · equations = Σ μ_k
         (unscaled equations of k).
         """
-        mu = np.zeros((1, self.segment.grid_rows, self._points.count))
-        mu[:, self.first :] = multipliers[self.rows].reshape(self.shape) / self.unit_m
-        return self._of(part), mu
+        mu = np.zeros((1, self.segment.grid_times, self._points.count))
+        mu[:, self.first_evaluation :] = multipliers[self.rows].reshape(self.shape) / self.unit_m
+        return self._history_of(iterate), mu
 
-    def _jacobian(self) -> Iterator[Outer]:
+    def _jacobian_blocks(self) -> Iterator[EntryBlock]:
         """Yield the entries of the equations by b and by x, then those of the motion by b."""
-        rows = self.places.row + self._own
-        columns = self.places.variable + self._own
-        instance = self._points.pairs[0]
-        yield Outer([rows], [columns])
-        for here, x, *_ in self._lags(self.first):
-            yield Outer([rows[:, here][..., instance]], [x])
-        for pairs, k, row, _ in self._motion():
-            yield Outer([row], [columns[:, k[:, None] - self.first, instance[pairs]]])
+        rows = self.offsets.row + self._indices
+        columns = self.offsets.variable + self._indices
+        instance = self._points.nonzero_weights[0]
+        yield EntryBlock([rows], [columns])
+        for here, x, *_ in self._position_lags(self.first_evaluation):
+            yield EntryBlock([rows[:, here][..., instance]], [x])
+        for pairs, k, row, _ in self._motion_entries():
+            yield EntryBlock(
+                [row], [columns[:, k[:, None] - self.first_evaluation, instance[pairs]]]
+            )
 
-    def jacobian_values(self, part: Part, z: Array) -> tuple[Array, Array]:
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the equations, and the values of `jacobian_entries`."""
-        history = self._of(part)
+        history = self._history_of(iterate)
         d = self._points.dofs
-        slopes = history.parts(slice(None))
-        by = type(slopes)(*(each[d:, :, self.first :] / self.unit_m for each in slopes))
+        slopes = history.derivatives(slice(None))
+        by = type(slopes)(*(each[d:, :, self.first_evaluation :] / self.unit_m for each in slopes))
         blocks = [self.unit_m * by.b]
-        blocks += [self.segment.length_m * each for each in self._by_x(self.first, by)]
-        blocks += self._motion_by_b(slopes)
-        return self.values(part, z), np.concatenate([each.ravel() for each in blocks])
+        blocks += [
+            self.segment.length_m * each
+            for each in self._position_derivatives(self.first_evaluation, by)
+        ]
+        blocks += self._motion_derivatives(slopes)
+        return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])

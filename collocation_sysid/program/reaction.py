@@ -39,7 +39,7 @@ def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
         Mask of the rows, and the number of grid times by which the reaction force precedes its row.
     """
     t = dynamics.tables
-    lags = np.arange(dynamics.reach + 1.0)
+    lags = np.arange(dynamics.largest_lag + 1.0)
     second = np.column_stack([t.s.sum(axis=1), t.s @ lags, t.s @ lags**2 - 2, t.r])
     is_complete = np.isclose(t.w.sum(axis=1), 1.0)
     moving = is_complete & np.isclose(second, 0.0).all(axis=1)
@@ -51,42 +51,44 @@ def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldForces:
+class GraspForces:
     """Forces F on the sensed dofs at every evaluation, and their changes.
 
     Attributes
     ----------
     force : (rows, g) array
         Forces [N].
-    slopes : (rows, g, columns) array
+    changes : (rows, g, columns) array
         Changes dF of each column of a forward substitution.
     """
 
     force: Array
-    slopes: Array
+    changes: Array
 
     @classmethod
-    def nothing(cls, rows: int, dofs: int, columns: int) -> HeldForces:
+    def zeros(cls, rows: int, dofs: int, columns: int) -> GraspForces:
         """Allocate zeros for `rows` evaluations, `dofs` dofs and `columns` columns."""
         return cls(np.zeros((rows, dofs)), np.zeros((rows, dofs, columns)))
 
-    def begin(self, known: HeldForces) -> None:
+    def copy_first_rows(self, known: GraspForces) -> None:
         """Copy the first rows from `known`, in place."""
         done = len(known.force)
         self.force[:done] = known.force
-        self.slopes[:done] = known.slopes
+        self.changes[:done] = known.changes
 
 
-def forces_on(dynamics: Dynamics, x: Array, dofs: Index, along: Sequence[AnyHistory] = ()) -> Array:
+def forces_on_dofs(
+    dynamics: Dynamics, x: Array, dofs: Index, histories: Sequence[AnyHistory] = ()
+) -> Array:
     """Return the forces F (N, g) on dofs at the evaluations of x (N, 3n) [N], including
     forces on prescribed dofs; zero before the first equation of motion.
     """
     force = np.zeros((len(x), len(dofs)))
-    force[dynamics.first_row :] = dynamics.force(x, along)[:, dofs]
+    force[dynamics.first_row :] = dynamics.force(x, histories)[:, dofs]
     return force
 
 
-def reactions(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array) -> Array:
+def reaction_forces(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Array) -> Array:
     """Return the reaction forces R (N, g) [N] of dofs.
 
     Parameters
@@ -103,7 +105,9 @@ def reactions(dynamics: Dynamics, mass_kg: Array, force: Array, acceleration: Ar
     return mass_kg * acceleration - dynamics.combine(dynamics.tables.w, force)
 
 
-def reaction_slopes(dynamics: Dynamics, mass_kg: Array, slopes: Array, moved: Array) -> Array:
+def reaction_changes(
+    dynamics: Dynamics, mass_kg: Array, force_changes: Array, position_changes: Array
+) -> Array:
     """Return the changes dR (N, g, columns) of reaction forces.
 
     Parameters
@@ -112,10 +116,10 @@ def reaction_slopes(dynamics: Dynamics, mass_kg: Array, slopes: Array, moved: Ar
         Equations of motion.
     mass_kg : (N, g) array
         Masses of the dofs [kg].
-    slopes : (N, g, columns) array
+    force_changes : (N, g, columns) array
         Changes dF of the forces.
-    moved : (N, g, columns) array
+    position_changes : (N, g, columns) array
         Changes of the positions of the dofs.
     """
-    second = dynamics.combine(dynamics.tables.s, moved) / dynamics.step_s**2
-    return mass_kg[..., None] * second - dynamics.combine(dynamics.tables.w, slopes)
+    second = dynamics.combine(dynamics.tables.s, position_changes) / dynamics.step_s**2
+    return mass_kg[..., None] * second - dynamics.combine(dynamics.tables.w, force_changes)

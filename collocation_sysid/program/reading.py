@@ -4,7 +4,8 @@ parameters.
 A sample measures y(c, φ, data), where c are a few vectors of its observable (such as the place of a
 marker at neighbouring times) and φ its nuisance parameters. The residual is r = (y − ŷ) / σ with
 the measurement ŷ, in groups of usually three numbers, and the loss is Σ ρ(‖r‖) over the groups. All
-derivatives are generated from the expression. Subclass `Reading` for another kind of sensor.
+derivatives are generated from the expression. Subclass `MeasurementResidual` for another kind of
+sensor.
 """
 
 from __future__ import annotations
@@ -22,65 +23,65 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array, Index
-from ..model.generated import Generated
+from ..model.generated import GeneratedFunction
 from ..model.nuisance import NuisanceMap
-from .channel import Entries, Points, Slopes
-from .wrench_channel import GraspWrench, Grid
+from .channel import ObservableDerivatives, PointPositions, SparseEntries
+from .wrench_channel import GraspWrench, ReactionGrid
 
 GROUP = 3
 
 # What can be looked at.
-Channel = Points | GraspWrench
+Channel = PointPositions | GraspWrench
 
 T = TypeVar("T", float, ca.SX)
 Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
 
 @dataclass(frozen=True, eq=False)
-class Instrument:
+class ResidualExpression:
     """Residual and loss of one sample as generated functions.
 
     Attributes
     ----------
     expression : callable
         ``expression(c, phi, data) -> y`` in CasADi operations; c is (3, vectors).
-    vectors, own, data : int
+    vector_count, nuisance_count, data_count : int
         Numbers of vectors, of nuisance parameters and of data.
-    measured : int
+    measured_count : int
         Length of y, a multiple of the group.
     huber : float or None
         Threshold of Huber's loss in standard deviations: ρ(d) = d² up to it, linear beyond; None
         means ρ(d) = d².
-    group : int
+    group_size : int
         How many numbers of y the loss takes as one vector.
     """
 
     expression: Expression
-    vectors: int
-    own: int
-    data: int
-    measured: int
+    vector_count: int
+    nuisance_count: int
+    data_count: int
+    measured_count: int
     huber: float | None = None
-    group: int = GROUP
+    group_size: int = GROUP
 
     @cached_property
-    def residual(self) -> Generated:
+    def residual(self) -> GeneratedFunction:
         """Residual r of u = (c, φ), given the data, ŷ and 1/σ; the latter is zero where
         nothing is measured.
         """
-        return Generated(self._residual, self._inputs, self._data)
+        return GeneratedFunction(self._residual_expression, self._input_count, self._data_count)
 
     @cached_property
-    def loss(self) -> Generated:
+    def loss(self) -> GeneratedFunction:
         """Loss Σ ρ of the residual, of the same inputs."""
-        return Generated(self._loss, self._inputs, self._data)
+        return GeneratedFunction(self._loss_expression, self._input_count, self._data_count)
 
     @property
     def is_quadratic(self) -> bool:
         """Whether second derivatives of the loss are constant."""
         return self.huber is None and self.residual.is_linear
 
-    def curvature(self, u: Array, data: Array, bent: bool = True) -> Array:
+    def curvature(self, u: Array, data: Array, has_observation_curvature: bool = True) -> Array:
         """Return second derivatives (k, k, …) of the loss by u.
 
         Parameters
@@ -89,49 +90,53 @@ class Instrument:
             Inputs (c, φ) of the samples.
         data : array
             Data, ŷ and 1/σ.
-        bent : bool
+        has_observation_curvature : bool
             If false, neglect the curvature of the observations: the Gauss–Newton matrix, which is
             convex. Outliers then have the weights ρ'/2d of reweighted least squares; this is an
             upper bound of the curvature of ρ, and avoids the zero of ρ'' along their residuals.
         """
-        if bent:
-            return self.loss.curvature(u, data)
-        residual, slopes = self.residual.slopes(u, data)
+        if has_observation_curvature:
+            return self.loss.weighted_hessian(u, data)
+        residual, slopes = self.residual.evaluate_with_jacobian(u, data)
         weights = np.full(residual.shape, 2.0)
         if self.huber is not None:
-            groups = residual.reshape(-1, self.group, *residual.shape[1:])
+            groups = residual.reshape(-1, self.group_size, *residual.shape[1:])
             lengths = np.linalg.norm(groups, axis=1)
-            weights *= np.repeat(self.huber / np.maximum(lengths, self.huber), self.group, axis=0)
+            weights *= np.repeat(
+                self.huber / np.maximum(lengths, self.huber), self.group_size, axis=0
+            )
         return np.einsum("ai...,a...,aj...->ij...", slopes, weights, slopes, optimize=True)
 
     @property
-    def _inputs(self) -> int:
+    def _input_count(self) -> int:
         """Number of inputs u."""
-        return GROUP * self.vectors + self.own
+        return GROUP * self.vector_count + self.nuisance_count
 
     @property
-    def _data(self) -> int:
+    def _data_count(self) -> int:
         """Number of data, including ŷ and 1/σ."""
-        return self.data + 2 * self.measured
+        return self.data_count + 2 * self.measured_count
 
-    def _residual(self, u: ca.SX, data: ca.SX) -> ca.SX:
+    def _residual_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
         """Expression of the residual."""
-        ends = [0, self.data, self.data + self.measured, self._data]
+        ends = [0, self.data_count, self.data_count + self.measured_count, self._data_count]
         own, measured, weight = ca.vertsplit(data, ends)
-        vectors, phi = ca.vertsplit(u, [0, GROUP * self.vectors, self._inputs])
-        predicted = self.expression(ca.reshape(vectors, GROUP, self.vectors), phi, own)
+        vectors, phi = ca.vertsplit(u, [0, GROUP * self.vector_count, self._input_count])
+        predicted = self.expression(ca.reshape(vectors, GROUP, self.vector_count), phi, own)
         return weight * (predicted - measured)
 
-    def _loss(self, u: ca.SX, data: ca.SX) -> ca.SX:
+    def _loss_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
         """Expression of the loss."""
-        return self._rhos(self._residual(u, data), data)
+        return self._robust_loss(self._residual_expression(u, data), data)
 
-    def _rhos(self, residual: ca.SX, _: ca.SX) -> ca.SX:
+    def _robust_loss(self, residual: ca.SX, _: ca.SX) -> ca.SX:
         """Expression of Σ ρ over the groups of a residual."""
-        groups = ca.vertsplit(residual, self.group)
-        return sum((self._rho(ca.sumsqr(group)) for group in groups), start=ca.SX(0))
+        groups = ca.vertsplit(residual, self.group_size)
+        return sum(
+            (self._robust_loss_of_square(ca.sumsqr(group)) for group in groups), start=ca.SX(0)
+        )
 
-    def _rho(self, square: ca.SX) -> ca.SX:
+    def _robust_loss_of_square(self, square: ca.SX) -> ca.SX:
         """Expression of ρ from the squared length of a group."""
         if self.huber is None:
             return square
@@ -140,7 +145,9 @@ class Instrument:
         return ca.if_else(square > limit, beyond, square)
 
 
-def as_squares(residual: Array, slope: Array, huber: float | None) -> tuple[Array, Array]:
+def huber_as_least_squares(
+    residual: Array, derivatives: Array, huber: float | None
+) -> tuple[Array, Array]:
     """Scale residuals and derivatives such that their squares reproduce Huber's loss and its
     gradient.
 
@@ -152,51 +159,53 @@ def as_squares(residual: Array, slope: Array, huber: float | None) -> tuple[Arra
     ----------
     residual : (…, 3) array
         Residuals in standard deviations.
-    slope : (…, 3, p) array
+    derivatives : (…, 3, p) array
         Their derivatives by p parameters.
     huber : float or None
         Threshold δ; None returns both unchanged.
     """
     if huber is None:
-        return residual, slope
+        return residual, derivatives
     length = np.linalg.norm(residual, axis=-1, keepdims=True)
     beyond = np.maximum(length, huber)
     root = np.sqrt(2 * huber * beyond - huber**2)
     shrunk = residual * np.where(length > huber, root / beyond, 1.0)
-    return shrunk, slope * np.where(length > huber, huber / root, 1.0)[..., None]
+    return shrunk, derivatives * np.where(length > huber, huber / root, 1.0)[..., None]
 
 
-def as_weights(residual: Array, slope: Array, huber: float | None) -> tuple[Array, Array]:
+def huber_as_weights(
+    residual: Array, derivatives: Array, huber: float | None
+) -> tuple[Array, Array]:
     """Weight residuals and derivatives as Huber's loss does at its optimum, for statistics.
 
     Derivatives get the square root of the weight in the normal equations. Residuals are shortened
     to the threshold, so that a few outliers do not determine the noise of the others. Arguments as
-    in `as_squares`.
+    in `huber_as_least_squares`.
     """
     if huber is None:
-        return residual, slope
+        return residual, derivatives
     length = np.linalg.norm(residual, axis=-1, keepdims=True)
     weight = huber / np.maximum(length, huber)
-    return residual * weight, slope * np.sqrt(weight)[..., None]
+    return residual * weight, derivatives * np.sqrt(weight)[..., None]
 
 
-class Window(NamedTuple):
+class RowStencil(NamedTuple):
     """Vectors and data that samples are computed from.
 
     Attributes
     ----------
-    places : (S, E, v) array
+    indices : (S, E, v) array
         Indices of v vectors among those of the observable, flattened over times and points.
     data : (d, S, E) array
         Data of the expression.
     """
 
-    places: Index
+    indices: Index
     data: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Pooled:
+class PooledResiduals:
     """Residuals as statistics use them, in M groups of three.
 
     Attributes
@@ -205,7 +214,7 @@ class Pooled:
         Name of each group.
     sigmas : (M,) array
         Standard deviations.
-    components : (S, M, 3) array of bool
+    is_compared : (S, M, 3) array of bool
         Numbers that exist.
     places_m : (3M, 3) array or None
         Place of each number on the undeformed body [m]; None if they have none.
@@ -213,22 +222,22 @@ class Pooled:
 
     names: tuple[str, ...]
     sigmas: Array
-    components: NDArray[np.bool_]
+    is_compared: NDArray[np.bool_]
     places_m: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Reading(ABC):
+class MeasurementResidual(ABC):
     """Measurement model: S samples of E entities at a time, of m numbers each, in one experiment.
 
     Attributes
     ----------
-    channel : Channel
+    observable : Channel
         Observable; its values c are (n, e, 3), at the first n of its times.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
     huber : float or None
-        Threshold of Huber's loss, see `Instrument`; None means a quadratic loss.
+        Threshold of Huber's loss, see `ResidualExpression`; None means a quadratic loss.
     names : (G,) tuple of str
         Name of each group, G = E m / g.
     t_s : (S,) array
@@ -237,73 +246,73 @@ class Reading(ABC):
         Stated standard deviations, in the unit of the measurement.
     measured : (S, E, m) array
         Measurements ŷ, NaN where missing.
-    components : (S, G, g) array of bool
+    is_compared : (S, G, g) array of bool
         Numbers that are compared.
-    own : (E, f) array
+    own_parameters : (E, f) array
         Indices in φ of the nuisance parameters of each entity.
-    stated : str
+    sigma_key : str
         Key of σ in a problem file.
     has_offsets : bool
         Whether measurements have an unknown offset, such as a tare, which must be allowed for
         before anything is fitted.
-    group : int
+    group_size : int
         How many numbers the loss takes as one vector, g; three for a position.
-    has_fixed_windows : bool
+    has_fixed_stencils : bool
         Whether the stencils do not depend on φ.
-    noise_at_least_stated : bool
+    has_noise_floor : bool
         Whether error bars never use a noise below σ, and the residuals are not used to estimate the
         noise of other measurements. Set it for measurements with rounding errors, which may happen
         to be small.
     """
 
-    channel: Channel
+    observable: Channel
     nuisance: NuisanceMap
     huber: float | None
     names: tuple[str, ...]
     t_s: Array
     sigmas: Array
     measured: Array
-    components: NDArray[np.bool_]
-    own: Index
+    is_compared: NDArray[np.bool_]
+    own_parameters: Index
 
-    group: ClassVar[int] = GROUP
-    stated: ClassVar[str] = "sigma_m"
+    group_size: ClassVar[int] = GROUP
+    sigma_key: ClassVar[str] = "sigma_m"
     has_offsets: ClassVar[bool] = False
-    has_fixed_windows: ClassVar[bool] = True
-    noise_at_least_stated: ClassVar[bool] = False
+    has_fixed_stencils: ClassVar[bool] = True
+    has_noise_floor: ClassVar[bool] = False
 
     @property
-    def begins_s(self) -> float:
+    def first_needed_s(self) -> float:
         """Time [s] that must be known before the first sample can be compared, for any φ."""
-        return float(self.t_s[self.components.any(axis=(1, 2)).argmax()])
+        return float(self.t_s[self.is_compared.any(axis=(1, 2)).argmax()])
 
     @cached_property
-    def pool(self) -> Pooled:
+    def pooled_groups(self) -> PooledResiduals:
         """Groups that statistics use: those of the measurement, unless a subclass combines
         neighbours.
         """
-        return Pooled(self.names, self.sigmas, self.components)
+        return PooledResiduals(self.names, self.sigmas, self.is_compared)
 
-    def pooled(self, values: Array) -> Array:
+    def pool_values(self, values: Array) -> Array:
         """Return residuals (S, G, g, …), or their derivatives, as values (S, M, 3, …) of
-        the groups of `pool`.
+        the groups of `pooled_groups`.
         """
         return values
 
     @property
-    def looked_sigmas(self) -> Array:
+    def observable_sigmas(self) -> Array:
         """Standard deviations (3 e,) of the observable as one sample determines it;
         infinite where it does not.
         """
         return np.repeat(self.sigmas, GROUP)
 
     @abstractmethod
-    def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+    def expression(self, vectors: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the prediction y of one sample as a CasADi expression.
 
         Parameters
         ----------
-        looked : (3, v) SX
+        vectors : (3, v) SX
             Vectors of the observable.
         phi : SX
             Nuisance parameters of the entity.
@@ -312,28 +321,28 @@ class Reading(ABC):
         """
 
     @abstractmethod
-    def window(self, phi: Array, known: int) -> Window:
+    def stencil(self, phi: Array, known: int) -> RowStencil:
         """Return the stencil of those first samples for which the first `known` times of
         the observable may suffice.
         """
 
-    def windows(self) -> Index:
+    def all_stencils(self) -> Index:
         """Return the indices (…, E, v) of vectors that samples may be computed from, for any φ."""
-        return self.window(np.zeros(self.nuisance.size), self.channel.count).places
+        return self.stencil(np.zeros(self.nuisance.size), self.observable.count).indices
 
-    def there(self, known: int) -> NDArray[np.bool_]:
+    def compared_with(self, known: int) -> NDArray[np.bool_]:
         """Return the mask (S, G, 3) of the numbers that can be compared if the first
         `known` times are known.
         """
-        return self.components & self.covered(known)[:, None, None]
+        return self.is_compared & self.is_covered(known)[:, None, None]
 
-    def covered(self, known: int) -> NDArray[np.bool_]:
+    def is_covered(self, known: int) -> NDArray[np.bool_]:
         """Return the mask (S,) of the samples for which the first `known` times suffice,
         for any φ.
         """
         return np.ones(len(self.t_s), dtype=bool)
 
-    def roughly(self, x: Array, phi: Array) -> Array | None:
+    def rough_residuals(self, x: Array, phi: Array) -> Array | None:
         """Return residuals for ranking first guesses, or None if the ordinary residuals are
         suitable.
         """
@@ -342,11 +351,11 @@ class Reading(ABC):
     # One sample -------------------------------------------------------------------------------
 
     @cached_property
-    def _instruments(self) -> dict[tuple[int, int], Instrument]:
+    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
         """Generated functions by the numbers of vectors and of data."""
         return {}
 
-    def of_some(self, known_s: Array, t_s: Array, numbers: Array, **changes: Any) -> Self:
+    def with_samples(self, known_s: Array, t_s: Array, indices: Array, **changes: Any) -> Self:
         """Return the model of other samples, sharing the generated functions.
 
         Parameters
@@ -355,64 +364,72 @@ class Reading(ABC):
             Times at which the observable is known [s].
         t_s : (S,) array
             Times of the samples [s].
-        numbers : (S, m) array
+        indices : (S, m) array
             Measurements, NaN where missing.
         changes : Any
             Other attributes to replace.
         """
         measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
-        measured[:, 0, : numbers.shape[1]] = numbers
+        measured[:, 0, : indices.shape[1]] = indices
         is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
-        changes |= {"t_s": t_s, "measured": measured, "components": is_compared}
-        is_wrench = isinstance(self.channel, GraspWrench)
-        times = {"on": Grid.at(known_s)} if is_wrench else {"rows": np.arange(len(known_s))}
-        changes["channel"] = replace(self.channel, **times)
+        changes |= {"t_s": t_s, "measured": measured, "is_compared": is_compared}
+        is_wrench = isinstance(self.observable, GraspWrench)
+        times = (
+            {"reaction_grid": ReactionGrid.from_times(known_s)}
+            if is_wrench
+            else {"rows": np.arange(len(known_s))}
+        )
+        changes["observable"] = replace(self.observable, **times)
         other = replace(self, **changes)
         # Derivatives of the same expression are generated once.
-        vars(other)["_instruments"] = self._instruments
+        vars(other)["_expressions"] = self._expressions
         return other
 
-    def instrument(self, vectors: int, data: int) -> Instrument:
+    def expression_for(self, vectors: int, data: int) -> ResidualExpression:
         """Return the generated functions for stencils of `vectors` vectors and `data` data."""
-        if (vectors, data) not in self._instruments:
-            self._instruments[vectors, data] = Instrument(
+        if (vectors, data) not in self._expressions:
+            self._expressions[vectors, data] = ResidualExpression(
                 self.expression,
-                vectors=vectors,
-                own=self.own.shape[1],
-                data=data,
-                measured=self.measured.shape[2],
+                vector_count=vectors,
+                nuisance_count=self.own_parameters.shape[1],
+                data_count=data,
+                measured_count=self.measured.shape[2],
                 huber=self.huber,
-                group=self.group,
+                group_size=self.group_size,
             )
-        return self._instruments[vectors, data]
+        return self._expressions[vectors, data]
 
     @cached_property
-    def _compared(self) -> tuple[Array, Array]:
+    def _data_and_weights(self) -> tuple[Array, Array]:
         """Measurements ŷ (m, S, E), and 1/σ, which is zero where nothing is compared."""
-        weight = (self.components / self.sigmas[:, None]).reshape(self.measured.shape)
+        weight = (self.is_compared / self.sigmas[:, None]).reshape(self.measured.shape)
         return np.moveaxis(np.nan_to_num(self.measured), 2, 0), np.moveaxis(weight, 2, 0)
 
-    def _at(self, values: Array, phi: Array) -> tuple[Instrument, Window, Array, Array]:
+    def _inputs_at(
+        self, values: Array, phi: Array
+    ) -> tuple[ResidualExpression, RowStencil, Array, Array]:
         """Return generated functions, stencil, inputs u (k, s, E) and data of the samples
         that can be computed.
         """
-        window = self.window(phi, len(values))
-        samples, each, vectors = window.places.shape
-        around = values.reshape(-1, GROUP)[window.places].reshape(samples, each, GROUP * vectors)
-        own = np.broadcast_to(phi[self.own.T][:, None], (self.own.shape[1], samples, each))
-        measured, weight = (part[:, :samples] for part in self._compared)
-        is_covered = self.covered(len(values))[:samples, None]
+        window = self.stencil(phi, len(values))
+        samples, each, vectors = window.indices.shape
+        around = values.reshape(-1, GROUP)[window.indices].reshape(samples, each, GROUP * vectors)
+        own = np.broadcast_to(
+            phi[self.own_parameters.T][:, None], (self.own_parameters.shape[1], samples, each)
+        )
+        measured, weight = (part[:, :samples] for part in self._data_and_weights)
+        is_covered = self.is_covered(len(values))[:samples, None]
         data = np.concatenate([window.data, measured, weight * is_covered])
         u = np.concatenate([around.transpose(2, 0, 1), own])
-        return self.instrument(vectors, len(window.data)), window, u, data
+        return self.expression_for(vectors, len(window.data)), window, u, data
 
     def _grouped(self, values: Array) -> Array:
         """Return values (m, s, E) as groups (s, G, g)."""
-        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), self.group)
+        return values.transpose(1, 2, 0).reshape(values.shape[1], len(self.names), self.group_size)
 
     # All samples ------------------------------------------------------------------------------
 
-    def predicted(self, values: Array, phi: Array) -> Array:
+    def predict(self, values: Array, phi: Array) -> Array:
         """Return predictions y (s, G, g), for the first samples that the values suffice for.
 
         Parameters
@@ -422,22 +439,22 @@ class Reading(ABC):
         phi : (k,) array
             Nuisance parameters.
         """
-        instrument, window, u, data = self._at(values, phi)
+        instrument, window, u, data = self._inputs_at(values, phi)
         own = len(window.data)
         measured = self.measured.shape[2]
         data[own : own + measured] = 0.0
         data[own + measured :] = 1.0
-        return self._grouped(instrument.residual.value(u, data))
+        return self._grouped(instrument.residual.evaluate(u, data))
 
     def residuals(self, values: Array, phi: Array) -> Array:
         """Return residuals (y − ŷ) / σ (s, G, g), zero where missing; arguments as in
-        `predicted`.
+        `predict`.
         """
-        instrument, _, u, data = self._at(values, phi)
-        return self._grouped(instrument.residual.value(u, data))
+        instrument, _, u, data = self._inputs_at(values, phi)
+        return self._grouped(instrument.residual.evaluate(u, data))
 
-    def linearised(
-        self, values: Array, slopes: Slopes, phi: Array, size: int
+    def linearise(
+        self, values: Array, observable_derivatives: ObservableDerivatives, phi: Array, size: int
     ) -> tuple[Array, Array]:
         """Return residuals (s, G, g) and their derivatives (s, G, g, size) by all parameters.
 
@@ -445,7 +462,7 @@ class Reading(ABC):
         ----------
         values : (n, e, 3) array
             Values of the observable.
-        slopes : Slopes
+        observable_derivatives : MemoryForwardColumns
             Their derivatives.
         phi : (k,) array
             Nuisance parameters; they are the last of all parameters.
@@ -453,80 +470,87 @@ class Reading(ABC):
             Number of all parameters.
         """
         if not len(values):
-            none = np.zeros((len(self.window(phi, 0).places), len(self.names), self.group))
+            none = np.zeros((len(self.stencil(phi, 0).indices), len(self.names), self.group_size))
             return none, np.zeros((*none.shape, size))
-        window, residual, by_u = self._read(values, phi)
-        samples, each, vectors = window.places.shape
+        window, residual, by_u = self._evaluate(values, phi)
+        samples, each, vectors = window.indices.shape
         by_looked = by_u[..., : GROUP * vectors]
         by_own = by_u[..., GROUP * vectors :]
         derivatives = np.zeros((*by_u.shape[:3], size))
         first = size - len(phi)
-        derivatives[..., slopes.columns] = by_looked @ _around(slopes.by, window.places)
-        if len(slopes.entities):
-            entities = slopes.entities
-            times = window.places[:, entities] // values.shape[1]
+        derivatives[..., observable_derivatives.columns] = by_looked @ _gather(
+            observable_derivatives.by_common, window.indices
+        )
+        if len(observable_derivatives.entities):
+            entities = observable_derivatives.entities
+            times = window.indices[:, entities] // values.shape[1]
             number = np.arange(len(entities))[:, None]
-            shape = samples, len(entities), GROUP * vectors, slopes.own.shape[3]
-            around = slopes.own[times, number].reshape(shape)
-            _add(derivatives, entities, first + slopes.places, by_looked[:, entities] @ around)
-        if self.own.size:
-            _add(derivatives, np.arange(each), first + self.own, by_own)
-        grouped = residual.reshape(samples, len(self.names), self.group)
+            shape = samples, len(entities), GROUP * vectors, observable_derivatives.by_own.shape[3]
+            around = observable_derivatives.by_own[times, number].reshape(shape)
+            _add_columns(
+                derivatives,
+                entities,
+                first + observable_derivatives.own_parameters,
+                by_looked[:, entities] @ around,
+            )
+        if self.own_parameters.size:
+            _add_columns(derivatives, np.arange(each), first + self.own_parameters, by_own)
+        grouped = residual.reshape(samples, len(self.names), self.group_size)
         return grouped, derivatives.reshape(*grouped.shape, size)
 
-    def _read(self, values: Array, phi: Array) -> tuple[Window, Array, Array]:
+    def _evaluate(self, values: Array, phi: Array) -> tuple[RowStencil, Array, Array]:
         """Return the stencil, residuals (s, E, m) and their derivatives (s, E, m, u) by the
         inputs.
         """
-        if self._linear is None or len(values) < self.channel.count:
-            instrument, window, u, data = self._at(values, phi)
-            residual, by_u = instrument.residual.slopes(u, data)
+        if self._linear_part is None or len(values) < self.observable.count:
+            instrument, window, u, data = self._inputs_at(values, phi)
+            residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
             return window, residual.transpose(1, 2, 0), by_u.transpose(2, 3, 0, 1)
-        window, at_zero, by_u = self._linear
-        samples, each, vectors = window.places.shape
-        around = values.reshape(-1, GROUP)[window.places].reshape(samples, each, GROUP * vectors)
-        if self.own.size:
-            own = np.broadcast_to(phi[self.own], (samples, *self.own.shape))
+        window, at_zero, by_u = self._linear_part
+        samples, each, vectors = window.indices.shape
+        around = values.reshape(-1, GROUP)[window.indices].reshape(samples, each, GROUP * vectors)
+        if self.own_parameters.size:
+            own = np.broadcast_to(phi[self.own_parameters], (samples, *self.own_parameters.shape))
             around = np.concatenate([around, own], axis=2)
         return window, at_zero + (by_u @ around[..., None])[..., 0], by_u
 
     @cached_property
-    def _linear(self) -> tuple[Window, Array, Array] | None:
+    def _linear_part(self) -> tuple[RowStencil, Array, Array] | None:
         """Stencil, residuals and derivatives at zero inputs; None if derivatives are not
         constant.
         """
-        if not self.has_fixed_windows or not self._first.residual.is_linear:
+        if not self.has_fixed_stencils or not self._full_expression.residual.is_linear:
             return None
-        nothing = np.zeros((self.channel.count, self.channel.each, GROUP))
-        instrument, window, u, data = self._at(nothing, np.zeros(self.nuisance.size))
-        residual, by_u = instrument.residual.slopes(u, data)
+        nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
+        instrument, window, u, data = self._inputs_at(nothing, np.zeros(self.nuisance.size))
+        residual, by_u = instrument.residual.evaluate_with_jacobian(u, data)
         by_u = np.ascontiguousarray(by_u.transpose(2, 3, 0, 1))
         return window, np.ascontiguousarray(residual.transpose(1, 2, 0)), by_u
 
-    def changes(self, values: Array, by: Array, phi: Array) -> Array:
+    def residual_changes(self, values: Array, by: Array, phi: Array) -> Array:
         """Return the changes (s, M, 3, c) of the pooled residuals if the observable changes
         by `by` (n, e, 3, c).
         """
         size = by.shape[3] + len(phi)
-        slopes = Slopes.along(np.arange(by.shape[3]), by)
-        return self.pooled(self.linearised(values, slopes, phi, size)[1][..., : by.shape[3]])
+        slopes = ObservableDerivatives.without_own(np.arange(by.shape[3]), by)
+        return self.pool_values(self.linearise(values, slopes, phi, size)[1][..., : by.shape[3]])
 
     def loss(self, values: Array, phi: Array) -> float:
         """Return the loss Σ ρ of values (n, e, 3) at φ (k,)."""
         if not len(values):
             return 0.0
-        instrument, _, u, data = self._at(values, phi)
-        return float(instrument.loss.value(u, data).sum())
+        instrument, _, u, data = self._inputs_at(values, phi)
+        return float(instrument.loss.evaluate(u, data).sum())
 
-    def loss_slopes(self, values: Array, phi: Array) -> tuple[Array, Array]:
+    def loss_gradient(self, values: Array, phi: Array) -> tuple[Array, Array]:
         """Return the gradient of the loss by the observable (n, e, 3) and by φ (k,)."""
         by_values = np.zeros_like(values)
         by_phi = np.zeros(len(phi))
         if not len(values):
             return by_values, by_phi
-        instrument, window, u, data = self._at(values, phi)
-        by_u = instrument.loss.slopes(u, data)[1][0]
-        places = window.places
+        instrument, window, u, data = self._inputs_at(values, phi)
+        by_u = instrument.loss.evaluate_with_jacobian(u, data)[1][0]
+        places = window.indices
         by_looked, by_own = np.split(by_u, [GROUP * places.shape[2]])
         by_looked = by_looked.reshape(places.shape[2], GROUP, *places.shape[:2])
         where = np.moveaxis(places, 2, 0).ravel()
@@ -535,17 +559,17 @@ class Reading(ABC):
             by_values[..., axis] = np.bincount(
                 where, by_looked[:, axis].ravel(), minlength=count
             ).reshape(values.shape[:2])
-        np.add.at(by_phi, self.own, by_own.sum(axis=1).T)
+        np.add.at(by_phi, self.own_parameters, by_own.sum(axis=1).T)
         return by_values, by_phi
 
     # Second derivatives -----------------------------------------------------------------------
 
-    def _gathering(self, places: Index) -> sp.csr_array:
+    def _gather_matrix(self, places: Index) -> sp.csr_array:
         """Return ∂u/∂(c, φ) of samples with stencils (s, E, v); rows by sample, then by input."""
         samples, each, vectors = places.shape
         of_looked = GROUP * places[..., None] + np.arange(GROUP)
-        first = GROUP * self.channel.count * self.channel.each
-        own = np.broadcast_to(first + self.own, (samples, *self.own.shape))
+        first = GROUP * self.observable.count * self.observable.vector_count
+        own = np.broadcast_to(first + self.own_parameters, (samples, *self.own_parameters.shape))
         columns = np.concatenate([of_looked.reshape(samples, each, GROUP * vectors), own], axis=2)
         rows = np.arange(columns.size + 1)
         shape = columns.size, first + self.nuisance.size
@@ -554,38 +578,44 @@ class Reading(ABC):
     @property
     def is_quadratic(self) -> bool:
         """Whether second derivatives of the loss by the observable are constant."""
-        return self._first.is_quadratic
+        return self._full_expression.is_quadratic
 
     @cached_property
-    def _first(self) -> Instrument:
+    def _full_expression(self) -> ResidualExpression:
         """Generated functions for the stencil of all times."""
-        window = self.window(np.zeros(self.nuisance.size), self.channel.count)
-        return self.instrument(window.places.shape[2], len(window.data))
+        window = self.stencil(np.zeros(self.nuisance.size), self.observable.count)
+        return self.expression_for(window.indices.shape[2], len(window.data))
 
     @cached_property
-    def _pattern(self) -> NDArray[np.bool_]:
+    def _curvature_pattern(self) -> NDArray[np.bool_]:
         """Mask (u, u) of the second derivatives that a sample may have."""
-        return self._first.loss.curvature_pattern
+        return self._full_expression.loss.hessian_pattern
 
-    def hessian_structure(self, slopes: sp.csr_array) -> tuple[Index, Index]:
+    def hessian_structure(self, derivatives: sp.csr_array) -> tuple[Index, Index]:
         """Return rows and columns of ∂²loss by some variables, upper triangle, sorted by column.
 
         Parameters
         ----------
-        slopes : sparse array
+        derivatives : sparse array
             Structure of the derivatives of (c, φ) by these variables, all ones.
         """
-        places = self.windows()
+        places = self.all_stencils()
         instances = int(np.prod(places.shape[:2]))
-        ones = np.broadcast_to(self._pattern.astype(float), (instances, *self._pattern.shape))
+        ones = np.broadcast_to(
+            self._curvature_pattern.astype(float), (instances, *self._curvature_pattern.shape)
+        )
         # Positive numbers cannot cancel, so that no entry is lost.
-        entries = _product(self._gathering(places) @ slopes, ones)
+        entries = _congruence(self._gather_matrix(places) @ derivatives, ones)
         order = np.lexsort(entries[:2])
         return entries.rows[order], entries.columns[order]
 
     def hessian(
-        self, values: Array, phi: Array, slopes: sp.csr_array, bent: bool = True
-    ) -> Entries:
+        self,
+        values: Array,
+        phi: Array,
+        derivatives: sp.csr_array,
+        has_observation_curvature: bool = True,
+    ) -> SparseEntries:
         """Return the entries of ∂²loss by some variables, upper triangle; entries may be missing or
         repeated.
 
@@ -595,18 +625,18 @@ class Reading(ABC):
             Values of the observable.
         phi : (k,) array
             Nuisance parameters.
-        slopes : sparse array
+        derivatives : sparse array
             Derivatives of (c, φ) by the variables.
-        bent : bool
-            If false, neglect the curvature of the observations, see `Instrument.curvature`.
+        has_observation_curvature : bool
+            If false, neglect the curvature of the observations, see `ResidualExpression.curvature`.
         """
-        instrument, window, u, data = self._at(values, phi)
-        by_u = np.moveaxis(instrument.curvature(u, data, bent), (0, 1), (2, 3))
+        instrument, window, u, data = self._inputs_at(values, phi)
+        by_u = np.moveaxis(instrument.curvature(u, data, has_observation_curvature), (0, 1), (2, 3))
         by_u = by_u.reshape(-1, *by_u.shape[2:])
-        return _product(self._gathering(window.places) @ slopes, by_u)
+        return _congruence(self._gather_matrix(window.indices) @ derivatives, by_u)
 
 
-def _around(by: Array, places: Index) -> Array:
+def _gather(by: Array, places: Index) -> Array:
     """Return changes (s, E, 3 v, c) of the stencils' vectors from changes (n, e, 3, c) of
     the observable.
     """
@@ -615,14 +645,14 @@ def _around(by: Array, places: Index) -> Array:
     return flat.reshape(*places.shape[:2], GROUP * places.shape[2], count)
 
 
-def _add(slope: Array, entities: Index, columns: Index, values: Array) -> None:
+def _add_columns(slope: Array, entities: Index, columns: Index, values: Array) -> None:
     """Add values (s, e, m, k) to columns (e, k) of the derivatives (s, E, m, size) of
     entities (e,), in place.
     """
     slope[:, entities[:, None], :, columns] += values.transpose(1, 3, 0, 2)
 
 
-def _product(slopes: sp.csr_array, blocks: Array) -> Entries:
+def _congruence(slopes: sp.csr_array, blocks: Array) -> SparseEntries:
     """Return the upper triangle of Sᵀ B S, B being block-diagonal with the blocks
     (instances, u, u).
     """
@@ -630,10 +660,10 @@ def _product(slopes: sp.csr_array, blocks: Array) -> Entries:
     middle = sp.bsr_array((blocks, count[:-1], count))
     upper = sp.coo_array(sp.triu(slopes.T @ (middle.tocsr() @ slopes), format="coo"))
     rows, columns = (np.asarray(index, dtype=np.int64) for index in upper.coords)
-    return Entries(rows, columns, np.asarray(upper.data, dtype=np.float64))
+    return SparseEntries(rows, columns, np.asarray(upper.data, dtype=np.float64))
 
 
-def times_around(known_s: Array, at_s: Array, count: int) -> Index:
+def neighbouring_times(known_s: Array, at_s: Array, count: int) -> Index:
     """Return the indices (S, count) of consecutive times around each sample, as evenly as possible.
 
     Parameters
@@ -650,17 +680,17 @@ def times_around(known_s: Array, at_s: Array, count: int) -> Index:
     return first[:, None] + np.arange(count)
 
 
-def lagrange_weights(at: T, places: Sequence[T]) -> list[Any]:
-    """Return Lagrange's weights of values at some places, for the value at `at`.
+def lagrange_weights(position: T, places: Sequence[T]) -> list[Any]:
+    """Return Lagrange's weights of values at some places, for the value at `position`.
 
     Parameters
     ----------
-    at : float or SX
+    position : float or SX
         Place of interpolation.
     places : sequence of float or SX
         Distinct places of the values.
     """
     return [
-        math.prod((at - other) / (own - other) for j, other in enumerate(places) if j != i)
+        math.prod((position - other) / (own - other) for j, other in enumerate(places) if j != i)
         for i, own in enumerate(places)
     ]

@@ -8,21 +8,21 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array
 from ..model.contact import Contact
 from ..model.forces import Forces
-from ..model.viscoelasticity import at_start
+from ..model.viscoelasticity import with_start_memory
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .factorisation import NONE
 from .lapack import one_blas_thread
-from .newton import NewtonFailure, Solver, followed, simulation_error
+from .newton import NewtonFailure, NewtonSolver, follow_path, simulation_error
 
 
 @one_blas_thread()
-def rest_state(
+def equilibrium(
     experiment: Experiment,
     theta: Array,
     time_s: float | None = None,
     start: Array | None = None,
-    solver: Solver | None = None,
+    solver: NewtonSolver | None = None,
 ) -> Array:
     """Return the static equilibrium (3n,) [m] under gravity and external forces, with grasped dofs
     prescribed.
@@ -42,7 +42,7 @@ def rest_state(
         Time of loads and poses [s]; the first time by default.
     start : (3n,) array, optional
         First guess [m].
-    solver : Solver, optional
+    solver : NewtonSolver, optional
         Newton's method with the prescribed dofs of that time; a new one by default.
 
     Raises
@@ -51,26 +51,28 @@ def rest_state(
         If no stable equilibrium is found.
     """
     at_s = float(experiment.t_s[0] if time_s is None else time_s)
-    goals_m = experiment.grasped([at_s])[1].ravel()
-    forces = Forces.of(experiment, at_s, theta)
-    return _at_rest(experiment, forces, goals_m, at_s, start, solver or Solver(experiment))
+    goals_m = experiment.prescribed_displacements([at_s])[1].ravel()
+    forces = Forces.from_experiment(experiment, at_s, theta)
+    return _solve_equilibrium(
+        experiment, forces, goals_m, at_s, start, solver or NewtonSolver(experiment)
+    )
 
 
-def _at_rest(
+def _solve_equilibrium(
     experiment: Experiment,
     forces: Forces,
     goals_m: Array,
     at_s: float,
     start: Array | None,
-    solver: Solver,
+    solver: NewtonSolver,
 ) -> Array:
     """Return the equilibrium (3n,) under given forces with prescribed positions (3n,); see
-    `rest_state`.
+    `equilibrium`.
     """
     zero_velocity = np.zeros((1, len(goals_m)))
     shape = experiment.rigid_positions([at_s])[0]
-    forces = at_start(forces, experiment.loaded_since_s)
-    without_contact = _before_contact(forces, shape)
+    forces = with_start_memory(forces, experiment.loaded_since_s)
+    without_contact = _without_contact(forces, shape)
 
     def solve(x: Array, share: float) -> Array:
         loaded = forces.scaled(share)
@@ -85,35 +87,41 @@ def _at_rest(
 
         # Grasps that are off are there at the end: the way there may be any.
         goal = (
-            goals_m if share == 1 else _on_the_way(experiment, without_contact, at_s, share).ravel()
+            goals_m
+            if share == 1
+            else _partial_displacement(experiment, without_contact, at_s, share).ravel()
         )
-        return solver.newton(x, residual, linearise, keep_definite=True, goal=goal[solver.held])
+        return solver.solve(
+            x, residual, linearise, keep_definite=True, prescribed_m=goal[solver.is_prescribed]
+        )
 
     guess = shape.ravel() if start is None and experiment.obstacles else start
     try:
-        return followed(solve, without_contact.ravel(), solver.options.halvings, guess)
+        return follow_path(solve, without_contact.ravel(), solver.options.max_halvings, guess)
     except NewtonFailure as failure:
         raise simulation_error(
             solver, failure, at_s, "finding the rest state", static=True
         ) from failure
 
 
-def _before_contact(forces: Forces, shape: Array) -> Array:
+def _without_contact(forces: Forces, shape: Array) -> Array:
     """Return a shape (n, 3) with each obstacle retracted by its deepest penetration [m].
 
     Deep inside a curved obstacle, contact forces are not stable; the obstacle must approach from
     outside.
     """
     places = shape.copy()
-    for term in forces.further:
+    for term in forces.external_terms:
         if isinstance(term, Contact):
-            frame = term.contact.obstacle.nodes
-            depth_m, normal = term.deepest(shape.ravel())
+            frame = term.law_of_contact.obstacle.nodes
+            depth_m, normal = term.deepest_point(shape.ravel())
             places[frame] -= max(depth_m, 0.0) * normal
     return places
 
 
-def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: float) -> Array:
+def _partial_displacement(
+    experiment: Experiment, carried_m: Array, time_s: float, share: float
+) -> Array:
     """Return positions (n, 3) with the grasps moved by a share of their displacement from the
     carried body [m].
 
@@ -121,14 +129,14 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
     squeezed or sheared at large rotations. Obstacles have their final rotation already. Other nodes
     keep their positions.
     """
-    positions = carried.copy()
+    positions = carried_m.copy()
     for grasp in experiment.grasps:
-        if not grasp.holds(time_s):
+        if not grasp.is_active(time_s):
             continue
-        start = carried[grasp.nodes]
+        start = carried_m[grasp.nodes]
         nodes = grasp.nodes
-        place = np.ix_(nodes, grasp.columns)
-        goal = grasp.carry(experiment.body.nodes_m, [time_s])[0]
+        place = np.ix_(nodes, grasp.axis_indices)
+        goal = grasp.positions_at(experiment.body.nodes_m, [time_s])[0]
         if isinstance(grasp, Obstacle):
             positions[nodes] = start + share * (goal - start)
             continue
@@ -137,17 +145,17 @@ def _on_the_way(experiment: Experiment, carried: Array, time_s: float, share: fl
         middle = start.mean(axis=0)
         way = (goal - start).mean(axis=0)
         partial_m = middle + share * way + part.apply(start - middle)
-        positions[place] = partial_m[:, grasp.columns]
+        positions[place] = partial_m[:, grasp.axis_indices]
     return positions
 
 
 @one_blas_thread()
-def start_state(
+def initial_state(
     experiment: Experiment,
     forces: Forces,
-    solver: Solver,
-    near: Array | None = None,
-    goals_m: Array | None = None,
+    solver: NewtonSolver,
+    guess: Array | None = None,
+    prescribed_m: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return initial positions x_0 [m] and velocities v_0 [m/s], each (3n,), by the experiment's
     start rule.
@@ -158,11 +166,11 @@ def start_state(
         The experiment.
     forces : Forces
         Forces at the start.
-    solver : Solver
+    solver : NewtonSolver
         Newton's method with the prescribed dofs of the start.
-    near : (3n,) array, optional
+    guess : (3n,) array, optional
         First guess of an equilibrium [m].
-    goals_m : (3n,) array, optional
+    prescribed_m : (3n,) array, optional
         Prescribed positions [m], NaN at free dofs; those of the experiment by default.
 
     Raises
@@ -174,8 +182,12 @@ def start_state(
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
     if experiment.start == "equilibrium":
         at_s = float(experiment.t_s[0])
-        goals_m = experiment.grasped([at_s])[1].ravel() if goals_m is None else goals_m
-        return _at_rest(experiment, forces, goals_m, at_s, near, solver), v0
+        prescribed_m = (
+            experiment.prescribed_displacements([at_s])[1].ravel()
+            if prescribed_m is None
+            else prescribed_m
+        )
+        return _solve_equilibrium(experiment, forces, prescribed_m, at_s, guess, solver), v0
     if experiment.start_positions_m is not None:
         return experiment.start_positions_m.ravel().copy(), v0
     return experiment.rigid_positions(experiment.t_s[:1]).ravel(), v0

@@ -114,6 +114,6 @@ def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
     return _Axis(free, fixed, splu(sp.csc_matrix(rows[:, free])), sp.csc_array(rows[:, fixed]))
 
 
-def added(x: Array, increment: Array) -> Array:
+def add_increment(x: Array, increment: Array) -> Array:
     """Return x + δ: the update of a time step, in which a body rotates little."""
     return x + increment

@@ -1,7 +1,8 @@
 """Correspondences between the points of a depth camera and the surface of the body.
 
 Points are not labelled: each belongs to the nearest point of the surface, for the current shape and
-camera pose (iterative closest points). A `Sighting` states these correspondences for every image;
+camera pose (iterative closest points). A `SurfaceCorrespondences` states these correspondences for
+every image;
 it is renewed as estimates change, as charts of marker places are. In between, residuals along the
 surface normals are smooth.
 """
@@ -20,10 +21,10 @@ from ..arrays import Array, Index
 from ..fem.body import Body
 from ..model.nuisance import NuisanceMap
 from ..recording.experiment import Experiment
-from .camera_alignment import alignment, thinned
+from .camera_alignment import align_camera, thinned
 from .outline import Outline
-from .skin import GRAZING, Skin
-from .view import View
+from .skin import GRAZING, VisibleSurface
+from .view import DepthCameraModel
 
 # Share of the distance perpendicular to the normal beyond which a point lies beyond an edge.
 BESIDE = 0.5
@@ -44,7 +45,7 @@ LEFT_OUT = ("far", "grazing", "turned away", "not chosen", "hidden")
 FRONT = 0.5
 
 
-def wide_m(shape_m: Array) -> float:
+def initial_gate_m(shape_m: Array) -> float:
     """Return the largest distance of points from a surface with nodes (n, 3) before
     anything is fitted [m].
     """
@@ -52,16 +53,16 @@ def wide_m(shape_m: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class SurfaceCorrespondences:
     """Points of a camera and corresponding points of the surface, in S images of at most E points.
 
     Attributes
     ----------
-    view : View
+    camera : DepthCameraModel
         Model of the camera.
     body : Body
         The body.
-    skin : Skin
+    surface : VisibleSurface
         Surface of the body.
     nodes, weights : (S, E, v) arrays
         Nodes of the surface, and shape functions of the corresponding points.
@@ -71,17 +72,17 @@ class Sighting:
         Measured points, and directions of their depths, in the camera's frame.
     places_m : (S, E, 3) array
         Corresponding points on the undeformed body [m].
-    used : (S, E) array of bool
+    is_compared : (S, E) array of bool
         Points that are compared.
     gate_m : float
         Points farther from the surface are taken to belong to something else [m].
-    left_out : mapping of str to int
+    excluded_counts : mapping of str to int
         Number of points that are not compared, by reason.
     shapes_m : (S, n, 3) array
         Surface nodes for which the correspondences were found [m].
-    start : mapping of str to float
+    start_values : mapping of str to float
         The camera's nuisance parameters for which they were found, by label.
-    settled : bool
+    has_converged : bool
         Whether shapes had hardly changed since the correspondences before. Only then are points
         left out that the body hides from the camera: with wrong shapes, too many would seem hidden.
     outline : Outline
@@ -89,38 +90,38 @@ class Sighting:
         no images.
     """
 
-    view: View
+    camera: DepthCameraModel
     body: Body
-    skin: Skin
+    surface: VisibleSurface
     nodes: Index
     weights: Array
     normals: Array
     points: Array
     rays: Array
     places_m: Array
-    used: NDArray[np.bool_]
+    is_compared: NDArray[np.bool_]
     gate_m: float
-    left_out: Mapping[str, int]
+    excluded_counts: Mapping[str, int]
     shapes_m: Array
-    start: Mapping[str, float]
-    settled: bool
+    start_values: Mapping[str, float]
+    has_converged: bool
     outline: Outline
 
     @classmethod
-    def of(
+    def from_shapes(
         cls,
-        view: View,
+        camera: DepthCameraModel,
         body: Body,
         shapes_m: Array,
         phi: Array,
         gate_m: float,
         settled: bool = False,
-    ) -> Sighting:
+    ) -> SurfaceCorrespondences:
         """Find the correspondences for given shapes.
 
         Parameters
         ----------
-        view : View
+        camera : DepthCameraModel
             Model of the camera.
         body : Body
             The body.
@@ -133,12 +134,12 @@ class Sighting:
         settled : bool
             Whether to leave out points that the body hides.
         """
-        skin = Skin.of(body, view.depth)
+        skin = VisibleSurface.from_body(body, camera.depth)
         images = [
-            _seen(view, skin, body, k, x, phi=phi, gate_m=gate_m, settled=settled)
+            _match_image(camera, skin, body, k, x, phi=phi, gate_m=gate_m, settled=settled)
             for k, x in enumerate(shapes_m)
         ]
-        most = max(1, *(len(each["used"]) for each in images))
+        most = max(1, *(len(each["is_compared"]) for each in images))
         arrays: dict[str, Any] = {
             name: np.stack(
                 [
@@ -150,15 +151,22 @@ class Sighting:
             if name != "reasons"
         }
         total = np.sum([each["reasons"] for each in images], axis=0).tolist()
-        own: dict[str, Any] = {"left_out": dict(zip(LEFT_OUT, total, strict=True))}
-        own |= {"start": view.told(phi), "gate_m": gate_m, "shapes_m": shapes_m, "settled": settled}
+        own: dict[str, Any] = {"excluded_counts": dict(zip(LEFT_OUT, total, strict=True))}
+        own |= {
+            "start_values": camera.parameter_values(phi),
+            "gate_m": gate_m,
+            "shapes_m": shapes_m,
+            "has_converged": settled,
+        }
         own["outline"] = Outline.from_shapes(
-            view, skin, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
+            camera, skin, body, shapes_m=shapes_m, phi=phi, gate_m=gate_m
         )
-        return cls(view, body, skin, **own, **arrays)
+        return cls(camera, body, skin, **own, **arrays)
 
     @classmethod
-    def aligned(cls, view: View, body: Body, shapes_m: Array, phi: Array) -> Sighting:
+    def from_alignment(
+        cls, camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array
+    ) -> SurfaceCorrespondences:
         """Align the camera with the first shape, then find the correspondences.
 
         The alignment is rejected if it differs from the stated pose by more than four prior
@@ -166,7 +174,7 @@ class Sighting:
 
         Parameters
         ----------
-        view : View
+        camera : DepthCameraModel
             Model of the camera.
         body : Body
             The body.
@@ -175,19 +183,21 @@ class Sighting:
         phi : (k,) array
             Nuisance parameters, for those that the alignment does not estimate.
         """
-        first = view.depth.first
-        skin = Skin.of(body, view.depth)
-        turn, shift_m = alignment(view, skin, shapes_m[first], first)
-        moved = view.with_pose(phi, turn, shift_m)
-        is_implausible = np.abs(moved[view.own]).max(initial=0.0) > FARTHEST
-        gate_m = max(wide_m(body.nodes_m), view.depth.gate_m)
+        first = camera.depth.first_sample_with_points
+        skin = VisibleSurface.from_body(body, camera.depth)
+        turn, shift_m = align_camera(camera, skin, shapes_m[first], first)
+        moved = camera.with_pose(phi, turn, shift_m)
+        is_implausible = np.abs(moved[camera.parameter_indices]).max(initial=0.0) > FARTHEST
+        gate_m = max(initial_gate_m(body.nodes_m), camera.depth.gate_m)
         phi = phi if is_implausible else moved
-        clouds = tuple(map(thinned, view.depth.clouds))
-        thinned_view = replace(view, depth=replace(view.depth, clouds=clouds, images_m=()))
-        gate_m = cls.of(thinned_view, body, shapes_m, phi, gate_m).next_gate_m(shapes_m, phi)
-        return cls.of(view, body, shapes_m, phi, gate_m)
+        clouds = tuple(map(thinned, camera.depth.clouds))
+        thinned_view = replace(camera, depth=replace(camera.depth, clouds=clouds, images_m=()))
+        gate_m = cls.from_shapes(thinned_view, body, shapes_m, phi, gate_m).next_gate_m(
+            shapes_m, phi
+        )
+        return cls.from_shapes(camera, body, shapes_m, phi, gate_m)
 
-    def following(self, shapes_m: Array, phi: Array) -> Sighting:
+    def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
         """Update the correspondences.
 
         Parameters
@@ -204,62 +214,64 @@ class Sighting:
         """
         known = len(shapes_m)
         all_shapes_m = np.concatenate([shapes_m, self.shapes_m[known:]])
-        depth = self.view.depth
-        before = self.view.phi(self.start)
+        depth = self.camera.depth
+        before = self.camera.parameters_from(self.start_values)
         moved_m = np.abs(shapes_m - self.shapes_m[:known]).max(initial=0.0)
         for k in range(known if moved_m < FRONT * depth.spacing_m else 0):
-            way = self.view.world(phi, k) - self.view.world(before, k)
+            way = self.camera.world_points(phi, k) - self.camera.world_points(before, k)
             moved_m = max(moved_m, np.abs(way).max(initial=0.0))
         gate_m = self.next_gate_m(all_shapes_m, phi)
         settled = moved_m < FRONT * depth.spacing_m
-        if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.settled:
+        if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.has_converged:
             return self
-        return Sighting.of(self.view, self.body, all_shapes_m, phi, gate_m, settled)
+        return SurfaceCorrespondences.from_shapes(
+            self.camera, self.body, all_shapes_m, phi, gate_m, settled
+        )
 
-    def missed_m(self, x: Array, phi: Array) -> Array:
+    def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
         """Return the distances (P,) from visible parts of a shape x (n, 3) to the points of the
         first image [m].
 
-        Distances are limited to `wide_m` of the body.
+        Distances are limited to `initial_gate_m` of the body.
         """
-        view = self.view
-        is_facing = self.skin.facing(x, self.view.eye_m(phi, 0), GRAZING)
-        middles = x[self.skin.flat[is_facing]].mean(axis=1)
-        distances_m, _ = KDTree(view.world(phi, 0)).query(middles)
-        return np.minimum(distances_m, wide_m(self.body.nodes_m))
+        view = self.camera
+        is_facing = self.surface.is_facing(x, self.camera.eye_m(phi, 0), GRAZING)
+        middles = x[self.surface.flat_triangles[is_facing]].mean(axis=1)
+        distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
+        return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
 
     def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
         """Return a narrower gate if the points are near enough to the surface [m], else the
         present gate.
         """
-        gate_m = max(self._scatter_m(shapes_m, phi), self.view.depth.gate_m)
+        gate_m = max(self._expected_distance_m(shapes_m, phi), self.camera.depth.gate_m)
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
 
-    def _scatter_m(self, shapes_m: Array, phi: Array) -> float:
+    def _expected_distance_m(self, shapes_m: Array, phi: Array) -> float:
         """Return six times the median distance of the compared points from the surface [m];
         infinite without any.
         """
-        distances_m = self.apart_m(shapes_m, phi)
+        distances_m = self.signed_distances_m(shapes_m, phi)
         all_of_them = np.abs(distances_m[np.isfinite(distances_m)])
         return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
 
-    def apart_m(self, shapes_m: Array, phi: Array) -> Array:
+    def signed_distances_m(self, shapes_m: Array, phi: Array) -> Array:
         """Return how far points (S, E) are behind shapes (S, n, 3), along the normals [m].
 
         NaN where a point is not compared.
         """
-        distances_m = np.full(self.used.shape, np.nan)
+        distances_m = np.full(self.is_compared.shape, np.nan)
         for k, x in enumerate(shapes_m):
             surface = np.einsum("ea,eai->ei", self.weights[k], x[self.nodes[k]])
-            measured = self.view.corrected_at(phi, self.points[k], self.rays[k], k)
+            measured = self.camera.to_world(phi, self.points[k], self.rays[k], k)
             behind_m = np.sum(self.normals[k] * (surface - measured), axis=1)
-            distances_m[k] = np.where(self.used[k], behind_m, np.nan)
+            distances_m[k] = np.where(self.is_compared[k], behind_m, np.nan)
         return distances_m
 
 
-def _seen(
-    view: View,
-    skin: Skin,
+def _match_image(
+    camera: DepthCameraModel,
+    surface: VisibleSurface,
     body: Body,
     sample: int,
     x: Array,
@@ -272,15 +284,16 @@ def _seen(
     Returns
     -------
     dict of arrays
-        Arrays of the points within the gate, by attribute name of `Sighting`; and "reasons", the
+        Arrays of the points within the gate, by attribute name of `SurfaceCorrespondences`; and
+        "reasons", the
         numbers of points left out in the order of `LEFT_OUT`.
     """
-    depth = view.depth
-    cloud = view.depth.clouds[sample]
-    world = view.world(phi, sample)
-    eye_m = view.eye_m(phi, sample)
-    indices, faces, places = _near(world, skin, x, eye_m, gate_m)
-    weights, feet, normals = skin.points(x, faces, places)
+    depth = camera.depth
+    cloud = camera.depth.clouds[sample]
+    world = camera.world_points(phi, sample)
+    eye_m = camera.eye_m(phi, sample)
+    indices, faces, places = _nearest_facing(world, surface, x, eye_m, gate_m)
+    weights, feet, normals = surface.evaluate(x, faces, places)
     ways = normals if eye_m is None else eye_m - feet
     is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
     offsets = world[indices] - feet
@@ -291,32 +304,39 @@ def _seen(
     normals[is_beyond_edge] = offsets[is_beyond_edge] / distance[is_beyond_edge, None]
     has_similar_normal = is_visible = is_any = np.ones(len(indices), dtype=bool)
     if cloud.shape[1] == 6:
-        measured = cloud[indices, 3:] @ view.motion[0][sample].T
+        measured = cloud[indices, 3:] @ camera.poses[0][sample].T
         has_similar_normal = np.sum(normals * measured, axis=1) >= GRAZING
     if settled:
-        is_visible = ~skin.hidden(x, eye_m, feet, FRONT * depth.spacing_m)
+        is_visible = ~surface.is_hidden(x, eye_m, feet, FRONT * depth.spacing_m)
     is_within_gate = distance <= gate_m
     remaining = np.cumprod(
-        [is_any, is_within_gate, is_frontal, has_similar_normal, skin.chosen[faces], is_visible],
+        [
+            is_any,
+            is_within_gate,
+            is_frontal,
+            has_similar_normal,
+            surface.is_selected[faces],
+            is_visible,
+        ],
         axis=0,
     )
     reasons = -np.diff(remaining.sum(axis=1))
     reasons[0] += len(cloud) - len(indices)
-    rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[skin.nodes][skin.faces[faces]])
+    rest_m = np.einsum("pa,pai->pi", weights, body.nodes_m[surface.nodes][surface.faces[faces]])
     of_points = {
-        "nodes": skin.faces[faces],
+        "nodes": surface.faces[faces],
         "weights": weights,
         "normals": normals,
         "points": cloud[indices, :3],
-        "rays": view.rays[sample][indices],
+        "rays": camera.rays[sample][indices],
         "places_m": rest_m,
-        "used": remaining[-1].astype(bool),
+        "is_compared": remaining[-1].astype(bool),
     }
     return {name: each[is_within_gate] for name, each in of_points.items()} | {"reasons": reasons}
 
 
-def _near(
-    world: Array, skin: Skin, x: Array, eye_m: Array | None, gate_m: float
+def _nearest_facing(
+    world: Array, surface: VisibleSurface, x: Array, eye_m: Array | None, gate_m: float
 ) -> tuple[Index, Index, Array]:
     """Return indices of points near a shape, and the nearest points of faces towards the camera:
     faces and barycentric coordinates.
@@ -325,7 +345,7 @@ def _near(
     ----------
     world : (P, 3) array
         Points in the world [m].
-    skin : Skin
+    surface : VisibleSurface
         Surface of the body.
     x : (n, 3) array
         Surface nodes [m].
@@ -337,24 +357,26 @@ def _near(
     low = x.min(axis=0) - gate_m
     high = x.max(axis=0) + gate_m
     near = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
-    facing = np.flatnonzero(skin.facing(x, eye_m))
+    facing = np.flatnonzero(surface.is_facing(x, eye_m))
     if not len(facing) or not len(near):
         return near[:0], near[:0], np.zeros((0, 3))
-    return near, *skin.nearest(x, world[near], facing)
+    return near, *surface.nearest_points(x, world[near], facing)
 
 
-def sightings_of(experiment: Experiment) -> tuple[Sighting, ...]:
+def initial_correspondences(experiment: Experiment) -> tuple[SurfaceCorrespondences, ...]:
     """Return the correspondences of an experiment's depth cameras with the undeformed body
     in its grasps.
     """
     if not experiment.depths:
         return ()
-    nuisance = NuisanceMap.of(experiment)
+    nuisance = NuisanceMap.from_experiment(experiment)
     sightings = []
     for number, depth in enumerate(experiment.depths):
-        view = View.of(experiment, number, nuisance)
-        nodes = Skin.of(experiment.body, depth).nodes
-        shapes_m = experiment.rigid_positions(depth.times)[:, nodes]
+        view = DepthCameraModel.from_experiment(experiment, number, nuisance)
+        nodes = VisibleSurface.from_body(experiment.body, depth).nodes
+        shapes_m = experiment.rigid_positions(depth.sample_times_s)[:, nodes]
         nothing = np.zeros(nuisance.size)
-        sightings.append(Sighting.aligned(view, experiment.body, shapes_m, nothing))
+        sightings.append(
+            SurfaceCorrespondences.from_alignment(view, experiment.body, shapes_m, nothing)
+        )
     return tuple(sightings)

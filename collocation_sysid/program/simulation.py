@@ -20,19 +20,19 @@ from ..arrays import Array
 from ..errors import InputError, SimulationError
 from ..model.dynamics import Dynamics
 from ..model.nuisance import NuisanceMap
-from ..model.parameters import Parameters, theta_of
+from ..model.parameters import Parameters, resolve_theta
 from ..model.schemes import MOST_STEPS, Scheme, as_scheme
 from ..recording.experiment import Experiment
 from ..recording.nuisance import Nuisance
-from .channel import Forced, Motion
-from .gauge import gauge_readings
-from .lost_stability import explained
-from .marching import Progress, march
-from .newmark import newmark
+from .channel import ObservedMotion, ReactionForces
+from .gauge import custom_sensor_residuals
+from .lost_stability import explain_failure
+from .marching import Progress, simulate_scheme
+from .newmark import simulate_newmark
 from .newton import NewtonOptions
-from .reaction import forces_on, reactions
-from .wrench import wrench_readings
-from .wrench_channel import Grid, sensed_dofs
+from .reaction import forces_on_dofs, reaction_forces
+from .wrench import wrench_residuals
+from .wrench_channel import ReactionGrid, sensed_dofs
 
 # Name of the integrator that is no collocation scheme, and its order of accuracy.
 NEWMARK = "newmark"
@@ -65,12 +65,12 @@ class Trajectory:
         Node velocities [m/s]; zero in a static experiment.
     markers_m : (T, M, 3) array
         Markers [m].
-    reactions : (Grid, Forced)
+    reactions : (Table, ReactionForces)
         Reaction forces on the dofs of instrumented grasps, and their times.
     wrenches : tuple of (S, 6) arrays
         Predictions of the force–torque sensors at their times [N] and [N m], NaN outside the known
         times.
-    readings : tuple of (S, m) arrays
+    custom_sensor_values : tuple of (S, m) arrays
         Predictions of the custom sensors, from the positions at the samples.
     steps_per_sample : int
         Time steps between samples; 1 in a static experiment.
@@ -83,16 +83,16 @@ class Trajectory:
     positions_m: Array
     velocities_m_s: Array
     markers_m: Array
-    reactions: tuple[Grid, Forced]
+    reactions: tuple[ReactionGrid, ReactionForces]
     wrenches: tuple[Array, ...]
-    readings: tuple[Array, ...] = ()
+    custom_sensor_values: tuple[Array, ...] = ()
     steps_per_sample: int = 1
     step_error_m: float | None = None
 
 
 def require_steps(experiment: Experiment, step_s: float) -> None:
     """Raise InputError if a time step needs too many steps per sample of an experiment."""
-    if not experiment.static and experiment.timestep_s > MOST_STEPS * step_s:
+    if not experiment.is_static and experiment.timestep_s > MOST_STEPS * step_s:
         raise InputError(
             f"found steps of {step_s:g} s; expected at most {MOST_STEPS} from sample to sample"
         )
@@ -140,13 +140,13 @@ def simulate(
         density that leaves a node without mass.
     SimulationError
         When a step fails even after halvings; names time and element, and where an equilibrium
-        ceased to be stable the mode, see `program.lost_stability`.
+        ceased to be stable the mode, see `program.find_lost_stability`.
     """
-    theta = theta_of(experiment.body, parameters)
+    theta = resolve_theta(experiment.body, parameters)
     try:
         return _simulate(experiment, theta, integrator, timestep_s, substeps, options, progress)
     except SimulationError as error:
-        if (reason := explained(experiment, theta, error)) is error:
+        if (reason := explain_failure(experiment, theta, error)) is error:
             raise
         raise reason from error
 
@@ -167,14 +167,14 @@ def _simulate(
         raise InputError(f"substeps = {substeps!r}, expected a whole number or 'auto'")
     if isinstance(substeps, int) and substeps < 1:
         raise InputError(f"substeps = {substeps}, expected at least 1")
-    if (massless := experiment.body.massless(theta)) is not None:
+    if (massless := experiment.body.mass_problem(theta)) is not None:
         raise InputError(massless)
-    if (unreachable := experiment.body.unreachable(theta)) is not None:
+    if (unreachable := experiment.body.rest_shape_failure(theta)) is not None:
         raise InputError(unreachable)
-    if integrator == NEWMARK and timestep_s is not None and not experiment.static:
+    if integrator == NEWMARK and timestep_s is not None and not experiment.is_static:
         require_steps(experiment, timestep_s)
         substeps = max(1, round(experiment.timestep_s / timestep_s))
-    if experiment.static:
+    if experiment.is_static:
         substeps = 1
     if isinstance(substeps, int):
         return _with_steps(experiment, theta, integrator, substeps, options, progress)
@@ -242,29 +242,29 @@ def _with_steps(
 ) -> Trajectory:
     """Return the simulation with a number of time steps between samples, see `simulate`."""
     sensed = sensed_dofs(experiment)
-    if integrator == NEWMARK and not experiment.static:
-        x, v, forced = newmark(experiment, theta, steps, options, progress, sensed)
+    if integrator == NEWMARK and not experiment.is_static:
+        x, v, forced = simulate_newmark(experiment, theta, steps, options, progress, sensed)
         rows = (len(x) - 1) * steps + 1
-        at = Grid.at(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
+        at = ReactionGrid.from_times(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
     else:
-        dynamics = Dynamics.of(experiment, integrator, steps).with_theta(theta)
-        grid = march(experiment, dynamics, options, progress)
+        dynamics = Dynamics.from_experiment(experiment, integrator, steps).with_theta(theta)
+        grid = simulate_scheme(experiment, dynamics, options, progress)
         x = grid[::steps]
         zeros = np.zeros_like(grid)
-        v = zeros if experiment.static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
-        at = Grid.of(dynamics)
-        force = forces_on(dynamics, grid, sensed)
-        mass_kg = dynamics.mass.kg[:, sensed]
+        v = zeros if experiment.is_static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
+        at = ReactionGrid.from_dynamics(dynamics)
+        force = forces_on_dofs(dynamics, grid, sensed)
+        mass_kg = dynamics.mass.inertia_kg[:, sensed]
         acceleration = dynamics.acceleration(grid)
-        reaction = reactions(dynamics, mass_kg, force, acceleration[:, sensed])
-        forced = Forced(reaction, grid[:, sensed])
+        reaction = reaction_forces(dynamics, mass_kg, force, acceleration[:, sensed])
+        forced = ReactionForces(reaction, grid[:, sensed])
     shape = (len(x), -1, 3)
     positions = x.reshape(shape)
-    markers = experiment.markers.observe(positions)
-    ideal = NuisanceMap.of(replace(experiment, nuisance=Nuisance.none()))
+    markers = experiment.markers.predict_positions(positions)
+    ideal = NuisanceMap.from_experiment(replace(experiment, nuisance=Nuisance.none()))
     wrenches = tuple(
-        sensor.of_forced(forced, np.zeros(ideal.size))
-        for sensor in wrench_readings(experiment, at, ideal)
+        sensor.predict_reactions(forced, np.zeros(ideal.size))
+        for sensor in wrench_residuals(experiment, at, ideal)
     )
     return Trajectory(
         experiment.t_s,
@@ -273,25 +273,29 @@ def _with_steps(
         markers,
         (at, forced),
         wrenches,
-        _gauged(experiment, positions, (at, forced), ideal),
+        _custom_sensor_values(experiment, positions, (at, forced), ideal),
         steps,
     )
 
 
-def _gauged(
-    experiment: Experiment, positions_m: Array, reactions: tuple[Grid, Forced], ideal: NuisanceMap
+def _custom_sensor_values(
+    experiment: Experiment,
+    positions_m: Array,
+    reactions: tuple[ReactionGrid, ReactionForces],
+    ideal: NuisanceMap,
 ) -> tuple[Array, ...]:
     """Return the predictions (S, m) of the custom sensors for a motion, without nuisance
     parameters.
     """
-    readings = gauge_readings(experiment, experiment.t_s, reactions[0], ideal)
+    readings = custom_sensor_residuals(experiment, experiment.t_s, reactions[0], ideal)
 
-    def known_reactions() -> Forced:
+    def known_reactions() -> ReactionForces:
         return reactions[1]
 
-    motion = Motion(positions_m.reshape(len(positions_m), -1), known_reactions)
+    motion = ObservedMotion(positions_m.reshape(len(positions_m), -1), known_reactions)
     return tuple(
-        reading.said(reading.of_motion(motion, np.zeros(ideal.size))) for reading in readings
+        reading.without_padding(reading.predict_motion(motion, np.zeros(ideal.size)))
+        for reading in readings
     )
 
 
@@ -307,9 +311,9 @@ def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experime
     return replace(experiment, grasps=grasps)
 
 
-def with_readings(experiment: Experiment, readings: Sequence[ArrayLike]) -> Experiment:
+def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experiment:
     """Return the experiment with other samples (S, m) of its custom sensors."""
-    pairs = zip(experiment.readings, readings, strict=True)
+    pairs = zip(experiment.readings, values, strict=True)
     return replace(experiment, readings=[replace(g, values=v) for g, v in pairs])
 
 

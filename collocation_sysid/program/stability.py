@@ -17,7 +17,7 @@ from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs, eigsh
 from ..arrays import Array, Index
 from ..fem.pattern import SymmetricPattern
 from ..model.forces import Forces
-from .collocation import Collocation, Part
+from .collocation import Collocation, ExperimentIterate
 from .factorisation import Factoriser
 
 # Number of states of a motion that are examined.
@@ -56,33 +56,35 @@ class Instability:
     e_foldings: float
 
 
-def instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
+def find_instabilities(collocation: Collocation, z: Array) -> tuple[Instability, ...]:
     """Return the instabilities of the motions at z, at most one for each experiment."""
-    unstable = (_instability(part) for part in collocation.parts(z))
+    unstable = (_instability(part) for part in collocation.iterates(z))
     return tuple(each for each in unstable if each is not None)
 
 
-def _instability(part: Part) -> Instability | None:
+def _instability(iterate: ExperimentIterate) -> Instability | None:
     """Return the instability of one experiment's motion, or None if all examined states are
     stable.
     """
-    experiment = part.segment.experiment
+    experiment = iterate.segment.experiment
     last = len(experiment.t_s) - 1
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
     t_s = experiment.t_s[samples]
-    rows = part.segment.markers.grid_rows[samples]
-    is_prescribed = experiment.held(t_s).reshape(len(t_s), -1)
-    theta = part.setting.theta
+    rows = iterate.segment.markers.sample_rows[samples]
+    is_prescribed = experiment.is_prescribed(t_s).reshape(len(t_s), -1)
+    theta = iterate.equations.theta
     growths = np.array(
         [
-            growth_rate_1_s(Forces.of(experiment, time, theta), x, np.flatnonzero(~there))
-            for time, x, there in zip(t_s, part.x[rows], is_prescribed, strict=True)
+            growth_rate_1_s(
+                Forces.from_experiment(experiment, time, theta), x, np.flatnonzero(~there)
+            )
+            for time, x, there in zip(t_s, iterate.x[rows], is_prescribed, strict=True)
         ]
     )
     worst = int(np.argmax(growths))
     if growths[worst] <= 0:
         return None
-    e_foldings = np.inf if experiment.static else float(np.trapezoid(growths, t_s))
+    e_foldings = np.inf if experiment.is_static else float(np.trapezoid(growths, t_s))
     return Instability(experiment.name, float(t_s[worst]), float(growths[worst]), e_foldings)
 
 
@@ -102,10 +104,10 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
         return 0.0
     state = x.reshape(1, -1)
     at = forces.linearise(state, np.zeros_like(state))
-    mass = forces.mass.kg[0, free_dofs]
+    mass = forces.mass.inertia_kg[0, free_dofs]
     pattern = forces.pattern
     lowers = -at.by_position[0], -at.by_velocity[0]
-    if all(_definite(lower, pattern, free_dofs, mass) for lower in lowers):
+    if all(_is_definite(lower, pattern, free_dofs, mass) for lower in lowers):
         return 0.0
     root = sp.diags_array(1 / np.sqrt(mass))
     stiffness, damping = (
@@ -113,11 +115,11 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index) -> float:
         for lower in lowers
     )
     noise = SHIFT * np.sqrt(stiffness.diagonal().max())
-    growth = _fastest(stiffness, damping)
+    growth = _fastest_growth(stiffness, damping)
     return growth if growth > noise else 0.0
 
 
-def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
+def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
     """Whether a matrix is positive semidefinite up to rounding; true for zero."""
     own = pattern.diagonal[free_dofs]
     largest = float((lower[own] / mass).max())
@@ -125,23 +127,23 @@ def _definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: A
         return not lower[own].any()
     shifted = lower.copy()
     shifted[own] += SHIFT * largest * mass
-    return Factoriser.of(pattern, free_dofs).factorise(shifted).positive_definite
+    return Factoriser.cached(pattern, free_dofs).factorise(shifted).positive_definite
 
 
-def _fastest(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
+def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
     """Return the largest Re(s) of s² + D s + K."""
     size = len(stiffness.diagonal())
     if size <= DENSE:
         return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
-    lowest = [_lowest(each) for each in (stiffness, damping) if each.nnz]
+    lowest = [_lowest_eigenvectors(each) for each in (stiffness, damping) if each.nnz]
     basis, _ = np.linalg.qr(np.hstack(lowest))
     in_basis = [basis.T @ (each @ basis) for each in (stiffness, damping)]
     exponents = _exponents(*in_basis)
     guess = exponents[np.argmax(exponents.real)]
-    return max(_near(stiffness, damping, float(abs(guess))), 0.0)
+    return max(_growth_near(stiffness, damping, float(abs(guess))), 0.0)
 
 
-def _lowest(matrix: sp.csc_array) -> Array:
+def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
     """Return directions (n, k) with the smallest eigenvalues of a matrix, or approximations
     if the iteration stops early.
     """
@@ -160,7 +162,7 @@ def _exponents(stiffness: Array, damping: Array) -> NDArray[np.complex128]:
     return np.linalg.eigvals(chain).astype(np.complex128)
 
 
-class _Turned(LinearOperator):
+class _CayleyTransform(LinearOperator):
     """Operator (A + σ)/(A − σ) of A = [[0, 1], [−K, −D]] and σ > 0.
 
     Its eigenvalues (s + σ)/(s − σ) lie outside the unit circle where Re(s) > 0, so that Arnoldi's
@@ -184,11 +186,11 @@ class _Turned(LinearOperator):
         return np.concatenate([first + 2 * self.sigma * y, second + 2 * self.sigma * w])
 
 
-def _near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
+def _growth_near(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
     """Return the largest Re(s) of s² + D s + K for sparse matrices, with |s| of about σ; at
     least 0.
     """
-    turning = _Turned(stiffness, damping, sigma)
+    turning = _CayleyTransform(stiffness, damping, sigma)
     try:
         eigenpairs = eigs(
             turning, 4, v0=np.random.default_rng(0).normal(size=turning.shape[0]), ncv=60

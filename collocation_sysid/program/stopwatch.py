@@ -52,7 +52,7 @@ class Stopwatch:
             self.evaluations += evaluations
             self.linear_algebra += linear_algebra
 
-    def taken(self) -> tuple[float, float, float]:
+    def read_and_reset(self) -> tuple[float, float, float]:
         """Return (build, evaluations, linear_algebra) [s] and reset all three to zero."""
         spent = self.build, self.evaluations, self.linear_algebra
         self.build = self.evaluations = self.linear_algebra = 0.0

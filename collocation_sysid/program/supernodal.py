@@ -41,7 +41,7 @@ MISSING = (
 
 
 @cache
-def library() -> Any:
+def load_mkl() -> Any:
     """Return the MKL library, or None where it is not installed; the result is cached."""
     paths = []
     try:
@@ -68,7 +68,7 @@ class Pardiso:
     ----------
     size : int
         Number of rows.
-    numbers : int
+    factor_size : int
         Number of floating-point numbers in a factor.
 
     Parameters
@@ -83,7 +83,7 @@ class Pardiso:
     """
 
     def __init__(self, starts: Index, columns: Index) -> None:
-        if library() is None:
+        if load_mkl() is None:
             raise InputError(MISSING)
         self.size = len(starts) - 1
         self._handle = np.zeros(64, np.int64)
@@ -92,11 +92,11 @@ class Pardiso:
         self._columns = columns.astype(np.int32)
         self._values = np.zeros(len(columns))
         kind = ctypes.c_int(POSITIVE_DEFINITE)
-        library().pardisoinit(_at(self._handle), ctypes.byref(kind), _at(self._options))
+        load_mkl().pardisoinit(_pointer(self._handle), ctypes.byref(kind), _pointer(self._options))
         self._options[FROM_ZERO] = 1
         self._options[COUNTED] = -1
         self._call(ANALYSE)
-        self.numbers = int(self._options[COUNTED])
+        self.factor_size = int(self._options[COUNTED])
 
     def factorise(self, values: Array) -> bool:
         """Factorise the values of the upper triangle and return whether the matrix is
@@ -129,22 +129,22 @@ class Pardiso:
         error = ctypes.c_int(0)
         silent = ctypes.byref(ctypes.c_int(0))
         columns = ctypes.byref(ctypes.c_int(count))
-        library().pardiso(
-            _at(self._handle),
+        load_mkl().pardiso(
+            _pointer(self._handle),
             one,
             which,
             kind,
             stage,
             size,
-            _at(self._values),
-            _at(self._starts),
-            _at(self._columns),
+            _pointer(self._values),
+            _pointer(self._starts),
+            _pointer(self._columns),
             None,
             columns,
-            _at(self._options),
+            _pointer(self._options),
             silent,
-            _at(right),
-            _at(result),
+            _pointer(right),
+            _pointer(result),
             ctypes.byref(error),
         )
         if error.value == NO_MEMORY:
@@ -158,7 +158,7 @@ class Pardiso:
             self._call(RELEASE)
 
 
-def _at(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
+def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
     """Return a pointer to the data of an array, or None."""
     return None if array is None else ctypes.c_void_p(array.ctypes.data)
 

@@ -32,20 +32,20 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..errors import SimulationError
 from ..fem.body import Linearisation
-from ..model.dynamics import Dynamics, StencilRow, weighted
-from ..model.force_history import Carrying
+from ..model.dynamics import Dynamics, StencilRow, weighted_sum_of_past
+from ..model.force_history import ForceForwardColumns
 from ..model.histories import AnyHistory
-from ..model.setting import Setting
-from ..model.viscoelasticity import Slopes
+from ..model.setting import EquationsAtParameters
+from ..model.viscoelasticity import MemoryForwardColumns
 from .block_band import Submatrix
 from .factorisation import Choice, Factor, Factoriser
 from .lapack import one_blas_thread
-from .reaction import HeldForces
-from .segment import Segment
+from .reaction import GraspForces
+from .segment import Transcription
 from .stopwatch import Stopwatch
 
 if TYPE_CHECKING:
-    from ..fem.kernels.skyline import Room
+    from ..fem.kernels.skyline import FactorMemory
 
 # Largest size of the element results and factors that are stored at a time [bytes].
 CHUNK_BYTES = 128e6
@@ -66,11 +66,11 @@ class Tangent:
         Sensitivities Z = −c_x⁻¹ c_p to the m parameters that change the motion [m].
     violation_n : float
         Largest |c| [N].
-    indefinite : int
+    indefinite_count : int
         Number of time steps whose matrix −∂c_t/∂x_t is not positive definite.
-    last : LastRows
+    last : ForwardState
         State of the substitution, to continue with later rows.
-    held : HeldForces
+    grasp_forces : GraspForces
         Forces on the dofs of instrumented grasps, with their changes along the step (column 0) and
         by p.
     """
@@ -78,13 +78,13 @@ class Tangent:
     step: Array
     by_p: Array
     violation_n: float
-    indefinite: int
-    last: LastRows
-    held: HeldForces
+    indefinite_count: int
+    last: ForwardState
+    grasp_forces: GraspForces
 
 
 @dataclass(frozen=True, eq=False)
-class LastRows:
+class ForwardState:
     """State of a forward substitution: all that the next row depends on, most recent row first.
 
     Attributes
@@ -95,17 +95,17 @@ class LastRows:
         Force changes dF_{t−j}.
     forces : (free,) arrays
         Total forces F_{t−j} at the evaluations [N].
-    carried : arrays
+    history_columns : arrays
         Columns of the history variables, body first, then forces.
     """
 
     solutions: tuple[Array, ...]
     increments: tuple[Array, ...]
     forces: tuple[Array, ...] = ()
-    carried: tuple[Array, ...] = ()
+    history_columns: tuple[Array, ...] = ()
 
 
-class Step(NamedTuple):
+class FactorisedStep(NamedTuple):
     """Linearised and factorised equations of one time step.
 
     Attributes
@@ -135,26 +135,26 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Chunk:
+class LinearisedChunk:
     """Consecutive rows that are linearised and factorised together.
 
     Attributes
     ----------
-    here : slice
+    rows : slice
         Their grid times.
-    at : Linearisation
+    linearisation : Linearisation
         Their forces and derivatives.
-    steps : list of Step
+    steps : list of FactorisedStep
         One entry per row, in ascending order.
     """
 
-    here: slice
-    at: Linearisation
-    steps: list[Step]
+    rows: slice
+    linearisation: Linearisation
+    steps: list[FactorisedStep]
 
 
 @dataclass(frozen=True, eq=False)
-class GraspMotion:
+class PrescribedColumns:
     """Prescribed rows of the solution Y: changes of the displacements of grasped dofs.
 
     Attributes
@@ -163,109 +163,115 @@ class GraspMotion:
         Grasped dofs whose displacement changes.
     columns : (N, g, c) array
         Changes of their positions [m]: the step to the prescribed position, and derivatives by φ.
-    holds : (N, g) array of bool
+    is_prescribed : (N, g) array of bool
         Whether a dof is prescribed at a grid time.
     """
 
     dofs: Index
     columns: Array
-    holds: NDArray[np.bool_]
+    is_prescribed: NDArray[np.bool_]
 
     @classmethod
-    def along(cls, solver: Sweep, dofs: Index, columns: Array) -> GraspMotion:
+    def from_columns(cls, sweep: Sweep, dofs: Index, columns: Array) -> PrescribedColumns:
         """Build the prescribed rows of dofs (g,) that change by `columns` (N, g, c) [m]."""
-        return cls(dofs, columns, solver.dynamics.taken[:, dofs] | ~np.isin(dofs, solver.free))
+        return cls(
+            dofs, columns, sweep.dynamics.is_temporarily_held[:, dofs] | ~np.isin(dofs, sweep.free)
+        )
 
     @property
-    def count(self) -> int:
+    def column_count(self) -> int:
         """Number c of columns."""
         return self.columns.shape[-1]
 
-    def place(self, t: int, solution: Array) -> None:
+    def write_into(self, t: int, solution: Array) -> None:
         """Write the prescribed rows of grid time t into `solution` (3n, c), in place."""
-        prescribed = self.holds[t]
+        prescribed = self.is_prescribed[t]
         solution[self.dofs[prescribed]] = self.columns[t, prescribed]
 
-    def force(self, solver: Sweep, step: Step) -> Array | float:
+    def force(self, sweep: Sweep, step: FactorisedStep) -> Array | float:
         """Return the contribution (free, c) of the prescribed changes at a time step to F'
         [N]; 0 if nothing changes.
         """
-        now = np.where(self.holds[step.t, :, None], self.columns[step.t], 0.0)
+        now = np.where(self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0)
         # What is only parameters of other kinds does not move them.
         changed = np.flatnonzero(now.any(axis=0))
         if not len(changed):
             return 0.0
         p = step.row.p[0]
         q = step.row.q[0]
-        force = np.zeros((len(solver.free), self.count))
+        force = np.zeros((len(sweep.free), self.column_count))
         skew = step.row.skew(0, step.skew, step.rate_skew)
-        matrix = solver.beside.of(p * step.by_position + q * step.by_velocity, skew)
+        matrix = sweep.beside.extract(p * step.by_position + q * step.by_velocity, skew)
         force[:, changed] = matrix @ now[:, changed]
         return force
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class SweepColumns:
     """Right-hand sides of a forward substitution.
 
     Attributes
     ----------
-    setting : Setting
+    equations : EquationsAtParameters
         Equations of motion at the parameters.
     count : int
         Number of columns.
-    by_p : bool
+    has_parameters : bool
         Whether the last columns are derivatives by the parameters that change the motion.
-    step : bool
+    has_step : bool
         Whether the first column is the feasibility step.
-    grasped : GraspMotion or None
+    prescribed : PrescribedColumns or None
         Prescribed changes of grasped dofs; None if their displacements are fixed.
     """
 
-    setting: Setting
+    equations: EquationsAtParameters
     count: int
-    by_p: bool = True
-    step: bool = False
-    grasped: GraspMotion | None = None
+    has_parameters: bool = True
+    has_step: bool = False
+    prescribed: PrescribedColumns | None = None
 
     @classmethod
-    def by_parameters(cls, solver: Sweep, setting: Setting, x: Array | None = None) -> Columns:
+    def by_parameters(
+        cls, sweep: Sweep, equations: EquationsAtParameters, x: Array | None = None
+    ) -> SweepColumns:
         """Build the columns of all parameters that change the motion.
 
         Parameters
         ----------
-        solver : Sweep
+        sweep : Sweep
             The sweep that uses them.
-        setting : Setting
+        equations : EquationsAtParameters
             Equations of motion at the parameters.
         x : (N, 3n) array, optional
             Positions [m]. If given, the feasibility step from x is prepended as column 0.
         """
         first = int(x is not None)
-        count = len(solver.segment.moving)
+        count = len(sweep.segment.dynamic_parameters)
         grasped = None
-        if setting.held.moves:
-            prescribed = setting.held
-            goals = prescribed.positions_m[: solver.dynamics.rows]
+        if equations.prescribed.depends_on_phi:
+            prescribed = equations.prescribed
+            goals = prescribed.positions_m[: sweep.dynamics.row_count]
             columns = np.zeros((*goals.shape, first + count))
-            columns[..., first + solver.segment.nq :] = prescribed.by_phi[: len(goals)]
+            columns[..., first + sweep.segment.nq :] = prescribed.by_phi[: len(goals)]
             if x is not None:
                 columns[..., 0] = np.nan_to_num(goals - x[:, prescribed.dofs])
-            grasped = GraspMotion.along(solver, prescribed.dofs, columns)
-        return cls(setting, first + count, step=x is not None, grasped=grasped)
+            grasped = PrescribedColumns.from_columns(sweep, prescribed.dofs, columns)
+        return cls(equations, first + count, has_step=x is not None, prescribed=grasped)
 
     @classmethod
-    def along(cls, solver: Sweep, setting: Setting, moved: Array) -> Columns:
-        """Build the columns of prescribed changes `moved` (N, g, c) of the grasped dofs
+    def from_prescribed(
+        cls, sweep: Sweep, equations: EquationsAtParameters, changes_m: Array
+    ) -> SweepColumns:
+        """Build the columns of prescribed changes `changes_m` (N, g, c) of the grasped dofs
         [m], without parameters.
         """
-        grasped = GraspMotion.along(solver, setting.held.dofs, moved)
-        return cls(setting, grasped.count, by_p=False, grasped=grasped)
+        grasped = PrescribedColumns.from_columns(sweep, equations.prescribed.dofs, changes_m)
+        return cls(equations, grasped.column_count, has_parameters=False, prescribed=grasped)
 
-    def sides(
+    def right_hand_sides(
         self,
         rows: slice,
-        at: Linearisation,
+        linearisation: Linearisation,
         acceleration: Array,
         residual: Array | None,
         free: Index,
@@ -276,7 +282,7 @@ class Columns:
         ----------
         rows : slice
             Their grid times.
-        at : Linearisation
+        linearisation : Linearisation
             Forces of these rows with their derivatives.
         acceleration : (k, 3n) array
             Accelerations [m/s²].
@@ -289,19 +295,21 @@ class Columns:
         right, force = (np.zeros((count, k, self.count)) for k in (len(free), size))
         if residual is not None:
             right[..., 0] = residual
-        if self.by_p:
-            first = int(self.step)
-            force[..., first:] = self.setting.force_slopes(rows, at.by_theta)
-            right[..., first:] -= self.setting.inertia_slopes(rows, acceleration[:, free], free)
+        if self.has_parameters:
+            first = int(self.has_step)
+            force[..., first:] = self.equations.force_derivatives(rows, linearisation.by_theta)
+            right[..., first:] -= self.equations.inertia_derivatives(
+                rows, acceleration[:, free], free
+            )
         return right, force
 
-    def of_inputs(self, t: int) -> Array:
+    def input_derivatives(self, t: int) -> Array:
         """Return the derivatives (U, c) of the U inputs at evaluation t by the columns;
         zeros for the feasibility step.
         """
-        own = self.setting.by_p[t]
-        none = np.zeros((len(own), int(self.step) if self.by_p else self.count))
-        return np.hstack([none, own]) if self.by_p else none
+        own = self.equations.input_derivatives[t]
+        none = np.zeros((len(own), int(self.has_step) if self.has_parameters else self.count))
+        return np.hstack([none, own]) if self.has_parameters else none
 
 
 class Sweep:
@@ -309,7 +317,7 @@ class Sweep:
 
     Parameters
     ----------
-    segment : Segment
+    segment : Transcription
         Transcription of the experiment.
     rows : int, optional
         Number of grid times to use; None means all.
@@ -321,37 +329,39 @@ class Sweep:
 
     def __init__(
         self,
-        segment: Segment,
+        transcription: Transcription,
         rows: int | None = None,
         stopwatch: Stopwatch | None = None,
         factorisation: Choice = "auto",
     ) -> None:
         self.stopwatch = stopwatch or Stopwatch()
         self.factorisation: Choice = factorisation
-        self.dynamics = segment.dynamics.first_rows(rows or segment.grid_rows)
-        self.segment = segment
-        self.body = segment.body
-        self.pattern = segment.pattern
-        self.free = segment.free_dofs
-        self.sensed = segment.sensed_dofs
-        self.factoriser = Factoriser.of(self.pattern, self.free, factorisation)
+        self.dynamics = transcription.dynamics.truncated_to(rows or transcription.grid_times)
+        self.segment = transcription
+        self.body = transcription.body
+        self.pattern = transcription.pattern
+        self.free = transcription.free_dofs
+        self.sensed = transcription.sensed_dofs
+        self.factoriser = Factoriser.cached(self.pattern, self.free, factorisation)
         self.matrix = Submatrix(self.pattern, self.free)
-        self.beside = Submatrix(self.pattern, self.free, segment.grasping.dofs)
+        self.beside = Submatrix(self.pattern, self.free, transcription.prescribed_motion.dofs)
         self.of_sensed = Submatrix(self.pattern, self.sensed)
-        self._takes = bool(self.dynamics.taken.any())
+        self._takes = bool(self.dynamics.is_temporarily_held.any())
 
-    def __reduce__(self) -> tuple[type[Sweep], tuple[Segment, int, None, Choice]]:
-        return Sweep, (self.segment, self.dynamics.rows, None, self.factorisation)
+    def __reduce__(self) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
+        return Sweep, (self.segment, self.dynamics.row_count, None, self.factorisation)
 
     @one_blas_thread()
-    def forward(self, x: Array, setting: Setting, known: Tangent | None = None) -> Tangent:
+    def forward(
+        self, x: Array, equations: EquationsAtParameters, known: Tangent | None = None
+    ) -> Tangent:
         """Compute the feasibility step p and the sensitivities Z.
 
         Parameters
         ----------
         x : (N, 3n) array
             Positions [m].
-        setting : Setting
+        equations : EquationsAtParameters
             Equations of motion at the parameters.
         known : Tangent, optional
             Result for the first rows at the same positions and parameters; it is continued.
@@ -361,30 +371,32 @@ class Sweep:
         SimulationError
             If the equations of a time step are singular or not finite.
         """
-        sweep_columns = Columns.by_parameters(self, setting, x)
+        sweep_columns = SweepColumns.by_parameters(self, equations, x)
         columns = np.zeros((*x.shape, sweep_columns.count))
-        grasp_forces = HeldForces.nothing(len(x), len(self.sensed), sweep_columns.count)
-        march = Forward(self, sweep_columns, known.last if known else None, grasp_forces)
+        grasp_forces = GraspForces.zeros(len(x), len(self.sensed), sweep_columns.count)
+        march = ForwardSubstitution(
+            self, sweep_columns, known.last if known else None, grasp_forces
+        )
         if known is not None:
             done = len(known.step)
             columns[:done, :, 0] = known.step
             columns[:done, :, 1:] = known.by_p
             march.violation_n = known.violation_n
-            march.indefinite = known.indefinite
-            grasp_forces.begin(known.held)
-        for _ in march.rows(x, 0 if known is None else len(known.step), columns):
+            march.indefinite = known.indefinite_count
+            grasp_forces.copy_first_rows(known.grasp_forces)
+        for _ in march.iterate_rows(x, 0 if known is None else len(known.step), columns):
             pass
         return Tangent(
             step=columns[:, :, 0],
             by_p=columns[:, :, 1:],
             violation_n=march.violation_n,
-            indefinite=march.indefinite,
-            last=march.last,
-            held=grasp_forces,
+            indefinite_count=march.indefinite,
+            last=march.state,
+            grasp_forces=grasp_forces,
         )
 
     def sensitivities(
-        self, x: Array, setting: Setting, held: HeldForces | None = None
+        self, x: Array, equations: EquationsAtParameters, grasp_forces: GraspForces | None = None
     ) -> Iterator[Array]:
         """Iterate over the sensitivities Z_t (3n, m) row by row, keeping only the last few rows in
         memory.
@@ -396,9 +408,9 @@ class Sweep:
         ----------
         x : (N, 3n) array
             Positions [m].
-        setting : Setting
+        equations : EquationsAtParameters
             Equations of motion at the parameters.
-        held : HeldForces, optional
+        grasp_forces : GraspForces, optional
             Filled in place with the forces on instrumented grasps and their sensitivities.
 
         Raises
@@ -406,17 +418,19 @@ class Sweep:
         SimulationError
             If the equations of a time step are singular or not finite.
         """
-        return Forward(self, Columns.by_parameters(self, setting), held=held).rows(x)
+        return ForwardSubstitution(
+            self, SweepColumns.by_parameters(self, equations), grasp_forces=grasp_forces
+        ).iterate_rows(x)
 
     @one_blas_thread()
-    def backward(self, x: Array, setting: Setting, gradient: Array) -> Array:
+    def backward(self, x: Array, equations: EquationsAtParameters, gradient: Array) -> Array:
         """Solve the adjoint equations c_xᵀ y = −`gradient` backward in time.
 
         Parameters
         ----------
         x : (N, 3n) array
             Positions [m].
-        setting : Setting
+        equations : EquationsAtParameters
             Equations of motion at the parameters.
         gradient : (N, 3n) array
             Gradient of a scalar by the positions [1/m].
@@ -426,14 +440,14 @@ class Sweep:
         (N, 3n) array
             Multipliers y of the equations of motion [1/N]; zero at prescribed dofs.
         """
-        reach = self.dynamics.reach
+        reach = self.dynamics.largest_lag
         free = self.free
         y = np.zeros_like(x)
         remaining = -gradient[:, free]  # what is left for the rows that are still to come
-        histories = self.dynamics_at(setting).histories(x)
+        histories = self.dynamics_at(equations).histories(x)
         later = deque[StencilRow](maxlen=reach)
-        adjoints = [history.backward() for history in histories]
-        for chunk in self.chunks(x, setting, backward=True, along=histories):
+        adjoints = [history.adjoint() for history in histories]
+        for chunk in self.chunks(x, equations, backward=True, histories=histories):
             for step in reversed(chunk.steps):
                 t = step.t
                 row = step.row
@@ -441,89 +455,89 @@ class Sweep:
                 q = row.q
                 mass = row.mass_kg[free]
                 by_state = by_rate = 0.0
-                for own in (each.pulled() for each in adjoints):
+                for own in (each.state_gradient() for each in adjoints):
                     by_state = by_state + own[0][free]
                     by_rate = by_rate + own[1][free]
                 known = np.zeros(x.shape[1])
                 for j, other in enumerate(later, 1):
                     known += other.w[j] * y[t + j]
-                known[self.dynamics.taken[t]] = 0
+                known[self.dynamics.is_temporarily_held[t]] = 0
                 remaining[t] -= p[0] * by_state + q[0] * by_rate
                 if known.any():
-                    by_position = self.matrix.of(step.by_position, -step.skew) @ known
+                    by_position = self.matrix.extract(step.by_position, -step.skew) @ known
                     remaining[t] -= p[0] * by_position
                     remaining[t] -= q[0] * (
-                        self.matrix.of(step.by_velocity, -step.rate_skew) @ known
+                        self.matrix.extract(step.by_velocity, -step.rate_skew) @ known
                     )
                 # (w_0 (p_0 G + q_0 C) − s_0 M) y_t = what is left; the factor is of its negative.
-                right = self.without_taken(t, remaining[t])
+                right = self.without_prescribed(t, remaining[t])
                 y[t, free] = -step.factor.solve(right, transposed=True)
                 force_weight = known + row.w[0] * y[t]
-                by_position = self.matrix.of(step.by_position, -step.skew) @ force_weight
+                by_position = self.matrix.extract(step.by_position, -step.skew) @ force_weight
                 by_position += by_state
-                by_velocity = self.matrix.of(step.by_velocity, -step.rate_skew) @ force_weight
+                by_velocity = self.matrix.extract(step.by_velocity, -step.rate_skew) @ force_weight
                 by_velocity += by_rate
                 for each in adjoints:
-                    each.retreat(force_weight)
+                    each.step_back(force_weight)
                 for i in range(1, min(reach, t) + 1):
                     remaining[t - i] -= p[i] * by_position + q[i] * by_velocity
                     remaining[t - i] += row.s[i] * mass * y[t, free]
                 later.appendleft(row)
         return y
 
-    def without_taken(self, t: int, rows: Array) -> Array:
+    def without_prescribed(self, t: int, rows: Array) -> Array:
         """Set rows (free, …) of grid time t to zero where a grasp that holds for a part of
         the time prescribes the dof, in place.
         """
         if self._takes:
-            rows[self.dynamics.taken[t, self.free]] = 0
+            rows[self.dynamics.is_temporarily_held[t, self.free]] = 0
         return rows
 
     @property
-    def chunk(self) -> int:
+    def chunk_rows(self) -> int:
         """Number of time steps that are linearised and factorised at a time."""
-        most = ROOMS if self.factoriser.skyline else self.dynamics.rows
+        most = ROOMS if self.factoriser.skyline else self.dynamics.row_count
         # Each thread has one to factorise, however large it is.
-        least = min(self.body.threads, self.dynamics.rows)
-        return max(least, min(self.dynamics.rows, most, int(CHUNK_BYTES / self._step_bytes)))
+        least = min(self.body.threads, self.dynamics.row_count)
+        return max(least, min(self.dynamics.row_count, most, int(CHUNK_BYTES / self._step_bytes)))
 
     @property
     def chunk_bytes(self) -> int:
         """Memory of one chunk [bytes]."""
-        return self.chunk * self._step_bytes
+        return self.chunk_rows * self._step_bytes
 
     @property
     def _step_bytes(self) -> int:
         """Memory of one time step: element results and one factor [bytes]."""
         solver = self.factoriser
-        numbers = solver.unsymmetric_numbers if self.body.unsymmetric else solver.numbers
+        numbers = solver.unsymmetric_factor_size if self.body.is_unsymmetric else solver.factor_size
         return 8 * (self.body.linearisation_width + numbers)
 
-    def dynamics_at(self, setting: Setting) -> Dynamics:
+    def dynamics_at(self, equations: EquationsAtParameters) -> Dynamics:
         """Return the equations of motion of the first rows with the inputs of a setting."""
-        return setting.dynamics.first_rows(self.dynamics.rows)
+        return equations.dynamics.truncated_to(self.dynamics.row_count)
 
     def chunks(
         self,
         x: Array,
-        setting: Setting,
+        equations: EquationsAtParameters,
         backward: bool = False,
         first: int = 0,
-        along: Sequence[AnyHistory] = (),
-    ) -> Iterator[Chunk]:
+        histories: Sequence[AnyHistory] = (),
+    ) -> Iterator[LinearisedChunk]:
         """Iterate over the linearised and factorised time steps, a few at a time, using threads.
 
         Parameters
         ----------
         x : (N, 3n) array
             Positions [m].
-        setting : Setting
+        equations : EquationsAtParameters
             Equations of motion at the parameters.
         backward : bool
             If true, yield the last chunk first.
         first : int
             Grid time to begin with.
-        along : sequence of histories
+        histories : sequence of histories
             History variables at x; empty without any.
 
         Raises
@@ -531,20 +545,24 @@ class Sweep:
         SimulationError
             If a matrix is singular or not finite.
         """
-        dynamics = self.dynamics_at(setting)
+        dynamics = self.dynamics_at(equations)
         xi, nu = dynamics.evaluation_states(x)
-        starts = range(max(first, dynamics.first_row), dynamics.rows, self.chunk)
-        rooms = [self.factoriser.room(1 + self.body.unsymmetric) for _ in range(self.chunk)]
+        starts = range(max(first, dynamics.first_row), dynamics.row_count, self.chunk_rows)
+        rooms = [
+            self.factoriser.allocate(1 + self.body.is_unsymmetric) for _ in range(self.chunk_rows)
+        ]
         for start in reversed(starts) if backward else starts:
-            here = slice(start, min(start + self.chunk, dynamics.rows))
+            here = slice(start, min(start + self.chunk_rows, dynamics.row_count))
             evaluations = slice(start - dynamics.first_row, here.stop - dynamics.first_row)
             with self.stopwatch.evaluating():
-                at = dynamics.forces_along(along, here).linearise(xi[evaluations], nu[evaluations])
+                at = dynamics.forces_with_histories(histories, here).linearise(
+                    xi[evaluations], nu[evaluations]
+                )
             with self.stopwatch.solving():
-                rows = [StencilRow.of(dynamics, t) for t in range(start, here.stop)]
+                rows = [StencilRow.from_dynamics(dynamics, t) for t in range(start, here.stop)]
                 factors = self._factorise(dynamics, at, here, rows, rooms)
             steps = map(
-                Step,
+                FactorisedStep,
                 range(start, here.stop),
                 rows,
                 at.force,
@@ -554,25 +572,29 @@ class Sweep:
                 at.by_position_skew,
                 at.by_velocity_skew,
             )
-            yield Chunk(here, at, list(steps))
+            yield LinearisedChunk(here, at, list(steps))
 
     def _factorise(
         self,
         dynamics: Dynamics,
-        at: Linearisation,
-        here: slice,
+        linearisation: Linearisation,
+        grid_times: slice,
         rows: list[StencilRow],
-        rooms: Sequence[Room | None] = (),
+        buffers: Sequence[FactorMemory | None] = (),
     ) -> list[Factor]:
         """Factorise −∂c_t/∂x_t of some rows; dofs that are prescribed for a part of the
         time get a diagonal entry alone.
         """
         pattern = self.pattern
-        is_prescribed = dynamics.taken[here]
+        is_prescribed = dynamics.is_temporarily_held[grid_times]
 
         def matrix(k: int) -> tuple[Array, Array]:
-            values = rows[k].block(at.by_position[k], at.by_velocity[k], pattern)
-            skew = rows[k].skew_block(at.by_position_skew[k], at.by_velocity_skew[k])
+            values = rows[k].block(
+                linearisation.by_position[k], linearisation.by_velocity[k], pattern
+            )
+            skew = rows[k].skew_block(
+                linearisation.by_position_skew[k], linearisation.by_velocity_skew[k]
+            )
             if is_prescribed[k].any():
                 size = np.abs(values[pattern.diagonal]).mean()
                 removed = is_prescribed[k][pattern.rows] | is_prescribed[k][pattern.columns]
@@ -583,18 +605,18 @@ class Sweep:
             return values, skew
 
         try:
-            count = len(at.force)
+            count = len(linearisation.force)
             threads = self.body.threads
-            return self.factoriser.factorise_each(matrix, count, threads, rooms)
+            return self.factoriser.factorise_each(matrix, count, threads, buffers)
         except np.linalg.LinAlgError as error:
             raise SimulationError(
                 f"experiment '{self.segment.experiment.name}': the linearised equations of "
                 f"motion cannot be solved: {error}",
-                float(dynamics.t_s[here.start]),
+                float(dynamics.t_s[grid_times.start]),
             ) from error
 
 
-class Forward:
+class ForwardSubstitution:
     """Forward substitution of several columns, row by row.
 
     Attributes
@@ -608,52 +630,52 @@ class Forward:
     ----------
     solver : Sweep
         Factorised time steps.
-    columns : Columns
+    columns : QuantityTable
         Right-hand sides.
-    last : LastRows, optional
+    state : ForwardState, optional
         State after earlier rows; by default there are none.
-    held : HeldForces, optional
+    held : GraspForces, optional
         Filled in place with the forces on instrumented grasps.
     """
 
     def __init__(
         self,
         solver: Sweep,
-        columns: Columns,
-        last: LastRows | None = None,
-        held: HeldForces | None = None,
+        columns: SweepColumns,
+        last: ForwardState | None = None,
+        grasp_forces: GraspForces | None = None,
     ) -> None:
         self.solver = solver
         self.columns = columns
-        self.held = held if len(solver.sensed) else None
+        self.held = grasp_forces if len(solver.sensed) else None
         self.violation_n = 0.0
         self.indefinite = 0
         size = solver.pattern.size
-        reach = solver.dynamics.reach
+        reach = solver.dynamics.largest_lag
         self.shape = (size, columns.count)
         self._of_free = (len(solver.free), columns.count)
         nothing = (np.zeros(shape) for shape in (self.shape, self._of_free, len(solver.free)))
         solutions, increments, forces = ((each,) * reach for each in nothing)
-        last = last or LastRows(solutions, increments, forces)
+        last = last or ForwardState(solutions, increments, forces)
         self.past = deque(last.solutions, maxlen=reach)
         self.past_increments = deque(last.increments, maxlen=reach)
         self.past_forces = deque(last.forces, maxlen=reach)
         # Also where these rows do not: they may be continued.
         self.weighs_past = bool(solver.segment.dynamics.tables.w[:, 1:].any())
-        self.carried: list[Slopes | Carrying] = []
-        self._known = last.carried
+        self.carried: list[MemoryForwardColumns | ForceForwardColumns] = []
+        self._known = last.history_columns
 
     @property
-    def last(self) -> LastRows:
+    def state(self) -> ForwardState:
         """State that later rows depend on."""
-        return LastRows(
+        return ForwardState(
             solutions=tuple(self.past),
             increments=tuple(self.past_increments),
             forces=tuple(self.past_forces),
-            carried=tuple(each.columns for each in self.carried),
+            history_columns=tuple(each.columns for each in self.carried),
         )
 
-    def rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
+    def iterate_rows(self, x: Array, done: int = 0, out: Array | None = None) -> Iterator[Array]:
         """Iterate over the solutions Y_t (3n, c).
 
         Parameters
@@ -667,31 +689,33 @@ class Forward:
         """
         solver = self.solver
         columns = self.columns
-        setting = self.columns.setting
+        setting = self.columns.equations
         dynamics = solver.dynamics_at(setting)
         first = solver.dynamics.first_row
         histories = dynamics.histories(x)
         acceleration = dynamics.acceleration(x)
         known = self._known or [None] * len(histories)
         pairs = zip(histories, known, strict=True)
-        self.carried = [each.forward(columns.of_inputs, done, own) for each, own in pairs]
+        self.carried = [
+            each.forward_columns(columns.input_derivatives, done, own) for each, own in pairs
+        ]
         for t in range(done, first):  # the start is given
             for each in self.carried:
                 each.advance(partial(np.zeros, self.shape), partial(np.zeros, self.shape))
             start = np.zeros(self.shape)
-            if columns.grasped is not None:
-                columns.grasped.place(t, start)
+            if columns.prescribed is not None:
+                columns.prescribed.write_into(t, start)
             self.past.appendleft(start)
             yield np.zeros(self.shape)
-        for chunk in solver.chunks(x, setting, first=done, along=histories):
+        for chunk in solver.chunks(x, setting, first=done, histories=histories):
             residual = None
-            if columns.step:
+            if columns.has_step:
                 residual = np.stack([self._residual(s, acceleration[s.t]) for s in chunk.steps])
                 self.violation_n = max(self.violation_n, float(np.abs(residual).max(initial=0.0)))
-            sides = columns.sides(
-                chunk.here,
-                chunk.at,
-                acceleration=acceleration[chunk.here],
+            sides = columns.right_hand_sides(
+                chunk.rows,
+                chunk.linearisation,
+                acceleration=acceleration[chunk.rows],
                 residual=residual,
                 free=solver.free,
             )
@@ -699,98 +723,102 @@ class Forward:
                 self.indefinite += not step.factor.positive_definite
                 solution = np.zeros(self.shape) if out is None else out[step.t]
                 with solver.stopwatch.solving():
-                    self.advance(step, right, force, solution)
+                    self.solve_step(step, right, force, solution)
                 yield solution
 
-    def _residual(self, step: Step, acceleration: Array) -> Array:
+    def _residual(self, step: FactorisedStep, acceleration: Array) -> Array:
         """Return c_t on the free dofs [N]; call it for every row in ascending order,
         because it stores the forces.
         """
         solver = self.solver
         row = step.row
-        force = solver.without_taken(step.t, step.force[solver.free])
+        force = solver.without_prescribed(step.t, step.force[solver.free])
         total = row.w[0] * force - (row.mass_kg * acceleration)[solver.free]
         if self.weighs_past:
-            total += weighted(row.w, self.past_forces, force.shape)
+            total += weighted_sum_of_past(row.w, self.past_forces, force.shape)
             self.past_forces.appendleft(force)
-        return solver.without_taken(step.t, total)
+        return solver.without_prescribed(step.t, total)
 
-    def advance(self, step: Step, right: Array, force: Array, found: Array) -> None:
-        """Solve one row and store Y_t in `found`.
+    def solve_step(self, step: FactorisedStep, right: Array, force: Array, out: Array) -> None:
+        """Solve one row and store Y_t in `out`.
 
         Parameters
         ----------
-        step : Step
+        step : FactorisedStep
             The factorised time step.
         right : (free, c) array
             R_t; modified.
         force : (3n, c) array
             F_R.
-        found : (3n, c) array
+        out : (3n, c) array
             Y_t, overwritten.
         """
         t = step.t
         solver = self.solver
-        prescribed = self.columns.grasped
+        prescribed = self.columns.prescribed
         row = step.row
         free = solver.free
         w = row.w
         s = row.s
         mass = row.mass_kg.take(free)[:, None]
         if self.weighs_past:
-            right += weighted(w, self.past_increments, self._of_free)
-        right -= mass * weighted(s, self.past, self.shape).take(free, axis=0)
+            right += weighted_sum_of_past(w, self.past_increments, self._of_free)
+        right -= mass * weighted_sum_of_past(s, self.past, self.shape).take(free, axis=0)
         for each in self.carried:
-            force = force + each.force()
+            force = force + each.force_columns()
         forced = force.take(free, axis=0)
-        forced += self._of_past(step, row)
+        forced += self._past_force(step, row)
         if prescribed is not None:
             forced += prescribed.force(solver, step)
-        solver.without_taken(t, right)
-        solver.without_taken(t, forced)
+        solver.without_prescribed(t, right)
+        solver.without_prescribed(t, forced)
         solution = step.factor.solve(right + w[0] * forced)
         if self.weighs_past:
             self.past_increments.appendleft((s[0] * mass * solution - right) / w[0])
-        found[free] = solution
+        out[free] = solution
         if prescribed is not None:
-            prescribed.place(t, found)
+            prescribed.write_into(t, out)
         for each in self.carried:
             each.advance(
-                partial(self._evaluated, row.p, found), partial(self._evaluated, row.q, found)
+                partial(self._stencil_sum, row.p, out), partial(self._stencil_sum, row.q, out)
             )
         if self.held is not None:
-            self._sense(self.held, step, force, found)
-        self.past.appendleft(found)
+            self._store_grasp_forces(self.held, step, force, out)
+        self.past.appendleft(out)
 
-    def _sense(self, held: HeldForces, step: Step, force: Array, found: Array) -> None:
-        """Store F_t and dF_t of the dofs of instrumented grasps in `held`, in place."""
+    def _store_grasp_forces(
+        self, grasp_forces: GraspForces, step: FactorisedStep, force: Array, solution: Array
+    ) -> None:
+        """Store F_t and dF_t of the dofs of instrumented grasps in `grasp_forces`, in place."""
         row = step.row
         dofs = self.solver.sensed
         matrix = self.solver.of_sensed
-        held.force[step.t] = step.force[dofs]
-        state, rate = (self._evaluated(weights, found) for weights in (row.p, row.q))
-        slopes = force[dofs] + matrix.of(step.by_position, step.skew) @ state
-        held.slopes[step.t] = slopes + matrix.of(step.by_velocity, step.rate_skew) @ rate
+        grasp_forces.force[step.t] = step.force[dofs]
+        state, rate = (self._stencil_sum(weights, solution) for weights in (row.p, row.q))
+        slopes = force[dofs] + matrix.extract(step.by_position, step.skew) @ state
+        grasp_forces.changes[step.t] = (
+            slopes + matrix.extract(step.by_velocity, step.rate_skew) @ rate
+        )
 
-    def _evaluated(self, weights: Sequence[float], found: Array) -> Array:
+    def _stencil_sum(self, weights: Sequence[float], solution: Array) -> Array:
         """Return Σ_i weights[i] Y_{t−i} (3n, c): the change of ξ or ν of row t."""
-        return weights[0] * found + weighted(weights, self.past, self.shape)
+        return weights[0] * solution + weighted_sum_of_past(weights, self.past, self.shape)
 
-    def _of_past(self, step: Step, row: StencilRow) -> Array | float:
+    def _past_force(self, step: FactorisedStep, row: StencilRow) -> Array | float:
         """Return the force G Σ p_i Y_{t−i} + C Σ q_i Y_{t−i} of earlier rows (free, c),
         with as few products as possible.
         """
         matrix = self.solver.matrix
-        if not row.lags:
+        if not row.nonzero_lags:
             return 0.0
-        if len(row.lags) == 1:
-            (i,) = row.lags
+        if len(row.nonzero_lags) == 1:
+            (i,) = row.nonzero_lags
             block = row.p[i] * step.by_position
             block += row.q[i] * step.by_velocity
-            return matrix.of(block, row.skew(i, step.skew, step.rate_skew)) @ self.past[i - 1]
-        past = weighted(row.q, self.past, self.shape)
-        total = matrix.of(step.by_velocity, step.rate_skew) @ past
+            return matrix.extract(block, row.skew(i, step.skew, step.rate_skew)) @ self.past[i - 1]
+        past = weighted_sum_of_past(row.q, self.past, self.shape)
+        total = matrix.extract(step.by_velocity, step.rate_skew) @ past
         if any(row.p[1:]):
-            past = weighted(row.p, self.past, self.shape)
-            total += matrix.of(step.by_position, step.skew) @ past
+            past = weighted_sum_of_past(row.p, self.past, self.shape)
+            total += matrix.extract(step.by_position, step.skew) @ past
         return total

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import Array, Index
-from ..model.generated import Generated
+from ..model.generated import GeneratedFunction
 from ..model.nuisance import NuisanceMap
 from ..recording.depth import Depth
 from ..recording.experiment import Experiment
@@ -23,7 +23,7 @@ from ..recording.nuisance import (
     DEPTH_TIME,
     DEPTH_TURN,
     NuisanceRow,
-    rotation,
+    cayley_rotation,
 )
 
 OF_CAMERA = (DEPTH_TURN, DEPTH_SHIFT, DEPTH_BIAS, DEPTH_SCALE, DEPTH_TIME, DEPTH_EDGE)
@@ -32,14 +32,14 @@ EXACT = 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DepthCameraModel:
     """Depth camera with its estimated errors.
 
     Attributes
     ----------
     depth : Depth
         The camera and its measured points.
-    number : int
+    camera_index : int
         Index of the camera in the experiment.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment, which include the camera's errors.
@@ -51,45 +51,47 @@ class View:
     """
 
     depth: Depth
-    number: int
+    camera_index: int
     nuisance: NuisanceMap
     pivot_m: Array
     size_m: float
 
     @classmethod
-    def of(cls, experiment: Experiment, number: int, nuisance: NuisanceMap) -> View:
-        """Build the model of camera `number` (index) of an experiment."""
-        depth = experiment.depths[number]
-        rotations, translations = depth.camera.motion(depth.times[:1])
+    def from_experiment(
+        cls, experiment: Experiment, camera_index: int, nuisance: NuisanceMap
+    ) -> DepthCameraModel:
+        """Build the model of camera `camera_index` (index) of an experiment."""
+        depth = experiment.depths[camera_index]
+        rotations, translations = depth.camera.pose_at(depth.sample_times_s[:1])
         pivot_m = (experiment.body.nodes_m.mean(axis=0) - translations[0]) @ rotations[0]
         size_m = float(np.linalg.norm(np.ptp(experiment.body.nodes_m, axis=0)))
-        return cls(depth, number, nuisance, pivot_m, size_m)
+        return cls(depth, camera_index, nuisance, pivot_m, size_m)
 
     @cached_property
-    def instruments(self) -> dict[tuple[int, int], Any]:
+    def depth_expressions(self) -> dict[tuple[int, int], Any]:
         """Generated functions of its depth residuals, shared by all copies of the
         measurement model.
         """
         return {}
 
     @cached_property
-    def outline_instruments(self) -> dict[tuple[int, int], Any]:
+    def outline_expressions(self) -> dict[tuple[int, int], Any]:
         """Generated functions of its outline residuals, shared by all copies of the
         measurement model.
         """
         return {}
 
     @cached_property
-    def own(self) -> Index:
+    def parameter_indices(self) -> Index:
         """Indices in φ of the camera's nuisance parameters."""
-        return self.nuisance.places(*OF_CAMERA, of=self.number)
+        return self.nuisance.indices_of_rows(*OF_CAMERA, component=self.camera_index)
 
     @cached_property
-    def motion(self) -> tuple[Array, Array]:
+    def poses(self) -> tuple[Array, Array]:
         """Rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
         world, at each image.
         """
-        return self.depth.camera.motion(self.depth.times)
+        return self.depth.camera.pose_at(self.depth.sample_times_s)
 
     @cached_property
     def rays(self) -> list[Array]:
@@ -100,7 +102,9 @@ class View:
         pinhole = self.depth.camera.matrix is not None
         return [p / p[:, 2:] if pinhole else np.zeros_like(p) for p in clouds]
 
-    def corrected(self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]) -> ca.SX:
+    def corrected_expression(
+        self, point: ca.SX, ray: ca.SX, values: Mapping[NuisanceRow, ca.SX]
+    ) -> ca.SX:
         """Return the expression of a point in the camera's stated frame, corrected by the estimated
         errors.
 
@@ -116,32 +120,32 @@ class View:
         point = (1 + values.get(DEPTH_SCALE, 0)) * point + values.get(DEPTH_BIAS, 0) * ray
         if DEPTH_TURN in values:
             pivot = ca.DM(self.pivot_m)
-            point = rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
+            point = cayley_rotation(values[DEPTH_TURN]) @ (point - pivot) + pivot
         return point + values.get(DEPTH_SHIFT, 0)
 
     @cached_property
-    def _corrected(self) -> Generated:
-        """Generated function of `corrected`."""
+    def _correction(self) -> GeneratedFunction:
+        """Generated function of `corrected_expression`."""
 
         def expression(own: ca.SX, data: ca.SX) -> ca.SX:
-            values = self.nuisance.by_row(own, self.own)
-            return self.corrected(data[:3], data[3:], values)
+            values = self.nuisance.values_by_row(own, self.parameter_indices)
+            return self.corrected_expression(data[:3], data[3:], values)
 
-        return Generated(expression, len(self.own), 6)
+        return GeneratedFunction(expression, len(self.parameter_indices), 6)
 
-    def world(self, phi: Array, sample: int) -> Array:
+    def world_points(self, phi: Array, image: int) -> Array:
         """Return the points (P, 3) of an image in the world [m].
 
         Parameters
         ----------
         phi : (k,) array
             Nuisance parameters.
-        sample : int
+        image : int
             Index of the image.
         """
-        return self.corrected_at(phi, self.depth.points_m[sample], self.rays[sample], sample)
+        return self.to_world(phi, self.depth.points_m[image], self.rays[image], image)
 
-    def corrected_at(self, phi: Array, points: Array, rays: Array, sample: int) -> Array:
+    def to_world(self, phi: Array, points: Array, rays: Array, image: int) -> Array:
         """Return points (P, 3) of the camera's frame in the world [m], corrected at φ (k,).
 
         Parameters
@@ -152,38 +156,40 @@ class View:
             Points in the camera's frame [m].
         rays : (P, 3) array
             Directions of their depths; zeros if no bias of the depth is to be applied.
-        sample : int
+        image : int
             Index of the image.
         """
-        corrected = self._corrected.value(phi[self.own], np.vstack([points.T, rays.T])).T
-        rotations, translations = self.motion
-        return corrected @ rotations[sample].T + translations[sample]
+        corrected = self._correction.evaluate(
+            phi[self.parameter_indices], np.vstack([points.T, rays.T])
+        ).T
+        rotations, translations = self.poses
+        return corrected @ rotations[image].T + translations[image]
 
-    def middle_m(self, sample: int) -> Array:
+    def body_middle_m(self, sample: int) -> Array:
         """Return the middle (3,) of the undeformed body in the camera's stated frame, at an
         image [m].
         """
-        rotations, translations = self.motion
+        rotations, translations = self.poses
         middle_m = rotations[0] @ self.pivot_m + translations[0]
         return (middle_m - translations[sample]) @ rotations[sample]
 
-    def own_m(self, phi: Array, points_m: Array, sample: int) -> Array:
+    def to_camera_m(self, phi: Array, points_m: Array, sample: int) -> Array:
         """Return points (P, 3) of the world in the camera's frame [m]: the inverse of
-        `corrected_at` without bias.
+        `to_world` without bias.
         """
         basis = np.vstack([np.zeros(3), np.eye(3)])
-        corner, *axes = self.corrected_at(phi, basis, np.zeros((4, 3)), sample)
+        corner, *axes = self.to_world(phi, basis, np.zeros((4, 3)), sample)
         return np.linalg.solve((axes - corner).T, (points_m - corner).T).T
 
-    def told(self, phi: Array) -> dict[str, float]:
+    def parameter_values(self, phi: Array) -> dict[str, float]:
         """Return the camera's nuisance parameters in physical units by label, from φ (k,)."""
         entries = self.nuisance.entries
         values = phi * self.nuisance.scales
-        return {entries[k].label: float(values[k]) for k in self.own}
+        return {entries[k].label: float(values[k]) for k in self.parameter_indices}
 
-    def phi(self, told: Mapping[str, float]) -> Array:
+    def parameters_from(self, physical_values: Mapping[str, float]) -> Array:
         """Return φ (k,) with the given values in physical units by label; others are zero."""
-        values = [told.get(entry.label, 0.0) for entry in self.nuisance.entries]
+        values = [physical_values.get(entry.label, 0.0) for entry in self.nuisance.entries]
         return np.array(values) / self.nuisance.scales
 
     def eye_m(self, phi: Array, sample: int) -> Array | None:
@@ -192,28 +198,28 @@ class View:
         """
         if self.depth.camera.matrix is None:
             return None
-        return self.corrected_at(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)[0]
+        return self.to_world(phi, np.zeros((1, 3)), np.zeros((1, 3)), sample)[0]
 
-    def prior(self, row: NuisanceRow) -> Array:
+    def prior_weights(self, row: NuisanceRow) -> Array:
         """Return one over the prior standard deviations (3,) of the rotation [1/rad] or
         translation [1/m]; a large number for exact ones.
         """
-        places = self.nuisance.places(row, of=self.number)
+        places = self.nuisance.indices_of_rows(row, component=self.camera_index)
         return 1 / self.nuisance.scales[places] if len(places) else np.full(3, EXACT)
 
-    def late_s(self, phi: Array) -> float:
+    def clock_shift_s(self, phi: Array) -> float:
         """Return by how much images are taken later than their times state [s]."""
-        places = self.nuisance.places(DEPTH_TIME, of=self.number)
+        places = self.nuisance.indices_of_rows(DEPTH_TIME, component=self.camera_index)
         return float((phi * self.nuisance.scales)[places].sum())
 
-    def with_pose(self, phi: Array, turn: Array, shift_m: Array) -> Array:
+    def with_pose(self, phi: Array, rotation_vector: Array, shift_m: Array) -> Array:
         """Return φ (k,) with another rotation error (rotation vector [rad]) and translation
         error [m], as far as they are estimated.
         """
         updated = phi.copy()
-        angle = np.linalg.norm(turn)
-        cayley = turn * (2 * np.tan(angle / 2) / angle if angle else 1.0)
+        angle = np.linalg.norm(rotation_vector)
+        cayley = rotation_vector * (2 * np.tan(angle / 2) / angle if angle else 1.0)
         for row, values in ((DEPTH_TURN, cayley), (DEPTH_SHIFT, shift_m)):
-            places = self.nuisance.places(row, of=self.number)
+            places = self.nuisance.indices_of_rows(row, component=self.camera_index)
             updated[places] = values[: len(places)] / self.nuisance.scales[places]
         return updated

@@ -21,27 +21,27 @@ from ..recording.clock import TIME_TOLERANCE_S
 from ..recording.experiment import Experiment
 from ..recording.nuisance import SENSOR_TIME, TARE
 from ..recording.wrench import Wrench
-from .channel import Forced, Motion
-from .reading import Reading, Window, lagrange_weights, times_around
-from .wrench_channel import GraspWrench, Grid
+from .channel import ObservedMotion, ReactionForces
+from .reading import MeasurementResidual, RowStencil, lagrange_weights, neighbouring_times
+from .wrench_channel import GraspWrench, ReactionGrid
 
 # Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
 NEIGHBOURS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class WrenchReading(Reading):
+class WrenchResidual(MeasurementResidual):
     """Measurement model of the force–torque sensor of one grasp.
 
     Attributes
     ----------
-    channel : GraspWrench
+    observable : GraspWrench
         Wrench on the grid as an observable.
     wrench : Wrench
         Measured samples.
     """
 
-    channel: GraspWrench
+    observable: GraspWrench
     wrench: Wrench
 
     stated = "sigma_n"
@@ -49,18 +49,18 @@ class WrenchReading(Reading):
     has_fixed_windows = False
 
     @classmethod
-    def of(
+    def from_sensor(
         cls,
-        channel: GraspWrench,
+        observable: GraspWrench,
         wrench: Wrench,
         label: str = "",
         huber: float | None = None,
-    ) -> WrenchReading:
+    ) -> WrenchResidual:
         """Build the measurement model of a sensor.
 
         Parameters
         ----------
-        channel : GraspWrench
+        observable : GraspWrench
             Wrench on the grid as an observable.
         wrench : Wrench
             Measured samples.
@@ -70,67 +70,73 @@ class WrenchReading(Reading):
             Threshold of Huber's loss; None means a quadratic loss.
         """
         rows = (SENSOR_TIME, TARE)
-        is_compared = wrench.present & _covered(channel, wrench.t_s, channel.count)[:, None]
+        is_compared = (
+            wrench.is_measured & _is_covered(observable, wrench.t_s, observable.count)[:, None]
+        )
         return cls(
-            channel=channel,
-            nuisance=channel.nuisance,
+            observable=observable,
+            nuisance=observable.nuisance,
             huber=huber,
             names=(f"force{label}", f"torque{label}"),
             t_s=wrench.t_s,
             sigmas=wrench.sigmas[[0, 3]],
             measured=wrench.values[:, None],
-            components=is_compared.reshape(-1, 2, 3),
-            own=np.concatenate([channel.phi_places(row) for row in rows])[None],
+            is_compared=is_compared.reshape(-1, 2, 3),
+            own_parameters=np.concatenate([observable.parameter_indices(row) for row in rows])[
+                None
+            ],
             wrench=wrench,
         )
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def is_compared_by_component(self) -> NDArray[np.bool_]:
         """Mask (S, 6) of the numbers that are compared."""
-        return self.components.reshape(-1, 6)
+        return self.is_compared.reshape(-1, 6)
 
     @property
-    def begins_s(self) -> float:
+    def first_needed_s(self) -> float:
         """Time [s] of the first sample with the largest possible shift of the clock."""
-        return super().begins_s + self.channel.clock_limit_s
+        return super().first_needed_s + self.observable.clock_limit_s
 
-    def covered(self, known: int) -> NDArray[np.bool_]:
+    def is_covered(self, known: int) -> NDArray[np.bool_]:
         """Return the mask (S,) of the samples for which the first `known` times suffice,
         for any shift of the clock.
         """
-        return _covered(self.channel, self.t_s, known)
+        return _is_covered(self.observable, self.t_s, known)
 
-    def _used(self, known: int) -> int:
+    def _neighbour_count(self, known: int) -> int:
         """Return the number of grid times that a sample is interpolated from."""
-        return min(2 if self.channel.on.static else NEIGHBOURS, known)
+        return min(2 if self.observable.reaction_grid.is_static else NEIGHBOURS, known)
 
-    def window(self, phi: Array, known: int) -> Window:
+    def stencil(self, phi: Array, known: int) -> RowStencil:
         """Return the stencil of all samples: the grid times around each, and their
         distances from it.
         """
-        clock = self.channel.phi_places(SENSOR_TIME)
-        used = self._used(known)
-        t_s = self.channel.t_s[:known]
+        clock = self.observable.parameter_indices(SENSOR_TIME)
+        used = self._neighbour_count(known)
+        t_s = self.observable.t_s[:known]
         shift_s = (phi[clock] * self.nuisance.scales[clock]).sum()
-        times = times_around(t_s, self.t_s + shift_s, used)
-        data = self.channel.t_s[times] - self.t_s[:, None]
-        return Window(_both(times), data.T[..., None])
+        times = neighbouring_times(t_s, self.t_s + shift_s, used)
+        data = self.observable.t_s[times] - self.t_s[:, None]
+        return RowStencil(_vector_indices(times), data.T[..., None])
 
-    def windows(self) -> Index:
+    def all_stencils(self) -> Index:
         """Return the indices (…, 1, v) of neighbouring times, for any shift of the clock."""
-        used = self._used(self.channel.count)
-        return _both(np.arange(self.channel.count - used + 1)[:, None] + np.arange(used))
+        used = self._neighbour_count(self.observable.count)
+        return _vector_indices(
+            np.arange(self.observable.count - used + 1)[:, None] + np.arange(used)
+        )
 
-    def expression(self, looked: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
+    def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the prediction (6,) from wrenches at neighbouring grid times, the shift of
         the clock and the tare.
         """
         times = data.numel()
-        tared = np.flatnonzero(self.wrench.measured)
-        own = phi * self.nuisance.scales[self.own[0]][:, None]
-        has_clock = len(self.channel.phi_places(SENSOR_TIME))
+        tared = np.flatnonzero(self.wrench.measured_components)
+        own = phi * self.nuisance.scales[self.own_parameters[0]][:, None]
+        has_clock = len(self.observable.parameter_indices(SENSOR_TIME))
         at = own[0] if has_clock else ca.SX(0)
-        predicted = ca.reshape(looked, 6, times) @ ca.vertcat(
+        predicted = ca.reshape(values, 6, times) @ ca.vertcat(
             *lagrange_weights(at, ca.vertsplit(data))
         )
         predicted[tared[: own.numel() - has_clock]] += own[has_clock:]
@@ -138,58 +144,58 @@ class WrenchReading(Reading):
 
     # Of reactions -----------------------------------------------------------------------------
 
-    def of_forced(self, forced: Forced, phi: Array) -> Array:
+    def predict_reactions(self, known_reactions: ReactionForces, phi: Array) -> Array:
         """Return the prediction (S, 6) from reaction forces [N, N m]; NaN for samples
         outside the known times.
         """
 
-        def reactions() -> Forced:
-            return forced
+        def reactions() -> ReactionForces:
+            return known_reactions
 
-        motion = Motion(np.zeros((0, 0)), reactions)
-        values = self.channel.values(motion, phi)
+        motion = ObservedMotion(np.zeros((0, 0)), reactions)
+        values = self.observable.evaluate(motion, phi)
         if not len(values):
             return np.full(self.wrench.values.shape, np.nan)
-        predicted = self.predicted(values, phi).reshape(-1, 6)
-        return np.where(self.covered(len(values))[:, None], predicted, np.nan)
+        predicted = self.predict(values, phi).reshape(-1, 6)
+        return np.where(self.is_covered(len(values))[:, None], predicted, np.nan)
 
-    def on(self, grid: Grid) -> WrenchReading:
+    def on_grid(self, grid: ReactionGrid) -> WrenchResidual:
         """Return the model with reaction forces at the times of another grid."""
-        return WrenchReading.of(replace(self.channel, on=grid), self.wrench)
+        return WrenchResidual.from_sensor(replace(self.observable, reaction_grid=grid), self.wrench)
 
-    def told(self, wrench: Wrench) -> WrenchReading:
+    def with_samples(self, wrench: Wrench) -> WrenchResidual:
         """Return the model of other samples, in their own frame."""
-        observable = replace(self.channel, frame=wrench.frame, point_m=wrench.point_m)
-        return WrenchReading.of(observable, wrench)
+        observable = replace(self.observable, frame=wrench.frame, point_m=wrench.point_m)
+        return WrenchResidual.from_sensor(observable, wrench)
 
 
-def _covered(channel: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
+def _is_covered(observable: GraspWrench, t_s: Array, known: int) -> NDArray[np.bool_]:
     """Return the mask (S,) of the samples within the first `known` grid times for any shift
     of the clock.
     """
     if not known:
         return np.zeros(len(t_s), dtype=bool)
-    first, last = channel.t_s[[0, known - 1]]
-    rounding = 1e-6 * channel.on.step_s + TIME_TOLERANCE_S
-    limit_s = channel.clock_limit_s
+    first, last = observable.t_s[[0, known - 1]]
+    rounding = 1e-6 * observable.reaction_grid.step_s + TIME_TOLERANCE_S
+    limit_s = observable.clock_limit_s
     return (t_s >= first + limit_s - rounding) & (t_s <= last - limit_s + rounding)
 
 
-def _both(times: Index) -> Index:
+def _vector_indices(times: Index) -> Index:
     """Return the indices (S, 1, 2 used) of force and torque vectors at times (S, used)."""
     return (2 * times[..., None] + np.arange(2)).reshape(len(times), 1, -1)
 
 
-def wrench_readings(
-    experiment: Experiment, grid: Grid, nuisance: NuisanceMap, huber: float | None = None
-) -> tuple[WrenchReading, ...]:
+def wrench_residuals(
+    experiment: Experiment, grid: ReactionGrid, nuisance: NuisanceMap, huber: float | None = None
+) -> tuple[WrenchResidual, ...]:
     """Build the measurement models of all grasps of an experiment that have a force–torque sensor.
 
     Parameters
     ----------
     experiment : Experiment
         The experiment.
-    grid : Grid
+    grid : Table
         Times at which reaction forces are known.
     nuisance : NuisanceMap
         Nuisance parameters of the experiment.
@@ -200,7 +206,7 @@ def wrench_readings(
     sensors = [(g, g.wrench) for g in experiment.grasps if g.wrench is not None]
     for number, (grasp, wrench) in enumerate(sensors):
         label = "" if len(sensors) == 1 else f" {number + 1}"
-        channel = GraspWrench.of(
+        channel = GraspWrench.from_experiment(
             experiment,
             grasp,
             frame=wrench.frame,
@@ -209,11 +215,11 @@ def wrench_readings(
             nuisance=nuisance,
             number=number,
         )
-        models.append(WrenchReading.of(channel, wrench, label, huber))
+        models.append(WrenchResidual.from_sensor(channel, wrench, label, huber))
     return tuple(models)
 
 
-def without_sensors(experiment: Experiment) -> Experiment:
+def without_grasp_sensors(experiment: Experiment) -> Experiment:
     """Return the experiment without force–torque sensors and custom sensors of grasps."""
     grasps = [replace(grasp, wrench=None) for grasp in experiment.grasps]
     readings = [gauge for gauge in experiment.readings if gauge.grasp is None]

@@ -13,7 +13,8 @@ measured reaction forces.
 - `environment`: the density of the air.
 
 Files are read by `readers` (markers), `pose_files` (poses), `tables` (forces, displacements,
-pressures, custom sensors) and the subpackage `formats`; `writers` writes them. `alignment`, `clock`
+pressures, custom sensors) and the subpackage `formats`; `writers` writes them. `align_camera`,
+`clock_hypothesis`
 and `rigid` prepare data: one time grid, sample times, rigid fits. `refinement` moves an experiment
 to a finer mesh, `turning` finds the fastest rotation of its grasps, and `arrays` and `selected`
 check arrays and node selections.
@@ -28,8 +29,8 @@ from .experiment import Experiment as Experiment
 from .gauge import Gauge as Gauge
 from .gauge import Look as Look
 from .grasp import Grasp as Grasp
-from .grasp import held_dofs as held_dofs
-from .grasp import held_nodes as held_nodes
+from .grasp import prescribed_dofs as prescribed_dofs
+from .grasp import prescribed_nodes as prescribed_nodes
 from .loads import Force as Force
 from .loads import PointMass as PointMass
 from .markers import Markers as Markers

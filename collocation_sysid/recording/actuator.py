@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
-from ..fem.shape import Length, Volume
-from .loads import Course
+from ..fem.shape import EnclosedVolume, PolylineLength
+from .loads import TimeSeries
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
-S = TypeVar("S", Length, Volume)
+S = TypeVar("S", PolylineLength, EnclosedVolume)
 
 
 @dataclass(frozen=True, eq=False)
-class Placed(Generic[S]):
+class BodyMeasure(Generic[S]):
     """A scalar S of the shape of a given body: the length of a tendon, or a volume."""
 
     body: Body
@@ -36,25 +36,25 @@ class Actuator(ABC, Generic[S]):
         For messages and reports.
     t_s : (m,) or None
         Times of the stated tension or pressure; None if it is constant.
-    course : Course
+    stated_values : TimeSeries
         The tension or pressure as stated.
     factor : float
         Factor on the stated tension or pressure.
-    placed : Placed, optional
+    body_measure : BodyMeasure, optional
         The scalar S of a body; None before the actuator belongs to an experiment.
     """
 
     name: str
     t_s: Array | None
     factor: float
-    placed: Placed[S] | None
-    course: Course
+    body_measure: BodyMeasure[S] | None
+    stated_values: TimeSeries
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     unit: ClassVar[str]  # of the tension or pressure
-    lost: ClassVar[str]  # the field of what is lost
+    offset_field: ClassVar[str]  # the field of what is lost
 
-    def on(self, body: Body) -> Self:
+    def on_body(self, body: Body) -> Self:
         """Return the actuator with its scalar S evaluated for a body.
 
         Raises
@@ -62,9 +62,9 @@ class Actuator(ABC, Generic[S]):
         InputError
             If the actuator does not fit this body.
         """
-        if self.placed is not None and self.placed.body is body:
+        if self.body_measure is not None and self.body_measure.body is body:
             return self
-        return replace(self, placed=Placed(body, self._measure_on(body)))
+        return replace(self, body_measure=BodyMeasure(body, self._measure_on(body)))
 
     @abstractmethod
     def _measure_on(self, body: Body) -> S:
@@ -73,25 +73,25 @@ class Actuator(ABC, Generic[S]):
     @property
     def measure(self) -> S:
         """Scalar S of the body's shape; an `InputError` if the actuator is on no body yet."""
-        if self.placed is None:
+        if self.body_measure is None:
             raise InputError(f"{self.name} is not on a body yet; expected one of an experiment")
-        return self.placed.measure
+        return self.body_measure.measure
 
     @property
-    def off(self) -> tuple[float, float]:
+    def factor_and_offset(self) -> tuple[float, float]:
         """Factor on the stated tension or pressure, and its offset (the part that is lost)."""
-        return self.factor, getattr(self, self.lost)
+        return self.factor, getattr(self, self.offset_field)
 
-    def off_by(self, factor: float, lost: float) -> Self:
+    def with_factor_and_offset(self, factor: float, offset: float) -> Self:
         """Return the actuator with another factor and another offset."""
-        return replace(self, factor=factor, **{self.lost: lost})
+        return replace(self, factor=factor, **{self.offset_field: offset})
 
     @abstractmethod
-    def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
+    def energy_amplitude(self, stated_value: Any, factor: Any, offset: Any) -> Any:
         """Return the amplitude c for a stated tension or pressure: numbers, arrays or CasADi
         expressions.
         """
 
-    def amplitude(self, t_s: Array) -> Array:
+    def energy_amplitude_at(self, t_s: Array) -> Array:
         """Return the amplitude c at the times `t_s` (T,), as (T,)."""
-        return self.driven(self.course.at(t_s), *self.off)
+        return self.energy_amplitude(self.stated_values.values_at(t_s), *self.factor_and_offset)

@@ -9,7 +9,13 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from .clock import STEP_TOLERANCE, even_times_s, rounding_s, sample_interval_s, unrounded_s
+from .clock import (
+    STEP_TOLERANCE,
+    evenly_spaced_s,
+    printed_rounding_s,
+    sample_interval_s,
+    unrounded_s,
+)
 from .poses import PoseSequence
 from .readers import MarkerTable
 
@@ -22,7 +28,7 @@ _FEWEST_SAMPLES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Aligned:
+class AlignedRecording:
     """Poses and markers on one time grid.
 
     Attributes
@@ -49,9 +55,9 @@ def align(
     window_s: tuple[float, float] | None = None,
     resample_hz: float | None = None,
     every: int = 1,
-    held_s: Sequence[tuple[float, float]] | None = None,
+    hold_s: Sequence[tuple[float, float]] | None = None,
     static: bool = False,
-) -> Aligned:
+) -> AlignedRecording:
     """Put poses and markers on one evenly spaced time grid over the time that they share.
 
     Without `resample_hz` the grid is the markers' own time and no measurement is changed. With it,
@@ -72,7 +78,7 @@ def align(
         Rate of the new grid, which starts at the first sample that is kept.
     every : int
         Use every n-th sample of the markers.
-    held_s : sequence of (float, float), optional
+    hold_s : sequence of (float, float), optional
         First and last time at which each grasp holds; its poses need not cover other times. The
         whole recording by default.
     static : bool
@@ -84,9 +90,9 @@ def align(
         If the window is empty, the markers' time is uneven, or poses and markers share fewer than
         three samples.
     """
-    table = table if window_s is None else _cut(table, window_s)
-    held_s = held_s or [(-np.inf, np.inf)] * len(poses)
-    table, notes = _shared(table, poses, held_s, 1 if static else _FEWEST_SAMPLES)
+    table = table if window_s is None else _cut_to_window(table, window_s)
+    hold_s = hold_s or [(-np.inf, np.inf)] * len(poses)
+    table, notes = _cut_to_poses(table, poses, hold_s, 1 if static else _FEWEST_SAMPLES)
     if every > 1:
         table = MarkerTable(table.t_s[::every], table.names, table.positions_m[::every])
     if static:
@@ -94,27 +100,27 @@ def align(
     elif resample_hz is None:
         sample_interval_s(table.t_s, "markers")
         t_s = table.t_s
-        grid = even_times_s(table.t_s)
+        grid = evenly_spaced_s(table.t_s)
         table = MarkerTable(grid, table.names, table.positions_m)
     else:
-        t_s = grid = _grid(table.t_s, resample_hz)
-        table = MarkerTable(grid, table.names, _between_neighbours(table, grid))
+        t_s = grid = _even_grid(table.t_s, resample_hz)
+        table = MarkerTable(grid, table.names, _interpolate_markers(table, grid))
     moved = []
     for k, sequence in enumerate(poses):
         name = "the poses" if len(poses) == 1 else f"the poses of grasp {k + 1}"
-        matched = _matched(sequence, t_s, grid)
+        matched = _poses_on_grid(sequence, t_s, grid)
         if matched is None:
             matched = replace(sequence, t_s=unrounded_s(sequence.t_s))
-            notes.append(f"{name}{_interpolated(matched, grid)}")
-        notes += [f"{name}{note}" for note in _jumping(matched, grid)]
+            notes.append(f"{name}{_interpolation_note(matched, grid)}")
+        notes += [f"{name}{note}" for note in _jump_notes(matched, grid)]
         moved.append(matched)
-    return Aligned(grid, tuple(moved), table, tuple(notes))
+    return AlignedRecording(grid, tuple(moved), table, tuple(notes))
 
 
-def _shared(
+def _cut_to_poses(
     table: MarkerTable,
     poses: Sequence[PoseSequence],
-    held_s: Sequence[tuple[float, float]],
+    hold_s: Sequence[tuple[float, float]],
     fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
     """Return the markers at times for which every grasp that holds has a pose, and notes on the
@@ -127,7 +133,7 @@ def _shared(
     """
     t_s = table.t_s
     is_kept = np.ones(len(t_s), dtype=bool)
-    moving = [(p, window_s) for p, window_s in zip(poses, held_s, strict=True) if len(p.t_s) > 1]
+    moving = [(p, window_s) for p, window_s in zip(poses, hold_s, strict=True) if len(p.t_s) > 1]
     for sequence, (from_s, until_s) in moving:
         slack_s = _tolerance_s(sequence, t_s)
         # Beyond its first or last pose a grasp must not be asked for one.
@@ -137,10 +143,10 @@ def _shared(
             is_kept &= t_s <= sequence.t_s[-1] + slack_s
     if is_kept.all():
         return table, []
-    spans = " and ".join(_span(sequence.t_s) for sequence, _ in moving)
+    spans = " and ".join(_span_text(sequence.t_s) for sequence, _ in moving)
     if is_kept.sum() < fewest:
         raise InputError(
-            f"poses run {spans}, markers {_span(t_s)}: they share {is_kept.sum()} marker samples; "
+            f"poses run {spans}, markers {_span_text(t_s)}: they share {is_kept.sum()} marker samples; "
             f"expected at least {fewest}: check that both are of one recording and one "
             "clock, and window_s"
         )
@@ -152,14 +158,14 @@ def _shared(
     ]
     note = (
         f"the markers were cut to the time of the poses by {' and '.join(ends)}, "
-        f"{(~is_kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran {_span(t_s)}"
+        f"{(~is_kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran {_span_text(t_s)}"
     )
     if cut[0] > t_s[0]:
         note += f"; start tells the state at {cut[0]:.9g} s now"
     return MarkerTable(cut, table.names, table.positions_m[is_kept]), [note]
 
 
-def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
+def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
     """Return the samples within a window; an `InputError` if there are none."""
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
@@ -173,7 +179,7 @@ def _cut(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
     return MarkerTable(table.t_s[is_kept], table.names, table.positions_m[is_kept])
 
 
-def _grid(t_s: Array, rate_hz: float) -> Array:
+def _even_grid(t_s: Array, rate_hz: float) -> Array:
     """Return evenly spaced times at a rate [Hz] from the first time on, within the given times."""
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
@@ -186,7 +192,7 @@ def _grid(t_s: Array, rate_hz: float) -> Array:
     return t_s[0] + np.arange(count) / rate_hz
 
 
-def _between_neighbours(table: MarkerTable, grid: Array) -> Array:
+def _interpolate_markers(table: MarkerTable, grid: Array) -> Array:
     """Return marker positions on the grid; NaN beside a missing sample or within a gap of the
     times.
     """
@@ -203,7 +209,7 @@ def _between_neighbours(table: MarkerTable, grid: Array) -> Array:
     return np.where(on_earlier, x[k], np.where(on_later, x[k + 1], between))
 
 
-def _matched(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
+def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
     """Return poses whose samples at the marker times are moved onto the grid.
 
     None if a marker time within the span of the poses has no pose.
@@ -243,13 +249,13 @@ def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
     [s].
     """
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
-    return STEP_TOLERANCE * step_s + 0.5 * (rounding_s(t_s) + rounding_s(poses.t_s))
+    return STEP_TOLERANCE * step_s + 0.5 * (printed_rounding_s(t_s) + printed_rounding_s(poses.t_s))
 
 
-def _interpolated(poses: PoseSequence, grid: Array) -> str:
+def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
     """Return a note on poses that were interpolated to the grid, without its subject."""
     how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
-    at = f"{_rate_hz(grid):.6g} Hz {_span(grid)}" if len(grid) > 1 else _span(grid)
+    at = f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}" if len(grid) > 1 else _span_text(grid)
     note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
     steps = np.diff(poses.t_s)
     is_gap = (steps > _GAP_STEPS * np.median(steps)) & (poses.t_s[1:] > grid[0])
@@ -259,11 +265,11 @@ def _interpolated(poses: PoseSequence, grid: Array) -> str:
     k = int(np.argmax(np.where(is_gap, steps, 0.0)))
     return (
         f"{note}, also across {is_gap.sum()} gap{'s' * int(is_gap.sum() > 1)} in them, the longest "
-        f"{_span(poses.t_s[k : k + 2])}"
+        f"{_span_text(poses.t_s[k : k + 2])}"
     )
 
 
-def _jumping(poses: PoseSequence, grid: Array) -> list[str]:
+def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
     """Return a note on jumps of smooth poses within the grid, without its subject; empty if
     none.
     """
@@ -281,6 +287,6 @@ def _rate_hz(t_s: Array) -> float:
     return (len(t_s) - 1) / float(t_s[-1] - t_s[0])
 
 
-def _span(t_s: Array) -> str:
+def _span_text(t_s: Array) -> str:
     """First and last of some times as text."""
     return f"from {t_s[0]:.9g} s to {t_s[-1]:.9g} s"

@@ -43,7 +43,7 @@ def read_only_floats(
     return array
 
 
-def floats(
+def float_converter(
     shape: tuple[int | None, ...], name: str, finite: bool = True
 ) -> Callable[[ArrayLike], Array]:
     """Return a converter of field values that applies `read_only_floats` with these arguments."""
@@ -83,7 +83,7 @@ def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str)
     return nodes
 
 
-def triple(point: ArrayLike) -> str:
+def point_text(point: ArrayLike) -> str:
     """Return a point (3,) as text with four digits, "(x, y, z)", for messages."""
     return f"({', '.join(f'{x:.4g}' for x in np.asarray(point))})"
 

@@ -17,7 +17,7 @@ TIME_TOLERANCE_S = 1e-9
 # Largest rounding of printed times, in steps: more could hide a lost frame.
 _ROUNDING_LIMIT = 0.3
 # Shortest time step [s]: no clock resolves less, and rates of shorter steps overflow.
-SHORTEST_S = 1e-12
+SHORTEST_STEP_S = 1e-12
 _PRINTED_DECIMALS = range(10)
 
 
@@ -44,11 +44,11 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
     times = np.asarray(t_s, dtype=np.float64)
     if times.ndim != 1 or len(times) < 2:
         raise InputError(f"{what}: a sample interval needs at least two samples", source)
-    if fault := first_time_fault(times):
+    if fault := first_unordered_time(times):
         raise InputError(f"{what}: {fault[1]}", source, f"row {fault[0] + 1}")
     steps = np.diff(times)
     mean_s = float(times[-1] - times[0]) / len(steps)
-    uneven = np.abs(steps - mean_s) > STEP_TOLERANCE * mean_s + rounding_s(times)
+    uneven = np.abs(steps - mean_s) > STEP_TOLERANCE * mean_s + printed_rounding_s(times)
     if uneven.any():
         # A lost frame also shifts the mean, and with it every other step: name the worst.
         typical_s = float(np.median(steps))
@@ -63,30 +63,30 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
     return mean_s
 
 
-def first_time_fault(t_s: Array) -> tuple[int, str] | None:
+def first_unordered_time(t_s: Array) -> tuple[int, str] | None:
     """Return the index of the first time that does not exceed its predecessor, and a message; else
     None.
     """
-    faulty = np.flatnonzero(~(np.diff(t_s) > SHORTEST_S))
+    faulty = np.flatnonzero(~(np.diff(t_s) > SHORTEST_STEP_S))
     if not faulty.size:
         return None
     row = int(faulty[0]) + 1
     return row, f"t_s = {t_s[row]:.9g} follows {t_s[row - 1]:.9g}; time must increase"
 
 
-def even_times_s(t_s: Array) -> Array:
+def evenly_spaced_s(t_s: Array) -> Array:
     """Return evenly spaced times with the same first and last time and number as `t_s`."""
     return np.linspace(t_s[0], t_s[-1], len(t_s))
 
 
-def rounding_s(t_s: Array) -> float:
+def printed_rounding_s(t_s: Array) -> float:
     """Return the unit of the last decimal if rounding to it made even times uneven, else 0.
 
     Times of 30 Hz printed as 0.033, 0.067, 0.1 give 0.001; times 0.01, 0.02, 0.03 are even as
     they stand and give 0.
     """
     mean_s = float(t_s[-1] - t_s[0]) / max(len(t_s) - 1, 1)
-    if np.abs(t_s - even_times_s(t_s)).max() <= 1e-6 * mean_s:
+    if np.abs(t_s - evenly_spaced_s(t_s)).max() <= 1e-6 * mean_s:
         return 0.0
     for decimals in _PRINTED_DECIMALS:
         if np.allclose(t_s, np.round(t_s, decimals), rtol=1e-13, atol=1e-13):
@@ -100,5 +100,5 @@ def unrounded_s(t_s: Array) -> Array:
 
     Other times are returned unchanged.
     """
-    even = even_times_s(t_s)
-    return even if np.abs(t_s - even).max() <= rounding_s(t_s) else t_s
+    even = evenly_spaced_s(t_s)
+    return even if np.abs(t_s - even).max() <= printed_rounding_s(t_s) else t_s

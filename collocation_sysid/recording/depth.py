@@ -20,24 +20,24 @@ from ..fem.selection import Selection
 from ..section import Vector
 from ..stated import as_given, key, stated
 from .arrays import read_only_floats
-from .clock import TIME_TOLERANCE_S, first_time_fault
+from .clock import TIME_TOLERANCE_S, first_unordered_time
 from .poses import PoseSequence
-from .selected import Nodes, selection
+from .selected import Nodes, selection_from_section
 
-Row = tuple[Finite, Finite, Finite, Finite]
-Pose = tuple[Row, Row, Row, Row]
+MatrixRow = tuple[Finite, Finite, Finite, Finite]
+PoseMatrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
 # Relative difference of the depths of neighbouring pixels above which they show two surfaces.
-JUMP = 0.02
+LARGEST_RELATIVE_JUMP = 0.02
 # Fixed-point iterations that invert the distortion; each gains two digits for usual lenses.
-UNDISTORTING = 12
+UNDISTORTION_ITERATIONS = 12
 # Largest number of images of a recording whose outlines are compared: they are stored in memory,
 # and one of 640 x 480 pixels takes 1.2 MB.
-MOST_OUTLINED = 40
+MOST_OUTLINE_IMAGES = 40
 
 Background = Literal["auto", "empty", "unknown"]
 
 
-def _poses(poses: Any) -> PoseSequence:
+def _require_poses(poses: Any) -> PoseSequence:
     """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
     if not isinstance(poses, PoseSequence):
         raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
@@ -69,8 +69,8 @@ class DepthCamera:
 
     matrix: Any = key(tuple[Vector, Vector, Vector] | None, converter=as_given, default=None)
     distortion: Any = key(list[Finite], converter=as_given, default=())
-    pose: Any = key(Pose | None, converter=as_given, default=None)
-    poses: PoseSequence | None = key(converter=_poses, default=None)
+    pose: Any = key(PoseMatrix | None, converter=as_given, default=None)
+    poses: PoseSequence | None = key(converter=_require_poses, default=None)
 
     def __post_init__(self) -> None:
         pose = read_only_floats(np.eye(4) if self.pose is None else self.pose, (4, 4), "pose")
@@ -97,7 +97,7 @@ class DepthCamera:
                 )
             vars(self)["matrix"] = matrix
 
-    def motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
+    def pose_at(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return rotations (S, 3, 3) and translations (S, 3) [m] from the camera's frame to the
         world.
         """
@@ -109,7 +109,7 @@ class DepthCamera:
         rotations, translations = self.poses.at(times)
         return rotations @ rotation, rotations @ translation + translations
 
-    def rays(self, pixels: Array) -> Array:
+    def points_at_unit_depth(self, pixels: Array) -> Array:
         """Return the points (P, 3) at depth z = 1 that appear at the pixels (P, 2), u and v.
 
         Distortion is inverted by a fixed-point iteration.
@@ -119,7 +119,7 @@ class DepthCamera:
         ).T
         k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
         undistorted = distorted[:, :2].copy()
-        for _ in range(UNDISTORTING if len(self.distortion) else 0):
+        for _ in range(UNDISTORTION_ITERATIONS if len(self.distortion) else 0):
             x, y = undistorted.T
             r2 = x**2 + y**2
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -132,7 +132,7 @@ class DepthCamera:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, with
         distortion.
 
-        This is the inverse of `rays`. Points must be in front of the camera, z > 0.
+        This is the inverse of `points_at_unit_depth`. Points must be in front of the camera, z > 0.
         """
         x, y = (points_m[:, :2] / points_m[:, 2:]).T
         k1, k2, p1, p2, k3 = np.append(self.distortion, np.zeros(5 - len(self.distortion)))
@@ -147,7 +147,7 @@ class DepthCamera:
         )
         return (self.matrix @ distorted)[:2].T
 
-    def pixels(self, points_m: Array) -> Array:
+    def undistorted_pixels(self, points_m: Array) -> Array:
         """Return the pixels (P, 2), u and v, of points (P, 3) in the camera's frame, without
         distortion.
         """
@@ -155,7 +155,7 @@ class DepthCamera:
         return projected[:, :2] / projected[:, 2:]
 
 
-def _faces(faces: Any) -> Selection:
+def _require_selection(faces: Any) -> Selection:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(f"faces of a depth camera is {faces!r}; expected a selection")
@@ -206,7 +206,7 @@ class Depth:
         If shapes disagree, time does not increase, or there is no point.
     """
 
-    called: ClassVar[str] = "depth camera"
+    description_name: ClassVar[str] = "depth camera"
 
     name: str
     t_s: Any
@@ -215,7 +215,9 @@ class Depth:
     camera: DepthCamera = key(converter=as_given, default=DepthCamera())
     spacing_m: float = key(Positive, default=0.004)
     gate_m: float = key(Positive, default=0.01)
-    faces: Selection | None = key(Nodes | None, converter=_faces, read=selection, default=None)
+    faces: Selection | None = key(
+        Nodes | None, converter=_require_selection, read=selection_from_section, default=None
+    )
     background: Background = key(Background, default="auto")
     outline_sigma_px: float = key(Positive, default=0.5)
     images_m: Sequence[Any] = ()
@@ -223,19 +225,19 @@ class Depth:
     def __post_init__(self) -> None:
         where = f"the depth camera '{self.name}'"
         times = read_only_floats(self.t_s, (None,), f"t_s of {where}")
-        if fault := first_time_fault(times):
+        if fault := first_unordered_time(times):
             raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
         if len(times) != len(self.clouds):
             raise InputError(
                 f"{where} has {len(times)} times and {len(self.clouds)} images or clouds; "
                 "expected as many"
             )
-        clouds = tuple(self._thinned(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
+        clouds = tuple(self._thin_cloud(np.asarray(cloud, dtype=float)) for cloud in self.clouds)
         if not any(len(cloud) for cloud in clouds):
             raise InputError(f"{where} has no point; check its file and the unit of its depth")
-        vars(self).update(t_s=times, clouds=clouds, images_m=self._checked_images(len(times)))
+        vars(self).update(t_s=times, clouds=clouds, images_m=self._check_images(len(times)))
 
-    def _checked_images(self, count: int) -> tuple[Array | None, ...]:
+    def _check_images(self, count: int) -> tuple[Array | None, ...]:
         """Return `images_m` in single precision, with NaN for pixels without depth; empty if there
         are none.
 
@@ -283,18 +285,18 @@ class Depth:
         **options: Any,
     ) -> Depth:
         """Return the measurements of depth images (S, rows, columns) or (rows, columns), see
-        `points_of`.
+        `points_from_image`.
 
         At most `MOST_OUTLINED` of the images are stored, for the outlines of the body.
         """
         images = np.asarray(images_m, dtype=float)
         images = images[None] if images.ndim == 2 else images
-        clouds = [points_of(image, camera) for image in images]
-        outlined = outlined_samples(len(images))
+        clouds = [points_from_image(image, camera) for image in images]
+        outlined = samples_with_outlines(len(images))
         options["images_m"] = [image if k in outlined else None for k, image in enumerate(images)]
         return cls(name, t_s, clouds, sigma_m, camera, **options)
 
-    def _thinned(self, cloud: Array) -> Array:
+    def _thin_cloud(self, cloud: Array) -> Array:
         """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of
         `spacing_m`.
 
@@ -319,7 +321,7 @@ class Depth:
         return f"Depth({self.name!r}: {len(self.t_s)} images of {points} points together)"
 
     @property
-    def times(self) -> Array:
+    def sample_times_s(self) -> Array:
         """(S,) sample times of the camera [s]."""
         return cast(Array, self.t_s)
 
@@ -328,29 +330,35 @@ class Depth:
         """Points (P, 3) of each sample in the camera's frame [m], without normals."""
         return [cloud[:, :3] for cloud in self.clouds]
 
-    def until(self, end_s: float) -> Depth | None:
+    def until_time(self, end_s: float) -> Depth | None:
         """Return the samples up to the time `end_s`; None if these have no point."""
-        count = int(np.searchsorted(self.times, end_s, side="right"))
+        count = int(np.searchsorted(self.sample_times_s, end_s, side="right"))
         if not any(map(len, self.clouds[:count])):
             return None
         images_m = self.images_m[:count]
-        return replace(self, t_s=self.times[:count], clouds=self.clouds[:count], images_m=images_m)
+        return replace(
+            self, t_s=self.sample_times_s[:count], clouds=self.clouds[:count], images_m=images_m
+        )
 
     @property
-    def first(self) -> int:
+    def first_sample_with_points(self) -> int:
         """Index of the first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
 
 
-def outlined_samples(count: int) -> set[int]:
+def samples_with_outlines(count: int) -> set[int]:
     """Return the indices of the samples, of `count`, whose images are stored for their outlines.
 
     At most `MOST_OUTLINED`, evenly spread.
     """
-    return set(np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINED)).astype(int)).tolist())
+    return set(
+        np.unique(np.linspace(0, count - 1, min(count, MOST_OUTLINE_IMAGES)).astype(int)).tolist()
+    )
 
 
-def begun(depths: Sequence[Depth], t_s: Array, count: int, fewest: int) -> tuple[int, list[Depth]]:
+def until_all_cameras_see(
+    depths: Sequence[Depth], t_s: Array, count: int, fewest: int
+) -> tuple[int, list[Depth]]:
     """Return how many first samples of an experiment include points of every depth camera.
 
     Parameters
@@ -371,14 +379,16 @@ def begun(depths: Sequence[Depth], t_s: Array, count: int, fewest: int) -> tuple
         Images until then, of the cameras that have points by then.
     """
     for depth in depths:
-        last_s = depth.times[min(max(fewest - 1, depth.first), len(depth.times) - 1)]
+        last_s = depth.sample_times_s[
+            min(max(fewest - 1, depth.first_sample_with_points), len(depth.sample_times_s) - 1)
+        ]
         count = max(count, int(np.searchsorted(t_s, last_s - TIME_TOLERANCE_S)) + 1)
     end_s = t_s[:count][-1] + TIME_TOLERANCE_S
-    shorter = (depth.until(end_s) for depth in depths)
+    shorter = (depth.until_time(end_s) for depth in depths)
     return count, [depth for depth in shorter if depth is not None]
 
 
-def points_of(image_m: Array, camera: DepthCamera) -> Array:
+def points_from_image(image_m: Array, camera: DepthCamera) -> Array:
     """Return the points (P, 3) [m] of a depth image (rows, columns) [m]; zero and NaN are no depth.
 
     Pixels beside a jump of the depth, beside a pixel without depth or at the border of the image
@@ -395,10 +405,12 @@ def points_of(image_m: Array, camera: DepthCamera) -> Array:
     is_inner = np.isfinite(depth)
     for axis in (0, 1):
         for way in (1, -1):
-            is_inner &= np.abs(np.roll(depth, way, axis) - depth) < JUMP * np.nan_to_num(depth)
+            is_inner &= np.abs(
+                np.roll(depth, way, axis) - depth
+            ) < LARGEST_RELATIVE_JUMP * np.nan_to_num(depth)
     is_inner[[0, -1]] = is_inner[:, [0, -1]] = False
     v, u = np.nonzero(is_inner)
-    return camera.rays(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
+    return camera.points_at_unit_depth(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
 
 
 def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array) -> Array:
@@ -420,7 +432,7 @@ def depth_image(camera: DepthCamera, shape: tuple[int, int], triangles_m: Array)
     """
     image = np.full(shape, np.inf)
     for corners in triangles_m[(triangles_m[:, :, 2] > 0).all(axis=1)]:
-        pixels = camera.pixels(corners)
+        pixels = camera.undistorted_pixels(corners)
         low = np.maximum(np.ceil(pixels.min(axis=0)), 0).astype(int)
         high = np.minimum(np.floor(pixels.max(axis=0)), [shape[1] - 1, shape[0] - 1]).astype(int)
         sides = (pixels[1:] - pixels[0]).T

@@ -16,36 +16,36 @@ from ..errors import InputError
 from ..section import Vector, tables
 from ..stated import as_given, key, stated
 from .actuator import Actuator
-from .arrays import floats, read_only_floats
-from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_time_fault, sample_interval_s
+from .arrays import float_converter, read_only_floats
+from .clock import STEP_TOLERANCE, TIME_TOLERANCE_S, first_unordered_time, sample_interval_s
 from .depth import Depth
 from .environment import air_density, usual_air_density
 from .gauge import Gauge
-from .grasp import Grasp, free_motions, held_dofs
-from .loads import Change, Force, PointMass, ramp
+from .grasp import Grasp, free_rigid_motions, prescribed_dofs
+from .loads import Force, LoadTime, PointMass, smooth_ramp
 from .markers import Markers
 from .nuisance import Nuisance
-from .obstacle import Obstacle, with_frames_of
+from .obstacle import Obstacle, with_obstacle_frames
 from .pressure import Pressure
-from .tables import within
+from .tables import is_within_experiment
 from .tendon import Tendon
 from .wrench import Wrench
 
 if TYPE_CHECKING:
     from ..fem.body import Body
-    from ..fem.pattern import Joined, SymmetricPattern
+    from ..fem.pattern import JointPattern, SymmetricPattern
 
 Kind = Literal["dynamic", "static"]
 Start = Literal["equilibrium", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
 EARTH_M_S2 = (0.0, 0.0, -9.81)
-AS_IN_A_LABORATORY = Nuisance()
+DEFAULT_NUISANCE = Nuisance()
 
 
 def _state(name: str) -> Callable[[ArrayLike], Array]:
     """Return a converter of nodal vectors (n, 3) for the field ``start_<name>``."""
-    return floats((None, 3), f"start_{name}")
+    return float_converter((None, 3), f"start_{name}")
 
 
 @stated
@@ -109,10 +109,12 @@ class Experiment:
     """
 
     body: Body
-    t_s: Array = key(converter=floats((None,), "t_s"))
+    t_s: Array = key(converter=float_converter((None,), "t_s"))
     grasps: tuple[Grasp, ...] = key(converter=tuple[Grasp, ...])
     markers: Markers = key(converter=as_given, default=None)
-    gravity_m_s2: Array = key(Vector, converter=floats((3,), "gravity_m_s2"), default=EARTH_M_S2)
+    gravity_m_s2: Array = key(
+        Vector, converter=float_converter((3,), "gravity_m_s2"), default=EARTH_M_S2
+    )
     name: str = "experiment"
     _: KW_ONLY
     kind: Kind = key(Kind, default="dynamic")
@@ -128,24 +130,26 @@ class Experiment:
     pressures: tuple[Pressure, ...] = key(tables("pressure", Pressure), converter=tuple, default=())
     readings: tuple[Gauge, ...] = key(converter=tuple[Gauge, ...], default=())
     depths: tuple[Depth, ...] = key(converter=tuple[Depth, ...], default=())
-    nuisance: Nuisance = AS_IN_A_LABORATORY
+    nuisance: Nuisance = DEFAULT_NUISANCE
     air_density_kg_m3: float = key(converter=air_density, default_factory=usual_air_density)
 
     def __post_init__(self) -> None:
         loads = ("masses", "forces", "tendons", "pressures")
-        vars(self)["body"] = with_frames_of(self.body, self.obstacles, static=self.static)
+        vars(self)["body"] = with_obstacle_frames(
+            self.body, self.obstacles, is_static=self.is_static
+        )
         framed = zip(self.obstacles, self.body.frames, strict=True)
         vars(self).update(
             grasps=(
-                *(grasp.on(self.body, self.t_s) for grasp in self.gripping),
-                *(obstacle.framed(frame, self.t_s) for obstacle, frame in framed),
+                *(grasp.on_body(self.body, self.t_s) for grasp in self.body_grasps),
+                *(obstacle.with_frame_nodes(frame, self.t_s) for obstacle, frame in framed),
             ),
             markers=Markers.none(self.t_s) if self.markers is None else self.markers,
             **{name: tuple(load.on(self.body) for load in getattr(self, name)) for name in loads},
         )
         self._check_kind()
         self._check_time()
-        vars(self)["markers"] = self.markers.on(self.body, self._carried_back)
+        vars(self)["markers"] = self.markers.on_body(self.body, self._undeformed_places)
         self._check_nodes()
         self._check_start()
         self._check_actuators()
@@ -153,12 +157,12 @@ class Experiment:
         self._check_air()
 
     @property
-    def place(self) -> str:
+    def description(self) -> str:
         """Name of the experiment with the word "experiment" in front, for messages."""
         return f"experiment '{self.name}'"
 
     def __repr__(self) -> str:
-        static = "static, " if self.static else ""
+        static = "static, " if self.is_static else ""
         validation = ", validation" if self.validation else ""
         return (
             f"Experiment({self.name!r}: {static}{len(self.t_s)} samples over "
@@ -166,7 +170,7 @@ class Experiment:
         )
 
     @property
-    def gripping(self) -> tuple[Grasp, ...]:
+    def body_grasps(self) -> tuple[Grasp, ...]:
         """Grasps that hold nodes of the body: all `grasps` but the obstacles."""
         return tuple(grasp for grasp in self.grasps if not isinstance(grasp, Obstacle))
 
@@ -192,10 +196,10 @@ class Experiment:
 
     def with_obstacles(self, obstacles: Iterable[Obstacle]) -> Experiment:
         """Return the experiment with these obstacles in place of its own."""
-        return replace(self, grasps=(*self.gripping, *obstacles))
+        return replace(self, grasps=(*self.body_grasps, *obstacles))
 
     @property
-    def static(self) -> bool:
+    def is_static(self) -> bool:
         """Whether every sample is an equilibrium of its own."""
         return self.kind == "static"
 
@@ -210,19 +214,20 @@ class Experiment:
         return float(self.t_s[-1] - self.t_s[0])
 
     @cached_property
-    def held_dofs(self) -> Index:
+    def prescribed_dofs(self) -> Index:
         """Sorted dofs (3 · node + axis) with prescribed displacements at every sample time."""
-        is_held = self.held(self.t_s)
+        is_held = self.is_prescribed(self.t_s)
         return np.flatnonzero(is_held.all(axis=0))
 
     @cached_property
     def free_dofs(self) -> Index:
-        """Sorted dofs that are not in `held_dofs`; grasps with a time window may hold some of them
+        """Sorted dofs that are not in `prescribed_dofs`; grasps with a time window may hold some of
+        them
         for a while.
         """
-        return np.setdiff1d(np.arange(self.body.nodes_m.size), self.held_dofs)
+        return np.setdiff1d(np.arange(self.body.nodes_m.size), self.prescribed_dofs)
 
-    def grasped(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
+    def prescribed_displacements(self, t_s: ArrayLike) -> tuple[NDArray[np.bool_], Array]:
         """Return which nodal coordinates are prescribed at the times `t_s` (T,), and their values.
 
         Returns
@@ -233,88 +238,92 @@ class Experiment:
             Prescribed coordinates [m]; NaN where a coordinate is free.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        is_held = self.held(times)
+        is_held = self.is_prescribed(times)
         positions = np.full(is_held.shape, np.nan)
         for grasp in self.grasps:
-            holding = np.flatnonzero(grasp.holds(times))
-            carried_m = grasp.carry(self.body.nodes_m, times[holding])
-            positions[np.ix_(holding, grasp.nodes, grasp.columns)] = carried_m[..., grasp.columns]
+            holding = np.flatnonzero(grasp.is_active(times))
+            carried_m = grasp.positions_at(self.body.nodes_m, times[holding])
+            positions[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = carried_m[
+                ..., grasp.axis_indices
+            ]
         return is_held, positions
 
-    def held(self, t_s: ArrayLike) -> NDArray[np.bool_]:
+    def is_prescribed(self, t_s: ArrayLike) -> NDArray[np.bool_]:
         """Return whether each nodal coordinate is prescribed at the times `t_s` (T,), as (T, n, 3)
         bool.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         is_held = np.zeros((len(times), *self.body.nodes_m.shape), dtype=bool)
         for grasp in self.grasps:
-            holding = np.flatnonzero(grasp.holds(times))
-            is_held[np.ix_(holding, grasp.nodes, grasp.columns)] = True
+            holding = np.flatnonzero(grasp.is_active(times))
+            is_held[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = True
         return is_held
 
-    def held_positions(self, t_s: ArrayLike) -> Array:
-        """Return the prescribed coordinates of `held_dofs` at the times `t_s` (T,), as (T, held)
+    def prescribed_positions(self, t_s: ArrayLike) -> Array:
+        """Return the prescribed coordinates of `prescribed_dofs` at the times `t_s` (T,), as (T,
+        held)
         [m].
         """
-        positions = self.grasped(t_s)[1]
-        return positions.reshape(len(positions), -1)[:, self.held_dofs]
+        positions = self.prescribed_displacements(t_s)[1]
+        return positions.reshape(len(positions), -1)[:, self.prescribed_dofs]
 
-    def node_mass_kg(self, t_s: ArrayLike) -> Array:
+    def moving_node_mass_kg(self, t_s: ArrayLike) -> Array:
         """Return the mass that moves with each node at the times `t_s` (T,), as (T, n) [kg].
 
         The sum of the body's mass at its stated densities and of the point masses.
         """
-        return self.body.node_mass + self.tied_mass_kg(t_s)
+        return self.body.node_mass + self.point_mass_at_nodes_kg(t_s)
 
-    def tied_mass_kg(self, t_s: ArrayLike) -> Array:
+    def point_mass_at_nodes_kg(self, t_s: ArrayLike) -> Array:
         """Return the mass of all point masses at each node at times `t_s` (T,), as (T, n) [kg]."""
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
         mass = np.broadcast_to(0.0, (len(times), n))
         for point in self.masses:
-            mass = mass + np.outer(self.share(point, times), point.at_nodes(n))
+            mass = mass + np.outer(self.share(point, times), point.node_mass_kg(n))
         return mass
 
     def share(self, load: PointMass | Force, t_s: ArrayLike) -> Array:
         """Return the share of a load that acts at the times `t_s` (T,), from 0 to 1.
 
         In a motion the share rises, or falls, from one sample before to one sample after `from_s`
-        or `until_s`, see `loads.ramp`; a load that joins at or before the first sample acts fully
+        or `until_s`, see `loads.smooth_ramp`; a load that joins at or before the first sample acts
+        fully
         from the start. In a static experiment the share jumps at these times.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         share_joined, share_left = (
-            self._changed(load, change, times) for change in get_args(Change)
+            self._share_since(load, change, times) for change in get_args(LoadTime)
         )
         return share_joined - share_left
 
-    def _changed(self, load: PointMass | Force, change: Change, times: Array) -> Array:
+    def _share_since(self, load: PointMass | Force, change: LoadTime, times: Array) -> Array:
         """Return the share (T,) of a load that has joined (or left, by `change`) at the given
         times.
         """
         at_s = getattr(load, change)
-        if self.static:
+        if self.is_static:
             return (times >= at_s - TIME_TOLERANCE_S).astype(np.float64)
-        if self.changes(load, change):
-            return ramp((times - at_s) / self.timestep_s)
+        if self.changes_within(load, change):
+            return smooth_ramp((times - at_s) / self.timestep_s)
         return np.full(len(times), float(at_s <= self.t_s[0]))
 
-    def changes(self, load: PointMass | Force, change: Change) -> bool:
+    def changes_within(self, load: PointMass | Force, change: LoadTime) -> bool:
         """Return whether a load joins (or leaves, by `change`) within a motion; false if static."""
         within = self.t_s[0] < getattr(load, change) < self.t_s[-1]
-        return bool(within) and not self.static
+        return bool(within) and not self.is_static
 
-    def node_forces_n(self, t_s: ArrayLike) -> Array:
+    def stated_node_forces_n(self, t_s: ArrayLike) -> Array:
         """Return the forces besides gravity on each node at times `t_s` (T,), as (T, n, 3) [N]."""
         n = len(self.body.nodes_m)
         times = np.atleast_1d(t_s)
         total = np.broadcast_to(np.zeros(3), (len(times), n, 3))
         for force in self.forces:
-            total = total + self.share(force, times)[:, None, None] * force.at_nodes(times, n)
+            total = total + self.share(force, times)[:, None, None] * force.node_forces_n(times, n)
         return total
 
     @property
-    def sensed(self) -> tuple[int, ...]:
+    def instrumented_grasps(self) -> tuple[int, ...]:
         """Indices of the grasps whose force or torque is measured, by a wrench or custom sensor."""
         grasps_of_gauges = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
         sensed = (
@@ -323,22 +332,22 @@ class Experiment:
         return tuple(sensed)
 
     @property
-    def knows_a_force(self) -> bool:
+    def has_known_force(self) -> bool:
         """Whether a stated mass, force or actuator, or a measured force, sets the scale of all
         forces.
         """
-        if self.sensed:
+        if self.instrumented_grasps:
             return True
-        if any(actuator.amplitude(self.t_s).any() for actuator in self.actuators):
+        if any(actuator.energy_amplitude_at(self.t_s).any() for actuator in self.actuators):
             return True
-        tied = np.repeat(self.tied_mass_kg(self.t_s), 3, axis=1)
-        forces = self.node_forces_n(self.t_s).reshape(tied.shape)
+        tied = np.repeat(self.point_mass_at_nodes_kg(self.t_s), 3, axis=1)
+        forces = self.stated_node_forces_n(self.t_s).reshape(tied.shape)
         return bool((tied != 0)[:, self.free_dofs].any() or forces[:, self.free_dofs].any())
 
     @property
     def has_air_drag(self) -> bool:
         """Whether air drag acts: false in a vacuum and in static experiments."""
-        return self.air_density_kg_m3 > 0 and not self.static
+        return self.air_density_kg_m3 > 0 and not self.is_static
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
@@ -346,17 +355,17 @@ class Experiment:
         return (*self.tendons, *self.pressures)
 
     @property
-    def joined(self) -> Joined:
+    def coupled_graph(self) -> JointPattern:
         """Mesh graph of the body with the couplings of its actuators, obstacles and air drag."""
         couplings = [each.measure.couplings for each in self.actuators]
-        couplings += [each.surface(self.body).points.couplings for each in self.obstacles]
+        couplings += [each.contact_surface(self.body).points.couplings for each in self.obstacles]
         couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
-        return self.body.joined_with(couplings)
+        return self.body.joint_pattern_with(couplings)
 
     @property
-    def pattern(self) -> SymmetricPattern:
+    def sparsity(self) -> SymmetricPattern:
         """Sparsity pattern of the derivatives of the forces on the body."""
-        return self.joined.pattern
+        return self.coupled_graph.pattern
 
     def rigid_positions(self, t_s: ArrayLike) -> Array:
         """Return the node positions (T, n, 3) [m] if a grasp carried the undeformed body rigidly.
@@ -368,11 +377,11 @@ class Experiment:
         rotations, translations = self.rigid_motion(t_s)
         places = np.einsum("tij,kj->tki", rotations, self.body.nodes_m) + translations[:, None]
         for obstacle in self.obstacles:
-            places[:, obstacle.nodes] = obstacle.carry(self.body.nodes_m, np.atleast_1d(t_s))
+            places[:, obstacle.nodes] = obstacle.positions_at(self.body.nodes_m, np.atleast_1d(t_s))
         return places
 
     @property
-    def up(self) -> Array:
+    def upward_direction(self) -> Array:
         """(3,) unit vector against gravity; the z axis if there is no gravity."""
         pull = np.linalg.norm(self.gravity_m_s2)
         return -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
@@ -380,16 +389,16 @@ class Experiment:
     def rigid_motion(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return rotations (T, 3, 3) and translations (T, 3) [m] of `rigid_positions`."""
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        if not self.gripping:
+        if not self.body_grasps:
             return np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))
-        throughout = [grasp for grasp in self.gripping if grasp.holds(self.t_s).all()]
+        throughout = [grasp for grasp in self.body_grasps if grasp.is_active(self.t_s).all()]
         throughout.sort(key=lambda grasp: grasp.axes != "xyz")
-        poses = (throughout or self.gripping)[0].poses
+        poses = (throughout or self.body_grasps)[0].poses
         if len(poses.t_s) > 1 and not throughout:
             times = np.clip(times, poses.t_s[0], poses.t_s[-1])
         return poses.at(times)
 
-    def _carried_back(self, points_m: Array, t_s: Array) -> Array:
+    def _undeformed_places(self, points_m: Array, t_s: Array) -> Array:
         """Return the undeformed places (M, 3) of points (M, 3) seen at `t_s` (M,) if the body moved
         rigidly.
         """
@@ -412,7 +421,7 @@ class Experiment:
         return np.where(markers.located, sigma_m, body_m)
 
     def _check_kind(self) -> None:
-        if not self.static:
+        if not self.is_static:
             return
         for name, usual in (("start", "equilibrium"), ("start_rule", "standard")):
             if getattr(self, name) != usual:
@@ -434,15 +443,15 @@ class Experiment:
         )
 
     def _check_time(self) -> None:
-        fewest = 1 if self.static else 3
+        fewest = 1 if self.is_static else 3
         if len(self.t_s) < fewest:
             raise InputError(
                 f"{len(self.t_s)} samples in time; at least {fewest} are needed: check window_s "
                 "and the marker file"
             )
-        if not self.static:
+        if not self.is_static:
             step_s = sample_interval_s(self.t_s, f"t_s of experiment '{self.name}'")
-        elif fault := first_time_fault(self.t_s):
+        elif fault := first_unordered_time(self.t_s):
             raise InputError(f"t_s: {fault[1]}", where=f"row {fault[0] + 1}")
         else:
             step_s = float(np.diff(self.t_s).min(initial=self.timestep_s))
@@ -453,17 +462,19 @@ class Experiment:
             raise InputError(
                 "the markers' times differ from t_s; align poses and markers to one grid first"
             )
-        if self.markers.samples == 0:
-            self._refuse_unmeasured()
+        if self.markers.sample_count == 0:
+            self._require_measurements()
         for grasp in self.grasps:
-            grasp.poses.at(self.t_s[grasp.holds(self.t_s)])
+            grasp.poses.at(self.t_s[grasp.is_active(self.t_s)])
             if grasp.wrench is not None:
-                within(grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.static)
+                is_within_experiment(
+                    grasp.wrench.t_s, self.t_s, "the wrench of a grasp", self.is_static
+                )
         for gauge in self.readings:
             what = f"the reading '{gauge.name}'"
             if [other.name for other in self.readings].count(gauge.name) > 1:
                 raise InputError(f"two readings are called {gauge.name!r}; expected another name")
-            within(gauge.times, self.t_s, what, self.static)
+            is_within_experiment(gauge.sample_times_s, self.t_s, what, self.is_static)
             if gauge.grasp is not None and not 1 <= gauge.grasp <= len(self.grasps):
                 raise InputError(
                     f"{what} looks at grasp {gauge.grasp}; expected the number of a grasp, 1 to "
@@ -474,16 +485,16 @@ class Experiment:
             what = f"the depth camera '{depth.name}'"
             if [other.name for other in self.depths].count(depth.name) > 1:
                 raise InputError(f"two depth cameras are called {depth.name!r}; expected another")
-            within(depth.times, self.t_s, what, self.static)
-            distance_s = np.abs(depth.times[:, None] - self.t_s).min(axis=1)
-            if self.static and distance_s.max() > TIME_TOLERANCE_S:
+            is_within_experiment(depth.sample_times_s, self.t_s, what, self.is_static)
+            distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(axis=1)
+            if self.is_static and distance_s.max() > TIME_TOLERANCE_S:
                 raise InputError(
-                    f"{what} sees at {depth.times[distance_s.argmax()]:g} s, where the static "
+                    f"{what} sees at {depth.sample_times_s[distance_s.argmax()]:g} s, where the static "
                     "experiment has no sample; expected times among its own"
                 )
 
-    def _refuse_unmeasured(self) -> None:
-        if self.readings or self.depths or self.sensed:
+    def _require_measurements(self) -> None:
+        if self.readings or self.depths or self.instrumented_grasps:
             return
         if not self.markers.names:
             message = "nothing is measured: there are no markers, no wrench and no reading"
@@ -492,7 +503,7 @@ class Experiment:
 
     def _check_nodes(self) -> None:
         n = len(self.body.nodes_m)
-        grasped = held_dofs(self.grasps)
+        grasped = prescribed_dofs(self.grasps)
         if grasped.size and grasped[-1] >= 3 * n:
             raise InputError(f"a grasp holds node {grasped[-1] // 3}, but the body has {n}")
         for what, loads in (("point mass is tied to", self.masses), ("force is on", self.forces)):
@@ -518,12 +529,12 @@ class Experiment:
                 f"two tendons or pressures are called {twice[0]!r}; expected different names"
             )
         for actuator in self.actuators:
-            actuator.course.refuse_short(self.t_s, actuator.name)
+            actuator.stated_values.require_covered(self.t_s, actuator.name)
         if not self.pressures:
             return
-        is_held, places_m = self.grasped(self.t_s)
+        is_held, places_m = self.prescribed_displacements(self.t_s)
         throughout = np.asarray(is_held.all(axis=0))
-        bounded = tuple(pressure.bounded(throughout, places_m) for pressure in self.pressures)
+        bounded = tuple(pressure.with_held_rim(throughout, places_m) for pressure in self.pressures)
         vars(self)["pressures"] = bounded
 
     def _check_start(self) -> None:
@@ -538,25 +549,25 @@ class Experiment:
                 raise InputError("start = 'given' needs start_positions_m")
             if self.start_velocities_m_s is None:
                 vars(self)["start_velocities_m_s"] = np.zeros_like(self.start_positions_m)
-            self._start_frames(len(self.start_positions_m))
+            self._append_obstacle_frames(len(self.start_positions_m))
             for name in ("start_positions_m", "start_velocities_m_s"):
                 read_only_floats(getattr(self, name), self.body.nodes_m.shape, name)
         elif is_state_given:
             raise InputError(f"a starting state is given, but start is '{self.start}'")
         if self.start == "equilibrium":
-            self._refuse_free_motions()
+            self._require_unique_equilibrium()
 
-    def _start_frames(self, given: int) -> None:
+    def _append_obstacle_frames(self, given_count: int) -> None:
         """Append positions and velocities of the obstacles' frames to a given start state without
         them.
 
         Parameters
         ----------
-        given : int
+        given_count : int
             Number of nodes of the given state.
         """
         frames = self.body.frames.ravel()
-        if given == len(self.body.nodes_m):
+        if given_count == len(self.body.nodes_m):
             return
         at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
         places = self.rigid_positions(at_s)[:, frames]
@@ -564,11 +575,11 @@ class Experiment:
         for name, own in (("start_positions_m", places[0]), ("start_velocities_m_s", rates)):
             vars(self)[name] = np.vstack([getattr(self, name), own])
 
-    def _refuse_free_motions(self) -> None:
+    def _require_unique_equilibrium(self) -> None:
         if self.obstacles:
             return  # these may carry it: the rest state is looked for
-        is_held = self.held(self.t_s[:1])[0]
-        motions = free_motions(self.body.nodes_m, is_held)
+        is_held = self.is_prescribed(self.t_s[:1])[0]
+        motions = free_rigid_motions(self.body.nodes_m, is_held)
         if motions:
             raise InputError(
                 "start = 'equilibrium' needs grasps that leave the body no rigid motion, but it "

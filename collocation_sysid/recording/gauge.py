@@ -19,7 +19,7 @@ from ..files import reason
 from ..section import Vector
 from ..stated import Key, as_given, key, stated
 from .arrays import read_only_floats
-from .clock import first_time_fault
+from .clock import first_unordered_time
 from .wrench import Frame
 
 
@@ -46,8 +46,8 @@ class Look:
     torque_nm: Any = None
 
 
-OF_POINTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
-OF_GRASP = ("force_n", "torque_nm")
+POINT_INPUTS = ("position_m", "velocity_m_s", "acceleration_m_s2")
+GRASP_INPUTS = ("force_n", "torque_nm")
 
 
 _POINTS = Key("points_m", list[Vector], default=[])
@@ -97,7 +97,7 @@ class Gauge:
         above zero, or the expression cannot be evaluated or is not smooth at rest.
     """
 
-    called: ClassVar[str] = "reading"
+    description_name: ClassVar[str] = "reading"
 
     name: str
     expression: Callable[..., Any]
@@ -119,19 +119,19 @@ class Gauge:
             points if len(points) else np.zeros((0, 3)), (None, 3), f"points_m of {where}"
         )
         vars(self).update(t_s=times, points_m=points)
-        if fault := first_time_fault(times):
+        if fault := first_unordered_time(times):
             raise InputError(f"{fault[1]}, of {where}", where=f"row {fault[0] + 1}")
         if (self.grasp is None) == (not len(points)):
             both = "both points_m and grasp" if len(points) else "neither points_m nor grasp"
             raise InputError(f"{where} has {both}; expected one of them to look at")
-        count = self._checked_count()
+        count = self._count_of_values()
         names = [f"{self.name}_{k + 1}" for k in range(count)] if count > 1 else [self.name]
         vars(self).update(values=self._checked_values(count), columns=tuple(self.columns or names))
 
     def _checked_values(self, count: int) -> Array:
         """Return the values (S, m), zeros if none were given; `count` is m by the expression."""
         where = f"the reading '{self.name}'"
-        samples = len(self.times)
+        samples = len(self.sample_times_s)
         if self.values is None:
             return read_only_floats(np.zeros((samples, count)), (None, None), where)
         columns = np.array(self.values, dtype=float)
@@ -149,33 +149,33 @@ class Gauge:
         return values
 
     def __repr__(self) -> str:
-        return f"Gauge({self.name!r}: {len(self.times)} samples of {self.measured.shape[1]})"
+        return f"Gauge({self.name!r}: {len(self.sample_times_s)} samples of {self.measured_values.shape[1]})"
 
     @property
-    def times(self) -> Array:
+    def sample_times_s(self) -> Array:
         """(S,) sample times of the sensor [s]."""
         return np.asarray(self.t_s)
 
     @property
-    def measured(self) -> Array:
+    def measured_values(self) -> Array:
         """(S, m) measured values; NaN where missing."""
         return np.asarray(self.values)
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def is_measured(self) -> NDArray[np.bool_]:
         """(S, m) whether each value is measured."""
-        return np.isfinite(self.measured)
+        return np.isfinite(self.measured_values)
 
     # The expression ---------------------------------------------------------------------------
 
-    def read(self, t_s: ca.SX, looked: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
+    def read(self, t_s: ca.SX, inputs: Sequence[ca.SX], unknowns: Sequence[ca.SX]) -> ca.SX:
         """Evaluate the expression of the sensor.
 
         Parameters
         ----------
         t_s : SX
             Time of the sample.
-        looked : sequence of SX
+        inputs : sequence of SX
             Position, velocity and acceleration (3, P) of its points, or force and torque (3,) of
             its grasp.
         unknowns : sequence of SX
@@ -186,12 +186,12 @@ class Gauge:
         (m,) SX
             Predicted numbers.
         """
-        names = OF_POINTS if self.grasp is None else OF_GRASP
-        at = Look(t_s, **dict(zip(names, looked, strict=True)))
+        names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
+        at = Look(t_s, **dict(zip(names, inputs, strict=True)))
         read = self.expression(at, **dict(zip(self.unknowns, unknowns, strict=True)))
         return ca.vec(ca.SX(ca.vertcat(*read) if isinstance(read, (list, tuple)) else read))
 
-    def _checked_count(self) -> int:
+    def _count_of_values(self) -> int:
         """Return the number m of values of the expression, after evaluating it and its Jacobian at
         rest.
 
@@ -207,7 +207,7 @@ class Gauge:
         looked = [ca.SX.sym("c", *np.atleast_2d(np.transpose(each)).T.shape) for each in rest]
         t_s = ca.SX.sym("t_s")
         own = ca.SX.sym("own", len(self.unknowns))
-        names = OF_POINTS if self.grasp is None else OF_GRASP
+        names = POINT_INPUTS if self.grasp is None else GRASP_INPUTS
         try:
             read = self.read(t_s, looked, ca.vertsplit(own) if self.unknowns else [])
         except (Exception, SystemExit) as error:
@@ -219,7 +219,7 @@ class Gauge:
         u = ca.veccat(*looked, own)
         slopes = ca.Function("slopes", [t_s, u], [read, ca.jacobian(read, u)])
         at_rest = np.concatenate([*(each.ravel("F") for each in rest), np.zeros(own.numel())])
-        if not all(np.isfinite(e.full()).all() for e in slopes(self.times[0], at_rest)):
+        if not all(np.isfinite(e.full()).all() for e in slopes(self.sample_times_s[0], at_rest)):
             raise InputError(
                 f"the reading '{self.name}' or its slope is not finite where the body is at rest; "
                 "expected a smooth expression, such as sqrt(v·v + 1e-12) in place of |v|"

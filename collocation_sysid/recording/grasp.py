@@ -18,7 +18,7 @@ from ..fem.selection import Selection
 from ..stated import as_given, key, stated
 from .clock import TIME_TOLERANCE_S
 from .poses import PoseSequence
-from .selected import Nodes, on_body, selection, some_nodes
+from .selected import Nodes, node_converter, select_on_body, selection_from_section
 from .wrench import Wrench
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 # Smallest singular value of a constrained rigid motion, relative to the largest: less is rounding.
-HELD = 1e-6
+SMALLEST_SINGULAR_VALUE = 1e-6
 Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 
@@ -66,7 +66,7 @@ class Grasp:
         Measured force and torque that it exerts on the body.
     """
 
-    nodes: Index = key(Nodes, converter=some_nodes("the grasp"), read=selection)
+    nodes: Index = key(Nodes, converter=node_converter("the grasp"), read=selection_from_section)
     poses: PoseSequence = key(converter=as_given)  # matrices stay until there are times
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
@@ -78,11 +78,11 @@ class Grasp:
     wrench: Wrench | None = None
 
     def __post_init__(self) -> None:
-        self._begin()
+        self._check_times_and_axes()
 
-    def _begin(self) -> None:
+    def _check_times_and_axes(self) -> None:
         """Check the times and the axes of the zero, and store a selection of nodes in
-        `selection`.
+        `selection_from_section`.
         """
         if not self.from_s <= self.until_s:
             raise InputError(
@@ -96,11 +96,11 @@ class Grasp:
         if isinstance(self.nodes, Selection):
             vars(self)["selection"] = self.nodes
 
-    def on(self, body: Body, t_s: Array) -> Grasp:
+    def on_body(self, body: Body, t_s: Array) -> Grasp:
         """Return the grasp with the selected nodes of a body, and matrices as poses at `t_s`
         (T,).
         """
-        return self._with_nodes(on_body(self.nodes, body), t_s)
+        return self._with_nodes(select_on_body(self.nodes, body), t_s)
 
     def _with_nodes(self, nodes: Index, t_s: Array) -> Self:
         """Return the grasp with these nodes, and matrices as poses at `t_s`; itself if nothing
@@ -113,23 +113,23 @@ class Grasp:
         return self if placed else replace(self, nodes=nodes, poses=poses)
 
     @cached_property
-    def columns(self) -> Index:
+    def axis_indices(self) -> Index:
         """(a,) indices of the prescribed axes: 0, 1, 2 for x, y, z."""
         return np.array(["xyz".index(axis) for axis in self.axes])
 
     @cached_property
-    def dofs(self) -> Index:
+    def prescribed_dofs(self) -> Index:
         """(h a,) dofs (3 · node + axis) with prescribed displacements, ascending."""
-        return (3 * self.nodes[:, None] + self.columns).ravel()
+        return (3 * self.nodes[:, None] + self.axis_indices).ravel()
 
-    def holds(self, t_s: ArrayLike) -> NDArray[np.bool_]:
+    def is_active(self, t_s: ArrayLike) -> NDArray[np.bool_]:
         """Return whether the nodes are held at the times `t_s` (T,), as (T,) bool."""
         times = np.asarray(t_s, dtype=np.float64)
         return (times >= self.from_s - TIME_TOLERANCE_S) & (
             times <= self.until_s + TIME_TOLERANCE_S
         )
 
-    def carry(self, nodes_m: Array, t_s: ArrayLike) -> Array:
+    def positions_at(self, nodes_m: Array, t_s: ArrayLike) -> Array:
         """Return the positions (T, h, 3) [m] of the grasped nodes at the times `t_s` (T,).
 
         Parameters
@@ -138,15 +138,15 @@ class Grasp:
             All nodes of the undeformed body.
         t_s : (T,) array
         """
-        return self.poses.carry(nodes_m[self.nodes], t_s)
+        return self.poses.carried_positions(nodes_m[self.nodes], t_s)
 
 
-def held_nodes(grasps: Sequence[Grasp]) -> Index:
+def prescribed_nodes(grasps: Sequence[Grasp]) -> Index:
     """Return all nodes that are held at some time along some axis, sorted."""
-    return np.unique(held_dofs(grasps) // 3)
+    return np.unique(prescribed_dofs(grasps) // 3)
 
 
-def held_dofs(grasps: Sequence[Grasp]) -> Index:
+def prescribed_dofs(grasps: Sequence[Grasp]) -> Index:
     """Return all dofs (3 · node + axis) that are held at some time, sorted.
 
     Raises
@@ -155,7 +155,7 @@ def held_dofs(grasps: Sequence[Grasp]) -> Index:
         If two grasps hold the same node at the same time along the same axis.
     """
     for (i, first), (j, second) in combinations(enumerate(grasps, start=1), 2):
-        shared = np.intersect1d(first.dofs, second.dofs)
+        shared = np.intersect1d(first.prescribed_dofs, second.prescribed_dofs)
         if shared.size and max(first.from_s, second.from_s) <= min(first.until_s, second.until_s):
             node, axis = divmod(int(shared[0]), 3)
             on_axis = "" if first.axes == second.axes == "xyz" else f" along {'xyz'[axis]}"
@@ -163,13 +163,15 @@ def held_dofs(grasps: Sequence[Grasp]) -> Index:
                 f"node {node} is held by the grasps {i} and {j} at the same time{on_axis}; "
                 "select nodes so that each is held once"
             )
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(g.dofs for g in grasps)]))
+    return np.unique(
+        np.concatenate([np.zeros(0, dtype=np.int64), *(g.prescribed_dofs for g in grasps)])
+    )
 
 
 # What is left free --------------------------------------------------------------------------------
 
 
-def free_motions(points_m: Array, held: NDArray[np.bool_]) -> list[str]:
+def free_rigid_motions(points_m: Array, is_prescribed: NDArray[np.bool_]) -> list[str]:
     """Return the rigid motions that these prescribed coordinates leave free, in words; empty if
     none.
 
@@ -177,51 +179,53 @@ def free_motions(points_m: Array, held: NDArray[np.bool_]) -> list[str]:
     ----------
     points_m : (n, 3)
         Node positions.
-    held : (n, 3) bool
+    is_prescribed : (n, 3) bool
         Whether each coordinate is prescribed.
     """
-    if not held.any():
+    if not is_prescribed.any():
         return ["move and turn as a whole"]
-    about = points_m[held.any(axis=1)].mean(axis=0)
+    about = points_m[is_prescribed.any(axis=1)].mean(axis=0)
     arms = points_m - about
-    size_m = float(np.linalg.norm(arms[held.any(axis=1)], axis=1).max()) or 1.0
+    size_m = float(np.linalg.norm(arms[is_prescribed.any(axis=1)], axis=1).max()) or 1.0
     turned = np.stack([np.cross(axis, arms / size_m) for axis in np.eye(3)], axis=2)
-    modes = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)[held]
+    modes = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)[
+        is_prescribed
+    ]
     _, values, directions = np.linalg.svd(modes)
-    rank = int((values > HELD * values[0]).sum())
+    rank = int((values > SMALLEST_SINGULAR_VALUE * values[0]).sum())
     free = directions[rank:]
     if not len(free):
         return []
     # What is left without a turn, and the axes of what turns.
-    shifts = _null(free[:, 3:].T) @ free[:, :3]
+    shifts = _null_space(free[:, 3:].T) @ free[:, :3]
     rotations = free[:, 3:]
     return [
-        *(f"move along {_named(d)}" for d in _plain(shifts)),
-        *(f"turn about {_named(d)}" for d in _plain(rotations)),
+        *(f"move along {_direction_text(d)}" for d in _axis_aligned_basis(shifts)),
+        *(f"turn about {_direction_text(d)}" for d in _axis_aligned_basis(rotations)),
     ]
 
 
-def _null(matrix: Array) -> Array:
+def _null_space(matrix: Array) -> Array:
     """Return an orthonormal basis (k, n) of the null space of a matrix (m, n)."""
     _, values, directions = np.linalg.svd(matrix)
-    return directions[int((values > HELD).sum()) :]
+    return directions[int((values > SMALLEST_SINGULAR_VALUE).sum()) :]
 
 
-def _plain(vectors: Array) -> Iterator[Array]:
+def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
     """Yield an orthonormal basis of the span of vectors (k, 3), along coordinate axes where
     possible.
     """
     _, values, directions = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
-    space = directions[values > HELD]
+    space = directions[values > SMALLEST_SINGULAR_VALUE]
     while len(space):
         projected = space.T @ space
         best = int(np.argmax(np.diag(projected).round(9)))
         direction = projected[best] / np.linalg.norm(projected[best])
         yield direction
-        space = _null(np.vstack([direction, _null(space)]))
+        space = _null_space(np.vstack([direction, _null_space(space)]))
 
 
-def _named(direction: Array) -> str:
+def _direction_text(direction: Array) -> str:
     """Return the name of a coordinate axis, or the components of another direction (3,), as
     text.
     """

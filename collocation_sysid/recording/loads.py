@@ -15,19 +15,19 @@ from ..fem.selection import Selection
 from ..section import Vector
 from ..stated import Key, key, stated
 from .arrays import read_only_floats
-from .clock import TIME_TOLERANCE_S, first_time_fault
-from .selected import Nodes, on_body, selection, some_nodes
+from .clock import TIME_TOLERANCE_S, first_unordered_time
+from .selected import Nodes, node_converter, select_on_body, selection_from_section
 from .tables import read_forces
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
 # The times of a load that can be estimated.
-Change = Literal["from_s", "until_s"]
+LoadTime = Literal["from_s", "until_s"]
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class TimeSeries:
     """Values that change over time, linearly between samples, or a constant value.
 
     Parameters
@@ -59,18 +59,18 @@ class Course:
             raise InputError(f"{len(rows)} rows of {what} without times; expected t_s")
         if t_s is not None:
             t_s = read_only_floats(t_s, (len(rows),), f"t_s of {what}")
-            if fault := first_time_fault(t_s):
+            if fault := first_unordered_time(t_s):
                 raise InputError(f"{what}: {fault[1]}", where=f"row {fault[0] + 1}")
         vars(self).update(values=rows, t_s=t_s)
 
-    def at(self, t_s: ArrayLike) -> Array:
+    def values_at(self, t_s: ArrayLike) -> Array:
         """Return scalar values (T,) at the times (T,); the end values outside the samples."""
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         if self.t_s is None:
             return np.full(len(times), self.values[0])
         return np.interp(times, self.t_s, self.values)
 
-    def refuse_short(self, t_s: Array, name: str) -> None:
+    def require_covered(self, t_s: Array, name: str) -> None:
         """Raise an `InputError` if the samples do not cover the times `t_s` (T,) of a recording.
 
         Parameters
@@ -91,14 +91,17 @@ class Course:
             )
 
 
-def ramp(u: Any) -> Any:
+def smooth_ramp(time_steps: Any) -> Any:
     """Return a smooth ramp from 0 at u ≤ −1 to 1 at u ≥ 1, with a continuous derivative.
 
     The derivative is a hat function, so that the sum over an even grid with unit spacing is the
-    remaining length after u = 0, wherever u = 0 lies between grid points. `u` is an array or a
+    remaining length after u = 0, wherever u = 0 lies between grid points. `time_steps` is an array
+    or a
     CasADi expression.
     """
-    return (abs(u) < 1) * (0.5 + u - 0.5 * u * abs(u)) + (u >= 1)
+    return (abs(time_steps) < 1) * (0.5 + time_steps - 0.5 * time_steps * abs(time_steps)) + (
+        time_steps >= 1
+    )
 
 
 class Load:
@@ -107,21 +110,21 @@ class Load:
     nodes: Index
     from_s: float
     until_s: float
-    called: ClassVar[str]
+    description_name: ClassVar[str]
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def __post_init__(self) -> None:
         if not self.from_s < self.until_s:
             raise InputError(
-                f"a {self.called} is there from {self.from_s:g} s until {self.until_s:g} s; "
+                f"a {self.description_name} is there from {self.from_s:g} s until {self.until_s:g} s; "
                 "expected from_s < until_s"
             )
         if isinstance(self.nodes, Selection):
             vars(self)["selection"] = self.nodes
 
-    def on(self, body: Body) -> Self:
+    def on_body(self, body: Body) -> Self:
         """Return the load with its selection replaced by the selected nodes of a body."""
-        nodes = on_body(self.nodes, body)
+        nodes = select_on_body(self.nodes, body)
         return self if nodes is self.nodes else replace(self, nodes=nodes)
 
 
@@ -145,15 +148,17 @@ class PointMass(Load):
         evaluated again.
     """
 
-    nodes: Index = key(Nodes, converter=some_nodes("the point mass"), read=selection)
+    nodes: Index = key(
+        Nodes, converter=node_converter("the point mass"), read=selection_from_section
+    )
     mass_kg: float = key(Positive)
     from_s: float = key(Finite | None, default=-np.inf)
     selection: Selection | None = None
     until_s: float = key(Finite | None, default=np.inf)
 
-    called: ClassVar[str] = "point mass"
+    description_name: ClassVar[str] = "point mass"
 
-    def at_nodes(self, node_count: int) -> Array:
+    def node_mass_kg(self, node_count: int) -> Array:
         """Return the mass at each of the body's nodes, (n,) [kg]."""
         mass = np.zeros(node_count)
         mass[self.nodes] = self.mass_kg / len(self.nodes)
@@ -188,21 +193,21 @@ class Force(Load):
         When it ends, likewise.
     """
 
-    nodes: Index = key(Nodes, converter=some_nodes("the force"), read=selection)
+    nodes: Index = key(Nodes, converter=node_converter("the force"), read=selection_from_section)
     force_n: Array = key(Vector | None, converter=np.atleast_2d)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
     selection: Selection | None = None
     from_s: float = key(Finite | None, default=-np.inf)
     until_s: float = key(Finite | None, default=np.inf)
 
-    called: ClassVar[str] = "force"
+    description_name: ClassVar[str] = "force"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        course = Course(self.force_n, self.t_s, "force_n", (3,))
+        course = TimeSeries(self.force_n, self.t_s, "force_n", (3,))
         vars(self).update(force_n=course.values, t_s=course.t_s)
 
-    def at_nodes(self, t_s: ArrayLike, node_count: int) -> Array:
+    def node_forces_n(self, t_s: ArrayLike, node_count: int) -> Array:
         """Return the force on each node at the times `t_s` (T,), (T, n, 3) [N], without its time
         window.
         """

@@ -15,17 +15,17 @@ from ..arrays import Array, Index
 from ..checked import Positive
 from ..errors import InputError
 from ..stated import Key, as_given, key, stated
-from .arrays import floats, read_only_floats, read_only_tracks
-from .placement import Attachment, Placement, Shape, place_markers
+from .arrays import float_converter, read_only_floats, read_only_tracks
+from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
 __all__ = ["Markers", "Placement", "place_markers"]
 
-SHOWN = 4
+MOST_NAMES_SHOWN = 4
 
-CarriedBack = Callable[[Array, Array], Array]
+UndeformedPlaces = Callable[[Array, Array], Array]
 
 
 _FARTHEST = Key("max_distance_m", Positive | None)
@@ -57,14 +57,14 @@ class Markers:
         NaN where a place is not known: the estimate then starts from the first sample, with a prior
         as wide as the body. The same holds for all markers without places and placement.
     placement : Placement, optional
-        Weights of the nodes, one row per marker, in place of `places_m`.
+        Weights of the nodes, one row per marker, in place of `marker_places_m`.
     places_sigma_m : (M,) array or float, optional
         Standard deviation of the given places, zero for exact ones; that of the experiment's
         nuisance by default.
     on_surface : bool
         Whether estimated places stay on the surface: two coordinates in place of three.
     located : (M,) bool array, optional
-        Whether a place is given; derived from `places_m` by default.
+        Whether a place is given; derived from `marker_places_m` by default.
     attach : {"auto", "vertex", "embedded"}
         See `place_markers`.
     max_distance_m : float, optional
@@ -77,7 +77,7 @@ class Markers:
         given.
     """
 
-    t_s: Array = key(converter=floats((None,), "t_s of the markers"))
+    t_s: Array = key(converter=float_converter((None,), "t_s of the markers"))
     positions_m: Array = key(converter=np.asarray)
     sigma_m: Array = key(converter=np.asarray)
     names: tuple[str, ...] = key(converter=tuple[str, ...], default=None)
@@ -86,7 +86,7 @@ class Markers:
     places_sigma_m: Array | None = key(converter=np.asarray, default=None)
     on_surface: bool = key(_PLACES, converter=bool, default=False)
     located: NDArray[np.bool_] = key(converter=np.asarray, default=None)
-    attach: Attachment = key(Attachment, default="auto")
+    attach: AttachmentRule = key(AttachmentRule, default="auto")
     max_distance_m: float | None = key(_FARTHEST, converter=as_given, default=None)
 
     def __post_init__(self) -> None:
@@ -106,9 +106,9 @@ class Markers:
             if not sigma > 0:
                 raise InputError(f"sigma_m of marker '{name}' is {sigma:g}; expected > 0")
         vars(self).update(positions_m=tracks, sigma_m=sigma_m)
-        self._find_places(m)
+        self._check_places(m)
 
-    def _find_places(self, m: int) -> None:
+    def _check_places(self, m: int) -> None:
         """Check the places of the m markers and store them with `located`."""
         places_m = self.places_m
         placement = self.placement
@@ -134,18 +134,22 @@ class Markers:
     def __repr__(self) -> str:
         if not self.names:
             return "no markers"
-        shown = self.names if len(self.names) <= SHOWN else (*self.names[:SHOWN], "…")
-        missing = int(self.missing.sum())
+        shown = (
+            self.names
+            if len(self.names) <= MOST_NAMES_SHOWN
+            else (*self.names[:MOST_NAMES_SHOWN], "…")
+        )
+        missing = int(self.missing_counts.sum())
         gaps = f", {missing} missing" if missing else ""
-        return f"Markers({', '.join(shown)}: {self.samples} samples{gaps})"
+        return f"Markers({', '.join(shown)}: {self.sample_count} samples{gaps})"
 
-    def on(self, body: Body, carried_back: CarriedBack | None = None) -> Markers:
+    def on_body(self, body: Body, undeformed_places: UndeformedPlaces | None = None) -> Markers:
         """Return the markers with their placement on a body.
 
         Parameters
         ----------
         body : Body
-        carried_back : callable, optional
+        undeformed_places : callable, optional
             Maps points (M, 3) at times (M,) to their places on the undeformed body if a grasp
             carried it rigidly. Estimates of unknown places start there; without it, at the first
             sample.
@@ -160,16 +164,16 @@ class Markers:
         known = self.located
         places = self.places_m.copy()
         if not known.all():
-            shape = Shape(body.nodes_m, body)
+            shape = LocatedBody(body.nodes_m, body)
             points_m, times_s = self.first_samples
-            back = points_m if carried_back is None else carried_back(points_m, times_s)
+            back = points_m if undeformed_places is None else undeformed_places(points_m, times_s)
             for m in np.flatnonzero(~known).tolist():
-                if not self.present[:, m].any():
+                if not self.is_present[:, m].any():
                     raise InputError(
                         f"marker '{self.names[m]}' is never seen and has no place on the body; "
                         "give its reference_m, or leave it out"
                     )
-                nodes, weights = shape.nearest(back[m])
+                nodes, weights = shape.weights_at_nearest_point(back[m])
                 places[m] = weights @ body.nodes_m[nodes]
         nodes_m = body.nodes.points_m
         placement = place_markers(
@@ -185,34 +189,34 @@ class Markers:
         return cls(t_s, np.zeros((len(np.atleast_1d(t_s)), 0, 3)), 1.0)
 
     @property
-    def first_seen(self) -> int:
+    def first_seen_sample(self) -> int:
         """Index of the first sample in which a marker is seen; 0 if none is."""
-        return int(self.present.any(axis=1).argmax())
+        return int(self.is_present.any(axis=1).argmax())
 
     @cached_property
     def first_samples(self) -> tuple[Array, Array]:
         """First present sample of every marker (M, 3) [m], NaN if there is none, and its time (M,)
         [s].
         """
-        rows = self.present.argmax(axis=0)
+        rows = self.is_present.argmax(axis=0)
         return self.positions_m[rows, np.arange(len(self.names))], self.t_s[rows]
 
     @cached_property
-    def present(self) -> NDArray[np.bool_]:
+    def is_present(self) -> NDArray[np.bool_]:
         """(T, M) mask of samples with all three coordinates."""
         return np.asarray(np.isfinite(self.positions_m[:, :, 0]))
 
     @property
-    def missing(self) -> Index:
+    def missing_counts(self) -> Index:
         """(M,) number of missing samples of each marker."""
-        return (~self.present).sum(axis=0)
+        return (~self.is_present).sum(axis=0)
 
     @property
-    def samples(self) -> int:
+    def sample_count(self) -> int:
         """Number of present samples over all markers."""
-        return int(self.present.sum())
+        return int(self.is_present.sum())
 
-    def observe(self, node_positions_m: ArrayLike) -> Array:
+    def predict_positions(self, node_positions_m: ArrayLike) -> Array:
         """Return predicted marker positions (..., M, 3) from node positions (..., n, 3)."""
         nodes_m = np.asarray(node_positions_m, dtype=np.float64)
         element_nodes_m = nodes_m[..., self.placement.nodes, :]

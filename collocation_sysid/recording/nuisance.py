@@ -18,15 +18,15 @@ from ..errors import InputError, listed
 
 DEGREE = float(np.pi / 180)
 # Reach of parameters on which predictions depend linearly, which need no trust region [σ].
-FREELY = 1e3
+UNLIMITED_REACH = 1e3
 # Mesh edges that a marker's place may move in a step of the solver: it stays near its element.
 EDGES_A_STEP = 2.0
 # Samples that the time of a load may move in a step of the solver: the motion is smooth over these.
 SAMPLES_A_STEP = 2.0
 # Shift of a depth camera in a step of the solver [m]: correspondences stay about the same.
-SEEN_A_STEP_M = 0.02
+CAMERA_SHIFT_A_STEP_M = 0.02
 
-Of = Literal[
+Component = Literal[
     "recording",
     "place",
     "marker",
@@ -39,13 +39,18 @@ Of = Literal[
     "depth",
     "gauge",
 ]
-Changes = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth"]
+ModelPart = Literal["reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth"]
 # Scope of parameters that recordings share, as a pattern and in words for messages.
 SCOPE = r"shared( \S+)?"
-SCOPES = '"shared", or "shared" and a word for each of several groups'
+SCOPE_TEXT = '"shared", or "shared" and a word for each of several groups'
 # Readable units: factor and text by SI unit.
-SHOWN = {"m": (1e3, " mm"), "s": (1e3, " ms"), "rad": (180 / np.pi, "°"), "kg": (1e3, " g")}
-SHOWN |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
+READABLE_UNITS = {
+    "m": (1e3, " mm"),
+    "s": (1e3, " ms"),
+    "rad": (180 / np.pi, "°"),
+    "kg": (1e3, " g"),
+}
+READABLE_UNITS |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,8 @@ class NuisanceRow:
     """A kind of nuisance parameter of a recording; its values have normal priors with mean zero.
 
     A recording has one value for each component (marker, grasp, …) and axis. Custom kinds state
-    what they do to a marker's predicted position (`reading`) or to its time (`clock`), and go into
+    what they do to a marker's predicted position (`reading`) or to its time (`clock_hypothesis`),
+    and go into
     `Nuisance(own=[…])`.
 
     Attributes
@@ -114,9 +120,9 @@ class NuisanceRow:
     _: KW_ONLY
     key: str = ""
     beside: float | None = None
-    of: Of = "recording"
+    of: Component = "recording"
     axes: str = ""
-    changes: tuple[Changes, ...] = ("reading",)
+    changes: tuple[ModelPart, ...] = ("reading",)
     applies: Callable[[Any], bool] = lambda experiment: True
     low: float = -np.inf
     high: float = np.inf
@@ -146,39 +152,39 @@ class NuisanceRow:
     @property
     def usual(self) -> str:
         """Default standard deviation as text in a readable unit, such as "5 ms"."""
-        size, unit = in_unit_for_people(self.sigma or 0.0, self.unit)
+        size, unit = in_readable_unit(self.sigma or 0.0, self.unit)
         return f"{size:.4g}{unit}"
 
 
-def rotation(turn: ca.SX) -> ca.SX:
+def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
     """Return the rotation matrix (3, 3) of Cayley parameters turn / 2, a rational function.
 
-    Its angle is that of the rotation vector `turn` (3,) [rad] up to third order.
+    Its angle is that of the rotation vector `rotation_vector` (3,) [rad] up to third order.
     """
-    half = ca.skew(turn / 2)
-    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(turn) / 4) * (half + half @ half)
+    half = ca.skew(rotation_vector / 2)
+    return ca.SX.eye(3) + 2 / (1 + ca.sumsqr(rotation_vector) / 4) * (half + half @ half)
 
 
-def in_unit_for_people(value: float, unit: str) -> tuple[float, str]:
+def in_readable_unit(value: float, unit: str) -> tuple[float, str]:
     """Return a value in a readable unit (mm, ms, °, …), and that unit as it is printed behind the
     value.
     """
-    factor, shown = SHOWN.get(unit, (1.0, f" {unit}"))
+    factor, shown = READABLE_UNITS.get(unit, (1.0, f" {unit}"))
     return factor * value, shown
 
 
-def _turned(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+def _rotate_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
     """Rotate a marker's predicted position y (3,) by `values` (3,) [rad] about the pivot."""
     pivot = ca.DM(data.pivot_m)
-    return rotation(values) @ (y - pivot) + pivot
+    return cayley_rotation(values) @ (y - pivot) + pivot
 
 
-def _shifted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+def _shift_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
     """Shift a marker's predicted position y (3,) by `values` (3,) [m]."""
     return y + values
 
 
-def _distorted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
+def _distort_position(y: Any, values: Any, t_s: Any, data: Any) -> Any:
     """Apply radial distortion of first order, with the coefficient `values` [1/m²], about the
     pivot.
     """
@@ -186,104 +192,108 @@ def _distorted(y: Any, values: Any, t_s: Any, data: Any) -> Any:
     return y + values * ca.sumsqr(away) * away
 
 
-def _seen(experiment: Any) -> bool:
+def _has_markers(experiment: Any) -> bool:
     """Return whether the experiment has markers."""
     return bool(experiment.markers.names)
 
 
-def _is_seen(experiment: Any) -> bool:
+def _has_depth_cameras(experiment: Any) -> bool:
     """Return whether the experiment has depth cameras."""
     return bool(experiment.depths)
 
 
-def _has_outlines(experiment: Any) -> bool:
+def _has_depth_outlines(experiment: Any) -> bool:
     """Return whether a depth camera of the experiment has images, with outlines to compare."""
     return any(len(depth.images_m) for depth in experiment.depths)
 
 
-def _viewed(experiment: Any) -> dict[str, Any]:
+def _camera_sharing_key(experiment: Any) -> dict[str, Any]:
     """Return what must agree in recordings that share the pose of their depth cameras."""
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
     return {"body": id(experiment.body), "pose of its cameras": places}
 
 
-def _moves(experiment: Any) -> bool:
+def _is_motion(experiment: Any) -> bool:
     """Return whether the experiment is a motion."""
     return not experiment.static
 
 
-def _seen_in_grasp(experiment: Any) -> bool:
+def _has_observable_hand_eye(experiment: Any) -> bool:
     # Nothing but what markers see tells how the body is off in its grasp, and a start that is
     # given tells where it is.
     """Return whether markers determine the position of the body in its grasp (hand–eye
     transform).
     """
-    return bool(experiment.gripping) and _seen(experiment) and experiment.start == "equilibrium"
+    return (
+        bool(experiment.body_grasps)
+        and _has_markers(experiment)
+        and experiment.start == "equilibrium"
+    )
 
 
-def _edges(experiment: Any) -> float:
+def _largest_place_step_m(experiment: Any) -> float:
     """Return how far a marker's place may move in a step of the solver [m]."""
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
 
-def _grasped(experiment: Any) -> dict[str, Any]:
+def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
     """Return what must agree in recordings that share the hand–eye transform."""
-    nodes = {int(node) for grasp in experiment.gripping for node in grasp.nodes}
+    nodes = {int(node) for grasp in experiment.body_grasps for node in grasp.nodes}
     return {"body": id(experiment.body), "nodes in its grasps": nodes}
 
 
 # fmt: off
 PLACE = NuisanceRow("marker_offset_m", "m", 1e-3, key="marker_offsets", of="place", axes="x y z",
-    changes=(), reach=FREELY, step=_edges,
+    changes=(), reach=UNLIMITED_REACH, step=_largest_place_step_m,
     label="place of {which}, {axis}",
     said="errors of the places in reference_m without a reference_sigma_m; they turn with the body",
     same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface})
 OFFSET = NuisanceRow("camera_offset_m", "m", None, key="camera_offsets", of="marker", axes="x y z",
-    reach=FREELY, by="length",
+    reach=UNLIMITED_REACH, by="length",
     label="camera offset of {which}, {axis}", told="camera offsets up to {size}",
-    said="a constant offset of each marker in the cameras' frame", reading=_shifted)
+    said="a constant offset of each marker in the cameras' frame", reading=_shift_position)
 CALIBRATION_SCALE = NuisanceRow("calibration_scale", "1", None, key="calibration_scale",
     considered=2e-3,
     label="scale of the cameras", told="cameras see lengths {signed}",
     said="a factor on all lengths that the cameras see, how far from one",
-    applies=_seen, reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)))
+    applies=_has_markers, reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)))
 CALIBRATION_DISTORTION = NuisanceRow("calibration_distortion_1_m2", "1/m²", None,
-    key="calibration_distortion", considered=0.02, applies=_seen,
+    key="calibration_distortion", considered=0.02, applies=_has_markers,
     label="distortion of the cameras", told="cameras' distortion {signed}",
     said="radial distortion of first order about the body's middle: a factor 1 + k r²",
-    reading=_distorted)
-TIME = NuisanceRow("time_shift_s", "s", 5e-3, key="time_shift", changes=("clock",), applies=_moves,
+    reading=_distort_position)
+TIME = NuisanceRow("time_shift_s", "s", 5e-3, key="time_shift", changes=("clock",), applies=_is_motion,
     label="time shift", told="markers seen {size} {way} than their times say{limit}",
     said="how much later than their times say markers were seen, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
     clock=lambda values, t_s, data: values)
 CLOCK_RATE = NuisanceRow("clock_rate", "1", None, key="clock_rate", considered=1e-4,
-    changes=("clock",), applies=lambda experiment: _moves(experiment) and _seen(experiment),
+    changes=("clock",), applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
     label="rate of the markers' clock", told="the markers' clock {signed} slow",
     said="how much slower than the grasps' clock that of the markers goes",
     clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]))
-TURN = NuisanceRow("pose_turn_rad", "rad", None, key="pose", axes="x y z",
+POSE_TURN = NuisanceRow("pose_turn_rad", "rad", None, key="pose", axes="x y z",
     changes=("reading", "gravity"), by="length",
     label="turn of the pose, {axis}", told="poses turned by {size}",
     said="a constant turn of grasps and body in the cameras' frame, which turns gravity in the "
-         "body's", reading=_turned)
-SHIFT = NuisanceRow("pose_shift_m", "m", None, key="pose", axes="x y z", reach=FREELY, by="length",
+         "body's", reading=_rotate_position)
+POSE_SHIFT = NuisanceRow("pose_shift_m", "m", None, key="pose", axes="x y z", reach=UNLIMITED_REACH, by="length",
     label="shift of the pose, {axis}", told="poses shifted by {size}",
-    said="a constant shift of both", reading=_shifted)
+    said="a constant shift of both", reading=_shift_position)
 TILT = NuisanceRow("gravity_rad", "rad", DEGREE, key="gravity", axes="first second",
     changes=("gravity",), applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
     by="length",
     label="tilt of gravity, {axis}", told="gravity tilted by {size}",
     said="a tilt of the direction of gravity", same=lambda e: {"gravity": tuple(e.gravity_m_s2)})
 GRASP_TURN = NuisanceRow("hand_eye_rad", "rad", 0.5 * DEGREE, key="hand_eye", axes="x y z",
-    changes=("grasps",), applies=_seen_in_grasp, by="length",
+    changes=("grasps",), applies=_has_observable_hand_eye, by="length",
     label="turn in the grasp, {axis}", told="body turned in its grasp by {size}",
-    said="a constant turn of the body in its grasps", same=_grasped)
+    said="a constant turn of the body in its grasps", same=_hand_eye_sharing_key)
 GRASP_SHIFT = NuisanceRow("hand_eye_m", "m", 1e-3, key="hand_eye", axes="x y z",
-    changes=("grasps",), applies=_seen_in_grasp, by="length",
+    changes=("grasps",), applies=_has_observable_hand_eye, by="length",
     label="shift in the grasp, {axis}", told="body shifted in its grasp by {size}",
     said="a constant shift of it there; both where the start is an equilibrium and markers see it",
-    same=_grasped)
+    same=_hand_eye_sharing_key)
 ZERO = NuisanceRow("displacement_zero_m", "m", 1e-4, key="displacement_zero", of="grasp",
     axes="x y z", changes=("grasps",), by="worst",
     label="zero of grasp {which}, {axis}", told="zero of a displacement off by {size}",
@@ -307,7 +317,7 @@ TENSION_FACTOR = NuisanceRow("tension_factor", "1", None, key="tension_factor", 
     changes=("drives",),
     label="{which}, more than stated", told="{which} by {signed}",
     said="a factor on the tension of each tendon, how far from one")
-TENSION_LOST = NuisanceRow("tension_lost_n", "N", None, key="tension_lost", of="tendon",
+TENSION_OFFSET = NuisanceRow("tension_lost_n", "N", None, key="tension_lost", of="tendon",
     changes=("drives",),
     label="{which}, lost", told="{which} {signed}",
     said="tension of each tendon that friction takes")
@@ -315,7 +325,7 @@ PRESSURE_FACTOR = NuisanceRow("pressure_factor", "1", None, key="pressure_factor
     changes=("drives",),
     label="{which}, more than stated", told="{which} by {signed}",
     said="a factor on each pressure, how far from one")
-PRESSURE_LOST = NuisanceRow("pressure_lost_pa", "Pa", None, key="pressure_lost", of="pressure",
+PRESSURE_OFFSET = NuisanceRow("pressure_lost_pa", "Pa", None, key="pressure_lost", of="pressure",
     changes=("drives",),
     label="{which}, lost", told="{which} {signed}", said="an offset that each pressure lacks")
 JOINING = NuisanceRow("joining_s", "s", 1e-2, key="joining", of="load", changes=("loads",),
@@ -323,16 +333,16 @@ JOINING = NuisanceRow("joining_s", "s", 1e-2, key="joining", of="load", changes=
     label="{which}", told="{which} {number}{error}{unit} {way} than {stated}",
     said="how much later than stated each point mass or force joins or leaves, where it does so "
          "within the recording")
-TARE = NuisanceRow("tare", "σ", 10.0, key="tare", of="sensor", changes=("sensor",), reach=FREELY,
+TARE = NuisanceRow("tare", "σ", 10.0, key="tare", of="sensor", changes=("sensor",), reach=UNLIMITED_REACH,
     by="worst",
     label="tare{which} of {axis}", told="tare up to {size}",
     said="a constant offset of each component of a wrench, in its sigmas")
 SENSOR_TIME = NuisanceRow("sensor_time_s", "s", 5e-3, key="sensor_time", of="sensor",
-    changes=("sensor",), applies=_moves, low=-3.0, high=3.0, by="worst",
+    changes=("sensor",), applies=_is_motion, low=-3.0, high=3.0, by="worst",
     label="time shift of the sensor{which}", told="sensor late by {size}",
     said="how much later than their times say wrenches were measured; three deviations at most")
 SENSOR_LAG = NuisanceRow("sensor_lag_s", "s", None, key="sensor_lag", of="sensor",
-    changes=("sensor",), applies=_moves, low=0.0, high=3.0, by="worst",
+    changes=("sensor",), applies=_is_motion, low=0.0, high=3.0, by="worst",
     label="lag of the sensor{which}", told="lag of the sensor {size}",
     said="time constant of a first-order low-pass in the sensor; from zero to three deviations")
 TOOL_MASS = NuisanceRow("tool_kg", "kg", None, key="tool", of="sensor", changes=("sensor",),
@@ -345,44 +355,44 @@ TOOL_CENTRE = NuisanceRow("tool_m", "m", None, key="tool", of="sensor", axes="x 
     label="centre of the tool{which}, {axis}", told="its centre off by {size}",
     said="its centre about the sensor's point; in the world's frame that of the grasped nodes")
 DEPTH_TURN = NuisanceRow("depth_turn_rad", "rad", 5 * DEGREE, key="depth_pose", of="depth",
-    axes="x y z", changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, by="length",
+    axes="x y z", changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, by="length",
     label="turn of {which}, {axis}", told="a depth camera is turned by {size}",
     said="a turn of each depth camera about the middle of the body, along its own axes",
-    same=_viewed)
+    same=_camera_sharing_key)
 DEPTH_SHIFT = NuisanceRow("depth_shift_m", "m", 0.02, key="depth_pose", of="depth",
-    axes="x y z", changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, reach=FREELY,
-    step=lambda experiment: SEEN_A_STEP_M, by="length",
+    axes="x y z", changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, reach=UNLIMITED_REACH,
+    step=lambda experiment: CAMERA_SHIFT_A_STEP_M, by="length",
     label="shift of {which}, {axis}", told="a depth camera is shifted by {size}",
     said="a shift of it; where neither is given, the first image is aligned to the body first",
-    same=_viewed)
+    same=_camera_sharing_key)
 DEPTH_BIAS = NuisanceRow("depth_bias_m", "m", 5e-3, key="depth_bias", of="depth",
-    changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, reach=FREELY,
-    step=lambda experiment: SEEN_A_STEP_M, by="worst",
+    changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, reach=UNLIMITED_REACH,
+    step=lambda experiment: CAMERA_SHIFT_A_STEP_M, by="worst",
     label="bias of {which}", told="depth is off by {size}",
     said="what is to be added to each depth of an image")
 DEPTH_SCALE = NuisanceRow("depth_scale", "1", 5e-3, key="depth_scale", of="depth",
-    changes=("depth",), applies=_is_seen, low=-4.0, high=4.0, reach=4.0, by="worst",
+    changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, reach=4.0, by="worst",
     label="scale of {which}", told="depth is off by {size} of itself",
     said="a factor on each depth of an image, how far from one")
 DEPTH_TIME = NuisanceRow("depth_time_s", "s", 5e-3, key="depth_time", of="depth",
-    changes=("depth",), applies=lambda experiment: _moves(experiment) and _is_seen(experiment),
+    changes=("depth",), applies=lambda experiment: _is_motion(experiment) and _has_depth_cameras(experiment),
     low=-3.0, high=3.0, by="worst",
     label="time shift of {which}", told="a depth camera is late by {size}",
     said="how much later than its times say a depth camera saw; three deviations at most")
 DEPTH_EDGE = NuisanceRow("depth_edge_px", "px", 2.0, key="depth_edge", of="depth",
-    changes=("depth",), applies=_has_outlines, low=-4.0, high=4.0, reach=FREELY, by="worst",
+    changes=("depth",), applies=_has_depth_outlines, low=-4.0, high=4.0, reach=UNLIMITED_REACH, by="worst",
     label="edge of {which}", told="silhouettes end {size} inside the body",
     said="how many pixels inside the outline of the body its silhouette ends in the images of each "
          "depth camera, all around")
 # fmt: on
 
 # In the order of φ; neighbours of one component stand together.
-ROWS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
+KINDS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
 GAUGE = NuisanceRow("reading", "", None, of="gauge", changes=())
 
 
-class _Deviations:
+class _NuisanceBase:
     """Checks and look-ups of `Nuisance`, whose fields are made from the table `ROWS`."""
 
     scope: Mapping[str, str]
@@ -390,24 +400,24 @@ class _Deviations:
 
     def __post_init__(self) -> None:
         for row in self.own:
-            _require_own(row)
-            if [each.name for each in self.rows].count(row.name) > 1:
+            _check_custom_kind(row)
+            if [each.name for each in self.kinds].count(row.name) > 1:
                 raise InputError(f"two nuisance parameters are named {row.name!r}")
-        for row in self.rows:
+        for row in self.kinds:
             value = self.sigma(row)
             if value is not None and not value > 0:
                 raise InputError(f"{row.name} is {value:g}; expected a deviation above 0")
-        names = [row.name for row in self.rows]
+        names = [row.name for row in self.kinds]
         for name, word in self.scope.items():
             if name not in names:
                 raise InputError(f"found the scope of {name!r}; expected one of {listed(names)}")
             if not re.fullmatch(SCOPE, word):
-                raise InputError(f"the scope of {name} is {word!r}; expected {SCOPES}")
+                raise InputError(f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}")
 
     @property
-    def rows(self) -> tuple[NuisanceRow, ...]:
+    def kinds(self) -> tuple[NuisanceRow, ...]:
         """All kinds of nuisance parameters that may be estimated: `ROWS`, then custom ones."""
-        return (*ROWS, *self.own)
+        return (*KINDS, *self.own)
 
     def sigma(self, row: NuisanceRow) -> float | None:
         """Standard deviation of a kind's prior; None where it is not estimated."""
@@ -418,11 +428,11 @@ class _Deviations:
         """Return a `Nuisance` that estimates only the fields given here, with their standard
         deviations.
         """
-        nothing: dict[str, Any] = {row.name: None for row in ROWS}
+        nothing: dict[str, Any] = {row.name: None for row in KINDS}
         return Nuisance(**(nothing | deviations))
 
 
-def _require_own(row: NuisanceRow) -> None:
+def _check_custom_kind(row: NuisanceRow) -> None:
     """Raise an `InputError` if a custom kind has another component, no prior, or no effect."""
     if row.of not in ("recording", "marker"):
         raise InputError(f"{row.name} is of a {row.of}; expected of = 'recording' or 'marker'")
@@ -432,7 +442,7 @@ def _require_own(row: NuisanceRow) -> None:
         raise InputError(f"{row.name} has to have a reading or a clock, one of both")
 
 
-_SAID = """Standard deviations of an experiment's nuisance parameters; None where not estimated.
+_DOCSTRING = """Standard deviations of an experiment's nuisance parameters; None where not estimated.
 
 Every one has a normal prior around zero with its deviation. The defaults are those of a careful
 laboratory; `none` is for ideal data.
@@ -441,7 +451,7 @@ Attributes
 ----------
 """
 
-_SCOPE_SAID = """
+_SCOPE_DOCSTRING = """
 scope : mapping of the name of a field to "shared", or "shared" and a word
     Those that are the same in all recordings that have the word; each recording has its own else.
 own : sequence of NuisanceRow
@@ -451,7 +461,7 @@ own : sequence of NuisanceRow
 if TYPE_CHECKING:
 
     @dataclass(frozen=True, init=False)
-    class Nuisance(_Deviations):
+    class Nuisance(_NuisanceBase):
         """Type stub of the class that is made from `ROWS` below: one field for each kind."""
 
         def __init__(self, **deviations: Any) -> None: ...
@@ -461,17 +471,17 @@ else:
     Nuisance = make_dataclass(
         "Nuisance",
         [
-            *((row.name, "float | None", field(default=row.sigma)) for row in ROWS),
+            *((row.name, "float | None", field(default=row.sigma)) for row in KINDS),
             ("scope", "Mapping[str, str]", field(default_factory=dict, hash=False)),
             ("own", "Sequence[NuisanceRow]", field(default=(), hash=False)),
         ],
-        bases=(_Deviations,),
+        bases=(_NuisanceBase,),
         frozen=True,
         kw_only=True,
         namespace={
             "__module__": __name__,
-            "__doc__": _SAID
-            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in ROWS)
-            + _SCOPE_SAID,
+            "__doc__": _DOCSTRING
+            + "\n".join(f"{row.name} : float or None\n    {row.said}." for row in KINDS)
+            + _SCOPE_DOCSTRING,
         },
     )

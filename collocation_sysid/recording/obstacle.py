@@ -17,18 +17,18 @@ from ..checked import NotNegative, Positive, Text
 from ..errors import InputError
 from ..fem.constants import FRICTION, Constant, constant_named
 from ..fem.selection import Selection
-from ..fem.touching import Touching
+from ..fem.touching import ContactSurface
 from ..stated import key, stated
 from .grasp import Grasp
 from .poses import PoseSequence
-from .selected import Nodes, selection
-from .solids import KINDS, Solid, SolidSection, across, solid_of
+from .selected import Nodes, selection_from_section
+from .solids import KINDS, Solid, SolidSection, orthogonal_axes, solid_from_section
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
 
-def _shape(shape: Any) -> Solid:
+def _require_solid(shape: Any) -> Solid:
     """Return `shape` unchanged; an `InputError` if it is no `Solid`."""
     if not isinstance(shape, Solid):
         kinds = ", ".join(kind.__name__ for kind in KINDS.values())
@@ -36,7 +36,7 @@ def _shape(shape: Any) -> Solid:
     return shape
 
 
-def _faces(faces: Any) -> Selection:
+def _require_selection(faces: Any) -> Selection:
     """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(f"faces of an obstacle is {faces!r}; expected a selection")
@@ -86,11 +86,17 @@ class Obstacle(Grasp):
 
     nodes: Index = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     poses: PoseSequence = field(default_factory=PoseSequence.fixed)
-    shape: Solid = key(SolidSection, read=solid_of, converter=_shape, kw_only=True)
+    shape: Solid = key(
+        SolidSection, read=solid_from_section, converter=_require_solid, kw_only=True
+    )
     name: str = key(Text | None, default="obstacle", kw_only=True)
     friction: float | str = key(NotNegative | Text, default=0.0, kw_only=True)
     faces: Selection | None = key(
-        Nodes | None, converter=_faces, read=selection, default=None, kw_only=True
+        Nodes | None,
+        converter=_require_selection,
+        read=selection_from_section,
+        default=None,
+        kw_only=True,
     )
     stiffness_pa_m: float | None = key(Positive | None, default=None, kw_only=True)
     width_m: float | None = key(Positive | None, default=None, kw_only=True)
@@ -98,7 +104,7 @@ class Obstacle(Grasp):
     relaxed: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        self._begin()
+        self._check_times_and_axes()
         if self.axes != "xyz":
             raise InputError(f"axes of {self.name} is {self.axes!r}; expected none: it is rigid")
         least, largest = FRICTION.bounds
@@ -106,81 +112,83 @@ class Obstacle(Grasp):
             raise InputError(
                 f"friction of {self.name} is {self.friction:g}; expected {least:g} to {largest:g}"
             )
-        if (named := self.coefficient) and not named.name.endswith(FRICTION.name):
+        if (named := self.friction_constant) and not named.name.endswith(FRICTION.name):
             raise InputError(
                 f"friction of {self.name} is {named.name!r}; expected a number, or the name of a "
                 f"parameter that ends with {FRICTION.name}, such as table_friction"
             )
 
-    def framed(self, frame: Index, t_s: Array) -> Obstacle:
+    def with_frame_nodes(self, frame: Index, t_s: Array) -> Obstacle:
         """Return the obstacle with the nodes (4,) of its frame, and matrices as poses at `t_s`
         (T,).
         """
         same = np.array_equal(frame, self.nodes)
         return self._with_nodes(self.nodes if same else frame, t_s)
 
-    def surface(self, body: Body) -> Touching:
+    def contact_surface(self, body: Body) -> ContactSurface:
         """Contact points between a body and the obstacle; the result is cached."""
-        return _touching(body, self)
+        return _contact_surface(body, self)
 
     @property
-    def direction(self) -> Array:
+    def offset_direction(self) -> Array:
         """(3,) direction of its uncertain offset: axes with an uncertain zero, else the normal of
         its shape.
         """
         uncertain_axes = np.array([float(axis in self.zero) for axis in "xyz"])
-        return uncertain_axes if uncertain_axes.any() else self.shape.normal
+        return uncertain_axes if uncertain_axes.any() else self.shape.offset_direction
 
     @property
-    def across(self) -> Array:
+    def tilt_axes(self) -> Array:
         """(2, 3) unit axes of its uncertain tilt; with the normal of its shape they are an
         orthonormal basis.
         """
-        return across(self.shape.normal)
+        return orthogonal_axes(self.shape.offset_direction)
 
-    def off_by(self, offset_m: float, tilt_rad: Array, late_s: float) -> Obstacle:
+    def displaced(self, offset_m: float, tilt_rad: Array, delay_s: float) -> Obstacle:
         """Return the obstacle shifted, tilted and delayed.
 
         Parameters
         ----------
         offset_m : float
-            Shift along `direction`.
+            Shift along `offset_direction`.
         tilt_rad : (2,) array
-            Rotation about the axes `across`, through the middle of its shape.
-        late_s : float
+            Rotation about the axes `tilt_axes`, through the middle of its shape.
+        delay_s : float
             Delay of its motion.
         """
         motion = np.eye(4)
-        middle = self.shape.middle_m
-        motion[:3, :3] = Rotation.from_rotvec(tilt_rad @ self.across).as_matrix()
-        motion[:3, 3] = middle - motion[:3, :3] @ middle + offset_m * self.direction
+        middle = self.shape.tilt_centre_m
+        motion[:3, :3] = Rotation.from_rotvec(tilt_rad @ self.tilt_axes).as_matrix()
+        motion[:3, 3] = middle - motion[:3, :3] @ middle + offset_m * self.offset_direction
         poses = self.poses.after(motion)
-        return replace(self, poses=replace(poses, t_s=poses.t_s + late_s))
+        return replace(self, poses=replace(poses, t_s=poses.t_s + delay_s))
 
     @property
-    def rubs(self) -> bool:
+    def has_friction(self) -> bool:
         """Whether the obstacle has friction."""
         return self.friction != 0
 
     @cached_property
-    def coefficient(self) -> Constant | None:
+    def friction_constant(self) -> Constant | None:
         """Parameter that is the coefficient of friction; None if the coefficient is a number."""
         return constant_named(self.friction) if isinstance(self.friction, str) else None
 
 
 @lru_cache(maxsize=32)
-def _touching(body: Body, obstacle: Obstacle) -> Touching:
+def _contact_surface(body: Body, obstacle: Obstacle) -> ContactSurface:
     """Return the contact points between a body and an obstacle; the last 32 pairs are cached."""
-    return Touching.of(body, obstacle.nodes, obstacle.faces)
+    return ContactSurface.from_body(body, obstacle.nodes, obstacle.faces)
 
 
-def with_frames_of(body: Body, obstacles: Sequence[Obstacle], *, static: bool) -> Body:
+def with_obstacle_frames(body: Body, obstacles: Sequence[Obstacle], *, is_static: bool) -> Body:
     """Return the body with four nodes for the frame of each obstacle.
 
     The Jacobian of the contact forces is not symmetric if an obstacle has friction, or if pressures
     are averaged over time steps, which happens in motions without `relaxed` contact.
     """
-    named = (each.coefficient for each in obstacles)
+    named = (each.friction_constant for each in obstacles)
     frictions = tuple(dict.fromkeys(constant for constant in named if constant is not None))
-    unsymmetric = any(each.rubs or (each.relaxed is None and not static) for each in obstacles)
+    unsymmetric = any(
+        each.has_friction or (each.relaxed is None and not is_static) for each in obstacles
+    )
     return body.with_frames(len(obstacles), unsymmetric, frictions)

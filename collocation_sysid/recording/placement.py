@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, Index
 from ..errors import InputError
-from .arrays import read_only_floats, read_only_nodes, triple
+from .arrays import point_text, read_only_floats, read_only_nodes
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
-Attachment = Literal["auto", "vertex", "embedded"]
+AttachmentRule = Literal["auto", "vertex", "embedded"]
 
 # Largest distance, in mean edge lengths, at which "auto" attaches a marker to a mesh vertex.
-VERTEX_SNAP = 0.05
+VERTEX_SNAP_EDGES = 0.05
 # Least barycentric coordinate of a point inside an element: rounding.
 _INSIDE_TOLERANCE = 1e-9
 # Most iterations for a point in a curved element; they stop when the distance no longer decreases.
@@ -67,7 +67,7 @@ def place_markers(
     points_m: ArrayLike,
     node_positions_m: ArrayLike,
     body: Body,
-    attach: Attachment = "auto",
+    attach: AttachmentRule = "auto",
     max_distance_m: float | None = None,
     names: Sequence[str] | None = None,
 ) -> Placement:
@@ -100,16 +100,20 @@ def place_markers(
     labels = [str(k) for k in range(len(points))] if names is None else list(names)
     if len(labels) != len(points):
         raise InputError(f"{len(labels)} marker names for {len(points)} marker positions")
-    if attach not in get_args(Attachment):
-        raise InputError(f"attach is {attach!r}; expected one of {', '.join(get_args(Attachment))}")
+    if attach not in get_args(AttachmentRule):
+        raise InputError(
+            f"attach is {attach!r}; expected one of {', '.join(get_args(AttachmentRule))}"
+        )
     unplaced = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if unplaced.size:
         raise InputError(
             f"marker '{labels[unplaced[0]]}' has no position from which to find its place on the "
             "body; give its reference_m"
         )
-    shape = Shape(nodes_m, body)
-    snap_m = {"auto": VERTEX_SNAP * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[attach]
+    shape = LocatedBody(nodes_m, body)
+    snap_m = {"auto": VERTEX_SNAP_EDGES * shape.mean_edge_m, "vertex": np.inf, "embedded": -1.0}[
+        attach
+    ]
     limit_m = shape.mean_edge_m if max_distance_m is None else max_distance_m
 
     nodes = np.empty((len(points), body.cells.shape[1]), dtype=np.int64)
@@ -119,13 +123,13 @@ def place_markers(
         node_distance = np.linalg.norm(nodes_m - point, axis=1)
         vertex = int(np.argmin(node_distance))
         if node_distance[vertex] <= snap_m:
-            nodes[k], weights[k] = shape.vertex(vertex)
+            nodes[k], weights[k] = shape.weights_at_node(vertex)
             distance[k] = node_distance[vertex]
         else:
-            nodes[k], weights[k], distance[k] = shape.embed(point)
+            nodes[k], weights[k], distance[k] = shape.weights_at_point(point)
         if distance[k] > limit_m:
             raise InputError(
-                f"marker '{labels[k]}' at {triple(point)} m is "
+                f"marker '{labels[k]}' at {point_text(point)} m is "
                 f"{distance[k]:.4g} m away from the body, more than the {limit_m:.4g} m allowed; "
                 "check length_unit, the frame of the poses and the marker's reference_m, "
                 "or raise max_distance_m"
@@ -133,7 +137,7 @@ def place_markers(
     return Placement(nodes, weights, distance, len(nodes_m))
 
 
-class Shape:
+class LocatedBody:
     """A body in one configuration, prepared for locating points in it.
 
     Parameters
@@ -154,23 +158,23 @@ class Shape:
         self.inverse = np.linalg.inv(edges)  # L1..L3 = (x − origin) @ inverse
         self.triangles = nodes_m[body.mesh.surface]
 
-    def vertex(self, node: int) -> tuple[Index, Array]:
+    def weights_at_node(self, node: int) -> tuple[Index, Array]:
         """Return nodes (npe,) and weights (npe,) of a marker on a node: those of an element with
         that node.
         """
         cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
 
-    def embed(self, point: Array) -> tuple[Index, Array, float]:
+    def weights_at_point(self, point: Array) -> tuple[Index, Array, float]:
         """Return nodes (npe,), weights (npe,) and the distance from the surface [m] of a point
         (3,).
 
         The distance is 0 inside the body.
         """
-        cell, distance = self.cell_of(point)
-        return self.body.cells[cell], self._weights(point, cell), distance
+        cell, distance = self.nearest_cell(point)
+        return self.body.cells[cell], self._shape_functions_at(point, cell), distance
 
-    def cell_of(self, point: Array) -> tuple[int, float]:
+    def nearest_cell(self, point: Array) -> tuple[int, float]:
         """Return the element that contains a point (3,), or is nearest to it, and its
         distance [m].
         """
@@ -178,27 +182,29 @@ class Shape:
         cell = int(np.argmax(depth))
         if depth[cell] >= -_INSIDE_TOLERANCE:
             return cell, 0.0
-        to_faces = np.linalg.norm(point - nearest_on(point, self.triangles), axis=1)
+        to_faces = np.linalg.norm(
+            point - nearest_points_of_triangles(point, self.triangles), axis=1
+        )
         distance = float(to_faces.min())
         # Where an edge or corner is nearest, extrapolate from the element that must the least.
         nearest = self.body.mesh.surface_cells[to_faces <= distance + 1e-9 * self.mean_edge_m]
         return int(nearest[np.argmax(depth[nearest])]), distance
 
-    def nearest(self, point: Array) -> tuple[Index, Array]:
+    def weights_at_nearest_point(self, point: Array) -> tuple[Index, Array]:
         """Return nodes (npe,) and weights (npe,) of the point of the body that is nearest to a
         point (3,).
         """
-        nodes, weights, distance = self.embed(point)
+        nodes, weights, distance = self.weights_at_point(point)
         if distance == 0.0:
             return nodes, weights
-        nodes, weights, _ = self.embed(self.on_surface(point)[0])
+        nodes, weights, _ = self.weights_at_point(self.nearest_surface_point(point)[0])
         return nodes, weights
 
-    def on_surface(self, point: Array) -> tuple[Array, Array]:
+    def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
         """Return the nearest point (3,) of the surface, and two unit tangents (3, 2) of its
         face.
         """
-        nearest = nearest_on(point, self.triangles)
+        nearest = nearest_points_of_triangles(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
         sides = self.triangles[face, 1:] - self.triangles[face, 0]
         return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
@@ -210,14 +216,14 @@ class Shape:
         rest = np.einsum("ei,eij->ej", points - self.origin[cells], self.inverse[cells])
         return np.column_stack([1.0 - rest.sum(axis=1), rest])
 
-    def gradients(self, cells: Index) -> Array:
+    def barycentric_gradients(self, cells: Index) -> Array:
         """Return the derivatives (k, 4, 3) of the barycentric coordinates by the point, in the
         cells (k,).
         """
         rest = np.asarray(np.swapaxes(self.inverse[cells], 1, 2), dtype=np.float64)
         return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
-    def _weights(self, point: Array, cell: int) -> Array:
+    def _shape_functions_at(self, point: Array, cell: int) -> Array:
         """Return the shape functions (npe,) of an element at a point (3,).
 
         Barycentric coordinates of the corners are exact for straight edges. In a quadratic element
@@ -239,7 +245,7 @@ class Shape:
         return best
 
 
-def nearest_on(point: Array, triangles: Array) -> Array:
+def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     """Return the nearest point of each triangle (F, 3, 3) to a point (3,), or to (F, 3), as
     (F, 3).
     """

@@ -12,20 +12,20 @@ from ..array_files import load_arrays
 from ..arrays import Array
 from ..errors import InputError
 from ..files import DAMAGE
-from .formats.columns import TIME, column_of, name_and_unit
+from .formats.columns import TIME, find_column, name_and_unit
 from .formats.text import (
-    Grid,
     Row,
+    Table,
     decode,
     is_number,
-    numbers,
-    of_file,
+    names_file_in_errors,
+    numeric_cells,
     read_bytes,
-    read_grid,
-    times_of,
+    read_table,
+    times_in_column,
 )
 from .formats.topics import POSE
-from .formats.units import METRES_PER_UNIT, refuse_unknown_unit, si_factor
+from .formats.units import METRES_PER_UNIT, require_length_unit, si_factor
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 
 POSE_COLUMNS = ("t_s", *POSE)
@@ -35,7 +35,7 @@ _ORDERS = ("xyzw", "wxyz")
 _ZIP = b"PK\x03\x04"
 
 
-@of_file
+@names_file_in_errors
 def read_poses(
     path: str | Path, quaternion: str | None = None, length_unit: str | None = None
 ) -> PoseSequence:
@@ -63,70 +63,72 @@ def read_poses(
         a quaternion is not of unit norm or a matrix is no rigid motion; the line is named. Also if
         order or unit is neither in the file nor given, or both disagree.
     """
-    refuse_unknown_unit(length_unit)
+    require_length_unit(length_unit)
     if quaternion not in (None, *_ORDERS):
         raise InputError(f"quaternion is {quaternion!r}; expected one of {', '.join(_ORDERS)}")
     content = read_bytes(path)
     if content.startswith(_ZIP):
-        t_s, matrices = _archive(path)
+        t_s, matrices = _read_archive(path)
         places = [f"index {k}" for k in range(len(t_s))]
         return _from_matrices(t_s, matrices, length_unit, places)
-    grid = _with_names(read_grid(decode(content)))
+    grid = _with_column_names(read_table(decode(content)))
     lines = [f"line {row.line}" for row in grid.rows]
-    time = column_of(grid, TIME)
+    time = find_column(grid, TIME)
     if time is None:
-        raise _other_columns(grid)
-    t_s = times_of(grid, *time)
+        raise _column_error(grid)
+    t_s = times_in_column(grid, *time)
     others = [k for k in range(len(grid.columns)) if k != time[0]]
     if sorted(grid.columns[k] for k in others) == sorted(_MATRIX_COLUMNS):
-        matrices = _columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(-1, 4, 4)
+        matrices = _numbers_in_columns(grid, map(grid.columns.index, _MATRIX_COLUMNS)).reshape(
+            -1, 4, 4
+        )
         return _from_matrices(t_s, matrices, length_unit, lines)
-    axes, metres = _axes(grid, length_unit)
-    components = _components(grid, quaternion, [k for k in others if k not in axes])
-    positions_m = _columns(grid, axes) * metres
-    return _sequence(t_s, positions_m, _columns(grid, components), lines)
+    axes, metres = _position_columns(grid, length_unit)
+    components = _quaternion_columns(grid, quaternion, [k for k in others if k not in axes])
+    positions_m = _numbers_in_columns(grid, axes) * metres
+    return _checked_sequence(t_s, positions_m, _numbers_in_columns(grid, components), lines)
 
 
-def _sequence(
-    t_s: Array, positions_m: Array, quaternions: Array, places: list[str]
+def _checked_sequence(
+    t_s: Array, positions_m: Array, quaternions: Array, row_names: list[str]
 ) -> PoseSequence:
     """Return a pose sequence; a faulty pose raises an `InputError` that names its entry of
-    `places`.
+    `row_names`.
     """
     if fault := first_pose_fault(t_s, positions_m, quaternions):
-        raise InputError(fault[1], where=places[fault[0]])
+        raise InputError(fault[1], where=row_names[fault[0]])
     return PoseSequence(t_s, positions_m, quaternions)
 
 
 # Columns ------------------------------------------------------------------------------------------
 
 
-def _columns(grid: Grid, places: Iterable[int]) -> Array:
+def _numbers_in_columns(grid: Table, places: Iterable[int]) -> Array:
     """Return the cells of these columns as numbers (rows, columns); blank cells raise an
     `InputError`.
     """
-    return numbers(grid, list(places), blank_allowed=False)
+    return numeric_cells(grid, list(places), blank_allowed=False)
 
 
-def _with_names(table: Grid) -> Grid:
+def _with_column_names(table: Table) -> Table:
     """Name the columns of a table with eight columns whose first row is numbers; others are
     unchanged.
     """
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
     names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
-    return Grid(names, [Row(1, table.columns), *table.rows])
+    return Table(names, [Row(1, table.columns), *table.rows])
 
 
-def _other_columns(grid: Grid) -> InputError:
+def _column_error(grid: Table) -> InputError:
     """Return the error for a table whose columns are not those of poses."""
-    return grid.refusal(
+    return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {', '.join(POSE_COLUMNS)}, each once "
         "(or t_s and m00, m01 … m33)"
     )
 
 
-def _axes(grid: Grid, length_unit: str | None) -> tuple[list[int], float]:
+def _position_columns(grid: Table, length_unit: str | None) -> tuple[list[int], float]:
     """Return the indices of the columns of x, y, z, and the factor from their unit to metres.
 
     Raises
@@ -140,48 +142,48 @@ def _axes(grid: Grid, length_unit: str | None) -> tuple[list[int], float]:
     units = [parts[k][1] for k in axes]
     metres = [si_factor(unit or length_unit or "m", "length") for unit in units]
     if len(axes) != 3 or None in metres or len(set(metres)) > 1:
-        raise _other_columns(grid)
+        raise _column_error(grid)
     named = ", ".join(grid.columns[k] for k in axes)
     if length_unit is None and None in units:
-        raise grid.refusal(
+        raise grid.error_at(
             f"the columns {named} name no unit; expected length_unit, one of "
             f"{', '.join(METRES_PER_UNIT)}, or columns such as x_m, y_m, z_m"
         )
     if length_unit and any(
         unit and si_factor(unit, "length") != METRES_PER_UNIT[length_unit] for unit in units
     ):
-        raise grid.refusal(
+        raise grid.error_at(
             f"length_unit is '{length_unit}', but the columns are {named}; expected the same "
             "unit, or no length_unit"
         )
     return axes, float(metres[0] or 1.0)
 
 
-def _components(grid: Grid, order: str | None, others: list[int]) -> list[int]:
+def _quaternion_columns(grid: Table, order: str | None, columns: list[int]) -> list[int]:
     """Return the indices of the columns of the quaternion in the order x, y, z, w.
 
     Parameters
     ----------
-    grid : Grid
+    grid : Table
     order : {"xyzw", "wxyz"} or None
         Stated order of the columns; needed if the columns are numbered.
-    others : list of int
+    columns : list of int
         Columns that hold neither time nor position.
     """
-    place = {grid.columns[k]: k for k in others}
+    place = {grid.columns[k]: k for k in columns}
     if sorted(place) == ["qw", "qx", "qy", "qz"]:
         named = "".join(name[1] for name in place)
         if order not in (None, named):
-            raise grid.refusal(
+            raise grid.error_at(
                 f"quaternion is '{order}', but the columns are {', '.join(place)}; expected the "
                 "same order, or no quaternion"
             )
         return [place[f"q{axis}"] for axis in "xyzw"]
     numbered = sorted(place)
-    if len(others) != 4 or numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
-        raise _other_columns(grid)
+    if len(columns) != 4 or numbered not in (["q0", "q1", "q2", "q3"], ["q1", "q2", "q3", "q4"]):
+        raise _column_error(grid)
     if order is None:
-        raise grid.refusal(
+        raise grid.error_at(
             f"the columns {', '.join(numbered)} do not say which is the scalar; expected "
             "quaternion = 'xyzw' or 'wxyz', or columns qx, qy, qz, qw"
         )
@@ -191,7 +193,7 @@ def _components(grid: Grid, order: str | None, others: list[int]) -> list[int]:
 # Matrices -----------------------------------------------------------------------------------------
 
 
-def _archive(path: str | Path) -> tuple[Array, Array]:
+def _read_archive(path: str | Path) -> tuple[Array, Array]:
     """Return `t_s` (T,) and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit."""
     try:
         arrays = load_arrays(path)
@@ -213,11 +215,11 @@ def _archive(path: str | Path) -> tuple[Array, Array]:
 
 
 def _from_matrices(
-    t_s: Array, matrices: Array, length_unit: str | None, places: list[str]
+    t_s: Array, matrices: Array, length_unit: str | None, row_names: list[str]
 ) -> PoseSequence:
-    """Return the poses of matrices (T, 4, 4); `places` name the rows in messages."""
+    """Return the poses of matrices (T, 4, 4); `row_names` name the rows in messages."""
     if fault := first_matrix_fault(t_s, matrices):
-        raise InputError(fault[1], where=places[fault[0]])
+        raise InputError(fault[1], where=row_names[fault[0]])
     metres = METRES_PER_UNIT[length_unit or "m"]
     quaternions = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
-    return _sequence(t_s, matrices[:, :3, 3] * metres, quaternions, places)
+    return _checked_sequence(t_s, matrices[:, :3, 3] * metres, quaternions, row_names)

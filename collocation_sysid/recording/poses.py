@@ -20,26 +20,26 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..stated import key, stated
-from .arrays import floats, read_only_floats
-from .clock import TIME_TOLERANCE_S, first_time_fault
+from .arrays import float_converter, read_only_floats
+from .clock import TIME_TOLERANCE_S, first_unordered_time
 
 Interpolation = Literal["smooth", "linear", "hold"]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 # A held pose starts at its sample, also where the time asked for is rounded to just before it.
-_HOLD_SNAP = 1e-6
+_HOLD_SNAP_STEPS = 1e-6
 # Largest entry of RᵀR − I of a rotation: files print few digits, and mistakes are far larger.
-_ORTHONORMAL = 1e-3
+_ORTHONORMALITY_TOLERANCE = 1e-3
 # Largest deviation of a matrix's last row from 0, 0, 0, 1, which files print exactly.
-_LAST_ROW = 1e-6
+_LAST_ROW_TOLERANCE = 1e-6
 # A motion that its samples resolve is not this many times slower just before and just after.
-_JUMP_RATIO = 10.0
+_LEAST_JUMP_RATIO = 10.0
 # Smallest jump as a share of the range of the values: less is rounding.
-_LEAST_JUMP = 1e-3
+_LEAST_JUMP_SHARE = 1e-3
 # Longest time between poses [s] at which they still determine a smooth motion between them.
 LONGEST_STEP_S = 1.0
 # Largest difference of the poses of a grasp at rest, in metres and in a quaternion's components.
-STILL = 1e-6
+LARGEST_REST_DIFFERENCE = 1e-6
 
 
 @stated
@@ -58,7 +58,7 @@ class PoseSequence:
     interpolation : {"smooth", "linear", "hold"}
         Between samples: cubic splines of the position and of the quaternion, which is then
         normalised; linear in position with SLERP in rotation; or the latest sample. Across a jump
-        (see `jumps`) and between only two poses "smooth" is linear.
+        (see `jump_intervals`) and between only two poses "smooth" is linear.
 
     Raises
     ------
@@ -67,7 +67,7 @@ class PoseSequence:
         unit norm; the first bad row is named, counting from 1.
     """
 
-    t_s: Array = key(converter=floats((None,), "t_s of the poses", finite=False))
+    t_s: Array = key(converter=float_converter((None,), "t_s of the poses", finite=False))
     positions_m: Array = key(converter=np.asarray)
     quaternions_xyzw: Array = key(converter=np.asarray)
     interpolation: Interpolation = key(Interpolation, default="smooth")
@@ -108,7 +108,7 @@ class PoseSequence:
         quaternions = Rotation.from_matrix(motions[:, :3, :3]).as_quat()
         return cls(times, motions[:, :3, 3], quaternions, interpolation)
 
-    def after(self, matrix: ArrayLike | PoseSequence) -> PoseSequence:
+    def after(self, first: ArrayLike | PoseSequence) -> PoseSequence:
         """Return the composition of these poses with a constant rigid motion that is applied first.
 
         If these are poses U_t of a gripper and the matrix G places the undeformed body in the
@@ -116,7 +116,7 @@ class PoseSequence:
 
         Parameters
         ----------
-        matrix : (4, 4) array or PoseSequence
+        first : (4, 4) array or PoseSequence
             [[R, p], [0, 1]] in metres; of a sequence the first pose is taken.
 
         Raises
@@ -124,7 +124,6 @@ class PoseSequence:
         InputError
             If the matrix is no rigid motion.
         """
-        first = matrix
         if not isinstance(first, PoseSequence):
             first = PoseSequence.from_matrices([0.0], np.asarray(first)[None])
         rotations = self._rotations
@@ -135,9 +134,9 @@ class PoseSequence:
             quaternions_xyzw=(rotations * first._rotations[0]).as_quat(),
         )
 
-    def shifted(self, by_m: ArrayLike) -> PoseSequence:
+    def with_shift(self, shift_m: ArrayLike) -> PoseSequence:
         """Return the poses with a constant (3,) [m] added to their positions."""
-        return replace(self, positions_m=self.positions_m + np.asarray(by_m))
+        return replace(self, positions_m=self.positions_m + np.asarray(shift_m))
 
     def at(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Return the poses at the times `t_s` (k,).
@@ -160,28 +159,28 @@ class PoseSequence:
         if len(self.t_s) == 1:
             first = np.zeros(len(times), dtype=np.int64)
             return self._rotations.as_matrix()[first], self.positions_m[first]
-        self._require_covered(times)
+        self._require_times_covered(times)
         if self.interpolation == "hold":
-            snap_s = _HOLD_SNAP * np.diff(self.t_s).min() + TIME_TOLERANCE_S
+            snap_s = _HOLD_SNAP_STEPS * np.diff(self.t_s).min() + TIME_TOLERANCE_S
             k = np.maximum(np.searchsorted(self.t_s, times + snap_s, side="right") - 1, 0)
             return self._rotations.as_matrix()[k], self.positions_m[k]
         if self.interpolation == "smooth" and len(self.t_s) > 2:
             turned = Rotation.from_quat(self._quaternion_spline(times))
             return turned.as_matrix(), self._position_spline(times)
-        return self._linear_at(times)
+        return self._interpolate_linearly(times)
 
-    def _linear_at(self, times: Array) -> tuple[Array, Array]:
+    def _interpolate_linearly(self, times: Array) -> tuple[Array, Array]:
         """Return linearly interpolated rotations (k, 3, 3) and translations (k, 3) at times
         (k,).
         """
         k = np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 2)
         fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
         step_m = self.positions_m[k + 1] - self.positions_m[k]
-        turn = Rotation.from_rotvec(fraction * self.turns[k])
+        turn = Rotation.from_rotvec(fraction * self.rotation_steps[k])
         rotations = (Rotation.from_quat(self.quaternions_xyzw[k]) * turn).as_matrix()
         return rotations, self.positions_m[k] + fraction * step_m
 
-    def carry(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
+    def carried_positions(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
         """Return positions (T, k, 3) [m] of undeformed points (k, 3) at the times `t_s` (T,)."""
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
@@ -190,8 +189,8 @@ class PoseSequence:
     @cached_property
     def jumps_s(self) -> Array:
         """Times of the samples after which the position or the rotation jumps."""
-        of_position = jumps(self.t_s, self.positions_m)
-        of_rotation = jumps(self.t_s, self.quaternions_xyzw)
+        of_position = jump_intervals(self.t_s, self.positions_m)
+        of_rotation = jump_intervals(self.t_s, self.quaternions_xyzw)
         return self.t_s[np.union1d(of_position, of_rotation)]
 
     @cached_property
@@ -211,13 +210,13 @@ class PoseSequence:
         return Rotation.from_quat(self.quaternions_xyzw)
 
     @cached_property
-    def turns(self) -> Array:
+    def rotation_steps(self) -> Array:
         """(m − 1, 3) rotation vector from each sample to the next, in the frame of the earlier one
         [rad].
         """
         return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
 
-    def _require_covered(self, times: Array) -> None:
+    def _require_times_covered(self, times: Array) -> None:
         """Raise an `InputError` if a time is over half a sample outside the sequence."""
         first_step, last_step = np.diff(self.t_s)[[0, -1]]
         earliest = self.t_s[0] - max(0.5 * first_step, TIME_TOLERANCE_S)
@@ -242,7 +241,7 @@ def first_pose_fault(
     finite = np.isfinite(np.column_stack([t_s, positions_m, quaternions_xyzw])).all(axis=1)
     if not finite.all():
         return int(np.argmin(finite)), "the pose holds a value that is not a finite number"
-    if fault := first_time_fault(t_s):
+    if fault := first_unordered_time(t_s):
         return fault
     norms = np.linalg.norm(quaternions_xyzw, axis=1)
     off = np.flatnonzero(np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE)
@@ -271,14 +270,16 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
         at = f"the matrix at t_s = {time_s:.9g}"
         if not np.isfinite(matrices[k]).all():
             return k, f"{at} holds a value that is not a finite number"
-        if last[k] > _LAST_ROW:
+        if last[k] > _LAST_ROW_TOLERANCE:
             row = ", ".join(f"{value:.4g}" for value in matrices[k, 3])
-            hint = "; is it written column by column?" if last_column[k] <= _LAST_ROW else ""
+            hint = (
+                "; is it written column by column?" if last_column[k] <= _LAST_ROW_TOLERANCE else ""
+            )
             return k, f"{at} has the last row {row}; expected 0, 0, 0, 1{hint}"
-        if gram[k] > _ORTHONORMAL:
+        if gram[k] > _ORTHONORMALITY_TOLERANCE:
             return k, (
                 f"{at} is no rotation: its RᵀR differs from the identity by {gram[k]:.3g}; "
-                f"expected at most {_ORTHONORMAL:g}"
+                f"expected at most {_ORTHONORMALITY_TOLERANCE:g}"
             )
         if np.linalg.det(rotations[k]) < 0:
             return k, f"{at} mirrors: its determinant is −1; expected a rotation"
@@ -300,7 +301,7 @@ def _unit_and_continuous(quaternions: Array) -> Array:
 # Between samples ---------------------------------------------------------------------------------
 
 
-def jumps(t_s: Array, values: Array) -> Index:
+def jump_intervals(t_s: Array, values: Array) -> Index:
     """Return the indices of the intervals in which values (m, k) jump; interval i begins at sample
     i.
 
@@ -308,9 +309,9 @@ def jumps(t_s: Array, values: Array) -> Index:
     """
     change = np.linalg.norm(np.diff(values, axis=0), axis=1)
     rate = change / np.diff(t_s)
-    large = change > _LEAST_JUMP * np.linalg.norm(np.ptp(values, axis=0))
+    large = change > _LEAST_JUMP_SHARE * np.linalg.norm(np.ptp(values, axis=0))
     neighbour_rate = np.maximum(rate[:-2], rate[2:])
-    return 1 + np.flatnonzero(large[1:-1] & (rate[1:-1] > _JUMP_RATIO * neighbour_rate))
+    return 1 + np.flatnonzero(large[1:-1] & (rate[1:-1] > _LEAST_JUMP_RATIO * neighbour_rate))
 
 
 def smooth_spline(t_s: Array, values: Array) -> PPoly:
@@ -319,7 +320,7 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
     Across a jump the spline is linear, with separate splines on either side, as one spline would
     overshoot near the jump. Three samples make a parabola and two a line.
     """
-    broken = jumps(t_s, values)
+    broken = jump_intervals(t_s, values)
     coefficients = np.zeros((4, len(t_s) - 1, values.shape[1]))
     for first, end in pairwise([0, *(broken + 1), len(t_s)]):
         if end - first > 1:
@@ -334,8 +335,8 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
 # Over a recording --------------------------------------------------------------------------------
 
 
-def refuse_untold(
-    poses: PoseSequence, t_s: Array, held_s: tuple[float, float], file: str | Path
+def require_determined_motion(
+    poses: PoseSequence, t_s: Array, hold_s: tuple[float, float], file: str | Path
 ) -> None:
     """Raise an `InputError` if poses do not determine the motion of a grasp while it holds.
 
@@ -344,7 +345,7 @@ def refuse_untold(
     poses : PoseSequence
     t_s : (T,) array
         Times of the recording's samples.
-    held_s : (float, float)
+    hold_s : (float, float)
         First and last time at which the grasp holds.
     file : str or Path
         File of the poses, for messages.
@@ -355,8 +356,8 @@ def refuse_untold(
         For a single pose, for poses that are missing for more than a sample at either end, and for
         a smooth motion that is sampled below 1 Hz.
     """
-    first_s = max(t_s[0], held_s[0])
-    last_s = min(t_s[-1], held_s[1])
+    first_s = max(t_s[0], hold_s[0])
+    last_s = min(t_s[-1], hold_s[1])
     lasts = f"the recording lasts from {first_s:.6g} s to {last_s:.6g} s"
     if len(poses.t_s) == 1:
         raise InputError(
@@ -391,5 +392,5 @@ def _typical_step_s(poses: PoseSequence, first_s: float, last_s: float) -> float
     shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
     turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)
     within = (poses.t_s[1:] > first_s) & (poses.t_s[:-1] < last_s)
-    steps_s = np.diff(poses.t_s)[within & (np.maximum(shift_m, turn) > STILL)]
+    steps_s = np.diff(poses.t_s)[within & (np.maximum(shift_m, turn) > LARGEST_REST_DIFFERENCE)]
     return float(np.median(steps_s)) if len(steps_s) else 0.0

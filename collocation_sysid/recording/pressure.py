@@ -11,29 +11,29 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array, Index
 from ..checked import Finite, Text
 from ..errors import InputError
-from ..fem.refinement import faces_in_four
+from ..fem.refinement import split_faces_in_four
 from ..fem.selection import Indices, Selection, rows_of_faces
-from ..fem.shape import Volume
+from ..fem.shape import EnclosedVolume
 from ..stated import Key, key, stated
-from .actuator import Actuator, Placed
-from .loads import Course
-from .selected import Nodes, selection
+from .actuator import Actuator, BodyMeasure
+from .loads import TimeSeries
+from .selected import Nodes, selection_from_section
 from .tables import read_pressure
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
 # Largest distance of points of a plane from it, relative to the size of the body: rounding.
-PLANE = 1e-9
+PLANE_TOLERANCE = 1e-9
 
 
-def _faces(wanted: Selection | ArrayLike) -> Selection | Index:
+def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
     """Return a selection, or node numbers (F, 3) of triangles; an `InputError` for anything
     else.
     """
-    if isinstance(wanted, Selection):
-        return wanted
-    faces = np.array(wanted)
+    if isinstance(faces, Selection):
+        return faces
+    faces = np.array(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise InputError(
             f"faces of a pressure are {faces.dtype} {faces.shape}; expected a selection or a "
@@ -52,7 +52,7 @@ _TABLE = Key(
 
 
 @stated
-class Pressure(Actuator[Volume]):
+class Pressure(Actuator[EnclosedVolume]):
     """A pressure above the surroundings' on faces of the boundary, such as a cavity's wall.
 
     Its force follows the faces as they move. It derives from an energy, and has a symmetric
@@ -74,23 +74,23 @@ class Pressure(Actuator[Volume]):
         Pressure in the body: factor · stated pressure − lost_pa.
     """
 
-    faces: Selection | Index = key(Nodes, converter=_faces, read=selection)
+    faces: Selection | Index = key(Nodes, converter=_checked_faces, read=selection_from_section)
     pressure_pa: Array = key(Finite | None, converter=np.asarray)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
     name: str = key(Text | None, default="pressure")
     _: KW_ONLY
     factor: float = 1.0
     lost_pa: float = 0.0
-    placed: Placed[Volume] | None = None
+    body_measure: BodyMeasure[EnclosedVolume] | None = None
 
     unit: ClassVar[str] = "Pa"
-    lost: ClassVar[str] = "lost_pa"
+    offset_field: ClassVar[str] = "lost_pa"
 
     def __post_init__(self) -> None:
-        pressure = Course(self.pressure_pa, self.t_s, f"pressure_pa of {self.name}")
+        pressure = TimeSeries(self.pressure_pa, self.t_s, f"pressure_pa of {self.name}")
         vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, course=pressure)
 
-    def _measure_on(self, body: Body) -> Volume:
+    def _measure_on(self, body: Body) -> EnclosedVolume:
         """Return the volume behind the faces of a body.
 
         Raises
@@ -106,29 +106,29 @@ class Pressure(Actuator[Volume]):
             if rows[0] < 0:
                 raise InputError(f"{self.name}: not all faces are on the boundary of the body")
         # Seen from the cavity, the outside of the material is the inside.
-        wall = body.nodes.on_faces(mesh.surface[rows][:, ::-1])
-        volume = Volume(wall, len(body.nodes_m))
-        if not volume.rim.size and volume.value(body.nodes_m.reshape(1, -1))[0] <= 0:
+        wall = body.nodes.nodes_of_faces(mesh.surface[rows][:, ::-1])
+        volume = EnclosedVolume(wall, len(body.nodes_m))
+        if not volume.rim.size and volume.evaluate(body.nodes_m.reshape(1, -1))[0] <= 0:
             raise InputError(
                 f"{self.name}: the faces surround the body from outside; expected the wall of a "
                 "cavity in it, or an open patch whose rim is held"
             )
         return volume
 
-    def refined(self, body: Body, finer: Body) -> Pressure:
+    def on_refined_body(self, body: Body, finer: Body) -> Pressure:
         """Return the pressure on a body whose mesh is that of `body` with every element split in
         eight.
         """
         if isinstance(self.faces, Selection) and not isinstance(self.faces, Indices):
-            return replace(self, placed=None)
-        corners = self.on(body).measure.faces[:, :3]
-        return replace(self, faces=faces_in_four(corners, body.mesh), placed=None)
+            return replace(self, body_measure=None)
+        corners = self.on_body(body).measure.faces[:, :3]
+        return replace(self, faces=split_faces_in_four(corners, body.mesh), body_measure=None)
 
-    def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
+    def energy_amplitude(self, stated_value: Any, factor: Any, offset: Any) -> Any:
         """Return the amplitude of the energy: minus the pressure in the body."""
-        return lost - factor * stated
+        return offset - factor * stated_value
 
-    def bounded(self, held: NDArray[np.bool_], places_m: Array) -> Pressure:
+    def with_held_rim(self, is_prescribed: NDArray[np.bool_], prescribed_m: Array) -> Pressure:
         """Return the pressure with a volume that does not depend on the motion of a held rim.
 
         The volume of an open patch is that of the cones over its faces from an apex. The pressure
@@ -137,9 +137,9 @@ class Pressure(Actuator[Volume]):
 
         Parameters
         ----------
-        held : (n, 3) bool
+        is_prescribed : (n, 3) bool
             Whether each coordinate is prescribed throughout.
-        places_m : (T, n, 3)
+        prescribed_m : (T, n, 3)
             Prescribed coordinates, NaN elsewhere.
 
         Raises
@@ -147,18 +147,18 @@ class Pressure(Actuator[Volume]):
         InputError
             If the rim moves otherwise.
         """
-        placed = self.placed
+        placed = self.body_measure
         volume = self.measure
         if placed is None or not volume.rim.size:
             return self
-        moving_rim = volume.rim[~held[volume.rim].all(axis=(1, 2))]
-        is_sliding = np.asarray(np.logical_and.reduce(held[moving_rim], axis=1))  # (k, 3)
+        moving_rim = volume.rim[~is_prescribed[volume.rim].all(axis=(1, 2))]
+        is_sliding = np.asarray(np.logical_and.reduce(is_prescribed[moving_rim], axis=1))  # (k, 3)
         free = int((~is_sliding.any(axis=1)).sum())
         apex = np.zeros(3)
-        size_m = np.nanmax(np.abs(places_m), initial=0.0)
+        size_m = np.nanmax(np.abs(prescribed_m), initial=0.0)
         for axis in range(3):
-            plane = places_m[:, moving_rim[is_sliding[:, axis]], axis]
-            if plane.size and np.ptp(plane) > PLANE * size_m:
+            plane = prescribed_m[:, moving_rim[is_sliding[:, axis]], axis]
+            if plane.size and np.ptp(plane) > PLANE_TOLERANCE * size_m:
                 free += plane.shape[1]
             elif plane.size:
                 apex[axis] = plane.mean()
@@ -168,4 +168,4 @@ class Pressure(Actuator[Volume]):
                 "of their rim move; expected the whole wall of a cavity, or a rim that is held or "
                 "slides in one plane across an axis: the force on other patches has no energy"
             )
-        return replace(self, placed=Placed(placed.body, volume.from_apex(apex)))
+        return replace(self, body_measure=BodyMeasure(placed.body, volume.with_apex(apex)))

@@ -12,12 +12,12 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, hint_at, listed
 from ..stated import key, stated
-from .arrays import floats, read_only_tracks
-from .clock import first_time_fault
+from .arrays import float_converter, read_only_tracks
+from .clock import first_unordered_time
 from .formats import c3d, motive, plain, qualisys, trc
-from .formats.text import decode, of_file, read_bytes
-from .formats.tracks import Choose, RawTracks
-from .formats.units import METRES_PER_UNIT, refuse_unknown_unit
+from .formats.text import decode, names_file_in_errors, read_bytes
+from .formats.tracks import LabelChooser, RawTracks
+from .formats.units import METRES_PER_UNIT, require_length_unit
 
 # A frame rate and a column of times agree within this part.
 _RATE_TOLERANCE = 0.01
@@ -45,20 +45,20 @@ class MarkerTable:
         What was missing or assumed in the file, a sentence each.
     """
 
-    t_s: Array = key(converter=floats((None,), "t_s of the markers"))
+    t_s: Array = key(converter=float_converter((None,), "t_s of the markers"))
     names: tuple[str, ...] = key(converter=tuple[str, ...])
     positions_m: Array = key(converter=np.asarray)
     notes: tuple[str, ...] = key(converter=tuple[str, ...], default=())
 
     def __post_init__(self) -> None:
-        if fault := first_time_fault(self.t_s):
+        if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(self.t_s), len(self.names), 3)
         tracks = read_only_tracks(self.positions_m, shape, "marker positions")
         vars(self)["positions_m"] = tracks
 
 
-@of_file
+@names_file_in_errors
 def read_markers(
     path: str | Path,
     *,
@@ -94,22 +94,22 @@ def read_markers(
         what is given here, a unit or rate is neither in the file nor given, or a marker is not
         there.
     """
-    refuse_unknown_unit(length_unit)
+    require_length_unit(length_unit)
     if rate_hz is not None and not 0 < rate_hz < np.inf:
         raise InputError(f"rate_hz is {rate_hz:g}; expected a rate above 0")
     labels = dict(labels or {})
-    raw = _read_tracks(path, _choice(names, labels))
-    metres = METRES_PER_UNIT[_unit(raw, length_unit)]
+    raw = _read_tracks(path, _label_chooser(names, labels))
+    metres = METRES_PER_UNIT[_length_unit(raw, length_unit)]
     t_s = _times_s(raw, rate_hz)
     names_taken = [labels.get(label, label) for label in raw.labels]
-    coordinates, notes = _present(raw, names_taken)
+    coordinates, notes = _mark_missing(raw, names_taken)
     return MarkerTable(t_s, tuple(names_taken), coordinates * metres, (*raw.notes, *notes))
 
 
-def _read_tracks(path: str | Path, choose: Choose) -> RawTracks:
+def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     """Read the markers that `choose` picks from a file of any known format."""
     content = read_bytes(path)
-    if c3d.recognises(content):
+    if c3d.is_c3d(content):
         return c3d.read(path, content, choose)
     text = decode(content)
     start = text.lstrip().lstrip('"')
@@ -117,7 +117,7 @@ def _read_tracks(path: str | Path, choose: Choose) -> RawTracks:
     return next(known, plain.read)(text, choose)
 
 
-def _choice(names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
+def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
     """Return the function that picks the requested markers from the labels in a file.
 
     Parameters
@@ -128,14 +128,16 @@ def _choice(names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
         From labels in the file to names.
     """
 
-    def choose(labels: Sequence[str], aside: Collection[str] = ()) -> list[int]:
-        _refuse_repeated(labels, "two markers are labelled")
+    def choose(labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
+        _require_distinct(labels, "two markers are labelled")
         for label in renamed:
             _require_one_of(label, labels, "label")
         known = [renamed.get(label, label) for label in labels]
-        _refuse_repeated(known, "after renaming two markers are named")
+        _require_distinct(known, "after renaming two markers are named")
         if names is None:
-            wanted = [k for k, label in enumerate(labels) if label not in aside or label in renamed]
+            wanted = [
+                k for k, label in enumerate(labels) if label not in excluded or label in renamed
+            ]
             if not labels:
                 raise InputError("holds no markers")
             if not wanted:
@@ -146,28 +148,28 @@ def _choice(names: Sequence[str] | None, renamed: Mapping[str, str]) -> Choose:
             raise InputError("no markers are asked for; leave the names out to take all of them")
         for name in names:
             _require_one_of(name, known, "marker")
-        _refuse_repeated(names, "asked for more than once: marker")
+        _require_distinct(names, "asked for more than once: marker")
         index_of = {name: k for k, name in enumerate(known)}
         return [index_of[name] for name in names]
 
     return choose
 
 
-def _refuse_repeated(names: Sequence[str], message: str) -> None:
+def _require_distinct(names: Sequence[str], message: str) -> None:
     """Raise an `InputError` that begins with `message` if a name occurs twice."""
     for name, count in Counter(names).items():
         if count > 1:
             raise InputError(f"{message} '{name}'; expected names that differ")
 
 
-def _require_one_of(name: str, there: Sequence[str], what: str) -> None:
+def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
     """Raise an `InputError` if a name is not among the names in the file."""
-    if name not in there:
-        hint = hint_at(name, there)
-        raise InputError(f"no {what} '{name}'; the file has {', '.join(there)}{hint}")
+    if name not in known:
+        hint = hint_at(name, known)
+        raise InputError(f"no {what} '{name}'; the file has {', '.join(known)}{hint}")
 
 
-def _unit(raw: RawTracks, length_unit: str | None) -> str:
+def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
     """Return the unit of length by the file or by the user; an `InputError` if they differ or both
     lack.
     """
@@ -192,7 +194,7 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
     stated_rates = {key: rate for key, rate in rates.items() if rate}
     if t_s is not None:
         for key, rate in stated_rates.items():
-            _refuse_other_rate(t_s, key, rate)
+            _require_rate(t_s, key, rate)
         return t_s
     if not stated_rates:
         raise InputError(
@@ -208,7 +210,7 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
     return np.arange(len(raw.coordinates)) / first
 
 
-def _refuse_other_rate(t_s: Array, key: str, rate_hz: float) -> None:
+def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
     """Raise an `InputError` if neither the mean nor the median time step agrees with a frame rate.
 
     Lost frames change the mean step, and coarsely printed times the median: one of them must agree.
@@ -225,7 +227,7 @@ def _refuse_other_rate(t_s: Array, key: str, rate_hz: float) -> None:
         )
 
 
-def _present(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
+def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
     """Return coordinates (T, M, 3) with NaN for missing samples, and notes on how many are missing.
 
     Markers with the same losses share a note.

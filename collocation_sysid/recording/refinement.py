@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..arrays import Array
-from ..fem.refinement import refined_nodes
+from ..fem.refinement import refine_nodes
 from .experiment import Experiment
 from .placement import place_markers
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..fem.body import Body
 
 
-def refined(experiment: Experiment, finer: Body) -> Experiment:
+def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     """Return the experiment on a finer body.
 
     Selections of nodes are evaluated on the finer mesh. Markers are material points: their places
@@ -24,18 +24,22 @@ def refined(experiment: Experiment, finer: Body) -> Experiment:
     markers = experiment.markers
 
     def anew(load):
-        return replace(load, nodes=refined_nodes(load.nodes, load.selection, body, finer))
+        return replace(load, nodes=refine_nodes(load.nodes, load.selection, body, finer))
 
     placement = place_markers(
-        markers.observe(body.nodes_m), finer.nodes.points_m, finer, "embedded", float("inf")
+        markers.predict_positions(body.nodes_m),
+        finer.nodes.points_m,
+        finer,
+        "embedded",
+        float("inf"),
     )
     return replace(
         experiment,
         body=finer,
-        grasps=(*map(anew, experiment.gripping), *experiment.obstacles),
+        grasps=(*map(anew, experiment.body_grasps), *experiment.obstacles),
         masses=tuple(map(anew, experiment.masses)),
         forces=tuple(map(anew, experiment.forces)),
-        pressures=tuple(pressure.refined(body, finer) for pressure in experiment.pressures),
+        pressures=tuple(pressure.on_refined_body(body, finer) for pressure in experiment.pressures),
         markers=replace(markers, placement=placement, places_m=None),
         start_positions_m=_interpolated(experiment.start_positions_m, body, finer),
         start_velocities_m_s=_interpolated(experiment.start_velocities_m_s, body, finer),

@@ -24,7 +24,7 @@ from .readers import MarkerTable
 
 # Smallest spread of markers across their line, relative to the spread along it, that determines a
 # rotation.
-_FLAT = 0.01
+_LEAST_RELATIVE_SPREAD = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ def align_to_template(
     return TemplateFit(rotations[0], translations[0], np.linalg.norm(moved - places, axis=1))
 
 
-def loosest_marker(reference_m: Array, positions_m: Array) -> int:
+def least_rigid_marker(reference_m: Array, positions_m: Array) -> int:
     """Return the index of the marker whose distances to the others differ most between two
     configurations.
 
@@ -230,7 +230,7 @@ def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
     )
     if spread.shape[1] < 2:
         return np.zeros(len(points), dtype=bool)
-    return spread[:, 1] > _FLAT * spread[:, 0]
+    return spread[:, 1] > _LEAST_RELATIVE_SPREAD * spread[:, 0]
 
 
 def _mean(points: Array, weight: Array) -> Array:

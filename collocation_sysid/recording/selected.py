@@ -63,7 +63,7 @@ KINDS: dict[str, Any] = {
 }
 
 
-def selection(section: NodesSection | str) -> Selection:
+def selection_from_section(section: NodesSection | str) -> Selection:
     """Return the selection that a table states, or that a text names."""
     if isinstance(section, str):
         return Named(section)
@@ -71,7 +71,7 @@ def selection(section: NodesSection | str) -> Selection:
     return kind(*value) if kind in (Box, Ball) else kind(value)
 
 
-def some_nodes(what: str) -> Callable[[ArrayLike | Selection], Index]:
+def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
     """Return a converter to sorted distinct node numbers; a `Selection` is returned unchanged.
 
     Parameters
@@ -97,6 +97,6 @@ def some_nodes(what: str) -> Callable[[ArrayLike | Selection], Index]:
     return chosen
 
 
-def on_body(nodes: Index | Selection, body: Body) -> Index:
+def select_on_body(nodes: Index | Selection, body: Body) -> Index:
     """Return the nodes of a body that a selection selects; node numbers are returned unchanged."""
     return body.select(nodes) if isinstance(nodes, Selection) else nodes

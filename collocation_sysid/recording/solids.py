@@ -15,21 +15,21 @@ from ..checked import NotNegative, Positive
 from ..errors import InputError
 from ..section import Section, Vector, require_one, section_of, stated_in
 from ..stated import key, stated
-from .arrays import floats
+from .arrays import float_converter
 
 # Added to squared distances [m²]: the square root has no derivative at zero.
-TINY_M2 = 1e-24
+SMALLEST_SQUARE_M2 = 1e-24
 
 
 class Solid(ABC):
     """A rigid solid in the frame of its obstacle: the world's frame if the obstacle is at rest."""
 
     @abstractmethod
-    def gap(self, point: ca.SX) -> ca.SX:
+    def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the surface [m], an expression; negative inside."""
 
     @abstractmethod
-    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
         """Return polylines (k, 3) that draw the solid.
 
         Parameters
@@ -41,28 +41,28 @@ class Solid(ABC):
         """
 
     @property
-    def normal(self) -> Array:
+    def offset_direction(self) -> Array:
         """(3,) unit vector along which the solid's position is uncertain."""
         return np.array([0.0, 0.0, 1.0])
 
     @property
-    def flat(self) -> bool:
+    def has_tilt(self) -> bool:
         """Whether a tilt of the solid may be estimated."""
         return False
 
     @property
-    def middle_m(self) -> Array:
+    def tilt_centre_m(self) -> Array:
         """(3,) point about which the solid is tilted [m]."""
         return np.zeros(3)
 
 
-def _unit(name: str) -> Any:
+def _unit_vector_converter(name: str) -> Any:
     """Return a converter that normalises a vector (3,); it raises an `InputError` for a zero
     vector.
     """
 
     def made(value: Any) -> Array:
-        vector = floats((3,), name)(value)
+        vector = float_converter((3,), name)(value)
         length = float(np.linalg.norm(vector))
         if not length > 0:
             raise InputError(f"{name} is zero; expected a direction")
@@ -83,29 +83,34 @@ class Plane(Solid):
         A point on the plane.
     """
 
-    normal: Array = key(Vector, converter=_unit("normal of a plane"), default=(0.0, 0.0, 1.0))
-    point_m: Array = key(Vector, converter=floats((3,), "point_m of a plane"), default=(0.0,) * 3)
+    normal: Array = key(
+        Vector, converter=_unit_vector_converter("normal of a plane"), default=(0.0, 0.0, 1.0)
+    )
+    point_m: Array = key(
+        Vector, converter=float_converter((3,), "point_m of a plane"), default=(0.0,) * 3
+    )
 
     @property
-    def flat(self) -> bool:
+    def has_tilt(self) -> bool:
         """Always true: a tilt of a plane may be estimated."""
         return True
 
     @property
-    def middle_m(self) -> Array:
+    def tilt_centre_m(self) -> Array:
         """(3,) stated point of the plane [m]."""
         return self.point_m
 
-    def outline(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return a square with edges of `size_m` about the point of the plane that is nearest to
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
+        """Return a square with edges of `body_size_m` about the point of the plane that is nearest
+        to
         `about_m`.
         """
         middle = about_m - (about_m - self.point_m) @ self.normal * self.normal
-        u, v = across(self.normal) * size_m / 2
+        u, v = orthogonal_axes(self.normal) * size_m / 2
         corners = [middle + a * u + b * v for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
         return [np.array(corners)]
 
-    def gap(self, point: ca.SX) -> ca.SX:
+    def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the plane along its normal [m]; negative behind the
         plane.
         """
@@ -123,40 +128,40 @@ class Sphere(Solid):
     """
 
     radius_m: float = key(Positive)
-    centre_m: Array = key(Vector, converter=floats((3,), "centre_m"), default=(0.0,) * 3)
+    centre_m: Array = key(Vector, converter=float_converter((3,), "centre_m"), default=(0.0,) * 3)
 
-    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
         """Return three circles, one across each axis; both arguments are ignored."""
         return [_circle(self.centre_m, axis, self.radius_m) for axis in np.eye(3)]
 
-    def gap(self, point: ca.SX) -> ca.SX:
+    def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the sphere [m]; negative inside."""
         return _length(point - ca.DM(self.centre_m)) - self.radius_m
 
 
-def _ends(value: Any) -> Array:
+def _checked_ends(value: Any) -> Array:
     """Check the two ends (2, 3) of an axis; an `InputError` is raised if they coincide."""
-    ends = floats((2, 3), "ends_m")(value)
+    ends = float_converter((2, 3), "ends_m")(value)
     if (ends[0] == ends[1]).all():
         raise InputError("the ends of an axis are at the same place; expected two places")
     return ends
 
 
 @stated
-class _Round(Solid):
+class _AxialSolid(Solid):
     """A solid of revolution about an axis between two ends."""
 
     radius_m: float = key(Positive)
-    ends_m: Array = key(tuple[Vector, Vector], converter=_ends)
+    ends_m: Array = key(tuple[Vector, Vector], converter=_checked_ends)
 
-    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
         """Return a circle at each end and four lines between them; both arguments are ignored."""
         axis = np.diff(self.ends_m, axis=0)[0]
         first, last = (_circle(end, axis, self.radius_m) for end in self.ends_m)
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
-    def _along(self, point: ca.SX) -> tuple[ca.SX, ca.SX, float]:
+    def _cylindrical_coordinates(self, point: ca.SX) -> tuple[ca.SX, ca.SX, float]:
         """Return the cylindrical coordinates of a point (3,) and half of the length of the axis
         [m].
 
@@ -172,7 +177,7 @@ class _Round(Solid):
 
 
 @stated
-class Cylinder(_Round):
+class Cylinder(_AxialSolid):
     """A cylinder with flat ends, whose edges may be rounded.
 
     Parameters
@@ -186,15 +191,15 @@ class Cylinder(_Round):
 
     rounding_m: float = key(NotNegative, default=0.0)
 
-    def gap(self, point: ca.SX) -> ca.SX:
+    def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the cylinder [m]; negative inside."""
-        axial, radial, half = self._along(point)
+        axial, radial, half = self._cylindrical_coordinates(point)
         beyond = ca.vertcat(radial - self.radius_m, ca.fabs(axial) - half)
-        return _of_corner(beyond + self.rounding_m) - self.rounding_m
+        return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
 @stated
-class Capsule(_Round):
+class Capsule(_AxialSolid):
     """A cylinder with a half-ball at each end, such as a finger.
 
     Parameters
@@ -204,9 +209,9 @@ class Capsule(_Round):
         Centres of the balls.
     """
 
-    def gap(self, point: ca.SX) -> ca.SX:
+    def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the capsule [m]; negative inside."""
-        axial, radial, half = self._along(point)
+        axial, radial, half = self._cylindrical_coordinates(point)
         beyond = ca.fmax(ca.fabs(axial) - half, 0)
         return _length(ca.vertcat(beyond, radial)) - self.radius_m
 
@@ -223,7 +228,7 @@ class Cuboid(Solid):
         Radius of its edges.
     """
 
-    corners_m: Array = key(tuple[Vector, Vector], converter=floats((2, 3), "corners_m"))
+    corners_m: Array = key(tuple[Vector, Vector], converter=float_converter((2, 3), "corners_m"))
     rounding_m: float = key(NotNegative, default=0.0)
 
     def __post_init__(self) -> None:
@@ -231,29 +236,29 @@ class Cuboid(Solid):
             raise InputError("the corners of a box have to be its lowest, then its highest")
 
     @property
-    def flat(self) -> bool:
+    def has_tilt(self) -> bool:
         """Always true: a tilt of a box may be estimated."""
         return True
 
     @property
-    def middle_m(self) -> Array:
+    def tilt_centre_m(self) -> Array:
         """(3,) centre of the box [m]."""
         return self.corners_m.mean(axis=0)
 
-    def outline(self, about_m: Array, size_m: float) -> list[Array]:
+    def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
         """Return the twelve edges; both arguments are ignored."""
         corners = np.array(list(product(*self.corners_m.T)))
         differences = (corners[:, None] != corners).sum(axis=2)
         return [corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j]
 
-    def gap(self, point: ca.SX) -> ca.SX:
+    def signed_distance(self, point: ca.SX) -> ca.SX:
         """Signed distance of a point (3,) from the box [m]; negative inside."""
         low, high = self.corners_m
         beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM((high - low) / 2)
-        return _of_corner(beyond + self.rounding_m) - self.rounding_m
+        return _corner_distance(beyond + self.rounding_m) - self.rounding_m
 
 
-def across(normal: Array) -> Array:
+def orthogonal_axes(normal: Array) -> Array:
     """Return two unit vectors (2, 3) orthogonal to a direction (3,) and to each other."""
     return np.linalg.svd(normal[None])[2][1:]
 
@@ -261,16 +266,16 @@ def across(normal: Array) -> Array:
 def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
     """Return a closed polyline (33, 3) of the circle about a centre (3,) across an axis (3,)."""
     angle = np.linspace(0, 2 * np.pi, 33)
-    round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across(axis)
+    round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ orthogonal_axes(axis)
     return centre_m + radius_m * round_m
 
 
 def _length(vector: ca.SX) -> ca.SX:
     """Euclidean norm with finite second derivatives at zero."""
-    return ca.sqrt(ca.sumsqr(vector) + TINY_M2)
+    return ca.sqrt(ca.sumsqr(vector) + SMALLEST_SQUARE_M2)
 
 
-def _of_corner(beyond: ca.SX) -> ca.SX:
+def _corner_distance(beyond: ca.SX) -> ca.SX:
     """Signed distance from a convex corner, by the signed distances from each of its sides."""
     return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
 
@@ -323,12 +328,12 @@ KINDS: dict[str, type[Solid]] = {
 }
 
 
-def name_of(solid: Solid) -> str:
+def solid_key(solid: Solid) -> str:
     """Key of a solid's kind in a problem file, such as "sphere_m"."""
     return next(name for name, kind in KINDS.items() if isinstance(solid, kind))
 
 
-def solid_of(section: SolidSection) -> Solid:
+def solid_from_section(section: SolidSection) -> Solid:
     """Return the solid that a `SolidSection` states."""
     ((name, own),) = ((name, own) for name, own in section if own is not None)
     return KINDS[name](**stated_in(own, KINDS[name], name))

@@ -13,19 +13,26 @@ from ..errors import InputError, hint_at
 from .clock import TIME_TOLERANCE_S, unrounded_s
 from .formats.columns import (
     DISPLACEMENT,
+    DISPLACEMENTS,
     FORCE,
     FORCES,
     PRESSURE,
-    SHIFTS,
     STRAIN,
     STRESS,
     TENSION,
     TORQUES,
-    Columns,
     Quantity,
+    QuantityTable,
     read_columns,
 )
-from .formats.text import decode, numbers, of_file, read_bytes, read_grid, times_of
+from .formats.text import (
+    decode,
+    names_file_in_errors,
+    numeric_cells,
+    read_bytes,
+    read_table,
+    times_in_column,
+)
 from .poses import PoseSequence
 
 WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
@@ -34,7 +41,7 @@ LARGEST_PA = 1e8
 # Largest plausible tension [N]: larger ones are likely in another unit, or raw counts of a sensor.
 LARGEST_N = 1e5
 # Least number of samples of a file within a moving experiment: fewer come from different clocks.
-FEWEST = 3
+FEWEST_SHARED_SAMPLES = 3
 
 
 def read_forces(path: str | Path) -> tuple[Array, Array]:
@@ -51,7 +58,7 @@ def read_forces(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, or time does not increase; the
         line is named.
     """
-    table = read_columns(path, FORCES, all_of=True)
+    table = read_columns(path, FORCES, requires_all=True)
     return table.t_s, np.column_stack([table.values[quantity.key] for quantity in FORCES])
 
 
@@ -64,7 +71,7 @@ def read_tension(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, time does not increase, or a
         tension is negative; the line is named.
     """
-    return _course(path, TENSION, LARGEST_N, at_least=0.0)
+    return _read_limited(path, TENSION, LARGEST_N, at_least=0.0)
 
 
 def read_pressure(path: str | Path) -> tuple[Array, Array]:
@@ -77,11 +84,11 @@ def read_pressure(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, time does not increase, or a
         pressure is implausibly large; the line is named.
     """
-    return _course(path, PRESSURE, LARGEST_PA)
+    return _read_limited(path, PRESSURE, LARGEST_PA)
 
 
-@of_file
-def _course(
+@names_file_in_errors
+def _read_limited(
     path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
 ) -> tuple[Array, Array]:
     """Return times (T,) and values (T,) of one quantity, with limits on the values.
@@ -99,7 +106,7 @@ def _course(
             why = ", which no soft body bears; check the unit of the column"
         else:
             why = "; expected 0 or more, since a tendon only pulls: take the sensor's offset off"
-        raise table.grid.refusal(is_so + why, int(row))
+        raise table.grid.error_at(is_so + why, int(row))
     return table.t_s, values
 
 
@@ -147,9 +154,9 @@ def read_wrench(
         time does not increase; the line is named.
     """
     quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
-    table = read_columns(path, quantities, columns, blank_allowed=True, timed=timed)
+    table = read_columns(path, quantities, columns, blank_allowed=True, requires_times=timed)
     factor = sign * (area_m2 or 1.0) / symmetry
-    return _unrounded(table.t_s), factor * _components(table, (*FORCES, *TORQUES), axis)
+    return _without_rounding(table.t_s), factor * _axis_components(table, (*FORCES, *TORQUES), axis)
 
 
 def read_displacement(
@@ -191,8 +198,10 @@ def read_displacement(
         If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
         does not increase; the line is named.
     """
-    table = _shifts(path, columns, length_m, timed)
-    shifts_m = sign * (length_m or 1.0) * np.nan_to_num(_components(table, SHIFTS, axis))
+    table = _read_displacements(path, columns, length_m, timed)
+    shifts_m = (
+        sign * (length_m or 1.0) * np.nan_to_num(_axis_components(table, DISPLACEMENTS, axis))
+    )
     return PoseSequence(table.t_s, shifts_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1)))
 
 
@@ -205,20 +214,22 @@ def displaced_axes(
     """Return the axes along which a file has displacements, such as "z"; see
     `read_displacement`.
     """
-    shifts = _components(_shifts(path, columns, length_m, timed=False), SHIFTS, axis)
+    shifts = _axis_components(
+        _read_displacements(path, columns, length_m, timed=False), DISPLACEMENTS, axis
+    )
     is_present = np.asarray(np.isfinite(shifts).any(axis=0))
     return "".join(each for each, there in zip("xyz", is_present, strict=True) if there)
 
 
-def _shifts(
+def _read_displacements(
     path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
-) -> Columns:
+) -> QuantityTable:
     """Read the columns of a displacement, or of a strain if the undeformed length is given."""
-    quantities = (*SHIFTS, DISPLACEMENT) if length_m is None else (STRAIN,)
-    return read_columns(path, quantities, columns, timed=timed)
+    quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    return read_columns(path, quantities, columns, requires_times=timed)
 
 
-def _components(table: Columns, wanted: Sequence[Quantity], axis: str) -> Array:
+def _axis_components(table: QuantityTable, wanted: Sequence[Quantity], axis: str) -> Array:
     """Return the (T, n) values of the `wanted` quantities; NaN where missing.
 
     A machine's quantity, whose name contains no axis, becomes the component along `axis`.
@@ -230,7 +241,7 @@ def _components(table: Columns, wanted: Sequence[Quantity], axis: str) -> Array:
     return values
 
 
-def _unrounded(t_s: Array) -> Array:
+def _without_rounding(t_s: Array) -> Array:
     """Return times without the rounding of the file, see `unrounded_s`; two or fewer stay."""
     return unrounded_s(t_s) if len(t_s) > 2 else t_s
 
@@ -238,8 +249,10 @@ def _unrounded(t_s: Array) -> Array:
 # Of an instrument ---------------------------------------------------------------------------------
 
 
-@of_file
-def read_gauge(path: str | Path, columns: Sequence[str] = ()) -> tuple[Array, Array, list[str]]:
+@names_file_in_errors
+def read_custom_sensor(
+    path: str | Path, columns: Sequence[str] = ()
+) -> tuple[Array, Array, list[str]]:
     """Read the values of a custom sensor over time.
 
     Parameters
@@ -262,31 +275,33 @@ def read_gauge(path: str | Path, columns: Sequence[str] = ()) -> tuple[Array, Ar
         If a column is missing or repeated, a cell is not a number, or time does not increase; the
         line is named.
     """
-    grid = read_grid(decode(read_bytes(path)))
+    grid = read_table(decode(read_bytes(path)))
     wanted = list(columns) or [name for name in grid.columns if name != "t_s"]
     for name in ("t_s", *wanted):
         if (count := grid.columns.count(name)) != 1:
             there = f"{count} columns are called" if count else "there is no column"
             hint = "" if count else hint_at(name, grid.columns)
             among = ", ".join(grid.columns)
-            raise grid.refusal(f"{there} {name!r}; expected one among {among}{hint}")
-    t_s = times_of(grid, grid.columns.index("t_s"))
-    values = numbers(grid, [grid.columns.index(name) for name in wanted], True)
-    return _unrounded(t_s), np.asarray(values), wanted
+            raise grid.error_at(f"{there} {name!r}; expected one among {among}{hint}")
+    t_s = times_in_column(grid, grid.columns.index("t_s"))
+    values = numeric_cells(grid, [grid.columns.index(name) for name in wanted], True)
+    return _without_rounding(t_s), np.asarray(values), wanted
 
 
-def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_]:
+def is_within_experiment(
+    sample_times_s: Array, t_s: Array, name: str, is_static: bool
+) -> NDArray[np.bool_]:
     """Return which samples lie within an experiment's times, as (S,) bool.
 
     Parameters
     ----------
-    at_s : (S,) array
+    sample_times_s : (S,) array
         Sample times of a file.
     t_s : (T,) array
         Times of the experiment.
     name : str
         What was sampled, for messages.
-    static : bool
+    is_static : bool
         Whether one sample is enough.
 
     Raises
@@ -294,12 +309,14 @@ def within(at_s: Array, t_s: Array, name: str, static: bool) -> NDArray[np.bool_
     InputError
         If fewer than three samples do (one if static), as when clocks or units differ.
     """
-    is_inside = (at_s >= t_s[0] - TIME_TOLERANCE_S) & (at_s <= t_s[-1] + TIME_TOLERANCE_S)
-    fewest = 1 if static else FEWEST
+    is_inside = (sample_times_s >= t_s[0] - TIME_TOLERANCE_S) & (
+        sample_times_s <= t_s[-1] + TIME_TOLERANCE_S
+    )
+    fewest = 1 if is_static else FEWEST_SHARED_SAMPLES
     if is_inside.sum() >= fewest:
         return is_inside
-    span = [f"{t[0]:.6g} s to {t[-1]:.6g} s" for t in (at_s, t_s)]
-    ratio = np.ptp(at_s) / max(np.ptp(t_s), TIME_TOLERANCE_S)
+    span = [f"{t[0]:.6g} s to {t[-1]:.6g} s" for t in (sample_times_s, t_s)]
+    ratio = np.ptp(sample_times_s) / max(np.ptp(t_s), TIME_TOLERANCE_S)
     hint = (
         f"{name} seems to be in milliseconds"
         if 300 < ratio < 3000

@@ -11,20 +11,20 @@ from pydantic import Field
 from ..arrays import Array
 from ..checked import NotNegative, Text
 from ..errors import InputError
-from ..fem.shape import Length
+from ..fem.shape import PolylineLength
 from ..section import Vector
 from ..stated import Key, key, stated
-from .actuator import Actuator, Placed
-from .arrays import floats, triple
-from .loads import Course
-from .placement import Shape
+from .actuator import Actuator, BodyMeasure
+from .arrays import float_converter, point_text
+from .loads import TimeSeries
+from .placement import LocatedBody
 from .tables import read_tension
 
 if TYPE_CHECKING:
     from ..fem.body import Body
 
 # Largest distance of a tendon's point from the body, in mean edge lengths: coarse meshes cut arcs.
-FARTHEST = 1.0
+FARTHEST_POINT_EDGES = 1.0
 
 
 _TABLE = Key(
@@ -37,7 +37,7 @@ _TABLE = Key(
 
 
 @stated
-class Tendon(Actuator[Length]):
+class Tendon(Actuator[PolylineLength]):
     """A thread through points of the body, straight between them, that pulls itself shorter.
 
     It slides through its points without friction. A sheath needs as many points as it takes to
@@ -60,7 +60,7 @@ class Tendon(Actuator[Length]):
 
     points_m: Array = key(
         Annotated[list[Vector], Field(min_length=2)],
-        converter=floats((None, 3), "points_m of the tendon"),
+        converter=float_converter((None, 3), "points_m of the tendon"),
     )
     tension_n: Array = key(NotNegative | None, converter=np.asarray)
     t_s: Array | None = key(_TABLE, converter=np.asarray, default=None)
@@ -68,10 +68,10 @@ class Tendon(Actuator[Length]):
     _: KW_ONLY
     factor: float = 1.0
     lost_n: float = 0.0
-    placed: Placed[Length] | None = None
+    body_measure: BodyMeasure[PolylineLength] | None = None
 
     unit: ClassVar[str] = "N"
-    lost: ClassVar[str] = "lost_n"
+    offset_field: ClassVar[str] = "lost_n"
 
     def __post_init__(self) -> None:
         points = self.points_m
@@ -86,7 +86,7 @@ class Tendon(Actuator[Length]):
                 f"{name}: the points {same[0] + 1} and {same[0] + 2} are at the same place; "
                 "expected different ones, in their order from base to end"
             )
-        tension = Course(self.tension_n, self.t_s, f"tension_n of {name}")
+        tension = TimeSeries(self.tension_n, self.t_s, f"tension_n of {name}")
         if (tension.values < 0).any():
             row = int(np.argmax(tension.values < 0))
             raise InputError(
@@ -95,25 +95,25 @@ class Tendon(Actuator[Length]):
             )
         vars(self).update(tension_n=tension.values, t_s=tension.t_s, course=tension)
 
-    def _measure_on(self, body: Body) -> Length:
+    def _measure_on(self, body: Body) -> PolylineLength:
         """Return the length of the polyline in a body; an `InputError` if a point is too far
         outside.
         """
-        shape = Shape(body.nodes_m, body)
-        embedded = [shape.embed(point) for point in self.points_m]
+        shape = LocatedBody(body.nodes_m, body)
+        embedded = [shape.weights_at_point(point) for point in self.points_m]
         nodes, weights, distances = (np.array(part) for part in zip(*embedded, strict=True))
         worst = int(distances.argmax())
-        if distances[worst] > FARTHEST * shape.mean_edge_m:
+        if distances[worst] > FARTHEST_POINT_EDGES * shape.mean_edge_m:
             raise InputError(
-                f"{self.name}: point {worst + 1} at {triple(self.points_m[worst])} m is "
+                f"{self.name}: point {worst + 1} at {point_text(self.points_m[worst])} m is "
                 f"{distances[worst]:.4g} m outside the body, more than the mean edge length of "
                 f"{shape.mean_edge_m:.4g} m; expected points_m on the undeformed body, in metres"
             )
-        return Length(nodes, weights, len(body.nodes_m))
+        return PolylineLength(nodes, weights, len(body.nodes_m))
 
-    def driven(self, stated: Any, factor: Any, lost: Any) -> Any:
+    def energy_amplitude(self, stated_value: Any, factor: Any, offset: Any) -> Any:
         """Return the tension at the body, max(0, factor · stated − lost); 0 if the stated tension
         is 0.
         """
-        pull = factor * stated - lost
-        return (stated > 0) * (pull > 0) * pull
+        pull = factor * stated_value - offset
+        return (stated_value > 0) * (pull > 0) * pull

@@ -15,16 +15,16 @@ import numpy as np
 from .experiment import Experiment
 
 # Rotation within a grid step [rad] above which there is a warning: it seems a strain of 4e-4.
-FAST = 0.055
+WARNING_ANGLE_RAD = 0.055
 # Rotation within a grid step [rad] that the recommended substeps reach; below FAST for rounding.
-SLOW = 0.05
+TARGET_ANGLE_RAD = 0.05
 # Rotation within a grid step [rad] that makes the result doubtful: it seems a strain of 1e-3.
-TOO_FAST = 0.1
+DOUBTFUL_ANGLE_RAD = 0.1
 _KEY = "transcription.substeps"
 
 
 @dataclass(frozen=True)
-class Turn:
+class GraspRotation:
     """The largest rotation of a grasp between two times of the grid.
 
     Attributes
@@ -51,7 +51,7 @@ class Turn:
         return self.angle_rad / self.step_s
 
 
-def fastest_turn(experiment: Experiment, substeps: int) -> Turn:
+def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
     """Return the largest rotation of an experiment's grasps within a step of the time grid.
 
     Parameters
@@ -67,8 +67,8 @@ def fastest_turn(experiment: Experiment, substeps: int) -> Turn:
     largest = 0.0
     time_s = float(t_s[0])
     is_hold = False
-    for grasp in () if experiment.static else experiment.grasps:
-        times_s = t_s[grasp.holds(t_s)]
+    for grasp in () if experiment.is_static else experiment.grasps:
+        times_s = t_s[grasp.is_active(t_s)]
         if len(times_s) < 2:
             continue
         rotations = grasp.poses.at(times_s)[0]
@@ -80,7 +80,7 @@ def fastest_turn(experiment: Experiment, substeps: int) -> Turn:
             largest = angle
             time_s = float(times_s[k])
             is_hold = grasp.poses.interpolation == "hold"
-    needed = max(1, ceil(substeps * largest / SLOW))
+    needed = max(1, ceil(substeps * largest / TARGET_ANGLE_RAD))
     # A pose that is held turns by as much at a sample, however many steps there are between.
     remedy = 'set interpolation = "smooth" in the grasp' if is_hold else f"set {_KEY} = {needed}"
-    return Turn(experiment.name, largest, time_s, step_s, remedy)
+    return GraspRotation(experiment.name, largest, time_s, step_s, remedy)

@@ -12,8 +12,8 @@ from ..checked import AtLeastOne, Positive
 from ..errors import InputError
 from ..section import Vector
 from ..stated import key, stated
-from .arrays import floats, read_only_floats
-from .clock import first_time_fault
+from .arrays import float_converter, read_only_floats
+from .clock import first_unordered_time
 
 Frame = Literal["world", "grasp"]
 
@@ -21,7 +21,7 @@ COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 UNITS = ("N",) * 3 + ("N m",) * 3
 
 
-def _six(values: ArrayLike) -> Array:
+def _with_torques(values: ArrayLike) -> Array:
     """Return values (S, 3) of forces with three more columns of NaN for torques; others
     unchanged.
     """
@@ -60,13 +60,13 @@ class Wrench:
         If shapes disagree, time does not increase, nothing is measured, or a sigma is missing.
     """
 
-    t_s: Array = key(converter=floats((None,), "t_s of the wrench"))
-    values: Array = key(converter=_six)
+    t_s: Array = key(converter=float_converter((None,), "t_s of the wrench"))
+    values: Array = key(converter=_with_torques)
     sigma_n: float = key(Positive)
     sigma_nm: float | None = key(Positive | None, default=None)
     frame: Frame = key(Frame, default="world")
     point_m: Array = key(
-        Vector, converter=floats((3,), "point_m of the wrench"), default=(0.0,) * 3
+        Vector, converter=float_converter((3,), "point_m of the wrench"), default=(0.0,) * 3
     )
     symmetry: int = key(AtLeastOne, default=1)
 
@@ -76,37 +76,37 @@ class Wrench:
         shape = len(self.t_s), 6
         values = read_only_floats(self.values, shape, "values of the wrench", finite=False)
         vars(self)["values"] = values
-        if fault := first_time_fault(self.t_s):
+        if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         if np.isinf(self.values).any():
             raise InputError(
                 "a wrench holds an infinite value; expected numbers, or NaN if missing"
             )
-        if not self.measured.any():
+        if not self.measured_components.any():
             raise InputError("a wrench has no sample of any component")
-        if self.sigma_nm is None and self.measured[3:].any():
+        if self.sigma_nm is None and self.measured_components[3:].any():
             raise InputError(
                 "a wrench with torques needs sigma_nm, the standard deviation of their noise [N m]"
             )
 
     def __repr__(self) -> str:
-        names = ", ".join(self.names)
+        names = ", ".join(self.component_names)
         return f"Wrench({len(self.t_s)} samples of {names} in the frame of the {self.frame})"
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def is_measured(self) -> NDArray[np.bool_]:
         """(S, 6) whether each component is measured at each sample."""
         return np.isfinite(self.values)
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured_components(self) -> NDArray[np.bool_]:
         """(6,) whether each component is measured at any sample."""
-        return np.asarray(self.present.any(axis=0))
+        return np.asarray(self.is_measured.any(axis=0))
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def component_names(self) -> tuple[str, ...]:
         """Names of the measured components, such as "fz"."""
-        return tuple(COMPONENTS[k] for k in np.flatnonzero(self.measured))
+        return tuple(COMPONENTS[k] for k in np.flatnonzero(self.measured_components))
 
     @property
     def sigmas(self) -> Array:

@@ -8,8 +8,10 @@ Text: `run_sections` describes a run, `probe_sections` its probes, and `check_se
 of a check; `report` turns such sections into an HTML page or Markdown, and `progress` shows a solve
 while it runs.
 
-Pictures: the package `pictures` has static figures in the look of `style`; `animation` makes films,
-`view` an interactive window, and `page` a web page with the moving body. `seen` prepares the points
+Pictures: the package `design_figures` has static figures in the look of `style`; `animation` makes
+films,
+`view` an interactive window, and `page` a web page with the moving body. `fit_summary` prepares the
+points
 of depth cameras for all of these, and `fields` evaluates stress and energy in each element.
 
 Other simulators: the package `export` writes the identified body.

@@ -2,7 +2,7 @@
 
 Beside the body a panel shows the distance of the markers from their measurements over time.
 `animate`
-works from a run folder, `film` from a `Replay`.
+works from a run folder, `write_film` from a `Replay`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ from .style import BLACK, BLUE, GREEN, LINE_PT, TEXT_PT, dress, legend_above
 WIDTH_MM = 160.0
 TALLEST_MM = 110.0
 LOWEST_MM = 30.0
-# Width of a film in pixels, even for H.264 (see `_even`); smaller for GIF, which compresses badly.
+# Width of a film in pixels, even for H.264 (see `_stiffening_of_interval`); smaller for GIF, which
+# compresses badly.
 PIXELS_WIDE = {".mp4": 1280, ".gif": 800}
 HEAD_MM = 12.0
 FOOT_MM = 12.0

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..display import Line, Shown, Table, duration, labelled
 from ..fem.constants import symbol_of, unit_of
-from ..runs.check import BodyFinding, Findings, Glance, Hold, Recording
-from ..runs.check.body import hold_sentence
+from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
+from ..runs.check.body import grasp_sentence
 from .run_sections import how_to
 
 # Natural modes in the table, lowest first.
@@ -21,12 +21,12 @@ SHOWN_MODES = 3
 SHOWN_RECORDINGS = 4
 
 
-def glance_table(seen: Glance) -> list[Shown]:
+def glance_table(seen: QuickCheck) -> list[Shown]:
     """Return tables of the bodies and of the measurements, which need no simulation."""
     return [*map(_body_section, seen.bodies), _measurements_section(seen)]
 
 
-def closer_table(findings: Findings) -> list[Shown]:
+def closer_table(findings: CheckResult) -> list[Shown]:
     """Return tables of modes, costs and derivatives, then notes, warnings, remedies and the
     conclusion.
     """
@@ -45,18 +45,18 @@ def closer_table(findings: Findings) -> list[Shown]:
     ]
 
 
-def _check_verdict(findings: Findings) -> Line:
+def _check_verdict(findings: CheckResult) -> Line:
     """Return the conclusion of a check: valid, wrong derivatives, or a suspect description."""
     if not findings.derivatives_agree:
         return Line("The derivatives do not agree with differences at the guess.", "doubtful")
     if findings.causes:
-        likeliest = findings.causes[0].sentence
+        likeliest = findings.causes[0].message
         sentence = f"The derivatives agree, but the description looks wrong: {likeliest}"
         return Line(sentence, "doubtful")
     return Line("The problem is valid and the derivatives agree.", "good")
 
 
-def _body_section(body: BodyFinding) -> Table:
+def _body_section(body: BodyCheck) -> Table:
     """Return the table of a body: size, mass, mesh, element quality, rest shape and fields."""
     size = " × ".join(f"{1e3 * x:.4g}" for x in body.size_m)
     low, mean, high = (1e3 * x for x in body.edges_m)
@@ -79,7 +79,7 @@ def _body_section(body: BodyFinding) -> Table:
     )
 
 
-def _rest_shape(body: BodyFinding) -> str:
+def _rest_shape(body: BodyCheck) -> str:
     """Return what is known of the stress-free shape, which is not the mesh."""
     if body.rest_shape is None:
         return "not stated: see object.rest_shape"
@@ -89,7 +89,7 @@ def _rest_shape(body: BodyFinding) -> str:
     return f"the mesh was made under gravity; the stress-free shape is up to {change} away"
 
 
-def _motion_section(findings: Findings) -> list[Shown]:
+def _motion_section(findings: CheckResult) -> list[Shown]:
     """Return the table of natural modes; empty if all experiments are static."""
     if not findings.motions:  # equilibria only
         return []
@@ -107,13 +107,15 @@ def _motion_section(findings: Findings) -> list[Shown]:
         )
         for mode in motion.modes[:SHOWN_MODES]
     )
-    firsts = [f"'{m.experiment}' {m.first.frequency_hz:.3g} Hz" for m in others if m.first]
+    firsts = [
+        f"'{m.experiment}' {m.first_mode.frequency_hz:.3g} Hz" for m in others if m.first_mode
+    ]
     firsts = [*firsts[:SHOWN_RECORDINGS], *["…"] * (len(firsts) > SHOWN_RECORDINGS)]
     more = [f"  first modes elsewhere: {', '.join(firsts)}"] if firsts else []
     return [Table(title, heads, rows, names=0), *more]
 
 
-def _measurements_section(findings: Glance) -> Table:
+def _measurements_section(findings: QuickCheck) -> Table:
     """Return the table of recordings: samples, markers, air and grasps."""
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
@@ -132,9 +134,9 @@ def _measurements_section(findings: Glance) -> Table:
     return labelled("Measurements", rows)
 
 
-def _grasps(experiment: str, holds: Iterable[Hold]) -> dict[str, str]:
+def _grasps(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
     """Return a sentence on each grasp of an experiment; several grasps are numbered from 1."""
-    own = [hold_sentence(hold) for hold in holds if hold.experiment == experiment]
+    own = [grasp_sentence(hold) for hold in holds if hold.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
     return {f"grasp {k} of '{experiment}'": sentence for k, sentence in enumerate(own, start=1)}
@@ -147,15 +149,15 @@ def _air(density_kg_m3: float) -> str:
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
 
 
-def _markers_seen(recording: Recording) -> str:
+def _markers_seen(recording: RecordingCheck) -> str:
     """Return how many markers a recording has, how many samples are missing, and the farthest
     marker.
     """
     if not recording.markers:
         return f"{', '.join(recording.instruments)}, no markers"
     besides = "".join(f", {name}" for name in recording.instruments)
-    farthest = recording.farthest
-    most_missing = recording.least_seen
+    farthest = recording.farthest_marker
+    most_missing = recording.most_missing_marker
     missing = (
         f"{recording.missing} samples missing, most of '{most_missing.name}' "
         f"({most_missing.missing})"
@@ -168,7 +170,7 @@ def _markers_seen(recording: Recording) -> str:
     )
 
 
-def _solve_section(findings: Findings) -> Table:
+def _solve_section(findings: CheckResult) -> Table:
     """Return the table of guesses, problem size, expected costs of each method, and derivative
     errors.
     """

@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..fem.body import Body
 from ..fem.elements import Element
-from ..fem.expressions import Law, kernel_of, point_of
-from ..fem.kernel import Derivative, PointKernel
-from ..fem.kernels import Batch, Evaluator
+from ..fem.expressions import PointLaw, kernel_from_outputs, quadrature_point
+from ..fem.kernel import Derivative, ElementKernel
+from ..fem.kernels import Evaluator, KernelBatch
 
 NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
@@ -64,9 +64,9 @@ class ElementFields:
             if part.stress_field:
                 logs = np.arange(len(cells))[:, None, None]
                 histories = np.broadcast_to(logs, (*geometry.shape[:2], 1))
-            elif body.inverse is not None:
-                histories = body.inverse.places_of_points(number)
-            batch = Batch(kernel, cells, geometry, places, width, histories)
+            elif body.inverse_equilibrium is not None:
+                histories = body.inverse_equilibrium.point_data_columns(number)
+            batch = KernelBatch(kernel, cells, geometry, places, width, histories)
             evaluators.append(body.make_evaluator(batch))
         volumes = body.stress_free_geometry(theta)[:, :, -1].sum(axis=1)
         return cls(body, theta, evaluators, volumes)
@@ -88,30 +88,32 @@ class ElementFields:
         body = self.body
         x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
         sums = np.empty((len(x), len(NAMES) * len(self._volumes)))
-        shares = body.split(self.theta)
+        shares = body.split_theta(self.theta)
         for k, (part, evaluate) in enumerate(zip(body.parts, self._evaluators, strict=True)):
-            constants = np.array(shares[k][: part.of_law], dtype=float)
-            if body.inverse is not None:
+            constants = np.array(shares[k][: part.law_constant_count], dtype=float)
+            if body.inverse_equilibrium is not None:
                 constants = body.point_constants(k, self.theta)
-            evaluate([x], constants, sums, body.threads, k > 0, body.brought(k, self.theta))
+            evaluate([x], constants, sums, body.threads, k > 0, body.point_data(k, self.theta))
         means = sums.reshape(len(x), -1, len(NAMES)) / self._volumes[:, None]
         return {name: means[:, :, k] for k, name in enumerate(NAMES)}
 
 
-def field_kernel(element: Element, law: Law) -> PointKernel:
+def field_kernel(element: Element, law: PointLaw) -> ElementKernel:
     """Return the compiled fields at a quadrature point times its volume; see `expressions` for the
     inputs.
     """
-    point = point_of(element, law, "x")
-    fields = ca.vertcat(*_point_fields(law, point.constants))
-    evaluated = ca.substitute(fields, _F, ca.vec(point.felt))
-    return kernel_of("fields", point, {"fields": (Derivative(point.volume * evaluated, ()),)})
+    point = quadrature_point(element, law, "x")
+    fields = ca.vertcat(*_point_fields(law, point.local_constants))
+    evaluated = ca.substitute(fields, _F, ca.vec(point.material_gradient))
+    return kernel_from_outputs(
+        "fields", point, {"fields": (Derivative(point.volume * evaluated, ()),)}
+    )
 
 
 _F = ca.SX.sym("F", 9)
 
 
-def _point_fields(law: Law, theta: ca.SX) -> tuple[ca.SX, ...]:
+def _point_fields(law: PointLaw, theta: ca.SX) -> tuple[ca.SX, ...]:
     """Return det F, the energy density and the von Mises stress as expressions in `_F`.
 
     `_F` has the nine components of the deformation gradient column after column; `theta` are the

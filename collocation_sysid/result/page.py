@@ -125,7 +125,9 @@ def _trajectories(replay: Replay) -> dict[str, Array]:
 
 
 def _content(replay: Replay, colouring: Colouring) -> dict[str, Any]:
-    """Return the data of the page, ready for JSON; arrays are in base64, see `_packed`."""
+    """Return the data of the page, ready for JSON; arrays are in base64, see
+    `_pack_without_lifted`.
+    """
     samples = np.arange(0, len(replay.t_s), -(-len(replay.t_s) // MOST_FRAMES))
     surface_nodes, nodes = np.unique(replay.surface_nodes, return_inverse=True)
     nodes = nodes.reshape(len(replay.surface), -1)

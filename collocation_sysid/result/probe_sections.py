@@ -8,8 +8,8 @@ from ..display import Section, Table, short
 from ..errors import listed
 from ..fem.constants import symbol_of
 from ..runs.result import Result
-from ..statistics.budget import worded
-from ..statistics.relaxation import Move, Probe
+from ..statistics.budget import source_label
+from ..statistics.relaxation import EstimateChange, Probe
 
 # Measures of stiffness, the most important first.
 FOREMOST = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
@@ -43,7 +43,7 @@ def probe_section(result: Result) -> Section:
     heads = ("refit", "−Δχ²", "size", *map(symbol_of, names))
     rows = [
         (
-            worded(p.name) if p.kind == "assumption" else p.name,
+            source_label(p.name) if p.kind == "assumption" else p.name,
             f"{p.chi_squared:.1f}",
             "" if p.size is None else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
             *(_moved(p.moves.get(name), result.values[name].value) for name in names),
@@ -71,7 +71,7 @@ def _first_order(probe: Probe) -> str:
     """Return the size of a relaxed assumption and the reduction of χ² by it, in words."""
     size = short(probe.size or 0.0)
     error = short(probe.size_error or 0.0)
-    return f"{worded(probe.name)} ({size} ± {error}, −Δχ² {probe.chi_squared:.1f})"
+    return f"{source_label(probe.name)} ({size} ± {error}, −Δχ² {probe.chi_squared:.1f})"
 
 
 def is_routine(result: Result) -> bool:
@@ -103,13 +103,13 @@ def _shown(result: Result) -> list[str]:
     return [*first, *(n for n in known if n in result.parameters and n not in first)][:SHOWN]
 
 
-def _moved(move: Move | None, value: float) -> str:
+def _moved(move: EstimateChange | None, value: float) -> str:
     """Return the change of an estimate with its ratios to the half widths of both intervals; "–"
     for None.
 
     Parameters
     ----------
-    move : Move or None
+    move : EstimateChange or None
         Change of the estimate in a refit; None if the refit does not have it.
     value : float
         The estimate itself.
@@ -122,7 +122,7 @@ def _moved(move: Move | None, value: float) -> str:
     return f"{_change(move, value)} ({shares})"
 
 
-def _change(move: Move, value: float) -> str:
+def _change(move: EstimateChange, value: float) -> str:
     """Return the change of an estimate as text, in percent of `value` unless that is zero."""
     return f"{100 * move.change / abs(value):+.2f} %" if value else f"{move.change:+.2g}"
 
@@ -152,11 +152,11 @@ def _said(result: Result) -> Iterator[str]:
         size = short(first.size or 0.0)
         error = short(first.size_error or 0.0)
         yield (
-            f"the data determine {worded(first.name)}: {size} ± {error}, with which χ² falls by "
+            f"the data determine {source_label(first.name)}: {size} ± {error}, with which χ² falls by "
             f"{first.chi_squared:.3g} and the estimates change by {listed(moved)}: measure it, or "
             "estimate it"
         )
-        if others := [f"{worded(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
+        if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
             yield f"alternatively {listed(others)}: these assumptions have similar effects"
     elif not significant:
         tested = " or ".join(_first_order(p) for p in result.probes)
@@ -187,7 +187,7 @@ def _matters(result: Result) -> Iterator[str]:
         if source is not None:
             share = result.budget[name][source]
             yield (
-                f"of the assumptions not determined by the data, {worded(source)} matters most: "
+                f"of the assumptions not determined by the data, {source_label(source)} matters most: "
                 f"{share:.0%} of {symbol_of(name)}'s variance"
             )
             return

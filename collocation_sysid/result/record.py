@@ -19,12 +19,12 @@ from ..errors import InputError
 from ..fem.body import Body
 from ..files import RESULT_FILE, write_whole
 from ..program.depth_comparison import SurfaceComparison
-from ..program.touches import on_surface
+from ..program.touches import surface_gaps_and_pressures
 from ..recording.experiment import Experiment
-from ..runs.answer import Answer
-from ..runs.forward_simulation import Rollout
+from ..runs.answer import SolvedProblem
+from ..runs.forward_simulation import ForwardSimulation
 from ..runs.result import Result
-from ..runs.told import result_of
+from ..runs.told import build_result
 from ..tree import as_json
 from .fields import ElementFields
 from .replay import Replay
@@ -34,7 +34,7 @@ REFINEMENT_FILE = "refinement.json"
 
 
 def write_run(
-    finished: Answer, folder: str | Path, *, frames: bool = True, pictures: bool = True
+    finished: SolvedProblem, folder: str | Path, *, frames: bool = True, pictures: bool = True
 ) -> Path:
     """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
@@ -48,7 +48,7 @@ def write_run(
 
     Parameters
     ----------
-    finished : Answer
+    finished : SolvedProblem
         The solved problem.
     folder : str or Path
         An earlier, unchanged run at this place is replaced.
@@ -60,7 +60,7 @@ def write_run(
     InputError
         If the folder holds anything but an earlier run; see `writers.run_folder`.
     """
-    result = result_of(finished)
+    result = build_result(finished)
     with run_folder(folder) as place:
         origin = finished.problem.origin
         if origin is not None:
@@ -78,12 +78,14 @@ def write_run(
     return Path(folder)
 
 
-def draw_run(finished: Answer, folder: Path, say: Callable[[str], None] | None = None) -> Result:
+def draw_run(
+    finished: SolvedProblem, folder: Path, say: Callable[[str], None] | None = None
+) -> Result:
     """Draw the pictures of a run into its folder, and store in ``result.json`` how long that took.
 
     Parameters
     ----------
-    finished : Answer
+    finished : SolvedProblem
         The solved problem.
     folder : Path
         The folder that `write_run` wrote for this solved problem.
@@ -101,7 +103,7 @@ def draw_run(finished: Answer, folder: Path, say: Callable[[str], None] | None =
         If the folder holds another result, or cannot be written to.
     """
     began_s = time.perf_counter()
-    result = result_of(finished)
+    result = build_result(finished)
     file = folder / RESULT_FILE
     _write_pictures(finished, result, folder, say or (lambda _: None))
     if not file.is_file() or file.read_text(encoding="utf-8") != _as_text(result):
@@ -122,7 +124,7 @@ def _as_text(result: Result) -> str:
 
 
 def _write_pictures(
-    finished: Answer, result: Result, folder: Path, say: Callable[[str], None]
+    finished: SolvedProblem, result: Result, folder: Path, say: Callable[[str], None]
 ) -> None:
     """Draw all pictures of a run, including the Jacobian's structure, and write them into its
     folder.
@@ -136,7 +138,7 @@ def _write_pictures(
     save_pictures(folder, album(replays(finished), result) | {"jacobian": jacobian}, say)
 
 
-def _told_of_cells(finished: Answer, body: Body) -> dict[str, Any]:
+def _told_of_cells(finished: SolvedProblem, body: Body) -> dict[str, Any]:
     """Return the cell data that are the same in every frame: region numbers and spatially varying
     constants.
 
@@ -153,7 +155,7 @@ def _told_of_cells(finished: Answer, body: Body) -> dict[str, Any]:
     return data
 
 
-def _write_all_frames(finished: Answer, place: Path) -> None:
+def _write_all_frames(finished: SolvedProblem, place: Path) -> None:
     """Write the ParaView frames of every fitted experiment into the folder `place`.
 
     With several fitted experiments each has a subfolder of its name.
@@ -164,7 +166,7 @@ def _write_all_frames(finished: Answer, place: Path) -> None:
         here = place if len(finished.solution.parts) == 1 else place / segment.experiment.name
         here.mkdir(exist_ok=True)
         body = segment.body
-        residual = np.zeros((len(positions), segment.dofs))
+        residual = np.zeros((len(positions), segment.dof_count))
         residual[:, segment.free_dofs] = part.residual_n
         write_frames(
             here,
@@ -174,12 +176,12 @@ def _write_all_frames(finished: Answer, place: Path) -> None:
             body.element,
             body.nodes_m,
             {"residual_force_n": residual.reshape(positions.shape)},
-            fields=ElementFields.of(body, body.theta(finished.solution.parameters)),
+            fields=ElementFields.of(body, body.theta_from_values(finished.solution.parameters)),
             cell_data=_told_of_cells(finished, body),
         )
 
 
-def replays(finished: Answer) -> list[Replay]:
+def replays(finished: SolvedProblem) -> list[Replay]:
     """Return each experiment with its measured, fitted and simulated motion, for pictures and
     files.
 
@@ -190,16 +192,16 @@ def replays(finished: Answer) -> list[Replay]:
     fitted = {}
     collected = []
     for part, readings in zip(finished.solution.parts, finished.solution.readings_m, strict=True):
-        x = part.x[part.segment.markers.grid_rows]
+        x = part.x[part.segment.markers.sample_rows]
         fitted[part.segment.experiment.name] = x.reshape(len(x), -1, 3), readings
     for experiment in sorted(finished.problem.experiments, key=lambda each: each.validation):
         rollout = finished.rollouts[experiment.name]
         rolled_out = None
-        if isinstance(rollout, Rollout):
+        if isinstance(rollout, ForwardSimulation):
             rolled_out = rollout.trajectory.positions_m, rollout.trajectory.markers_m
         fit = fitted.get(experiment.name)
         if (shown := fit or rolled_out) is not None:
-            motion = finished.motions.get(experiment.name)
+            motion = finished.modes_by_experiment.get(experiment.name)
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _places_m(finished, experiment.name)
             replay = Replay.of(
@@ -218,32 +220,36 @@ def replays(finished: Answer) -> list[Replay]:
     return collected
 
 
-def _seen(finished: Answer, experiment: Experiment) -> dict[str, Array]:
+def _seen(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return the points of each depth camera on the fitted surface, or else on the simulated one.
 
-    The arrays are as in `Replay.seen`, by name of the camera; empty where neither surface is known.
+    The arrays are as in `Replay.fit_summary`, by name of the camera; empty where neither surface is
+    known.
     """
     part = finished.solution.part_of(experiment.name)
     rollout = finished.rollouts[experiment.name]
     surfaces: Mapping[str, SurfaceComparison] = {}
     if part is not None:
         surfaces = {
-            reading.sighting.view.depth.name: SurfaceComparison.from_fit(
+            reading.correspondences.camera.depth.name: SurfaceComparison.from_fit(
                 reading, part.x, values, part.phi
             )
-            for reading, values in part.sights
+            for reading, values in part.depth_residuals
         }
-    elif isinstance(rollout, Rollout):
-        surfaces = rollout.surfaces
+    elif isinstance(rollout, ForwardSimulation):
+        surfaces = rollout.depth_surfaces
     if not surfaces:
         return {}
     from .seen import compared_rows  # which needs matplotlib
 
-    return {name: compared_rows(surface, experiment.up) for name, surface in surfaces.items()}
+    return {
+        name: compared_rows(surface, experiment.upward_direction)
+        for name, surface in surfaces.items()
+    }
 
 
 def _touched(
-    finished: Answer, experiment: Experiment, positions_m: Array
+    finished: SolvedProblem, experiment: Experiment, positions_m: Array
 ) -> tuple[Array, Array] | None:
     """Return gap [m] and contact pressure [Pa] on the surface, (T, F) each; None without obstacles.
 
@@ -252,12 +258,14 @@ def _touched(
     if not experiment.obstacles:
         return None
     if (part := finished.solution.part_of(experiment.name)) is not None:
-        experiment = part.segment.corrected(part.phi)
-    theta = experiment.body.theta(finished.solution.parameters)
-    return on_surface(experiment, np.array(theta), positions_m.reshape(len(positions_m), -1))
+        experiment = part.segment.corrected_experiment(part.phi)
+    theta = experiment.body.theta_from_values(finished.solution.parameters)
+    return surface_gaps_and_pressures(
+        experiment, np.array(theta), positions_m.reshape(len(positions_m), -1)
+    )
 
 
-def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:
+def _in_cells(finished: SolvedProblem, body: Body) -> dict[str, Array]:
     """Return the estimates (E, 4) of each spatially varying constant, by name of the field.
 
     The columns are those of `Replay.fields`. Rows of elements in other regions are NaN.
@@ -270,7 +278,7 @@ def _in_cells(finished: Answer, body: Body) -> dict[str, Array]:
     return estimates
 
 
-def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
+def _sensed(finished: SolvedProblem, experiment: Experiment) -> list[Array]:
     """Return an array (S, 19) for each force sensor: time, and the wrench measured, fitted and
     simulated.
 
@@ -282,7 +290,7 @@ def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
     rollout = finished.rollouts[experiment.name]
     fitted = finished.solution.wrenches
     fit = fitted.get(experiment.name, [None] * len(sensors))
-    rolled = rollout.wrenches if isinstance(rollout, Rollout) else [None] * len(sensors)
+    rolled = rollout.wrenches if isinstance(rollout, ForwardSimulation) else [None] * len(sensors)
     both = zip(sensors, fit, rolled, strict=True)
     sensed = []
     for sensor, *models in both:
@@ -292,7 +300,7 @@ def _sensed(finished: Answer, experiment: Experiment) -> list[Array]:
     return sensed
 
 
-def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
+def _own_readings(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
     """Return an array (S, 1 + 3m) for each custom sensor, by name.
 
     The columns are the time [s], and its m numbers as measured, fitted and simulated; NaN where the
@@ -300,10 +308,12 @@ def _own_readings(finished: Answer, experiment: Experiment) -> dict[str, Array]:
     """
     rollout = finished.rollouts[experiment.name]
     fit = finished.solution.readings
-    rolled = rollout.readings if isinstance(rollout, Rollout) else {}
+    rolled = rollout.readings if isinstance(rollout, ForwardSimulation) else {}
     both = fit.get(experiment.name, {}), rolled
     return {
-        gauge.name: _compared(gauge.times, gauge.measured, *(each.get(gauge.name) for each in both))
+        gauge.name: _compared(
+            gauge.sample_times_s, gauge.measured_values, *(each.get(gauge.name) for each in both)
+        )
         for gauge in experiment.readings
     }
 
@@ -318,7 +328,7 @@ def _compared(t_s: Array, measured: Array, *models: Array | None) -> Array:
     return np.column_stack([t_s, measured, *columns])
 
 
-def _places_m(finished: Answer, experiment: str) -> Array | None:
+def _places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     """Return the estimated places (M, 3) of the markers on the undeformed body; None where that
     failed.
     """
@@ -326,7 +336,7 @@ def _places_m(finished: Answer, experiment: str) -> Array | None:
         places = [place.position_m for place in finished.places[experiment].values()]
         return np.array(places).reshape(-1, 3)
     rollout = finished.rollouts[experiment]
-    if not isinstance(rollout, Rollout):
+    if not isinstance(rollout, ForwardSimulation):
         return None
     return np.array([*rollout.places_m.values()]).reshape(-1, 3)
 

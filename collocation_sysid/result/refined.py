@@ -15,15 +15,15 @@ from ..errors import InputError
 from ..files import RESULT_FILE, require_own, whole_file
 from ..model.parameters import Parameters
 from ..problem import Problem
-from ..runs.refine import refinement_of
+from ..runs.refine import solve_refined
 from ..runs.result import ReportedEstimate, Result
 from ..runs.verdict import combined_concerns
-from ..runs.warm_start import Earlier
+from ..runs.warm_start import WarmStart
 from ..statistics.budget import NUMERICAL as DISCRETISATION
 from ..statistics.combined import combine
 from ..statistics.estimates import Estimate
-from ..statistics.numerical import Level, NumericalError, Refinement
-from ..statistics.trust import NUMERICAL, Trust, numerical_concerns
+from ..statistics.numerical import DiscretisationError, Refinement, RefinementLevel
+from ..statistics.trust import NUMERICAL, Assessment, numerical_concerns
 from ..tree import as_json, read
 from .record import REFINEMENT_FILE
 from .replay import reading_run
@@ -72,7 +72,7 @@ def refine_run(
     before = Result.read(folder)
     file = run / RESULT_FILE
     levels_file = run / REFINEMENT_FILE
-    home = before.home(file, "use collocation_sysid.refine")
+    home = before.problem_folder(file, "use collocation_sysid.refine")
     if not before.converged:
         raise InputError("the run did not converge: there is no answer to refine", file)
     problem = Problem.read(run / "problem.toml", allow_code=allow_code, folder=home)
@@ -80,7 +80,7 @@ def refine_run(
     estimates = _at_optimum(before, problem.parameters)
     with reading_run(run):
         known = _known_levels(levels_file, estimates)
-        answer = Earlier.of_result(before, run)
+        answer = WarmStart.from_result(before, run)
 
     def keep(refinement: Refinement) -> Result:
         """Write a refinement and the updated result into the folder, and return the latter."""
@@ -90,7 +90,7 @@ def refine_run(
             draft.write_text(as_json(after) + "\n", encoding="utf-8")
         return after
 
-    refinement = refinement_of(problem, answer, estimates, levels, say, known, keep)
+    refinement = solve_refined(problem, answer, estimates, levels, say, known, keep)
     return refinement, keep(refinement)
 
 
@@ -131,13 +131,13 @@ def refined(before: Result, refinement: Refinement, parameters: Parameters) -> R
         *numerical_concerns(optimum, uncertainties, refinement),
         *combined_concerns(parameters, after.values, budget),
     )
-    return replace(after, budget=budget, trust=Trust.of(concerns))
+    return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
 
 
 def _at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
     """Return the estimates before the correction of the discretisation error, by name."""
     return {
-        name: each.at_optimum(name, linear=name in parameters.linear)
+        name: each.at_optimum(name, linear=name in parameters.linear_names)
         for name, each in result.values.items()
     }
 
@@ -146,7 +146,7 @@ def _corrected(
     name: str,
     before: ReportedEstimate,
     optimum: Estimate,
-    error: NumericalError,
+    error: DiscretisationError,
     parameters: Parameters,
 ) -> ReportedEstimate:
     """Return an estimate corrected for its measured discretisation error.
@@ -157,7 +157,7 @@ def _corrected(
     before : ReportedEstimate
     optimum : Estimate
         The estimate at the optimum, before any correction.
-    error : NumericalError
+    error : DiscretisationError
         The measured discretisation error.
     parameters : Parameters
     """
@@ -189,7 +189,7 @@ def _shares(
     if not before.combined_std_error or not after.combined_std_error:
         return dict(shares)
     ratio = (before.combined_std_error / after.combined_std_error) ** 2
-    # Standard errors are relative to their values, see `Coordinate`.
+    # Standard errors are relative to their values, see `IntervalCoordinate`.
     ratio *= (after.value / before.value) ** 2 if before.value else 1.0
     others = {name: share * ratio for name, share in shares.items() if name != DISCRETISATION}
     total = max(1.0, sum(others.values()))
@@ -198,7 +198,7 @@ def _shares(
     return dict(sorted(corrected.items(), key=lambda item: -item[1]))
 
 
-def _known_levels(file: Path, names: Iterable[str]) -> list[Level]:
+def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
     """Return the levels that an earlier call finished, with the values of `names` alone; empty if
     none.
     """

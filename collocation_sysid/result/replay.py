@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import InputError
-from ..fem.constants import bare, symbol_of
+from ..fem.constants import symbol_of, without_region
 from ..fem.elements import EDGES
 from ..files import RESULT_FILE, damage_refused, require_own
 from ..recording.clock import TIME_TOLERANCE_S
@@ -194,7 +194,7 @@ class Replay:
         """
         body = experiment.body
         markers = experiment.markers
-        stated_m = markers.observe(body.nodes_m)
+        stated_m = markers.predict_positions(body.nodes_m)
         nodes_m = body.nodes.points_m
         # Frames of obstacles are left out: experiments of a run have one body, but not as many.
         fitted, rolled_out = (
@@ -209,8 +209,8 @@ class Replay:
             body.part_of_cells[body.mesh.surface_cells],
             nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
-            np.asarray(experiment.held(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
-            experiment.up,
+            np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
+            experiment.upward_direction,
             markers.names,
             stated_m if places_m is None else places_m,
             np.where(markers.located[:, None], stated_m, np.nan),
@@ -219,7 +219,7 @@ class Replay:
             *(rolled_out or (None, None)),
             natural_hz,
             wrenches,
-            experiment.static,
+            experiment.is_static,
             _apart([tendon.points_m for tendon in experiment.tendons]),
             readings or {},
             _outlines(experiment),
@@ -332,7 +332,7 @@ def _outlines(experiment: Experiment) -> Array | None:
         low = body.min(axis=0)
         high = body.max(axis=0)
         size_m = LONGER * float((high - low).max())
-        outline = _apart(obstacle.shape.outline((low + high) / 2, size_m))
+        outline = _apart(obstacle.shape.outline_polylines((low + high) / 2, size_m))
         assert outline is not None
         rotations, shifts = obstacle.poses.at(experiment.t_s)
         outlines.append(np.einsum("tij,kj->tki", rotations, outline) + shifts[:, None])
@@ -429,7 +429,9 @@ def headline(result: Result) -> str:
     """Return Young's moduli with their combined standard uncertainties, and the verdict, in one
     line.
     """
-    moduli = {symbol_of(n): each for n, each in result.values.items() if bare(n) == "young_pa"}
+    moduli = {
+        symbol_of(n): each for n, each in result.values.items() if without_region(n) == "young_pa"
+    }
     sentences = []
     for name, each in moduli.items():
         deviation = each.combined_std_error

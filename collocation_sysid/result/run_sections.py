@@ -28,16 +28,16 @@ from ..display import (
     short,
 )
 from ..errors import listed
-from ..fem.constants import symbol_of, unit_of, with_unit
+from ..fem.constants import symbol_of, symbol_with_unit, unit_of
 from ..files import is_own
 from ..pages import explain_command, page_url
 from ..program.depth_comparison import DepthError
-from ..recording.nuisance import in_unit_for_people
-from ..runs.prediction import PredictionError
+from ..recording.nuisance import in_readable_unit
+from ..runs.prediction import PredictionErrors
 from ..runs.result import Elapsed, Result, SimulatedExperiment
-from ..statistics.budget import largest_first, worded
+from ..statistics.budget import main_sources, source_label
 from ..statistics.concern import Concern, topics_of
-from ..statistics.trust import Trust
+from ..statistics.trust import Assessment
 from ..tree import content
 from .probe_sections import DEEPER, FOREMOST, is_deeper_check_worthwhile, probe_lines, probe_section
 from .replay import LARGEST, read_arrays, reading_run
@@ -170,12 +170,12 @@ def _ended(result: Result) -> Section:
     return Section("", tuple(parts))
 
 
-def verdict_of(trust: Trust, linked: bool = False, most: int | None = None) -> Section:
+def verdict_of(trust: Assessment, linked: bool = False, most: int | None = None) -> Section:
     """Return the verdict in one word, with its reasons.
 
     Parameters
     ----------
-    trust : Trust
+    trust : Assessment
     linked : bool
         Whether each reason links to its remedy on the same page.
     most : int, optional
@@ -185,7 +185,7 @@ def verdict_of(trust: Trust, linked: bool = False, most: int | None = None) -> S
     lines = [Line(f"Verdict: {verdict}", f"strong {verdict}")]
     for concern in trust.concerns[:most]:
         cure = Span(" (what to do)", to=f"#cure-{concern.topic}")
-        spans = (Span(f"  {concern.sentence}"), *[cure] * linked)
+        spans = (Span(f"  {concern.message}"), *[cure] * linked)
         lines.append(Line(spans, verdict))
     return Section("", tuple(lines), style=f"verdict {verdict}")
 
@@ -206,7 +206,7 @@ def _parameters(result: Result) -> Section:
     on it.
     """
     values = result.values
-    rows = tuple((with_unit(name), *_cells(result, name)) for name in values)
+    rows = tuple((symbol_with_unit(name), *_cells(result, name)) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
     parts: list[Shown] = [Table("", heads, rows, texts=1, faint=faint, aside=1)]
@@ -215,7 +215,7 @@ def _parameters(result: Result) -> Section:
         parts.append(_covered(result))
     elif any(each.statistical95 for each in values.values()):
         parts.append("combined intervals are missing: systematic effects were not evaluated")
-    if "mesh" in result.covers:
+    if "mesh" in result.discretisation_kinds:
         parts.append(refinement_table(result))
     elif corrected := [
         f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
@@ -243,7 +243,7 @@ def _not_determined(result: Result) -> list[str]:
     for name, shares in result.budget.items():
         if name in result.values and not result.values[name].is_determined:
             source, share = next(iter(shares.items()))
-            sources.append(f"{symbol_of(name)} (mostly {worded(source)}, {share:.0%})")
+            sources.append(f"{symbol_of(name)} (mostly {source_label(source)}, {share:.0%})")
     if not sources:
         return []
     return [f"not determined, as the interval is wider than the value: {listed(sources)}"]
@@ -255,8 +255,8 @@ def _covered(result: Result) -> str:
     """
     moving = any(not each.static for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",)
-    covered = [f"the {kind}" for kind in kinds if kind in result.covers]
-    missing = [f"the {kind}" for kind in kinds if kind not in result.covers]
+    covered = [f"the {kind}" for kind in kinds if kind in result.discretisation_kinds]
+    missing = [f"the {kind}" for kind in kinds if kind not in result.discretisation_kinds]
     parts = listed(["noise", *covered, "systematic effects"])
     sentence = f"± (standard uncertainty) and intervals combine {parts}"
     return sentence + (f", not {listed(missing)}: see refine" if missing else "")
@@ -277,7 +277,9 @@ def _largest_contributions(result: Result) -> list[str]:
     sentences = []
     for name in sorted(systematic, key=lambda name: -systematic[name])[:SHOWN_BUDGETS]:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
-        sources = ", ".join(f"{worded(s)} {share:.0%}" for s, share in shares if share > LITTLE)
+        sources = ", ".join(
+            f"{source_label(s)} {share:.0%}" for s, share in shares if share > LITTLE
+        )
         sentences.append(
             f"largest contributions to the combined uncertainty of {symbol_of(name)}: {sources}"
         )
@@ -287,8 +289,11 @@ def _largest_contributions(result: Result) -> list[str]:
 def budget_table(result: Result) -> Table:
     """Return the table of contributions to the variance of each estimate, in percent."""
     lines = result.budget
-    shown = largest_first(lines, LITTLE)
-    rows = [(worded(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values())) for s in shown]
+    shown = main_sources(lines, LITTLE)
+    rows = [
+        (source_label(s), *(f"{100 * line.get(s, 0):.0f}" for line in lines.values()))
+        for s in shown
+    ]
     return Table("", ("% of the variance", *map(symbol_of, lines)), tuple(rows))
 
 
@@ -297,7 +302,7 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
     each = result.values[name]
     interval = _interval(each.combined95)
     remark = each.reason or ""
-    if each.at_bound:
+    if each.is_at_bound:
         interval = "at its bound"
     elif each.reason:
         interval = "not determined" if each.statistical95 is None else "not identifiable"
@@ -329,7 +334,7 @@ def refinement_table(result: Result) -> Table:
         each = result.values[name]
         rows.append(
             (
-                with_unit(name),
+                symbol_with_unit(name),
                 "" if error.step is None else f"{error.step:+.3g}",
                 "" if error.step_order is None else f"{error.step_order:.1f}",
                 "" if error.mesh is None else f"{error.mesh:+.3g}",
@@ -427,7 +432,7 @@ def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
     if simulated.failed is not None:
         yield f"{kind} '{name}': failed: {simulated.failed}"
         return
-    own = PredictionError(
+    own = PredictionErrors(
         rms_m=simulated.rms_m,
         max_m=simulated.max_m,
         wrench_rms_n=simulated.wrench_rms_n,
@@ -449,7 +454,7 @@ def _simulated(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
         yield f"  no copy as a yardstick: {simulated.not_copied}"
 
 
-def _errors(error: PredictionError, units: Mapping[str, str] | None) -> str:
+def _errors(error: PredictionErrors, units: Mapping[str, str] | None) -> str:
     """Return the errors of a prediction in words; "" if nothing is compared.
 
     `units` are the units of custom sensors by name; None if none states a unit.
@@ -530,9 +535,9 @@ def _cards(result: Result) -> Cards:
 def _cures(concerns: Iterable[Concern]) -> Iterator[Line]:
     """Yield a line for each topic of the concerns: meaning, remedy, and documentation."""
     for name, topic in topics_of(concerns).items():
-        about = Span(f"{topic.about}.", "strong")
+        about = Span(f"{topic.title}.", "strong")
         command = Span(explain_command(topic.page), "code")
-        more = [Span(f" {topic.cure} More: "), command]
+        more = [Span(f" {topic.remedy} More: "), command]
         if (url := page_url(topic.page)) is not None:
             more += [Span(", or "), Span("the documentation", to=url)]
         yield Line((about, *more, Span(".")), name=f"cure-{name}")
@@ -678,7 +683,7 @@ def _provenance(result: Result, run: Path) -> Iterator[Shown]:
 
 def _size(value: float | None, unit: str) -> str:
     """Return a value in a suitable unit, such as millimetres for `unit` "m"; "–" for None."""
-    factor, shown = in_unit_for_people(1.0, unit)
+    factor, shown = in_readable_unit(1.0, unit)
     # No powers of ten for the sizes of bodies.
     digits = 2 if value is None or abs(factor * value) < 99.5 else 4
     return "–" if value is None else f"{number(factor * value, digits)}{shown}"

@@ -1,7 +1,7 @@
 """Points of depth cameras and outlines of the body's surface, as pictures and films need them.
 
 `compared_rows` is for a fitted or simulated surface, `seen_before` for the undeformed body before
-anything is fitted. Both give the rows of `Replay.seen`.
+anything is fitted. Both give the rows of `Replay.fit_summary`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 from ..arrays import Array
 from ..model.nuisance import NuisanceMap
 from ..program.depth_comparison import SurfaceComparison
-from ..program.skin import Skin
-from ..program.view import View
+from ..program.skin import VisibleSurface
+from ..program.view import DepthCameraModel
 from ..recording.experiment import Experiment
 from .pictures.album import of_different_names, save_pictures
 from .pictures.camera import Camera
@@ -35,9 +35,9 @@ class Projection:
 
     Attributes
     ----------
-    view : View
+    view : DepthCameraModel
         Model of the depth camera.
-    skin : Skin
+    skin : VisibleSurface
         Visible surface of the body.
     phi : (k,)
         Nuisance parameters, of which those of the camera correct its pose, bias and scale.
@@ -45,19 +45,21 @@ class Projection:
         Parallel projection for point clouds, which have no image of their own.
     """
 
-    view: View
-    skin: Skin
+    view: DepthCameraModel
+    skin: VisibleSurface
     phi: Array
     scene: Camera
 
     @classmethod
-    def of(cls, view: View, skin: Skin, phi: Array, shape_m: Array, up: Array) -> Projection:
+    def of(
+        cls, view: DepthCameraModel, skin: VisibleSurface, phi: Array, shape_m: Array, up: Array
+    ) -> Projection:
         """Return the projection whose parallel view faces the broad side of the body.
 
         Parameters
         ----------
-        view : View
-        skin : Skin
+        view : DepthCameraModel
+        skin : VisibleSurface
         phi : (k,)
         shape_m : (n, 3)
             Node positions that define the broad side.
@@ -80,7 +82,7 @@ class Projection:
         """
         camera = self.view.depth.camera
         if camera.matrix is not None:
-            return np.column_stack([camera.pixels(own_m), own_m[:, 2]])
+            return np.column_stack([camera.undistorted_pixels(own_m), own_m[:, 2]])
         right_top_mm = 1e3 * self.scene.project(world_m)
         return np.column_stack([right_top_mm * [1, -1], -self.scene.nearness(world_m)])
 
@@ -99,9 +101,9 @@ class Projection:
         if eye_m is None:
             size_m = float(np.linalg.norm(np.ptp(shape_m, axis=0)))
             eye_m = shape_m.mean(axis=0) + AWAY * size_m * self.scene.axes[2]
-        corners = shape_m[self.skin.flat[self.skin.facing(shape_m, eye_m)]]
+        corners = shape_m[self.skin.flat_triangles[self.skin.is_facing(shape_m, eye_m)]]
         closed = corners[:, [0, 1, 2, 0]].reshape(-1, 3)
-        own_m = self.view.own_m(self.phi, closed, sample)
+        own_m = self.view.to_camera_m(self.phi, closed, sample)
         if self.view.depth.camera.matrix is not None:
             is_in_front = np.repeat((own_m[:, 2].reshape(-1, 4) > 0).all(axis=1), 4)
             closed = closed[is_in_front]
@@ -110,7 +112,7 @@ class Projection:
         return np.pad(image, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
 
     def rows(self, sample: int, points_m: Array, rays: Array, apart_m: Array) -> Array:
-        """Return rows (P, 8) of `Replay.seen` for the points of one sample.
+        """Return rows (P, 8) of `Replay.fit_summary` for the points of one sample.
 
         Parameters
         ----------
@@ -121,18 +123,18 @@ class Projection:
         apart_m : (P,)
             Distance behind the surface; NaN for points that do not count.
         """
-        world = self.view.corrected_at(self.phi, points_m, rays, sample)
-        t_s = np.full(len(points_m), self.view.depth.times[sample])
+        world = self.view.to_world(self.phi, points_m, rays, sample)
+        t_s = np.full(len(points_m), self.view.depth.sample_times_s[sample])
         return np.column_stack([t_s, self.points(points_m, world), apart_m, world])
 
     def outline_rows(self, sample: int, shape_m: Array) -> Array:
-        """Return rows (k, 8) of `Replay.seen` with the outlines of a shape (n, 3).
+        """Return rows (k, 8) of `Replay.fit_summary` with the outlines of a shape (n, 3).
 
         The last row has the time alone, so that the sample is known also if no face is in view.
         """
         drawn = np.vstack([self.outlines(shape_m, sample), np.full((1, 2), np.nan)])
         rows = np.full((len(drawn), 8), np.nan)
-        rows[:, 0] = self.view.depth.times[sample]
+        rows[:, 0] = self.view.depth.sample_times_s[sample]
         rows[:, 1:3] = drawn
         return rows
 
@@ -149,17 +151,17 @@ def compared_rows(surface: SurfaceComparison, up: Array) -> Array:
     Returns
     -------
     (k, 8) array
-        Rows of `Replay.seen`, with outlines for at most `OUTLINED` samples.
+        Rows of `Replay.fit_summary`, with outlines for at most `OUTLINED` samples.
     """
-    correspondences = surface.sighting
+    correspondences = surface.correspondences
     shapes_m = surface.shapes_m
     phi = surface.phi
-    shown = Projection.of(correspondences.view, correspondences.skin, phi, shapes_m[0], up)
-    samples = np.flatnonzero(correspondences.used[: len(shapes_m)].any(axis=1)).tolist()
+    shown = Projection.of(correspondences.camera, correspondences.surface, phi, shapes_m[0], up)
+    samples = np.flatnonzero(correspondences.is_compared[: len(shapes_m)].any(axis=1)).tolist()
     rows = [np.zeros((0, 8))]
     for k in samples:
         within = correspondences.weights[k].any(axis=1)
-        sights = correspondences.points[k], correspondences.rays[k], surface.apart_m[k]
+        sights = correspondences.points[k], correspondences.rays[k], surface.signed_distances_m[k]
         rows.append(shown.rows(k, *(each[within] for each in sights)))
     few = np.unique(np.linspace(0, len(samples) - 1, OUTLINED).round().astype(int))
     rows += [shown.outline_rows(samples[k], shapes_m[samples[k]]) for k in few if samples]
@@ -170,22 +172,30 @@ def seen_before(experiment: Experiment) -> dict[str, Array]:
     """Return the first image of each depth camera with the undeformed body, before anything is
     fitted.
 
-    The arrays (k, 8) have the rows of `Replay.seen`, by name of the camera; the body is where the
+    The arrays (k, 8) have the rows of `Replay.fit_summary`, by name of the camera; the body is
+    where the
     grasps
     carry it rigidly, and distances from it are NaN.
     """
-    nuisance = NuisanceMap.of(experiment)
+    nuisance = NuisanceMap.from_experiment(experiment)
     by_camera = {}
     for number, depth in enumerate(experiment.depths):
-        view = View.of(experiment, number, nuisance)
-        skin = Skin.of(experiment.body, depth)
-        shape_m = skin.first_m(experiment, depth)
-        shown = Projection.of(view, skin, np.zeros(nuisance.size), shape_m, experiment.up)
-        points_m = depth.points_m[depth.first]
-        rows = shown.rows(
-            depth.first, points_m, view.rays[depth.first], np.full(len(points_m), np.nan)
+        view = DepthCameraModel.from_experiment(experiment, number, nuisance)
+        skin = VisibleSurface.from_body(experiment.body, depth)
+        shape_m = skin.initial_positions_m(experiment, depth)
+        shown = Projection.of(
+            view, skin, np.zeros(nuisance.size), shape_m, experiment.upward_direction
         )
-        by_camera[depth.name] = np.vstack([rows, shown.outline_rows(depth.first, shape_m)])
+        points_m = depth.points_m[depth.first_sample_with_points]
+        rows = shown.rows(
+            depth.first_sample_with_points,
+            points_m,
+            view.rays[depth.first_sample_with_points],
+            np.full(len(points_m), np.nan),
+        )
+        by_camera[depth.name] = np.vstack(
+            [rows, shown.outline_rows(depth.first_sample_with_points, shape_m)]
+        )
     return by_camera
 
 

@@ -17,7 +17,13 @@ from ..errors import InputError, require_among
 from ..files import whole_file
 from ..model.schemes import SCHEMES
 from ..problem import Problem
-from ..problem.bench_files import BenchTable, add_wrench, bench_tables, is_bench, table_name
+from ..problem.bench_files import (
+    BenchTable,
+    add_wrench,
+    bench_tables,
+    has_displacement_table,
+    table_name,
+)
 from ..problem.reading import parse_toml
 from ..problem.recording_schema import ExperimentSection, WrenchSection
 from ..problem.schema import ProblemFile
@@ -223,11 +229,11 @@ def _write_tables(
     for sensor, wrench, layout in zip(
         experiment.wrenches, trajectory.wrenches, layouts, strict=True
     ):
-        measured = np.where(sensor.measured, wrench, np.nan)
+        measured = np.where(sensor.measured_components, wrench, np.nan)
         # The load cell's noise: that of the modelled part is as much smaller as its load.
         sigmas = np.repeat([recipe.noise_n, recipe.noise_nm], 3) / layout.symmetry
         wrenches.append(measured + sigmas * rng.normal(size=wrench.shape))
-    if section is not None and is_bench(section):
+    if section is not None and has_displacement_table(section):
         for name, table in bench_tables(section, experiment, wrenches).items():
             write_columns_csv(files[name], table.columns)
     else:
@@ -235,21 +241,21 @@ def _write_tables(
             table = BenchTable(sensor.t_s)
             add_wrench(table, layout, sensor.t_s, wrenches[k])
             write_columns_csv(files[_numbered("wrench", k)], table.columns)
-    for gauge, read in zip(experiment.readings, trajectory.readings, strict=True):
+    for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
         noise = recipe.noise_own * gauge.sigma * rng.normal(size=read.shape)
         key = f"reading_{gauge.name}"
-        write_gauge_csv(files[key], gauge.times, gauge.columns, read + noise)
+        write_gauge_csv(files[key], gauge.sample_times_s, gauge.columns, read + noise)
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[WrenchSection]:
     """Return the table layout of each force sensor in order; empty without a problem file."""
-    moved = section.moved if section is not None else []
+    moved = section.moved_sections if section is not None else []
     return [each.wrench for each in moved if each.wrench is not None]
 
 
 def _refuse_unguessed(problem: Problem) -> None:
     """Raise an InputError if a parameter has no guess."""
-    if names := problem.parameters.unguessed:
+    if names := problem.parameters.names_without_guess:
         key = f"parameters.{names[0]}"
         raise InputError(
             f"has no guess, and a simulation needs a value; expected --set {key}.guess=VALUE",
@@ -313,12 +319,14 @@ def _table_names(experiment: Experiment, section: ExperimentSection | None) -> d
     """
     keys = [_MARKERS] * bool(experiment.markers.names)
     for k in range(len(experiment.grasps)):
-        moved = section and section.moved[k]
+        moved = section and section.moved_sections[k]
         if moved is None or moved.poses is not None or moved.markers is not None:
             keys.append(_numbered("poses", k))
     bench: list[str] = []
-    if section is not None and is_bench(section):
-        tables = [t for each in section.moved for t in (each.displacement, each.wrench) if t]
+    if section is not None and has_displacement_table(section):
+        tables = [
+            t for each in section.moved_sections for t in (each.displacement, each.wrench) if t
+        ]
         bench = [table_name(section, table) for table in tables]
     else:
         keys += [_numbered("wrench", k) for k in range(len(experiment.wrenches))]

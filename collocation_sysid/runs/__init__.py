@@ -7,6 +7,6 @@ and `warm_start` for a start from an earlier run.
 measurements.
 - `verdict`: concerns about a solution.
 - `refine`: solve at finer discretisations, for the numerical error.
-- `answer`: the solved problem with all of this; `told` converts it to `result`, the content of
+- `answer`: the solved problem with all of this; `report` converts it to `result`, the content of
 ``result.json``.
 """

@@ -11,39 +11,39 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, hint_at
-from ..fem.constants import is_mode, unit_of
+from ..fem.constants import is_field_coefficient, unit_of
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 from ..problem import Problem
-from ..statistics.budget import BudgetLine, Sources, budget
+from ..statistics.budget import BudgetLine, VarianceSources, budget
 from ..statistics.combined import combine
 from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
 from ..statistics.estimates import Estimate
-from ..statistics.fields import FieldEstimate, fields_of
+from ..statistics.fields import FieldEstimate, field_estimates
 from ..statistics.hypothesis import Hypothesis
-from ..statistics.identifiability import verdicts
-from ..statistics.linearised import Derived
-from ..statistics.numerical import NumericalError, Refinement
+from ..statistics.identifiability import identifiability_sentences
+from ..statistics.linearised import DerivedModuli
+from ..statistics.numerical import DiscretisationError, Refinement
 from ..statistics.profile import Profile
 from ..statistics.relaxation import Probe
-from ..statistics.trust import Trust, cause_concerns, numerical_concerns, probe_concerns
-from ..statistics.uncertainty import Place, Uncertainty, places_of
-from .check.motion import Motion
-from .forward_simulation import Rollout
+from ..statistics.trust import Assessment, cause_concerns, numerical_concerns, probe_concerns
+from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
+from .check.motion import ModesCheck
+from .forward_simulation import ForwardSimulation
 from .result import Elapsed, ReportedEstimate
-from .verdict import combined_concerns, concerns, expected_rms_m, motions_of
+from .verdict import combined_concerns, expected_rms_m, modes_by_experiment, solution_concerns
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class SolvedProblem:
     """A solved problem with its checks.
 
     Attributes
     ----------
     problem : Problem
     solution : Solution
-    rollouts : mapping of experiment name to Rollout or str
+    rollouts : mapping of experiment name to ForwardSimulation or str
         Forward simulations, or the reason why there is none.
     uncertainty : Uncertainty or None
         None if the solve did not converge.
@@ -58,9 +58,9 @@ class Answer:
     refinement : Refinement or None
         Discretisation errors: from solves at finer discretisations if requested, else the
         first-order effect of the step from finer forward simulations; None where these are missing.
-    missing : str
+    omitted_checks : str
         Checks that were left out after Ctrl-C; empty if all were done.
-    sources : Sources or None
+    systematic_effects : VarianceSources or None
         Systematic effects on the estimates; None without error bars.
     probes : tuple of Probe
         Refits with an assumption relaxed: the two of every solve, see `routine_probes`; or all, and
@@ -71,22 +71,22 @@ class Answer:
 
     problem: Problem
     solution: Solution
-    rollouts: Mapping[str, Rollout | str]
+    rollouts: Mapping[str, ForwardSimulation | str]
     uncertainty: Uncertainty | None
     diagnoses: tuple[MarkerDiagnosis, ...] = ()
     profiles: tuple[Profile, ...] = ()
     notes: tuple[str, ...] = ()
     causes: tuple[Hypothesis, ...] = ()
     refinement: Refinement | None = None
-    missing: str = ""
-    sources: Sources | None = None
+    omitted_checks: str = ""
+    systematic_effects: VarianceSources | None = None
     probes: tuple[Probe, ...] = ()
     elapsed_s: Elapsed = field(default_factory=Elapsed)
 
     def __repr__(self) -> str:
         solution = self.solution
         free = [item.name for item in self.problem.parameters.free]
-        values = ", ".join(f"{name} = {_with_error(self.estimates[name])}" for name in free)
+        values = ", ".join(f"{name} = {_estimate_text(self.estimates[name])}" for name in free)
         rms = f"{1e3 * solution.rms_m:.3g} mm RMS"
         summary = f"{solution.method}, {solution.status.value}, {self.trust.verdict}"
         return f"Run({summary}: {values}; {rms})"
@@ -97,27 +97,27 @@ class Answer:
         return {name: self.estimates[name].value for name in self.solution.parameters}
 
     @property
-    def started_from(self) -> Parameters:
+    def start_parameters(self) -> Parameters:
         """The parameters with the guesses that the search started from."""
         return self.solution.collocation.parameters
 
     @cached_property
     def derived(self) -> dict[str, float]:
         """Moduli that follow from the parameters at the optimum, by name."""
-        constants = (segment.constants for segment in self.solution.collocation.segments)
-        return dict(Derived.of(constants, self.solution.q).values)
+        constants = (segment.constants for segment in self.solution.collocation.transcriptions)
+        return dict(DerivedModuli.from_bodies(constants, self.solution.q).values)
 
     @cached_property
     def estimates(self) -> dict[str, ReportedEstimate]:
         """Parameters and derived moduli with their combined and statistical intervals, by name."""
-        return {name: self._reported(name, each) for name, each in self.optimum.items()}
+        return {name: self._report_estimate(name, each) for name, each in self.optimum.items()}
 
-    def _reported(self, name: str, optimum: Estimate) -> ReportedEstimate:
+    def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
         """Correct an estimate at the optimum and combine its uncertainties."""
-        item = next((each for each in self.started_from.items if each.name == name), None)
+        item = next((each for each in self.start_parameters.items if each.name == name), None)
         line = self.budget.get(name)
-        error = None if is_mode(name) else self.discretisation_errors.get(name)
-        linear, bounds = self.started_from.scale_and_bounds(name)
+        error = None if is_field_coefficient(name) else self.discretisation_errors.get(name)
+        linear, bounds = self.start_parameters.scale_and_bounds(name)
         systematic = None if line is None else line.systematic
         known_effect = 0.0 if line is None else line.known_effect
         combined = combine(
@@ -133,26 +133,31 @@ class Answer:
         tied = item is not None and item.tied is not None
         return ReportedEstimate(
             **vars(combined),
-            at_bound=optimum.at_bound,
+            is_at_bound=optimum.is_at_bound,
             reason=optimum.reason,
             optimum=optimum.value,
             systematic=systematic,
             known_effect=known_effect or None,
             numerical_error=error,
             guess=np.nan if item is not None and guess is None else guess,
-            fixed=None if item is None else item.fixed or tied,
+            fixed=None if item is None else item.is_fixed or tied,
             tied=tied or None,
         )
 
     @cached_property
     def budget(self) -> dict[str, BudgetLine]:
         """The uncertainty budget of each estimate, by name; empty without error bars."""
-        if self.uncertainty is None or self.sources is None:
+        if self.uncertainty is None or self.systematic_effects is None:
             return {}
-        return budget(self.sources, self.uncertainty, self.discretisation_errors, self.started_from)
+        return budget(
+            self.systematic_effects,
+            self.uncertainty,
+            self.discretisation_errors,
+            self.start_parameters,
+        )
 
     @property
-    def discretisation_errors(self) -> Mapping[str, NumericalError]:
+    def discretisation_errors(self) -> Mapping[str, DiscretisationError]:
         """Known discretisation errors, by name of the estimate; empty without `refinement`."""
         return {} if self.refinement is None else self.refinement.errors
 
@@ -165,54 +170,62 @@ class Answer:
         return {name: known.get(name, Estimate(value)) for name, value in values.items()}
 
     @cached_property
-    def places(self) -> dict[str, dict[str, Place]]:
+    def places(self) -> dict[str, dict[str, MarkerPlace]]:
         """Estimated places of the markers on the undeformed body, by fitted experiment and by
         marker.
         """
         named = ((part.segment.experiment.name, part) for part in self.solution.parts)
-        return {name: places_of(part, self.uncertainty) for name, part in named}
+        return {name: marker_places(part, self.uncertainty) for name, part in named}
 
     @cached_property
-    def trust(self) -> Trust:
+    def trust(self) -> Assessment:
         """Verdict (good, check or doubtful) with its concerns."""
-        of_fit = concerns(
-            self.solution, self.rollouts, self.motions.values(), self.uncertainty, self.diagnoses
+        of_fit = solution_concerns(
+            self.solution,
+            self.rollouts,
+            self.modes_by_experiment.values(),
+            self.uncertainty,
+            self.diagnoses,
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, self.refinement)
         shares = {name: line.shares for name, line in self.budget.items()}
-        vague = combined_concerns(self.started_from, self.estimates, shares)
+        vague = combined_concerns(self.start_parameters, self.estimates, shares)
         of_fields = [concern for field in self.fields.values() for concern in field.concerns]
-        if not self.missing:
+        if not self.omitted_checks:
             probed = probe_concerns(self.probes, self._discretisation_corrections)
             causes = cause_concerns(self.causes)
-            return Trust.of((*causes, *of_fit, *of_fields, *probed, *numerical, *vague))
-        interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.missing})
-        return Trust.of((interrupted, *(of_fit if self.uncertainty is not None else ())))
+            return Assessment.from_concerns(
+                (*causes, *of_fit, *of_fields, *probed, *numerical, *vague)
+            )
+        interrupted = Concern("solve/interrupted", "doubtful", {"left_out": self.omitted_checks})
+        return Assessment.from_concerns(
+            (interrupted, *(of_fit if self.uncertainty is not None else ()))
+        )
 
     @property
     def _discretisation_corrections(self) -> dict[str, float]:
         """Factors from optimum to reported value of the estimated parameters, without fields."""
         return {
             item.name: each.value / each.optimum if each.optimum else 1.0
-            for item in self.started_from.free
-            if not is_mode(item.name) and (each := self.estimates[item.name])
+            for item in self.start_parameters.free
+            if not is_field_coefficient(item.name) and (each := self.estimates[item.name])
         }
 
     @cached_property
-    def motions(self) -> dict[str, Motion]:
+    def modes_by_experiment(self) -> dict[str, ModesCheck]:
         """Natural modes of the body at the estimates, by experiment; only motions, empty if not
         converged.
         """
-        return motions_of(self.problem, self.solution)
+        return modes_by_experiment(self.problem, self.solution)
 
     @cached_property
     def fields(self) -> dict[str, FieldEstimate]:
         """Estimated fields (spatially varying constants), by name."""
         collocation = self.solution.collocation
         q = self.solution.q
-        bodies = dict.fromkeys(segment.body for segment in collocation.segments)
-        known = (fields_of(b, collocation.parameters, q, self.uncertainty) for b in bodies)
+        bodies = dict.fromkeys(segment.body for segment in collocation.transcriptions)
+        known = (field_estimates(b, collocation.parameters, q, self.uncertainty) for b in bodies)
         return {field.name: field for each in known for field in each}
 
     @property
@@ -306,8 +319,8 @@ class Answer:
         """Notes on the solve and its uncertainty, and statements on what the data determine."""
         if self.uncertainty is None:
             return self.notes
-        notes = (*self.notes, *self.uncertainty.notes, *verdicts(self.uncertainty))
-        return (*dict.fromkeys(notes), *(profile.sentence for profile in self.profiles))
+        notes = (*self.notes, *self.uncertainty.notes, *identifiability_sentences(self.uncertainty))
+        return (*dict.fromkeys(notes), *(profile.message for profile in self.profiles))
 
 
 def _or_nan(value: float | None) -> float:
@@ -315,7 +328,7 @@ def _or_nan(value: float | None) -> float:
     return np.nan if value is None else value
 
 
-def _with_error(estimate: ReportedEstimate) -> str:
+def _estimate_text(estimate: ReportedEstimate) -> str:
     """Return value, standard uncertainty and combined interval as text."""
     error = "" if estimate.combined_std_error is None else f" ± {estimate.combined_std_error:.2g}"
     interval = (

@@ -9,40 +9,40 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, SimulationError
-from ..fem.kernels import side_by_side
-from ..methods.complementarity import with_energy
+from ..fem.kernels import map_experiments
+from ..methods.complementarity import with_contact_energy
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
-from ..program.channel import Forced, Motion
-from ..program.collocation import Part
+from ..program.channel import ObservedMotion, ReactionForces
+from ..program.collocation import ExperimentIterate
 from ..program.depth_comparison import DepthError, SurfaceComparison
-from ..program.gauge import gauge_readings
-from ..program.segment import Segment
+from ..program.gauge import custom_sensor_residuals
+from ..program.segment import Transcription
 from ..program.simulation import Trajectory, simulate
-from ..program.wrench_channel import Grid
+from ..program.wrench_channel import ReactionGrid
 from ..recording import Experiment
 from ..statistics.estimates import Estimate
-from ..statistics.linearised import LinearisedFit, values_of
-from ..statistics.numerical import Refinement, changes_towards, numerical_errors
+from ..statistics.linearised import LinearisedFit, parameter_values
+from ..statistics.numerical import Refinement, change_towards_observations, discretisation_errors
 from .prediction import (
     CopyError,
-    Misfit,
-    Predicted,
-    PredictionError,
-    blind_phi,
-    copy_error,
-    misfits,
+    InstrumentMisfit,
+    InstrumentPrediction,
+    PredictionErrors,
+    instrument_misfits,
+    nearest_recording_error,
+    nuisance_of_fitted_recordings,
     prediction_error,
 )
 
 # Least ratio of grid step and simulation step for an estimate of the step's error: half, rounded.
-LEAST_FINER = 1.99
+LEAST_STEP_RATIO = 1.99
 
 
 @dataclass(frozen=True, eq=False)
-class Rollout:
+class ForwardSimulation:
     """A forward simulation with the estimated parameters, compared with the measurements.
 
     Attributes
@@ -64,14 +64,14 @@ class Rollout:
         Predicted values of custom sensors.
     reading_rms : mapping of name to float
         RMS difference of each custom sensor.
-    surfaces : mapping of the name of a depth camera to SurfaceComparison
+    depth_surfaces : mapping of the name of a depth camera to SurfaceComparison
         Its points against the simulated surface.
-    misfits : tuple of Misfit
+    misfits : tuple of InstrumentMisfit
         Differences of each instrument over its stated σ.
-    blind : PredictionError or None
+    blind_error : PredictionErrors or None
         Of an experiment for validation: the error with the nuisance parameters of the fitted
         recordings in place of its own; None where that cannot be simulated.
-    copied : CopyError or str
+    copy_error : CopyError or str
         Of an experiment for validation: the error of a fitted recording's measurements, or why
         there is none. Empty for fitted experiments.
     """
@@ -85,35 +85,43 @@ class Rollout:
     wrench_rms: tuple[float | None, float | None] = (None, None)
     readings: Mapping[str, Array] = field(default_factory=dict)
     reading_rms: Mapping[str, float] = field(default_factory=dict)
-    surfaces: Mapping[str, SurfaceComparison] = field(default_factory=dict)
-    misfits: tuple[Misfit, ...] = ()
-    blind: PredictionError | None = None
-    copied: CopyError | str = ""
+    depth_surfaces: Mapping[str, SurfaceComparison] = field(default_factory=dict)
+    misfits: tuple[InstrumentMisfit, ...] = ()
+    blind_error: PredictionErrors | None = None
+    copy_error: CopyError | str = ""
 
     @property
     def depth(self) -> dict[str, DepthError]:
         """Distances of depth cameras' points from the simulated surface, by camera."""
-        return {name: surface.error for name, surface in self.surfaces.items()}
+        return {name: surface.error for name, surface in self.depth_surfaces.items()}
 
 
-def roll_outs(problem: Problem, solution: Solution) -> dict[str, Rollout | str]:
-    """Simulate all experiments in parallel threads; results by experiment name, see `roll_out`."""
+def simulate_experiments(
+    problem: Problem, solution: Solution
+) -> dict[str, ForwardSimulation | str]:
+    """Simulate all experiments in parallel threads; results by experiment name, see
+    `simulate_experiment`.
+    """
     threads = solution.collocation.threads
-    rollouts = side_by_side(lambda e: roll_out(problem, e, solution), problem.experiments, threads)
+    rollouts = map_experiments(
+        lambda e: simulate_experiment(problem, e, solution), problem.experiments, threads
+    )
     return {e.name: each for e, each in zip(problem.experiments, rollouts, strict=True)}
 
 
-def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Rollout | str:
+def simulate_experiment(
+    problem: Problem, experiment: Experiment, solution: Solution
+) -> ForwardSimulation | str:
     """Simulate an experiment with a solution's parameters; return the reason if that fails."""
     try:
-        segment, phi = _seen(experiment, solution)
-        trajectory = _simulated(problem, segment, phi, solution)
+        segment, phi = _transcription_and_nuisance(experiment, solution)
+        trajectory = _simulate(problem, segment, phi, solution)
     except (InputError, SimulationError) as error:
         # A density that leaves a node without mass is input of who simulates, but found here.
         return str(error)
-    predicted, surfaces = _predicted(segment, trajectory, phi)
+    predicted, surfaces = _predict_instruments(segment, trajectory, phi)
     error = prediction_error(experiment, predicted)
-    rollout = Rollout(
+    rollout = ForwardSimulation(
         rms_m=error.rms_m or 0.0,
         max_m=error.max_m or 0.0,
         trajectory=replace(trajectory, markers_m=predicted.markers_m),
@@ -123,24 +131,26 @@ def roll_out(problem: Problem, experiment: Experiment, solution: Solution) -> Ro
         wrench_rms=(error.wrench_rms_n, error.wrench_rms_nm),
         readings=predicted.readings,
         reading_rms=error.reading_rms or {},
-        surfaces=surfaces,
-        misfits=tuple(misfits(experiment, predicted)),
+        depth_surfaces=surfaces,
+        misfits=tuple(instrument_misfits(experiment, predicted)),
     )
     if not experiment.validation:
         return rollout
     nuisance = segment.nuisance
-    places_m = segment.places_m(phi).tolist()
+    places_m = segment.marker_places_m(phi).tolist()
     fitted = [part.segment.experiment for part in solution.parts]
     return replace(
         rollout,
         nuisance=dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)),
         places_m=dict(zip(experiment.markers.names, places_m, strict=True)),
-        blind=_blind(problem, segment, solution),
-        copied=copy_error(experiment, fitted),
+        blind_error=_blind_error(problem, segment, solution),
+        copy_error=nearest_recording_error(experiment, fitted),
     )
 
 
-def _simulated(problem: Problem, segment: Segment, phi: Array, solution: Solution) -> Trajectory:
+def _simulate(
+    problem: Problem, segment: Transcription, phi: Array, solution: Solution
+) -> Trajectory:
     """Simulate a recording with its nuisance parameters φ (k,) and a solution's parameters.
 
     Raises
@@ -150,62 +160,70 @@ def _simulated(problem: Problem, segment: Segment, phi: Array, solution: Solutio
     """
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
     return simulate(
-        with_energy(segment.corrected(phi)),
-        segment.body.theta(solution.parameters),
+        with_contact_energy(segment.corrected_experiment(phi)),
+        segment.body.theta_from_values(solution.parameters),
         integrator,
         timestep_s=_step_s(problem, segment),
         substeps=segment.substeps,
     )
 
 
-def _predicted(
-    segment: Segment, trajectory: Trajectory, phi: Array
-) -> tuple[Predicted, dict[str, SurfaceComparison]]:
+def _predict_instruments(
+    segment: Transcription, trajectory: Trajectory, phi: Array
+) -> tuple[InstrumentPrediction, dict[str, SurfaceComparison]]:
     """Return the predictions of a recording's instruments for a simulated motion.
 
     Parameters
     ----------
-    segment : Segment
+    segment : Transcription
     trajectory : Trajectory
     phi : (k,) array
         Nuisance parameters of the recording.
 
     Returns
     -------
-    predicted : Predicted
+    predicted : InstrumentPrediction
     surfaces : mapping of the name of a depth camera to SurfaceComparison
     """
     grid, forced = trajectory.reactions
     positions_m = trajectory.positions_m
     x = positions_m.reshape(len(positions_m), -1)
-    gauged = zip(segment.gauges, _gauged(segment, x, trajectory.reactions, phi), strict=True)
+    gauged = zip(
+        segment.custom_sensors, _predict_sensors(segment, x, trajectory.reactions, phi), strict=True
+    )
     surfaces = {
-        reading.sighting.view.depth.name: SurfaceComparison.from_motion(
+        reading.correspondences.camera.depth.name: SurfaceComparison.from_motion(
             reading, trajectory.t_s, positions_m, phi
         )
         for reading in segment.depths
     }
-    predicted = Predicted(
-        markers_m=segment.markers.of_samples(positions_m, phi),
-        wrenches=[sensor.on(grid).of_forced(forced, phi) for sensor in segment.sensors],
-        readings={gauge.gauge.name: gauge.said(each) for gauge, each in gauged},
+    predicted = InstrumentPrediction(
+        markers_m=segment.markers.predict_samples(positions_m, phi),
+        wrenches=[
+            sensor.on_grid(grid).predict_reactions(forced, phi) for sensor in segment.sensors
+        ],
+        readings={gauge.sensor.name: gauge.without_padding(each) for gauge, each in gauged},
         depth={name: surface.error for name, surface in surfaces.items()},
     )
     return predicted, surfaces
 
 
-def _blind(problem: Problem, segment: Segment, solution: Solution) -> PredictionError | None:
+def _blind_error(
+    problem: Problem, segment: Transcription, solution: Solution
+) -> PredictionErrors | None:
     """Predict a recording with the nuisance parameters of the fitted ones; None if that fails."""
-    phi = blind_phi(segment, solution)
+    phi = nuisance_of_fitted_recordings(segment, solution)
     try:
-        trajectory = _simulated(problem, segment, phi, solution)
+        trajectory = _simulate(problem, segment, phi, solution)
     except (InputError, SimulationError):
         return None
-    predicted, _ = _predicted(segment, trajectory, phi)
+    predicted, _ = _predict_instruments(segment, trajectory, phi)
     return prediction_error(segment.experiment, predicted)
 
 
-def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
+def _transcription_and_nuisance(
+    experiment: Experiment, solution: Solution
+) -> tuple[Transcription, Array]:
     """Return an experiment's transcription and its nuisance parameters φ (k,).
 
     For a fitted experiment φ is the estimate; for validation it is fitted at the estimated
@@ -218,22 +236,22 @@ def _seen(experiment: Experiment, solution: Solution) -> tuple[Segment, Array]:
     alone = replace(
         solution.collocation,
         experiments=[replace(experiment, validation=False)],
-        parameters=solution.collocation.parameters.fixed_at(
+        parameters=solution.collocation.parameters.only_fixed(
             {name: values[name] for name in body.used_names(list(values))}
         ),
     )
-    (segment,) = alone.segments
+    (segment,) = alone.transcriptions
     # All that is left to estimate is φ.
     if not alone.nphi:
         return segment, np.zeros(0)
-    return segment, alone.parameters_of(ReducedSpace()(alone).unless_interrupted().z)
+    return segment, alone.parameters_from(ReducedSpace()(alone).unless_interrupted().z)
 
 
 def step_error(
     problem: Problem,
     solution: Solution,
     fit: LinearisedFit,
-    rollouts: Mapping[str, Rollout | str],
+    rollouts: Mapping[str, ForwardSimulation | str],
     estimates: Mapping[str, Estimate],
 ) -> Refinement | None:
     """Return the effect of the time step on every parameter and modulus, to first order.
@@ -246,7 +264,7 @@ def step_error(
     solution : Solution
     fit : LinearisedFit
         The measurements linearised at the solution.
-    rollouts : mapping of experiment name to Rollout or str
+    rollouts : mapping of experiment name to ForwardSimulation or str
     estimates : mapping of name to Estimate
 
     Returns
@@ -258,15 +276,15 @@ def step_error(
     """
     differences: list[Array] = []
     collocation = solution.collocation
-    moving = [s.experiment for s in collocation.segments if not s.experiment.static]
+    moving = [s.experiment for s in collocation.transcriptions if not s.experiment.is_static]
     if not moving or any(experiment.obstacles for experiment in moving):
         return None
     for part, readings in zip(solution.parts, solution.readings_m, strict=True):
         segment = part.segment
         experiment = part.segment.experiment
         rollout = rollouts.get(experiment.name)
-        share = _share(problem, segment)
-        if not isinstance(rollout, Rollout) or share is None:
+        share = _step_error_share(problem, segment)
+        if not isinstance(rollout, ForwardSimulation) or share is None:
             return None
         way = share * (rollout.trajectory.markers_m - readings)
         differences.append(np.nan_to_num(way / experiment.markers.sigma_m[:, None]))
@@ -274,73 +292,90 @@ def step_error(
         for sensor, read, rolled in zip(segment.sensors, fitted, rollout.wrenches, strict=True):
             way = share * np.nan_to_num((rolled - read) / sensor.wrench.sigmas)
             differences.append(way.reshape(-1, 2, 3))
-        differences += _of_gauges(part, rollout.trajectory, share)
-        differences += _of_depths(part, rollout.trajectory, share)
-    change = changes_towards(fit, differences)[: collocation.nq]
+        differences += _sensor_differences(part, rollout.trajectory, share)
+        differences += _depth_differences(part, rollout.trajectory, share)
+    change = change_towards_observations(fit, differences)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
-    linear = problem.parameters.linear
+    linear = problem.parameters.linear_names
     order = as_scheme(problem.scheme).order
-    return Refinement(numerical_errors(estimates, [values_of(collocation, q)], [], order, linear))
+    return Refinement(
+        discretisation_errors(estimates, [parameter_values(collocation, q)], [], order, linear)
+    )
 
 
-def _of_gauges(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
+def _sensor_differences(
+    part: ExperimentIterate, trajectory: Trajectory, share: float
+) -> list[Array]:
     """Return a share of the difference between simulated and fitted custom sensors, over σ.
 
     Of each sensor (S, G, 3).
     """
-    if not (segment := part.segment).gauges:
+    if not (segment := part.segment).custom_sensors:
         return []
-    fitted = part.x[segment.markers.grid_rows], (Grid.of(segment.dynamics), part.motion.forced)
+    fitted = (
+        part.x[segment.markers.sample_rows],
+        (ReactionGrid.from_dynamics(segment.dynamics), part.motion.reactions),
+    )
     rolled = trajectory.positions_m.reshape(len(fitted[0]), -1), trajectory.reactions
-    here, there = (_gauged(segment, *each, part.phi) for each in (fitted, rolled))
+    here, there = (_predict_sensors(segment, *each, part.phi) for each in (fitted, rolled))
     return [
         share * np.nan_to_num(simulated_values - fitted_values) / gauge.sigmas[:, None]
-        for gauge, fitted_values, simulated_values in zip(segment.gauges, here, there, strict=True)
+        for gauge, fitted_values, simulated_values in zip(
+            segment.custom_sensors, here, there, strict=True
+        )
     ]
 
 
-def _of_depths(part: Part, trajectory: Trajectory, share: float) -> list[Array]:
+def _depth_differences(
+    part: ExperimentIterate, trajectory: Trajectory, share: float
+) -> list[Array]:
     """Return a share of the difference between simulated and fitted depth residuals.
 
     Of each camera (S, M, 3), at the correspondences of the fit.
     """
-    if not (sights := part.surface_sights):
+    if not (sights := part.surface_residuals):
         return []
     known_s = part.segment.experiment.t_s
     rows_s = part.segment.dynamics.t_s
-    fitted = part.x[part.segment.markers.grid_rows]
+    fitted = part.x[part.segment.markers.sample_rows]
     way_m = share * (trajectory.positions_m.reshape(len(fitted), -1) - fitted)
     way_rows_m = np.array([np.interp(rows_s, known_s, each) for each in way_m.T])
     displacements_m = way_rows_m.T.reshape(len(rows_s), -1, 3, 1)
     return [
-        reading.changes(looked, displacements_m[:, reading.sighting.skin.nodes], part.phi)[..., 0]
+        reading.residual_changes(
+            looked, displacements_m[:, reading.correspondences.surface.nodes], part.phi
+        )[..., 0]
         for reading, looked in sights
     ]
 
 
-def _gauged(segment: Segment, x: Array, reactions: tuple[Grid, Forced], phi: Array) -> list[Array]:
+def _predict_sensors(
+    segment: Transcription, x: Array, reactions: tuple[ReactionGrid, ReactionForces], phi: Array
+) -> list[Array]:
     """Return the predictions (S, G, 3) of custom sensors for positions x (T, 3n) at the samples."""
     grid = reactions[0]
 
-    def forced() -> Forced:
+    def forced() -> ReactionForces:
         return reactions[1]
 
-    motion = Motion(x, forced)
-    gauges = gauge_readings(segment.experiment, segment.experiment.t_s, grid, segment.nuisance)
-    return [gauge.of_motion(motion, phi) for gauge in gauges]
+    motion = ObservedMotion(x, forced)
+    gauges = custom_sensor_residuals(
+        segment.experiment, segment.experiment.t_s, grid, segment.nuisance
+    )
+    return [gauge.predict_motion(motion, phi) for gauge in gauges]
 
 
-def _share(problem: Problem, segment: Segment) -> float | None:
+def _step_error_share(problem: Problem, segment: Transcription) -> float | None:
     """Return the share of the difference to a forward simulation that half the step would make.
 
     None if the simulation is no finer than the fit; 1 for static experiments.
     """
     experiment = segment.experiment
     options = problem.rollout
-    if experiment.static:
+    if experiment.is_static:
         return 1.0
     steps = experiment.timestep_s / _step_s(problem, segment) / segment.substeps
-    if options.integrator != "newmark" or steps < LEAST_FINER:
+    if options.integrator != "newmark" or steps < LEAST_STEP_RATIO:
         return None
     order = as_scheme(problem.scheme).order
     # Newmark's own error is of second order: beside one of the first it is none.
@@ -348,7 +383,7 @@ def _share(problem: Problem, segment: Segment) -> float | None:
     return (1 - 0.5**order) / (1 - remaining)
 
 
-def _step_s(problem: Problem, segment: Segment) -> float:
+def _step_s(problem: Problem, segment: Transcription) -> float:
     """Return the step of the forward simulation [s]: as stated, or finer than the grid of the fit.
 
     By default at most a quarter of the sample interval and half the grid step.

@@ -14,15 +14,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..arrays import Array, root_mean
-from ..methods.solution import Solution, reading_rms, wrench_rms
+from ..methods.solution import Solution, custom_sensor_rms, wrench_rms
 from ..program.depth_comparison import DepthError
-from ..program.segment import Segment
+from ..program.segment import Transcription
 from ..recording import Experiment
 from ..recording.clock import TIME_TOLERANCE_S
 
 
 @dataclass(frozen=True)
-class PredictionError:
+class PredictionErrors:
     """Differences between a prediction and the measurements; None for what is not measured.
 
     Attributes
@@ -52,43 +52,43 @@ class CopyError:
     ----------
     copied : str
         The name of the fitted recording that is nearest.
-    error : PredictionError
+    error : PredictionErrors
     """
 
     copied: str
-    error: PredictionError
+    error: PredictionErrors
 
 
 @dataclass(frozen=True)
-class Misfit:
+class InstrumentMisfit:
     """Differences between a prediction and the measurements of one kind, in stated σ.
 
     Attributes
     ----------
     what : str
         What is measured, for people.
-    stated : str
+    sigma_key : str
         Key of σ in the problem, for people.
     sigmas : float
         Root mean square of the differences over σ.
-    tame_sigmas : float
+    robust_sigmas : float
         The same without outliers of depth, see `DepthError`; predictions are judged by it.
-    numbers : int
+    count : int
         Number of measured values.
     size : str
         Root mean square in a unit, for people; empty if units differ.
     """
 
     what: str
-    stated: str
+    sigma_key: str
     sigmas: float
-    tame_sigmas: float
-    numbers: int
+    robust_sigmas: float
+    count: int
     size: str = ""
 
 
 @dataclass(frozen=True)
-class Predicted:
+class InstrumentPrediction:
     """Predictions of a recording's instruments by a simulation.
 
     Attributes
@@ -107,31 +107,33 @@ class Predicted:
     depth: Mapping[str, DepthError] = field(default_factory=dict)
 
 
-def prediction_error(experiment: Experiment, predicted: Predicted) -> PredictionError:
+def prediction_error(experiment: Experiment, predicted: InstrumentPrediction) -> PredictionErrors:
     """Return the differences between a prediction and the measurements of its recording.
 
     Values that are not measured, or not predicted, are left out.
     """
     distance_m = np.linalg.norm(predicted.markers_m - experiment.markers.positions_m, axis=2)
-    present_m = distance_m[experiment.markers.present & np.isfinite(distance_m)]
+    present_m = distance_m[experiment.markers.is_present & np.isfinite(distance_m)]
     force_n, torque_nm = wrench_rms(experiment, predicted.wrenches)
-    return PredictionError(
+    return PredictionErrors(
         rms_m=root_mean(present_m**2) if present_m.size else None,
         max_m=float(present_m.max()) if present_m.size else None,
         wrench_rms_n=force_n,
         wrench_rms_nm=torque_nm,
-        reading_rms=reading_rms(experiment, predicted.readings) or None,
+        reading_rms=custom_sensor_rms(experiment, predicted.readings) or None,
         depth=dict(predicted.depth) or None,
     )
 
 
-def misfits(experiment: Experiment, predicted: Predicted) -> list[Misfit]:
+def instrument_misfits(
+    experiment: Experiment, predicted: InstrumentPrediction
+) -> list[InstrumentMisfit]:
     """Return the differences over stated σ of each instrument that measured anything."""
     results = []
     markers = experiment.markers
-    if markers.present.any():
-        difference_m = (predicted.markers_m - markers.positions_m)[markers.present]
-        sigma_m = np.broadcast_to(markers.sigma_m, markers.present.shape)[markers.present]
+    if markers.is_present.any():
+        difference_m = (predicted.markers_m - markers.positions_m)[markers.is_present]
+        sigma_m = np.broadcast_to(markers.sigma_m, markers.is_present.shape)[markers.is_present]
         rms_m = root_mean(np.sum(difference_m**2, axis=1))
         ratio = difference_m / sigma_m[:, None]
         results.append(_misfit("the markers", "sigma_m", ratio, f"{1e3 * rms_m:.3g} mm RMS"))
@@ -139,29 +141,31 @@ def misfits(experiment: Experiment, predicted: Predicted) -> list[Misfit]:
         ratio = (read - sensor.values) / sensor.sigmas
         results.append(_misfit("the wrench", "sigma_n", ratio))
     for gauge in experiment.readings:
-        ratio = (predicted.readings[gauge.name] - gauge.measured) / gauge.sigma
+        ratio = (predicted.readings[gauge.name] - gauge.measured_values) / gauge.sigma
         results.append(_misfit(gauge.name, "its sigma", ratio))
     for name, error in predicted.depth.items():
         if error.rms_m is not None:
             size = f"{1e3 * error.rms_m:.3g} mm RMS"
             what = f"the depth of {name}"
             results.append(
-                Misfit(what, "its sigma_m", error.sigmas, error.tame_sigmas, error.points, size)
+                InstrumentMisfit(
+                    what, "its sigma_m", error.sigmas, error.tame_sigmas, error.points, size
+                )
             )
     return results
 
 
-def _misfit(what: str, stated: str, ratio: Array, size: str = "") -> Misfit:
+def _misfit(what: str, stated: str, ratio: Array, size: str = "") -> InstrumentMisfit:
     """Return the misfit of differences over σ, `ratio`, in which NaN is left out."""
     known = ratio[np.isfinite(ratio)]
     sigmas = root_mean(known**2)
-    return Misfit(what, stated, sigmas, sigmas, known.size, size)
+    return InstrumentMisfit(what, stated, sigmas, sigmas, known.size, size)
 
 
 # Blind predictions --------------------------------------------------------------------------------
 
 
-def blind_phi(segment: Segment, solution: Solution) -> Array:
+def nuisance_of_fitted_recordings(segment: Transcription, solution: Solution) -> Array:
     """Return the nuisance parameters (k,) of a recording by those of the fitted recordings.
 
     Each is the mean over the fitted recordings that have one of the same label, such as the place
@@ -170,30 +174,32 @@ def blind_phi(segment: Segment, solution: Solution) -> Array:
 
     Parameters
     ----------
-    segment : Segment
+    segment : Transcription
         Of the recording to be predicted.
     solution : Solution
         Of the fitted recordings.
     """
     nuisance = segment.nuisance
-    places = segment.markers.place_places
+    places = segment.markers.coordinate_parameters
     known: dict[str, list[float]] = {}
     for part in solution.parts:
-        for entry, _, value in part.segment.nuisance.valued(part.phi):
+        for entry, _, value in part.segment.nuisance.iterate_values(part.phi):
             known.setdefault(entry.label, []).append(value)
     phi = np.zeros(nuisance.size)
     for k, entry in enumerate(nuisance.entries):
         phi[k] = np.mean(known.get(entry.label, [0.0])) / entry.sigma
-    start_m = segment.places_m(np.zeros(nuisance.size))
-    for number in segment.chart.estimated.tolist():
+    start_m = segment.marker_places_m(np.zeros(nuisance.size))
+    for number in segment.association.estimated.tolist():
         name = segment.experiment.markers.names[number]
         places_m = [
-            part.segment.places_m(part.phi)[part.segment.experiment.markers.names.index(name)]
+            part.segment.marker_places_m(part.phi)[
+                part.segment.experiment.markers.names.index(name)
+            ]
             for part in solution.parts
             if name in part.segment.experiment.markers.names
         ]
         if places_m:
-            directions_m = segment.chart.sigma_m[number] * segment.chart.axes[number]
+            directions_m = segment.association.sigma_m[number] * segment.association.axes[number]
             way_m = np.mean(places_m, axis=0) - start_m[number]
             phi[places[number]] = np.linalg.pinv(directions_m) @ way_m
     return phi
@@ -202,7 +208,9 @@ def blind_phi(segment: Segment, solution: Solution) -> Array:
 # Copies of other recordings -----------------------------------------------------------------------
 
 
-def copy_error(experiment: Experiment, fitted: Iterable[Experiment]) -> CopyError | str:
+def nearest_recording_error(
+    experiment: Experiment, fitted: Iterable[Experiment]
+) -> CopyError | str:
     """Return how well the nearest fitted recording's measurements predict a recording.
 
     Measurements are compared sample by sample, at equal times after the start.
@@ -215,16 +223,16 @@ def copy_error(experiment: Experiment, fitted: Iterable[Experiment]) -> CopyErro
     reasons = {}
     copies = []
     for other in fitted:
-        reason = _difference(experiment, other)
+        reason = _reason_against_copy(experiment, other)
         if reason:
             reasons[other.name] = reason
             continue
         order = [other.markers.names.index(name) for name in experiment.markers.names]
-        known_m = np.where(other.markers.present[..., None], other.markers.positions_m, np.nan)
-        copy = Predicted(
+        known_m = np.where(other.markers.is_present[..., None], other.markers.positions_m, np.nan)
+        copy = InstrumentPrediction(
             markers_m=known_m[:, order],
             wrenches=[each.values for each in other.wrenches],
-            readings={gauge.name: gauge.measured for gauge in other.readings},
+            readings={gauge.name: gauge.measured_values for gauge in other.readings},
         )
         copies.append(CopyError(other.name, prediction_error(experiment, copy)))
     if not copies:
@@ -233,11 +241,11 @@ def copy_error(experiment: Experiment, fitted: Iterable[Experiment]) -> CopyErro
     return min(copies, key=lambda each: each.error.rms_m or each.error.wrench_rms_n or np.inf)
 
 
-def _difference(experiment: Experiment, other: Experiment) -> str:
+def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
     """Return why another recording's measurements do not predict a recording; "" if they do."""
     own = experiment.markers
     others = other.markers
-    if not (own.samples or experiment.wrenches or experiment.readings):
+    if not (own.sample_count or experiment.wrenches or experiment.readings):
         return "points of depth cameras have no counterparts"
     if set(own.names) != set(others.names):
         return "other markers"
@@ -245,9 +253,12 @@ def _difference(experiment: Experiment, other: Experiment) -> str:
         return "other wrenches"
     if [g.name for g in experiment.readings] != [g.name for g in other.readings]:
         return "other readings"
-    times = [(experiment.t_s, other.t_s)] if own.samples else []
+    times = [(experiment.t_s, other.t_s)] if own.sample_count else []
     times += [(a.t_s, b.t_s) for a, b in zip(experiment.wrenches, other.wrenches, strict=True)]
-    times += [(a.times, b.times) for a, b in zip(experiment.readings, other.readings, strict=True)]
+    times += [
+        (a.sample_times_s, b.sample_times_s)
+        for a, b in zip(experiment.readings, other.readings, strict=True)
+    ]
     starts_s = experiment.t_s[0], other.t_s[0]
     for here_s, there_s in times:
         if len(here_s) != len(there_s):

@@ -7,19 +7,19 @@ from dataclasses import replace
 from typing import TypeVar
 
 from ..errors import InputError
-from ..fem.refinement import refined
+from ..fem.refinement import refine_body
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..recording import refinement
 from ..statistics.estimates import Estimate
-from ..statistics.numerical import Level, Refinement, numerical_errors
-from .answer import Answer
+from ..statistics.numerical import Refinement, RefinementLevel, discretisation_errors
+from .answer import SolvedProblem
 from .solving import solve
-from .warm_start import Earlier
+from .warm_start import WarmStart
 
-A = TypeVar("A", bound=Answer)
+A = TypeVar("A", bound=SolvedProblem)
 # Most discretisations of each kind: three show the order of convergence, and a fourth is too large.
 MOST_LEVELS = 3
 # Last step of the parameters' logarithms at convergence: far below any error bar.
@@ -33,30 +33,34 @@ def finer_step(problem: Problem) -> Problem:
 
 def finer_mesh(problem: Problem) -> Problem:
     """Return the problem with every tetrahedron split into eight."""
-    bodies = {id(body): refined(body) for body in problem.bodies}
-    experiments = [refinement.refined(e, bodies[id(e.body)]) for e in problem.experiments]
+    bodies = {id(body): refine_body(body) for body in problem.bodies}
+    experiments = [
+        refinement.refined_experiment(e, bodies[id(e.body)]) for e in problem.experiments
+    ]
     return replace(problem, experiments=experiments)
 
 
-FINER = {"step": finer_step, "mesh": finer_mesh}
+REFINEMENTS = {"step": finer_step, "mesh": finer_mesh}
 
 
-def refine(finished: A, levels: int = 2, say: Callable[[str], None] | None = None) -> A:
-    """Return a converged run with its numerical error, see `refinement_of`."""
-    answer = Earlier.of(finished.solution)
-    problem = replace(finished.problem, substeps=finished.solution.collocation.substeps)
-    estimates = finished.optimum
-    return replace(finished, refinement=refinement_of(problem, answer, estimates, levels, say))
+def refine(run: A, levels: int = 2, report_progress: Callable[[str], None] | None = None) -> A:
+    """Return a converged run with its numerical error, see `solve_refined`."""
+    answer = WarmStart.of(run.solution)
+    problem = replace(run.problem, substeps=run.solution.collocation.substeps)
+    estimates = run.optimum
+    return replace(
+        run, refinement=solve_refined(problem, answer, estimates, levels, report_progress)
+    )
 
 
-def refinement_of(
+def solve_refined(
     problem: Problem,
-    answer: Earlier,
+    solution: WarmStart,
     estimates: Mapping[str, Estimate],
     levels: int = 2,
-    say: Callable[[str], None] | None = None,
-    known: Sequence[Level] = (),
-    keep: Callable[[Refinement], object] | None = None,
+    report_progress: Callable[[str], None] | None = None,
+    solved_levels: Sequence[RefinementLevel] = (),
+    save_progress: Callable[[Refinement], object] | None = None,
 ) -> Refinement:
     """Solve again at finer discretisations, each from the previous solution.
 
@@ -66,17 +70,17 @@ def refinement_of(
     Parameters
     ----------
     problem : Problem
-    answer : Earlier
+    solution : WarmStart
         The solution of the problem.
     estimates : mapping of name to Estimate
         Estimates of that solution, with their statistical intervals.
     levels : int
         2 discretisations of each kind, or 3 to observe the orders of convergence.
-    say : callable, optional
+    report_progress : callable, optional
         Called with a progress message.
-    known : sequence of Level
+    solved_levels : sequence of RefinementLevel
         Levels that were solved before.
-    keep : callable, optional
+    save_progress : callable, optional
         Called after each level with the refinement so far.
 
     Raises
@@ -84,45 +88,49 @@ def refinement_of(
     InputError
         For another number of levels, or where a finer problem is not solved.
     KeyboardInterrupt
-        If a solve was interrupted; the levels passed to `keep` are complete.
+        If a solve was interrupted; the levels passed to `save_progress` are complete.
     """
     if not 2 <= levels <= MOST_LEVELS:
         raise InputError(f"levels = {levels}; expected 2 or {MOST_LEVELS}")
     fitted = [experiment for experiment in problem.experiments if not experiment.validation]
     coarse = replace(problem, experiments=fitted, notes=())
-    moving = any(not experiment.static for experiment in fitted)
-    solved = {(each.halved, each.times): each for each in known}
-    reached: list[Level] = []
-    for kind, finer in FINER.items():
+    moving = any(not experiment.is_static for experiment in fitted)
+    solved = {(each.refined, each.halvings): each for each in solved_levels}
+    reached: list[RefinementLevel] = []
+    for kind, finer in REFINEMENTS.items():
         at = coarse
-        start = answer
+        start = solution
         for level in range(1, levels if moving or kind == "mesh" else 1):  # equilibria have no step
             at = finer(at)
             if (kind, level) in solved:
                 reached.append(solved[kind, level])
-                start = replace(answer, values={**answer.values, **reached[-1].values})
+                start = replace(solution, values={**solution.values, **reached[-1].values})
                 continue
-            if say is not None:
-                say(f"solving again: {kind} halved {level}×")
-            solution = _solved(at, start, f"{kind} halved {level}×")
-            start = Earlier.of(solution)
-            reached.append(_level(kind, level, solution))
-            if keep is not None:
-                keep(_of_levels(reached, problem, estimates))
-    return _of_levels(reached, problem, estimates)
+            if report_progress is not None:
+                report_progress(f"solving again: {kind} halved {level}×")
+            refined = _solve_refined_problem(at, start, f"{kind} halved {level}×")
+            start = WarmStart.of(refined)
+            reached.append(_level_summary(kind, level, refined))
+            if save_progress is not None:
+                save_progress(_errors_from_levels(reached, problem, estimates))
+    return _errors_from_levels(reached, problem, estimates)
 
 
-def _of_levels(
-    levels: Sequence[Level], problem: Problem, estimates: Mapping[str, Estimate]
+def _errors_from_levels(
+    levels: Sequence[RefinementLevel], problem: Problem, estimates: Mapping[str, Estimate]
 ) -> Refinement:
     """Return the numerical errors from the levels solved so far."""
-    by_step, by_mesh = ([each.values for each in levels if each.halved == kind] for kind in FINER)
+    by_step, by_mesh = (
+        [each.values for each in levels if each.refined == kind] for kind in REFINEMENTS
+    )
     order = as_scheme(problem.scheme).order
-    errors = numerical_errors(estimates, by_step, by_mesh, order, problem.parameters.linear)
+    errors = discretisation_errors(
+        estimates, by_step, by_mesh, order, problem.parameters.linear_names
+    )
     return Refinement(errors, tuple(levels))
 
 
-def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
+def _solve_refined_problem(problem: Problem, start: WarmStart, what: str) -> Solution:
     """Solve a finer problem in reduced space; `what` names it in the message of the
     `InputError`.
     """
@@ -135,7 +143,7 @@ def _solved(problem: Problem, start: Earlier, what: str) -> Solution:
     return solution
 
 
-def _level(kind: str, level: int, solution: Solution) -> Level:
+def _level_summary(kind: str, level: int, solution: Solution) -> RefinementLevel:
     """Return the summary of a level from its solution.
 
     Parameters
@@ -145,13 +153,13 @@ def _level(kind: str, level: int, solution: Solution) -> Level:
         How often it was halved.
     solution : Solution
     """
-    segments = solution.collocation.segments
-    return Level(
-        halved=kind,
-        times=level,
-        timesteps=sum(segment.grid_rows for segment in segments),
+    segments = solution.collocation.transcriptions
+    return RefinementLevel(
+        refined=kind,
+        halvings=level,
+        timesteps=sum(segment.grid_times for segment in segments),
         nodes=sum({id(s.body): len(s.body.nodes_m) for s in segments}.values()),
         iterations=solution.iterations,
         time_s=solution.timing.total,
-        values=dict(Earlier.of(solution).values),
+        values=dict(WarmStart.of(solution).values),
     )

@@ -9,21 +9,21 @@ from pathlib import Path
 from ..arrays import Array
 from ..display import short
 from ..errors import InputError
-from ..fem.constants import is_mode, symbol_of, unit_of
-from ..fem.field import FieldShapes
-from ..fem.two_phase import PhaseFinding
+from ..fem.constants import is_field_coefficient, symbol_of, unit_of
+from ..fem.field import FieldResolution
+from ..fem.two_phase import PhaseSummary
 from ..files import RESULT_FILE, damage_refused, read_json
 from ..methods.solution import Iteration, Timing
 from ..program.depth_comparison import DepthError
-from ..program.touches import Rubbing
+from ..program.touches import FrictionSummary
 from ..statistics.diagnostics import MarkerDiagnosis
-from ..statistics.estimates import Coordinate, Estimate
-from ..statistics.numerical import NumericalError, known_kinds
+from ..statistics.estimates import Estimate, IntervalCoordinate
+from ..statistics.numerical import DiscretisationError, known_kinds
 from ..statistics.relaxation import Probe
-from ..statistics.trust import Trust
-from ..statistics.uncertainty import Place
+from ..statistics.trust import Assessment
+from ..statistics.uncertainty import MarkerPlace
 from ..tree import optional, read
-from .prediction import CopyError, PredictionError
+from .prediction import CopyError, PredictionErrors
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class ReportedEstimate(Estimate):
         estimate; None if there is none.
     known_correction : float or None
         The same correction as part of `value`; None if there is none.
-    numerical_error : NumericalError or None
+    numerical_error : DiscretisationError or None
         Discretisation error as far as it is known.
     guess : float or None
         Initial guess.
@@ -63,7 +63,7 @@ class ReportedEstimate(Estimate):
     systematic: float | None = None
     known_effect: float | None = optional()
     known_correction: float | None = optional()
-    numerical_error: NumericalError | None = None
+    numerical_error: DiscretisationError | None = None
     guess: float | None = optional()
     fixed: bool | None = optional()
     tied: bool | None = optional()
@@ -75,18 +75,20 @@ class ReportedEstimate(Estimate):
         ----------
         name : str
         linear : bool
-            Whether the parameter is its own coordinate, see `Coordinate`.
+            Whether the parameter is its own coordinate, see `IntervalCoordinate`.
         """
         if self.optimum is None or self.statistical95 is None or self.optimum == self.value:
             optimum = self.value if self.optimum is None else self.optimum
             return replace(self._statistical, value=optimum)
-        at = Coordinate.of(name, (self.value, self.optimum, *self.statistical95), linear)
-        correction = at.at(self.value) - at.at(self.optimum)
-        low, high = (at.value(at.at(end) - correction) for end in self.statistical95)
+        at = IntervalCoordinate.for_estimate(
+            name, (self.value, self.optimum, *self.statistical95), linear
+        )
+        correction = at.from_value(self.value) - at.from_value(self.optimum)
+        low, high = (at.to_value(at.from_value(end) - correction) for end in self.statistical95)
         spread = self.statistical_std_error
         if spread is not None:
-            spread *= at.slope(self.value) / at.slope(self.optimum)
-        return Estimate(self.optimum, spread, (low, high), self.at_bound, self.reason)
+            spread *= at.derivative(self.value) / at.derivative(self.optimum)
+        return Estimate(self.optimum, spread, (low, high), self.is_at_bound, self.reason)
 
     @property
     def _statistical(self) -> Estimate:
@@ -95,7 +97,7 @@ class ReportedEstimate(Estimate):
             self.value,
             self.statistical_std_error,
             self.statistical95,
-            self.at_bound,
+            self.is_at_bound,
             self.reason,
         )
 
@@ -117,7 +119,7 @@ class ReportedEstimate(Estimate):
 
 
 @dataclass(frozen=True)
-class FoundNuisance:
+class NuisanceResult:
     """A nuisance parameter.
 
     Attributes
@@ -136,12 +138,12 @@ class FoundNuisance:
 
 
 @dataclass(frozen=True)
-class FoundField:
+class FieldResult:
     """A constant that varies in space; its arrays are in ``trajectory.npz``.
 
     Attributes
     ----------
-    shapes : FieldShapes
+    shapes : FieldResolution
     range : (least, most)
         Range of its values in the elements.
     share_told : float or None
@@ -151,16 +153,16 @@ class FoundField:
         Number of independent shapes that the data determine; None without intervals.
     likelier : mapping of length in metres to float
         Logarithm of the evidence of other correlation lengths, relative to the chosen one.
-    phases : PhaseFinding or None
+    phases : PhaseSummary or None
         Contrast and volume of the inclusion of a two-phase field; None for a smooth field.
     """
 
-    shapes: FieldShapes
+    shapes: FieldResolution
     range: tuple[float, float]
     share_told: float | None
     identified: int | None
     likelier: Mapping[str, float]
-    phases: PhaseFinding | None = None
+    phases: PhaseSummary | None = None
 
     def sentence(self, name: str) -> str:
         """Return a one-line summary of the field; `name` is the name of its constant."""
@@ -210,7 +212,7 @@ class RecordingsAgreement:
 
 
 @dataclass(frozen=True)
-class FoundProfile:
+class ProfileResult:
     """A profile likelihood.
 
     Attributes
@@ -234,7 +236,7 @@ class FoundProfile:
 
 
 @dataclass(frozen=True, eq=False)
-class FoundUncertainty:
+class UncertaintyResult:
     """Statistics behind the error bars.
 
     Matrices refer to the logarithms (or other coordinates) of the parameters in `names`.
@@ -251,11 +253,11 @@ class FoundUncertainty:
     quantiles: Array
     verdicts: tuple[str, ...]
     recordings: Mapping[str, RecordingsAgreement] | None
-    profiles: Mapping[str, FoundProfile]
+    profiles: Mapping[str, ProfileResult]
 
 
 @dataclass(frozen=True, eq=False)
-class FoundScan:
+class ScanResult:
     """The scan over stiffnesses that gave the start of the search.
 
     Attributes
@@ -300,7 +302,7 @@ class FittedExperiment:
         Stated standard deviations of their noise.
     reading_unit : mapping of name to str, optional
         Units of the custom sensors that state one.
-    friction : mapping of obstacle to Rubbing
+    friction : mapping of obstacle to FrictionSummary
         Of the obstacles with friction.
     depth : mapping of depth camera to DepthError
         Distances of its points from the fitted surface.
@@ -320,13 +322,13 @@ class FittedExperiment:
     wrench_sigma_nm: float | None = optional()
     reading_sigma: Mapping[str, float] | None = optional()
     reading_unit: Mapping[str, str] | None = optional()
-    friction: Mapping[str, Rubbing] | None = optional()
+    friction: Mapping[str, FrictionSummary] | None = optional()
     depth: Mapping[str, DepthError] | None = optional()
     air_density_kg_m3: float = 0.0
 
 
 @dataclass(frozen=True)
-class FoundFit:
+class FitResult:
     """Residuals of the fit of all experiments.
 
     Attributes
@@ -366,7 +368,7 @@ class SimulatedExperiment:
         Nuisance parameters and marker places that were fitted to a recording for validation.
     depth : mapping of depth camera to DepthError
         Distances of its points from the simulated surface.
-    blind : PredictionError, optional
+    blind : PredictionErrors, optional
         Of an experiment for validation, with the nuisance parameters of the fitted recordings in
         place of its own.
     copied : CopyError, optional
@@ -387,13 +389,13 @@ class SimulatedExperiment:
     wrench_rms_nm: float | None = optional()
     reading_rms: Mapping[str, float] | None = optional()
     depth: Mapping[str, DepthError] | None = optional()
-    blind: PredictionError | None = optional()  # noqa: RUF009, it returns a field
+    blind: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
     copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
     not_copied: str | None = optional()
 
 
 @dataclass(frozen=True)
-class FoundRollout:
+class ForwardResult:
     """Forward simulations with the estimates; RMS and largest distance of the fitted experiments'
     markers.
     """
@@ -404,7 +406,7 @@ class FoundRollout:
 
 
 @dataclass(frozen=True)
-class FoundDynamics:
+class DynamicsResult:
     """Residuals of the equations of motion: largest force [N], relative to other forces, and
     where.
     """
@@ -467,7 +469,8 @@ class Result:
 
     `timing_s` is about the iterations of the method alone, `elapsed_s` about the whole run. `basis`
     names what the values refer to: the damping law, and what sets the scale; `budget` has each
-    source's share of an estimate's variance; `probes` are refits with an assumption relaxed and,
+    source's share of an estimate's variance; `deep_probes` are refits with an assumption relaxed
+    and,
     where requested, of parts of the data.
     """
 
@@ -476,7 +479,7 @@ class Result:
     converged: bool
     message: str
     missing: str
-    trust: Trust
+    trust: Assessment
     method: str
     title: str
     parameters: Mapping[str, ReportedEstimate]
@@ -484,15 +487,15 @@ class Result:
     basis: tuple[str, ...]
     budget: Mapping[str, Mapping[str, float]]
     probes: tuple[Probe, ...]
-    places: Mapping[str, Mapping[str, Place]]
-    nuisance: Mapping[str, Mapping[str, FoundNuisance]]
-    fields: Mapping[str, FoundField]
-    uncertainty: FoundUncertainty | None
-    scan: FoundScan | None
-    fit: FoundFit
+    places: Mapping[str, Mapping[str, MarkerPlace]]
+    nuisance: Mapping[str, Mapping[str, NuisanceResult]]
+    fields: Mapping[str, FieldResult]
+    uncertainty: UncertaintyResult | None
+    scan: ScanResult | None
+    fit: FitResult
     residuals: tuple[MarkerDiagnosis, ...]
-    dynamics: FoundDynamics
-    rollout: FoundRollout
+    dynamics: DynamicsResult
+    rollout: ForwardResult
     iterations: int
     evaluations: int
     timing_s: Timing
@@ -503,13 +506,13 @@ class Result:
     provenance: Provenance
 
     @classmethod
-    def read(cls, run: str | Path, what: str = "a run folder") -> Result:
+    def read(cls, run: str | Path, expected: str = "a run folder") -> Result:
         """Read the result in a run folder.
 
         Parameters
         ----------
         run : str or Path
-        what : str
+        expected : str
             What is expected, for the message if the folder has no result.
 
         Raises
@@ -518,7 +521,7 @@ class Result:
             If it is no run folder, or damaged.
         """
         folder = Path(run)
-        content = read_json(folder / RESULT_FILE, what)
+        content = read_json(folder / RESULT_FILE, expected)
         with damage_refused(folder, RESULT_FILE, "solve the problem again"):
             return read(cls, content)
 
@@ -526,27 +529,27 @@ class Result:
     def values(self) -> dict[str, ReportedEstimate]:
         """Parameters, then derived moduli, by name, without the coefficients of fields."""
         both = {**self.parameters, **self.derived}
-        return {name: each for name, each in both.items() if not is_mode(name)}
+        return {name: each for name, each in both.items() if not is_field_coefficient(name)}
 
     @property
-    def covers(self) -> tuple[str, ...]:
+    def discretisation_kinds(self) -> tuple[str, ...]:
         """Kinds of discretisation error that the combined intervals contain: "step", "mesh"."""
         return known_kinds(self.numerical_errors.values())
 
     @property
-    def numerical_errors(self) -> dict[str, NumericalError]:
+    def numerical_errors(self) -> dict[str, DiscretisationError]:
         """Known discretisation errors, by name of the estimate."""
         errors = ((name, each.numerical_error) for name, each in self.values.items())
         return {name: error for name, error in errors if error is not None}
 
-    def home(self, run: str | Path, needs: str) -> Path:
+    def problem_folder(self, run: str | Path, purpose: str) -> Path:
         """Return the folder of the problem file.
 
         Parameters
         ----------
         run : str or Path
             The run folder, for the message.
-        needs : str
+        purpose : str
             Who needs the file, for the message, such as "which refine needs".
 
         Raises
@@ -555,5 +558,5 @@ class Result:
             If the run was not made from a problem file.
         """
         if self.provenance.problem_file is None:
-            raise InputError(f"the run is of no problem file, {needs}", run)
+            raise InputError(f"the run is of no problem file, {purpose}", run)
         return Path(self.provenance.problem_file).parent

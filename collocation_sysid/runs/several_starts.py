@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from ..methods.reduced_space import ReducedSpace
 from ..methods.scan import Scan
 from ..methods.solution import Method, Solution, Status, Watch
-from ..methods.start import placed_at_guess
+from ..methods.start import associated_at_guess
 from ..program.collocation import Collocation
 
 # Difference of losses below which two solutions are the same minimum with other correspondences:
@@ -24,7 +24,7 @@ Solve = Callable[[Method, Collocation], Solution]
 
 
 @dataclass(frozen=True, eq=False)
-class ScannedStart:
+class FollowedStart:
     """Start of a search after several starts of a scan were followed to convergence.
 
     Attributes
@@ -47,7 +47,7 @@ class ScannedStart:
 
 def has_local_minima(collocation: Collocation) -> bool:
     """Return whether correspondences of measurements change during the search."""
-    return any(segment.depths for segment in collocation.segments)
+    return any(segment.depths for segment in collocation.transcriptions)
 
 
 def robust_loss(solution: Solution) -> float:
@@ -58,16 +58,16 @@ def robust_loss(solution: Solution) -> float:
     """
     collocation = solution.collocation
     p, _ = collocation.unpack(solution.z)
-    prior, _ = collocation.prior(p)
+    prior, _ = collocation.prior_residuals(p)
     far_loss = sum(
-        reading.loss_of_far_points for part in solution.parts for reading, _ in part.sights
+        reading.loss_of_far_points for part in solution.parts for reading, _ in part.depth_residuals
     )
     return sum(part.loss for part in solution.parts) + float(prior @ prior) + far_loss
 
 
-def best_start(
+def follow_starts(
     solver: Method, collocation: Collocation, scan: Scan, watch: Watch | None, solve: Solve
-) -> ScannedStart:
+) -> FollowedStart:
     """Follow the starts of a scan to convergence and return the one with the lowest loss.
 
     Parameters
@@ -83,7 +83,7 @@ def best_start(
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
     """
-    first = ScannedStart(collocation, scan, None, "")
+    first = FollowedStart(collocation, scan, None, "")
     if not scan.others or not has_local_minima(collocation):
         return first
     own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
@@ -91,7 +91,7 @@ def best_start(
     method: Method = solver if is_own else ReducedSpace()
     candidates: list[tuple[float, int, Solution]] = []
     for number in (scan.best, *scan.others):
-        started = placed_at_guess(replace(collocation, parameters=scan.starts[number]))
+        started = associated_at_guess(replace(collocation, parameters=scan.starts[number]))
         solution = solve(method, started)
         if solution.status is Status.INTERRUPTED:
             return first if not is_own else replace(first, solution=solution)
@@ -110,4 +110,4 @@ def best_start(
         note += ": local minima, of which the lowest counts"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = replace(collocation, parameters=scan.starts[best])
-    return ScannedStart(started, chosen, solution if is_own else None, note)
+    return FollowedStart(started, chosen, solution if is_own else None, note)

@@ -11,25 +11,25 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..fem.constants import bare, usual_value
+from ..fem.constants import usual_value, without_region
 from ..methods.reduced_space import ReducedSpace
-from ..methods.scan import Scan, rescue, started
+from ..methods.scan import Scan, rescue, start_problem
 from ..methods.solution import Method, Solution, Status, Watch
-from ..methods.start import placed_at_guess
-from ..methods.workers import Workers, workers_of
+from ..methods.start import associated_at_guess
+from ..methods.workers import ExperimentExecutor, connect_executor
 from ..model.parameters import Parameters
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.cameras import require_depth_units
-from ..statistics.fields import fields_by_information
-from ..statistics.linearised import values_of
+from ..statistics.fields import field_estimates_at
+from ..statistics.linearised import parameter_values
 from .check.cost import require_memory
-from .several_starts import best_start
+from .several_starts import follow_starts
 from .two_phases import solve_two_phases
-from .warm_start import Earlier
+from .warm_start import WarmStart
 
 # Outcomes of a failed search, after which another start may help.
-LOST = (
+FAILED_STATUSES = (
     Status.INFEASIBLE,
     Status.STALLED,
     Status.DIVERGED,
@@ -37,16 +37,16 @@ LOST = (
     Status.NOT_SIMULABLE,
 )
 # Least decrease of χ² for which the solution from a second start is preferred.
-NOTICEABLE = 1e-3
+LEAST_GAIN = 1e-3
 # Most repetitions of a solve whose estimates change the correspondences of the measurements.
-REREADINGS = 5
+MOST_REREADINGS = 5
 
 
 def solve(
     problem: Problem,
     method: str | Method | None = None,
     watch: Watch | None = None,
-    start: str | Path | Earlier | None = None,
+    start: str | Path | WarmStart | None = None,
     scheduler: str | None = None,
 ) -> Solution:
     """Solve a problem, without the checks of `run`.
@@ -59,7 +59,7 @@ def solve(
         problem's own by default.
     watch : callable, optional
         Called with every `Iteration`.
-    start : str, Path or Earlier, optional
+    start : str, Path or WarmStart, optional
         An earlier solution or the folder of its run, of any mesh or timestep; its values replace
         the guesses of parameters with the same names.
     scheduler : str, optional
@@ -85,16 +85,16 @@ def solve(
             None,
             "--scheduler",
         )
-    with workers_of(scheduler) as workers:
-        return _likeliest(
-            problem, start, partial(_solved, solver=solver, watch=watch, workers=workers)
+    with connect_executor(scheduler) as workers:
+        return _solve_with_likeliest_lengths(
+            problem, start, partial(_solve_once, solver=solver, watch=watch, workers=workers)
         )
 
 
-def _likeliest(
+def _solve_with_likeliest_lengths(
     problem: Problem,
-    start: str | Path | Earlier | None,
-    solved: Callable[[Problem, str | Path | Earlier | None], Solution],
+    start: str | Path | WarmStart | None,
+    solve_once: Callable[[Problem, str | Path | WarmStart | None], Solution],
 ) -> Solution:
     """Solve a problem with the most likely of the correlation lengths that its fields allow.
 
@@ -103,35 +103,38 @@ def _likeliest(
     change or were tried before.
     """
     if any(not modes.has_phases for modes in problem.two_phase_fields.values()):
-        return solve_two_phases(problem, start, solved)
-    solution = solved(problem, start)
+        return solve_two_phases(problem, start, solve_once)
+    solution = solve_once(problem, start)
     tried = [problem.lengths_m]
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     if all(len(field.field.lengths_m) == 1 for field in fields):
         return solution
     while solution.status.converged:
-        known = fields_by_information(solution.collocation, solution.z)
-        best = {name: max(f.modes.field.lengths_m, key=f.likelier) for name, f in known.items()}
+        known = field_estimates_at(solution.collocation, solution.z)
+        best = {
+            name: max(f.modes.field.lengths_m, key=f.log_evidence_ratio)
+            for name, f in known.items()
+        }
         if best in tried:
             break
         tried.append(best)
         problem = problem.with_lengths(best)
-        solution = solved(problem, Earlier.of(solution))
+        solution = solve_once(problem, WarmStart.of(solution))
     return solution
 
 
-def _solved(
+def _solve_once(
     problem: Problem,
-    start: str | Path | Earlier | None,
+    start: str | Path | WarmStart | None,
     solver: Method,
     watch: Watch | None,
-    workers: Workers | None,
+    workers: ExperimentExecutor | None,
 ) -> Solution:
     """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
     solution.
     """
-    earlier = Earlier.read(start) if isinstance(start, (str, Path)) else start
-    problem = problem if earlier is None else earlier.started(problem)
+    earlier = WarmStart.read(start) if isinstance(start, (str, Path)) else start
+    problem = problem if earlier is None else earlier.apply_to_problem(problem)
     try:
         needs_whole_start = getattr(solver, "needs_whole_start", False)
         collocation = problem.collocation()
@@ -140,74 +143,78 @@ def _solved(
             require_depth_units(experiment)
         if earlier is not None and problem.substeps == "auto":
             collocation = replace(collocation, substeps=earlier.substeps)
-        has_guesses = not collocation.parameters.unguessed
+        has_guesses = not collocation.parameters.names_without_guess
         if has_guesses:
             require_memory(problem, collocation, solver)
-        collocation, scan = started(collocation, needs_whole_start)
+        collocation, scan = start_problem(collocation, needs_whole_start)
         if not has_guesses:  # the estimate evaluates the program at a guess
             require_memory(problem, collocation, solver)
-        collocation = placed_at_guess(collocation)
+        collocation = associated_at_guess(collocation)
         variables = None
         if earlier is not None and not scan:
-            collocation = earlier.placed(collocation)
-            variables = earlier.variables(collocation)
-        solver = shared(solver, workers)
+            collocation = earlier.apply_to_places(collocation)
+            variables = earlier.simulated_variables(collocation)
+        solver = with_workers(solver, workers)
         solution = None
         if scan is not None:
-            scanned = best_start(
-                solver, collocation, scan, watch, lambda by, of: read_where_found(by, of, watch)
+            scanned = follow_starts(
+                solver,
+                collocation,
+                scan,
+                watch,
+                lambda by, of: solve_with_renewed_correspondences(by, of, watch),
             )
-            collocation = placed_at_guess(scanned.collocation)
+            collocation = associated_at_guess(scanned.collocation)
             scan = scanned.scan
             solution = scanned.solution
             started_from = [scanned.note] if scanned.note else []
         if solution is None:
-            solution = read_where_found(solver, collocation, watch, variables)
-        if scan is None and solution.status in LOST:
-            scan, solution = _again(solver, solution, watch)
+            solution = solve_with_renewed_correspondences(solver, collocation, watch, variables)
+        if scan is None and solution.status in FAILED_STATUSES:
+            scan, solution = _solve_from_scan(solver, solution, watch)
         if solution.status.converged and earlier is None and solution.method == ReducedSpace.name:
-            solution = _from_elsewhere(solver, solution, watch)
+            solution = _best_of_second_start(solver, solution, watch)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, "solver")
     scan_notes = [] if scan is None else [scan.sentence]
-    notes = (*scan_notes, *started_from, *solution.notes, *_seen(solution))
+    notes = (*scan_notes, *started_from, *solution.notes, *_depth_notes(solution))
     return replace(solution, scan=scan or solution.scan, notes=notes)
 
 
-def _seen(solution: Solution) -> Iterator[str]:
+def _depth_notes(solution: Solution) -> Iterator[str]:
     """Yield notes on the distances of depth points and outlines from the fitted surface, per
     camera.
     """
     for part in solution.parts:
-        for reading, looked in part.sights:
-            distance_m = reading.apart_m(looked, part.phi)
-            sighting = reading.sighting
+        for reading, looked in part.depth_residuals:
+            distance_m = reading.signed_distances_m(looked, part.phi)
+            sighting = reading.correspondences
             left_out = ", ".join(
-                f"{count} {why}" for why, count in sighting.left_out.items() if count
+                f"{count} {why}" for why, count in sighting.excluded_counts.items() if count
             )
             distances = "count, as none is near enough to the body"
-            if sighting.used.any():
+            if sighting.is_compared.any():
                 distances = (
                     f"are off by {1e3 * np.sqrt(np.nanmean(distance_m**2)):.3g} mm (RMS; half of "
                     f"them by less than {1e3 * np.nanmedian(np.abs(distance_m)):.3g})"
                 )
             yield (
-                f"experiment '{part.segment.experiment.name}': {sighting.used.sum()} points of "
-                f"'{sighting.view.depth.name}' {distances}; left out: {left_out or 'none'}"
+                f"experiment '{part.segment.experiment.name}': {sighting.is_compared.sum()} points of "
+                f"'{sighting.camera.depth.name}' {distances}; left out: {left_out or 'none'}"
             )
         for outline, apart_px in part.outline_distances_px:
             if len(apart_px):
                 yield (
                     f"experiment '{part.segment.experiment.name}': {len(apart_px)} points of the "
-                    f"body's outline are off the edges in '{outline.sighting.view.depth.name}' by "
+                    f"body's outline are off the edges in '{outline.correspondences.camera.depth.name}' by "
                     f"{np.sqrt(np.mean(apart_px**2)):.2g} pixels (RMS)"
                 )
 
 
-def shared(solver: Method, workers: Workers | None) -> Method:
+def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
     """Return the method with workers for its experiments; itself without workers or for other
     methods.
     """
@@ -216,7 +223,9 @@ def shared(solver: Method, workers: Workers | None) -> Method:
     return partial(solver, workers=workers)
 
 
-def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | None, Solution]:
+def _solve_from_scan(
+    solver: Method, failed: Solution, watch: Watch | None
+) -> tuple[Scan | None, Solution]:
     """Solve from the result of a scan after a search from the guess failed.
 
     Returns
@@ -226,39 +235,40 @@ def _again(solver: Method, lost: Solution, watch: Watch | None) -> tuple[Scan | 
     solution : Solution
         The new solution, or the failed one.
     """
-    reason = f"the search from the guess was lost ({lost.status.value})"
+    reason = f"the search from the guess was lost ({failed.status.value})"
     needs_whole_start = getattr(solver, "needs_whole_start", False)
-    scan = rescue(lost.collocation, reason, needs_whole_start)
+    scan = rescue(failed.collocation, reason, needs_whole_start)
     if scan is None:
-        return None, lost
-    again = placed_at_guess(replace(lost.collocation, parameters=scan.parameters))
-    solution = read_where_found(solver, again, watch)
+        return None, failed
+    again = associated_at_guess(replace(failed.collocation, parameters=scan.parameters))
+    solution = solve_with_renewed_correspondences(solver, again, watch)
     ended = solution.status.converged or solution.status is Status.INTERRUPTED
-    return (scan, solution) if ended else (None, lost)
+    return (scan, solution) if ended else (None, failed)
 
 
-def _from_elsewhere(solver: Method, first: Solution, watch: Watch | None) -> Solution:
-    """Return the better of a solution and the solution from a second start, if `second_start` has
+def _best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -> Solution:
+    """Return the better of a solution and the solution from a second start, if
+    `second_start_parameters` has
     one.
     """
-    other = second_start(first)
+    other = second_start_parameters(first)
     if other is None:
         return first
-    again = placed_at_guess(replace(first.collocation, parameters=other))
-    second = read_where_found(solver, again, watch)
+    again = associated_at_guess(replace(first.collocation, parameters=other))
+    second = solve_with_renewed_correspondences(solver, again, watch)
     gain = first.history[-1].loss - second.history[-1].loss
     if second.status is Status.INTERRUPTED:
         return replace(first, status=second.status, message=second.message)
-    if not second.status.converged or gain <= NOTICEABLE:
+    if not second.status.converged or gain <= LEAST_GAIN:
         return first
     note = (
-        f"Poisson's ratio ended near one half; a second start, from the usual {USUAL}, found an "
+        f"Poisson's ratio ended near one half; a second start, from the usual {USUAL_POISSON}, found an "
         f"answer that fits better (χ² lower by {gain:.3g})"
     )
     return replace(second, notes=(note, *second.notes))
 
 
-def read_where_found(
+def solve_with_renewed_correspondences(
     solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
 ) -> Solution:
     """Solve, and repeat while estimates change the correspondences of the measurements.
@@ -267,11 +277,11 @@ def read_where_found(
     clocks. At most `REREADINGS` repetitions.
     """
     solution = solver(collocation, watch, start)
-    for _ in range(REREADINGS):
+    for _ in range(MOST_REREADINGS):
         if not solution.status.converged:
             break
         p, positions = solution.collocation.unpack(solution.z)
-        collocation, moved = solution.collocation.following(p, positions)
+        collocation, moved = solution.collocation.follow_estimates(p, positions)
         if collocation is solution.collocation:
             break
         solution = solver(collocation, watch, collocation.pack(moved, positions))
@@ -283,35 +293,39 @@ def read_where_found(
 # body can move almost like a stiffer, compressible one. Smaller ratios do not lock.
 NEARLY_INCOMPRESSIBLE = 0.42
 # Poisson's ratio of that start.
-USUAL = 0.3
+USUAL_POISSON = 0.3
 # Names of the constants that determine Young's modulus and Poisson's ratio, two of them at a time.
 LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
 
 
-def second_start(solution: Solution) -> Parameters | None:
+def second_start_parameters(solution: Solution) -> Parameters | None:
     """Return the parameters at a solution with high Poisson's ratios replaced by the usual one.
 
     Only estimated ratios count, of regions in which both moduli are estimated. None if no ratio is
     high or a parameter with one is at a bound.
     """
     collocation = solution.collocation
-    values = values_of(solution.collocation, solution.q)
+    values = parameter_values(solution.collocation, solution.q)
     free = {item.name: item for item in collocation.parameters.free}
     changed: dict[str, float] = {}
     for name, ratio in values.items():
-        if bare(name) == "poisson" and ratio > NEARLY_INCOMPRESSIBLE:
+        if without_region(name) == "poisson" and ratio > NEARLY_INCOMPRESSIBLE:
             region = name.removesuffix("poisson")
             own = [region + each for each in LAME if region + each in free]
             if len(own) == 2 or own == [name]:
                 young_pa = values[region + "young_pa"]
-                changed |= {each: _usual(each, young_pa) for each in own}
+                changed |= {each: _usual_modulus(each, young_pa) for each in own}
     if not changed or any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
         return None
     return collocation.parameters.with_guess({name: values[name] for name in free} | changed)
 
 
-def _usual(name: str, young_pa: float) -> float:
+def _usual_modulus(name: str, young_pa: float) -> float:
     """Return the value of a modulus for the usual Poisson's ratio and a Young's modulus [Pa]."""
-    value = USUAL if bare(name) == "poisson" else usual_value(name, young_pa, USUAL)
+    value = (
+        USUAL_POISSON
+        if without_region(name) == "poisson"
+        else usual_value(name, young_pa, USUAL_POISSON)
+    )
     assert value is not None
     return value

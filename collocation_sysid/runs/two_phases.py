@@ -20,33 +20,33 @@ import numpy as np
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.constants import CONTRAST, mode
-from ..fem.two_phase import ElementLogarithms, PhaseSamples, TwoPhaseModes, inclusion
+from ..fem.constants import CONTRAST, field_coefficient
+from ..fem.two_phase import ElementLogarithms, PhaseSamples, TwoPhaseModes, is_inclusion
 from ..methods.solution import Solution
 from ..problem import Problem
-from ..program.charts import Chart
+from ..program.charts import MarkerAssociation
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
 from ..statistics.fields import mean_logarithm
-from ..statistics.linearised import LinearisedFit, information, linearised_fit
+from ..statistics.linearised import LinearisedFit, factorise_information, linearise_fit
 from ..statistics.phases import (
     USUAL,
     ElementInformation,
-    Faces,
-    PhaseDraws,
-    draw_phases,
-    start_phases,
+    InternalFaces,
+    PosteriorDraws,
+    initial_phases,
+    sample_phases,
 )
-from .warm_start import Earlier
+from .warm_start import WarmStart
 
-Solved = Callable[[Problem, str | Path | Earlier | None], Solution]
+SolveOnce = Callable[[Problem, str | Path | WarmStart | None], Solution]
 
 # Most elements of a two-phase field: the sampler stores two dense square matrices of this size.
 MOST_ELEMENTS = 4000
 # Most rounds of phases and parameters.
-ROUNDS = 6
+MOST_ROUNDS = 6
 # Share of the inclusion's volume that changes in a round, below which the phases are final.
-SETTLED = 0.02
+SETTLED_VOLUME_SHARE = 0.02
 # Fewest elements of an inclusion: a single element is noise.
 FEWEST_ELEMENTS = 2
 
@@ -76,7 +76,7 @@ class _PhaseSearch:
 
 
 @dataclass(frozen=True)
-class _SmoothFit:
+class _SmoothFitQuality:
     """Quality of the fit with the smooth field.
 
     Attributes
@@ -98,13 +98,17 @@ class _SmoothFit:
         return max(1.0, (chi_squared - self.chi_squared) / max(1.0, self.determined))
 
 
-def _smooth_fit(fit: LinearisedFit) -> _SmoothFit:
+def _smooth_fit(fit: LinearisedFit) -> _SmoothFitQuality:
     """Return the quality of the fit with the smooth field, linearised at its solution."""
-    return _SmoothFit(fit.chi_squared, _misfit(fit), information(fit).fitted)
+    return _SmoothFitQuality(
+        fit.chi_squared,
+        _chi_squared_per_measurement(fit),
+        factorise_information(fit).determined_count,
+    )
 
 
 def solve_two_phases(
-    problem: Problem, start: str | Path | Earlier | None, solved: Solved
+    problem: Problem, start: str | Path | WarmStart | None, solve_once: SolveOnce
 ) -> Solution:
     """Solve a problem with a two-phase field; the body of the solution has the phases and their
     samples.
@@ -113,9 +117,9 @@ def solve_two_phases(
     ----------
     problem : Problem
         With exactly one two-phase field.
-    start : str, Path or Earlier, optional
+    start : str, Path or WarmStart, optional
         Start of the solve with the smooth field.
-    solved : callable
+    solve_once : callable
         ``solved(problem, start)``, the solution of a problem with given phases or a smooth field.
 
     Raises
@@ -123,41 +127,45 @@ def solve_two_phases(
     InputError
         For several two-phase fields, or too many elements.
     """
-    search = _search_of(problem)
-    solution = solved(problem.with_fields({search.name: search.modes.smooth}), start)
+    search = _two_phase_search(problem)
+    solution = solve_once(problem.with_fields({search.name: search.modes.smooth_field}), start)
     if not solution.status.converged:
         return solution
-    smooth = _smooth_fit(linearised_fit(solution.collocation, solution.z))
-    at_smooth = _linearised(problem, search, solution)
-    phase = start_phases(at_smooth.data(1.0), at_smooth.faces, search.modes.volumes_m3)
+    smooth = _smooth_fit(linearise_fit(solution.collocation, solution.z))
+    at_smooth = _linearise_in_elements(problem, search, solution)
+    phase = initial_phases(
+        at_smooth.normal_equations(1.0), at_smooth.faces, search.modes.volumes_m3
+    )
     best: Solution | None = None
     at_best = at_smooth
     rounds = 0
-    for _ in range(ROUNDS):
-        candidate = _solved_with(problem, search, phase, Earlier.of(best or solution), solved)
+    for _ in range(MOST_ROUNDS):
+        candidate = _solve_with_phases(
+            problem, search, phase, WarmStart.of(best or solution), solve_once
+        )
         if not candidate.status.converged and best is None:
             return candidate
         rounds += 1
         if not candidate.status.converged:
             break
-        at_candidate = _linearised(problem, search, candidate)
+        at_candidate = _linearise_in_elements(problem, search, candidate)
         if best is not None and at_candidate.fit.chi_squared >= at_best.fit.chi_squared:
             break
         best = candidate
         at_best = at_candidate
-        draws = draw_phases(at_best.data(1.0), at_best.faces, phase)
-        next_phase = _likelier(draws.probability)
+        draws = sample_phases(at_best.normal_equations(1.0), at_best.faces, phase)
+        next_phase = _likelier_phases(draws.probability)
         volumes_m3 = search.modes.volumes_m3
-        if volumes_m3 @ np.abs(next_phase - phase) < SETTLED * (volumes_m3 @ phase):
+        if volumes_m3 @ np.abs(next_phase - phase) < SETTLED_VOLUME_SHARE * (volumes_m3 @ phase):
             break
         phase = next_phase
     assert best is not None
-    final = _phase_of(best, search)
+    final = _phases_of_solution(best, search)
     temperature = smooth.lack_of_fit(at_best.fit.chi_squared)
     # The whole posterior is tempered, its prior too: with the data alone tempered the prior would
     # shrink inclusions.
     settings = replace(USUAL, face_nats=USUAL.face_nats / temperature)
-    draws = draw_phases(at_best.data(temperature), at_best.faces, final, settings)
+    draws = sample_phases(at_best.normal_equations(temperature), at_best.faces, final, settings)
     samples = _samples(draws, at_best.fit, search, best)
     best = _with_samples(best, replace(samples, smooth_misfit=smooth.misfit))
     note = (
@@ -169,28 +177,32 @@ def solve_two_phases(
     return replace(best, notes=(note, *best.notes))
 
 
-def _phase_of(solution: Solution, search: _PhaseSearch) -> Array:
+def _phases_of_solution(solution: Solution, search: _PhaseSearch) -> Array:
     """Return the phases (E,) of a solution."""
-    modes = _body_of(solution, search).parts[search.number].field
+    modes = _two_phase_body(solution, search).parts[search.number].field
     assert isinstance(modes, TwoPhaseModes)
     return modes.phase
 
 
-def _body_of(solution: Solution, search: _PhaseSearch) -> Body:
+def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
     """Return the body with the two-phase field."""
-    segments = solution.collocation.segments
-    return next(s.body for s in segments if search.name in s.body.lengths_m)
+    segments = solution.collocation.transcriptions
+    return next(s.body for s in segments if search.name in s.body.field_lengths_m)
 
 
-def _solved_with(
-    problem: Problem, search: _PhaseSearch, phase: Array, earlier: Earlier, solved: Solved
+def _solve_with_phases(
+    problem: Problem,
+    search: _PhaseSearch,
+    phase: Array,
+    warm_start: WarmStart,
+    solve_once: SolveOnce,
 ) -> Solution:
     """Solve with given phases, from the parameters of an earlier answer."""
     own = replace(search.modes, phase=phase)
-    return solved(problem.with_fields({search.name: own}), earlier)
+    return solve_once(problem.with_fields({search.name: own}), warm_start)
 
 
-def _search_of(problem: Problem) -> _PhaseSearch:
+def _two_phase_search(problem: Problem) -> _PhaseSearch:
     """Return the two-phase field of a problem; an `InputError` for several, or for too many
     elements.
     """
@@ -206,16 +218,16 @@ def _search_of(problem: Problem) -> _PhaseSearch:
             f"the two-phase field of {name} has {len(modes.phase)} elements; expected at most "
             f"{MOST_ELEMENTS}: take a coarser mesh, or a region around the inclusion"
         )
-    parts = next(body.parts for body in problem.bodies if name in body.lengths_m)
+    parts = next(body.parts for body in problem.bodies if name in body.field_lengths_m)
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
     part = parts[number]
-    elements = tuple(part.full_name(mode(k).name) for k in range(len(modes.phase)))
+    elements = tuple(part.full_name(field_coefficient(k).name) for k in range(len(modes.phase)))
     return _PhaseSearch(name, part.full_name(CONTRAST.name), modes, number, elements)
 
 
-def _likelier(probability: Array) -> Array:
+def _likelier_phases(probability: Array) -> Array:
     """Return the likelier phase (E,) of every element; neither phase is left empty."""
-    phase = inclusion(probability).astype(float)
+    phase = is_inclusion(probability).astype(float)
     order = np.argsort(probability)
     if phase.sum() < FEWEST_ELEMENTS:
         phase[order[-FEWEST_ELEMENTS:]] = 1.0
@@ -225,7 +237,7 @@ def _likelier(probability: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Linearised:
+class _LinearisedMeasurements:
     """Measurements linearised in the logarithm of every element.
 
     Attributes
@@ -235,7 +247,7 @@ class _Linearised:
         Columns of the elements' logarithms in the fit.
     base : (E,) array
         Logarithms relative to the mean at which the measurements are linearised.
-    faces : Faces
+    faces : InternalFaces
     deviation : float
         Prior standard deviation of the logarithm of the contrast.
     """
@@ -243,14 +255,14 @@ class _Linearised:
     fit: LinearisedFit
     columns: Index
     base: Array
-    faces: Faces
+    faces: InternalFaces
     deviation: float
 
-    def data(self, temperature: float) -> ElementInformation:
+    def normal_equations(self, temperature: float) -> ElementInformation:
         """Return the normal equations, with those of the measurements divided by the
         temperature T.
         """
-        return _information(
+        return _normal_equations(
             self.fit,
             self.columns,
             base=self.base,
@@ -259,20 +271,22 @@ class _Linearised:
         )
 
 
-def _linearised(problem: Problem, search: _PhaseSearch, solution: Solution) -> _Linearised:
+def _linearise_in_elements(
+    problem: Problem, search: _PhaseSearch, solution: Solution
+) -> _LinearisedMeasurements:
     """Return the measurements linearised at a solution in the logarithm of every element."""
-    body = _body_of(solution, search)
+    body = _two_phase_body(solution, search)
     part = body.parts[search.number]
     assert part.field is not None
-    theta = body.theta(solution.parameters)
-    base = part.field.logarithms(theta[body.mode_places[search.number]])
-    elements = ElementLogarithms.about(search.modes, base)
-    fit = _by_elements(problem.with_fields({search.name: elements}), solution, search)
-    return _Linearised(
+    theta = body.theta_from_values(solution.parameters)
+    base = part.field.logarithms(theta[body.field_slices[search.number]])
+    elements = ElementLogarithms.relative_to(search.modes, base)
+    fit = _fit_with_elements(problem.with_fields({search.name: elements}), solution, search)
+    return _LinearisedMeasurements(
         fit=fit,
         columns=_columns(fit, search),
         base=base,
-        faces=Faces.of(body.mesh, part.cells),
+        faces=InternalFaces.from_mesh(body.mesh, part.cells),
         deviation=search.modes.field.deviation,
     )
 
@@ -284,17 +298,17 @@ def _columns(fit: LinearisedFit, search: _PhaseSearch) -> Index:
 
 
 def _samples(
-    draws: PhaseDraws, fit: LinearisedFit, search: _PhaseSearch, solution: Solution
+    draws: PosteriorDraws, fit: LinearisedFit, search: _PhaseSearch, solution: Solution
 ) -> PhaseSamples:
     """Return draws of the phases as samples of the logarithms in the elements."""
     others = np.delete(np.arange(len(fit.names)), _columns(fit, search))
-    shared = [int(k) for k in others if k < fit.shared]
+    shared = [int(k) for k in others if k < fit.shared_count]
     names = tuple(fit.names[k] for k in shared)
     mean, slopes = mean_logarithm(
-        _body_of(solution, search),
+        _two_phase_body(solution, search),
         solution.collocation.parameters,
         solution.q,
-        number=search.number,
+        part_index=search.number,
         names=names,
     )
     by_parameters = draws.changes[:, : len(shared)] @ slopes
@@ -305,12 +319,12 @@ def _samples(
         volumes_m3=draws.phases @ search.modes.volumes_m3,
         names=(*names, search.contrast),
         deviations=np.atleast_2d(np.cov(means, rowvar=False)),
-        misfit=_misfit(fit),
+        misfit=_chi_squared_per_measurement(fit),
         smooth_misfit=np.nan,
     )
 
 
-def _by_elements(problem: Problem, solution: Solution, search: _PhaseSearch) -> LinearisedFit:
+def _fit_with_elements(problem: Problem, solution: Solution, search: _PhaseSearch) -> LinearisedFit:
     """Return the linearised fit at a solution, with the elements' logarithms as further parameters.
 
     The values of these parameters are zero.
@@ -321,8 +335,8 @@ def _by_elements(problem: Problem, solution: Solution, search: _PhaseSearch) -> 
         solved,
         experiments=problem.experiments,
         parameters=problem.parameters,
-        charts=_charts(solved, problem.experiments),
-        explicit=False,
+        associations=_marker_associations(solved, problem.experiments),
+        has_lifted_variables=False,
     )
     p, positions = solved.unpack(solution.z)
     values = dict(zip((item.name for item in solved.parameters.free), p, strict=False))
@@ -330,15 +344,15 @@ def _by_elements(problem: Problem, solution: Solution, search: _PhaseSearch) -> 
         0.0 if item.name in elements else values[item.name] for item in collocation.parameters.free
     ]
     both = np.concatenate([q, p[solved.nq :]])
-    return linearised_fit(collocation, collocation.pack(both, positions))
+    return linearise_fit(collocation, collocation.pack(both, positions))
 
 
-def _misfit(fit: LinearisedFit) -> float:
+def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
     """Return χ² per measurement of a linearised fit."""
-    return fit.chi_squared / max(1, fit.measurements)
+    return fit.chi_squared / max(1, fit.measurement_count)
 
 
-def _information(
+def _normal_equations(
     fit: LinearisedFit, of_z: Index, *, base: Array, deviation: float, temperature: float
 ) -> ElementInformation:
     """Return the normal equations of a linearised fit.
@@ -366,7 +380,7 @@ def _information(
     normal /= temperature
     score /= temperature
     of_p = np.delete(np.arange(size), of_z)
-    priors = fit.prior_slope[of_p]
+    priors = fit.prior_jacobian[of_p]
     return ElementInformation(
         of_p=normal[np.ix_(of_p, of_p)] + np.diag(priors**2),
         mixed=normal[np.ix_(of_z, of_p)],
@@ -382,7 +396,7 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
     """Return the solution whose body has the samples of the phases."""
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
-    for body in dict.fromkeys(segment.body for segment in collocation.segments):
+    for body in dict.fromkeys(segment.body for segment in collocation.transcriptions):
         fields = {
             part.field_name: replace(part.field, samples=samples)
             for part in body.parts
@@ -392,16 +406,18 @@ def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
     experiments = [
         replace(each, body=bodies.get(id(each.body), each.body)) for each in collocation.experiments
     ]
-    charts = _charts(collocation, experiments)
+    charts = _marker_associations(collocation, experiments)
     return replace(
-        solution, collocation=replace(collocation, experiments=experiments, charts=charts)
+        solution, collocation=replace(collocation, experiments=experiments, associations=charts)
     )
 
 
-def _charts(collocation: Collocation, experiments: Sequence[Experiment]) -> dict[str, Chart]:
+def _marker_associations(
+    collocation: Collocation, experiments: Sequence[Experiment]
+) -> dict[str, MarkerAssociation]:
     """Return the marker–element associations for bodies that differ in their fields only."""
     bodies = {experiment.name: experiment.body for experiment in experiments}
     return {
-        segment.experiment.name: replace(segment.chart, body=bodies[segment.experiment.name])
-        for segment in collocation.segments
+        segment.experiment.name: replace(segment.association, body=bodies[segment.experiment.name])
+        for segment in collocation.transcriptions
     }

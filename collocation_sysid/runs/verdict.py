@@ -13,14 +13,14 @@ from ..model.parameters import Parameters
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.depth_comparison import DepthError, SurfaceComparison
-from ..program.stability import instabilities
-from ..program.touches import touched
+from ..program.stability import find_instabilities
+from ..program.touches import contact_summaries_of_parts
 from ..recording.nuisance import DEPTH_SHIFT, DEPTH_TURN, TIME
-from ..recording.turning import TOO_FAST
-from ..statistics.budget import worded
+from ..recording.turning import DOUBTFUL_ANGLE_RAD
+from ..statistics.budget import source_label
 from ..statistics.concern import Concern
 from ..statistics.diagnostics import MarkerDiagnosis
-from ..statistics.plausible import odd_material, oddities
+from ..statistics.plausible import material_hypothesis, size_and_density_hypotheses
 from ..statistics.remedies import remedy_for
 from ..statistics.scale import scale_concerns
 from ..statistics.trust import (
@@ -28,30 +28,30 @@ from ..statistics.trust import (
     clock_concerns,
     contact_concerns,
     fit_concerns,
-    marker_concerns,
-    noise_rms_m,
+    forward_simulation_concerns,
     nuisance_concerns,
+    outlier_share_concerns,
     outline_concerns,
     parameter_concerns,
     prediction_concerns,
-    rollout_concerns,
+    rms_expected_from_noise_m,
+    rotation_step_concerns,
     scheme_concerns,
     stability_concerns,
-    turn_concerns,
 )
 from ..statistics.uncertainty import Uncertainty
-from .check.motion import Motion, motion_of
-from .forward_simulation import Rollout
+from .check.motion import ModesCheck, check_modes
+from .forward_simulation import ForwardSimulation
 from .result import ReportedEstimate
 
 # Largest noise of cameras, relative to the size of the body.
-NO_CAMERA = 0.01
+LARGEST_CAMERA_NOISE = 0.01
 
 
-def concerns(
+def solution_concerns(
     solution: Solution,
-    rollouts: Mapping[str, Rollout | str],
-    motions: Iterable[Motion],
+    rollouts: Mapping[str, ForwardSimulation | str],
+    motions: Iterable[ModesCheck],
     uncertainty: Uncertainty | None,
     diagnoses: Sequence[MarkerDiagnosis],
 ) -> Iterator[Concern]:
@@ -62,9 +62,9 @@ def concerns(
     Parameters
     ----------
     solution : Solution
-    rollouts : mapping of experiment name to Rollout or str
+    rollouts : mapping of experiment name to ForwardSimulation or str
         Forward simulations, or the reason why there is none.
-    motions : iterable of Motion
+    motions : iterable of ModesCheck
         Natural modes at the estimates.
     uncertainty : Uncertainty or None
     diagnoses : sequence of MarkerDiagnosis
@@ -82,42 +82,46 @@ def concerns(
     elif solution.collocation.nq:
         yield Concern("solve/no-error-bars", "doubtful")
     yield from allowance_concerns(solution)
-    yield from marker_concerns(diagnoses)
+    yield from outlier_share_concerns(diagnoses)
     for part in solution.parts:
         nuisance = part.segment.nuisance
-        low, high = nuisance.limits(part.segment.chart.samples)
+        low, high = nuisance.bounds(part.segment.association.clock_samples)
         # A lag and a tool may well be none.
         low = np.where(low == 0, -np.inf, low)
         yield from nuisance_concerns(nuisance.names, part.phi, low, high)
         for camera in range(len(part.segment.experiment.depths)):
-            pose = nuisance.places(DEPTH_TURN, DEPTH_SHIFT, of=camera)
+            pose = nuisance.indices_of_rows(DEPTH_TURN, DEPTH_SHIFT, component=camera)
             yield from camera_pose_concerns(
                 [nuisance.names[k] for k in pose], part.phi[pose].tolist()
             )
         for reading, distance_px in part.outline_distances_px:
-            camera = f"'{reading.sighting.view.depth.name}' of '{part.segment.experiment.name}'"
+            camera = (
+                f"'{reading.correspondences.camera.depth.name}' of '{part.segment.experiment.name}'"
+            )
             yield from outline_concerns(camera, distance_px)
-        for k in nuisance.places(TIME):
+        for k in nuisance.indices_of_rows(TIME):
             scale = float(nuisance.scales[k])
             name = part.segment.experiment.name
             yield from clock_concerns(name, float(part.phi[k]) * scale, scale)
-    yield from stability_concerns(instabilities(solution.collocation, solution.z))
-    yield from contact_concerns(touched(solution.parts))
+    yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
+    yield from contact_concerns(contact_summaries_of_parts(solution.parts))
     if not solution.collocation.nq:
-        yield from _of_predictions(rollouts)
+        yield from _prediction_concerns(rollouts)
     for name, rollout in rollouts.items():
-        yield from _of_unseen(name, rollout)
-        yield from _of_rollout(name, rollout, solution, expected_rms_m(solution, uncertainty))
+        yield from _unseen_depth_concerns(name, rollout)
+        yield from _forward_concerns(name, rollout, solution, expected_rms_m(solution, uncertainty))
     collocation = solution.collocation
-    for segment in collocation.segments:
-        yield from turn_concerns(segment.experiment, collocation.substeps, TOO_FAST, "scheme/turn")
+    for segment in collocation.transcriptions:
+        yield from rotation_step_concerns(
+            segment.experiment, collocation.substeps, DOUBTFUL_ANGLE_RAD, "scheme/turn"
+        )
     for motion in motions:
-        if motion.first is not None and motion.first.damping_ratio < 1:
+        if motion.first_mode is not None and motion.first_mode.damping_ratio < 1:
             yield from scheme_concerns(
                 motion.experiment,
-                motion.first.damping_ratio,
-                motion.first.numerical_damping_ratio,
-                motion.first.period_error,
+                motion.first_mode.damping_ratio,
+                motion.first_mode.numerical_damping_ratio,
+                motion.first_mode.period_error,
             )
 
 
@@ -138,17 +142,19 @@ def combined_concerns(
         Shares of the variance in the budget, largest first.
     """
     return [
-        _undetermined(item.name, estimates[item.name], shares[item.name])
+        _undetermined_concern(item.name, estimates[item.name], shares[item.name])
         for item in parameters.free
         if item.name in shares and not estimates[item.name].is_determined
     ]
 
 
-def _undetermined(name: str, estimate: ReportedEstimate, shares: Mapping[str, float]) -> Concern:
+def _undetermined_concern(
+    name: str, estimate: ReportedEstimate, shares: Mapping[str, float]
+) -> Concern:
     """Return the concern about an undetermined estimate, with the largest share of its budget."""
     source, share = next(iter(shares.items()))
     low, high = estimate.combined95 or (np.nan, np.nan)
-    data = {"name": name, "low": low, "high": high, "source": worded(source), "share": share}
+    data = {"name": name, "low": low, "high": high, "source": source_label(source), "share": share}
     return Concern("information/combined", "check", {**data, "remedy": remedy_for(source)})
 
 
@@ -156,10 +162,12 @@ def body_concerns(solution: Solution) -> Iterator[Concern]:
     """Yield concerns about implausible sizes and densities, implausible stiffness, and unknown
     scale.
     """
-    for body in dict.fromkeys(segment.body for segment in solution.collocation.segments):
-        odd = oddities(body) or [odd_material(body, body.theta(solution.parameters))]
+    for body in dict.fromkeys(segment.body for segment in solution.collocation.transcriptions):
+        odd = size_and_density_hypotheses(body) or [
+            material_hypothesis(body, body.theta_from_values(solution.parameters))
+        ]
         yield from (each.concern("doubtful") for each in odd if each is not None)
-    experiments = [segment.experiment for segment in solution.collocation.segments]
+    experiments = [segment.experiment for segment in solution.collocation.transcriptions]
     yield from scale_concerns(experiments, solution.collocation.parameters, "doubtful")
 
 
@@ -168,32 +176,32 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 
     In motions the autocorrelation of the residuals shows this; static experiments have none.
     """
-    for experiment in (segment.experiment for segment in solution.collocation.segments):
-        if not experiment.static or not experiment.markers.samples:
+    for experiment in (segment.experiment for segment in solution.collocation.transcriptions):
+        if not experiment.is_static or not experiment.markers.sample_count:
             continue
         sigma_m = float(np.max(experiment.markers.sigma_m))
         share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
-        if share > NO_CAMERA:
+        if share > LARGEST_CAMERA_NOISE:
             yield Concern("noise/allowance", data={"sigma_mm": 1e3 * sigma_m, "share": share})
 
 
-def _of_predictions(rollouts: Mapping[str, Rollout | str]) -> Iterator[Concern]:
+def _prediction_concerns(rollouts: Mapping[str, ForwardSimulation | str]) -> Iterator[Concern]:
     """Yield concerns about simulations with given parameters that differ by more than the noise."""
     for name, rollout in rollouts.items():
-        for misfit in rollout.misfits if isinstance(rollout, Rollout) else ():
+        for misfit in rollout.misfits if isinstance(rollout, ForwardSimulation) else ():
             yield from prediction_concerns(name, **vars(misfit))
 
 
-def _of_unseen(name: str, rollout: Rollout | str) -> Iterator[Concern]:
+def _unseen_depth_concerns(name: str, rollout: ForwardSimulation | str) -> Iterator[Concern]:
     """Yield a concern for each depth camera without a point near the simulated surface."""
-    for camera, error in rollout.depth.items() if isinstance(rollout, Rollout) else ():
+    for camera, error in rollout.depth.items() if isinstance(rollout, ForwardSimulation) else ():
         if not error.points:
             data = {"experiment": name, "camera": camera, "seen": error.seen}
             yield Concern("prediction/unseen", "doubtful", data)
 
 
-def _of_rollout(
-    name: str, rollout: Rollout | str, solution: Solution, noise_m: float
+def _forward_concerns(
+    name: str, rollout: ForwardSimulation | str, solution: Solution, noise_m: float
 ) -> list[Concern]:
     """Return concerns about the forward simulation of an experiment.
 
@@ -201,58 +209,60 @@ def _of_rollout(
     ----------
     name : str
         Name of the experiment.
-    rollout : Rollout or str
+    rollout : ForwardSimulation or str
     solution : Solution
     noise_m : float
         Expected RMS distance of the markers by their noise.
     """
     fit_rms_m = solution.rms_by_experiment_m
-    if not isinstance(rollout, Rollout):
+    if not isinstance(rollout, ForwardSimulation):
         return [Concern("roll-out/failed", "doubtful", {"experiment": name, "why": rollout})]
     fitted = name in fit_rms_m
     fit_m = fit_rms_m.get(name, solution.rms_m)
-    of_markers = rollout_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
+    of_markers = forward_simulation_concerns(name, rollout.rms_m, fit_m, noise_m, fitted)
     predicted_n = rollout.wrench_rms[0]
     fit_n = pooled_wrench_rms(solution)[0]
     if fitted or of_markers:
         return of_markers
     if predicted_n is not None and fit_n is not None:
-        of_markers = rollout_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
-    return [*of_markers, *_of_predicted_depth(name, rollout, solution)]
+        of_markers = forward_simulation_concerns(f"{name}/force", predicted_n, fit_n, 0.0, fitted)
+    return [*of_markers, *_depth_concerns(name, rollout, solution)]
 
 
-def _of_predicted_depth(name: str, rollout: Rollout, solution: Solution) -> Iterator[Concern]:
+def _depth_concerns(name: str, rollout: ForwardSimulation, solution: Solution) -> Iterator[Concern]:
     """Yield concerns about predicted depth, against the larger of the fitted residuals and the
     noise.
     """
     fitted = [error.tame_sigmas for error in depth_errors(solution).values()]
     yardstick = max(1.0, root_mean(np.square(fitted)) if fitted else 0.0)
     for camera, error in rollout.depth.items():
-        yield from rollout_concerns(f"{name}/{camera}", error.tame_sigmas, yardstick, 0.0, False)
+        yield from forward_simulation_concerns(
+            f"{name}/{camera}", error.tame_sigmas, yardstick, 0.0, False
+        )
 
 
 def depth_errors(solution: Solution) -> dict[tuple[str, str], DepthError]:
     """Distances of depth cameras' points from the fitted surface, by (experiment, camera)."""
     return {
-        (part.segment.experiment.name, reading.sighting.view.depth.name): (
+        (part.segment.experiment.name, reading.correspondences.camera.depth.name): (
             SurfaceComparison.from_fit(reading, part.x, looked, part.phi).error
         )
         for part in solution.parts
-        for reading, looked in part.sights
+        for reading, looked in part.depth_residuals
     }
 
 
 def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float:
     """RMS distance of the fitted markers that is expected from noise with the stated σ [m]."""
-    markers = [segment.experiment.markers for segment in solution.collocation.segments]
-    samples = np.concatenate([each.present.sum(axis=0) for each in markers]).astype(float)
+    markers = [segment.experiment.markers for segment in solution.collocation.transcriptions]
+    samples = np.concatenate([each.is_present.sum(axis=0) for each in markers]).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
-    measured = solution.collocation.measurements
+    measured = solution.collocation.measurement_count
     fitted = 0.0 if uncertainty is None else measured - uncertainty.degrees_of_freedom
-    return noise_rms_m(sigma_m, samples, float(fitted))
+    return rms_expected_from_noise_m(sigma_m, samples, float(fitted))
 
 
-def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
+def modes_by_experiment(problem: Problem, solution: Solution) -> dict[str, ModesCheck]:
     """Natural modes of each body at the estimates, by experiment; empty if the search failed.
 
     Static experiments, and those without an equilibrium, are left out.
@@ -260,11 +270,11 @@ def motions_of(problem: Problem, solution: Solution) -> dict[str, Motion]:
     motions = {}
     substeps = solution.collocation.substeps
     scheme = as_scheme(solution.collocation.scheme)
-    moving = [experiment for experiment in problem.experiments if not experiment.static]
+    moving = [experiment for experiment in problem.experiments if not experiment.is_static]
     for experiment in moving if solution.status.converged else ():
-        theta = experiment.body.theta(solution.parameters)
+        theta = experiment.body.theta_from_values(solution.parameters)
         try:
-            motions[experiment.name] = motion_of(
+            motions[experiment.name] = check_modes(
                 experiment, scheme, experiment.timestep_s / substeps, theta
             )
         except SimulationError:

@@ -12,16 +12,16 @@ from ..arrays import Array
 from ..errors import InputError
 from ..files import RESULT_FILE, damage_refused
 from ..methods.solution import Solution
-from ..methods.start import marched
+from ..methods.start import simulate_trajectories
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..program.segment import Segment
-from ..statistics.linearised import values_of
+from ..program.segment import Transcription
+from ..statistics.linearised import parameter_values
 from .result import Result
 
 
 @dataclass(frozen=True)
-class Earlier:
+class WarmStart:
     """Estimates of an earlier solution, by name, as the start of another solve.
 
     Attributes
@@ -31,7 +31,7 @@ class Earlier:
     values : mapping of name to value
         Parameters, and moduli derived from them.
     nuisance : mapping of name to value
-        Nuisance parameters by "experiment: label", as in `Collocation.names`.
+        Nuisance parameters by "experiment: label", as in `Collocation.parameter_names`.
     places_m : mapping of experiment to mapping of marker to (3,)
         Places of the markers.
     substeps : int
@@ -45,7 +45,7 @@ class Earlier:
     substeps: int = 1
 
     @classmethod
-    def read(cls, folder: str | Path) -> Earlier:
+    def read(cls, folder: str | Path) -> WarmStart:
         """Return the estimates in a run folder.
 
         Raises
@@ -53,10 +53,10 @@ class Earlier:
         InputError
             If the folder is no run folder, or damaged.
         """
-        return cls.of_result(Result.read(folder, "the folder of an earlier run"), Path(folder))
+        return cls.from_result(Result.read(folder, "the folder of an earlier run"), Path(folder))
 
     @classmethod
-    def of_result(cls, result: Result, folder: Path) -> Earlier:
+    def from_result(cls, result: Result, folder: Path) -> WarmStart:
         """Return the estimates of a result.
 
         Raises
@@ -87,7 +87,7 @@ class Earlier:
         return cls(folder, values, nuisance, places_m, result.problem.substeps)
 
     @classmethod
-    def of(cls, solution: Solution) -> Earlier:
+    def of(cls, solution: Solution) -> WarmStart:
         """Return the estimates of a solution."""
         collocation = solution.collocation
         nuisance = {}
@@ -95,14 +95,16 @@ class Earlier:
         for part in solution.parts:
             segment = part.segment
             name = segment.experiment.name
-            nuisance |= {f"{name}: {e.label}": v for e, _, v in segment.nuisance.valued(part.phi)}
+            nuisance |= {
+                f"{name}: {e.label}": v for e, _, v in segment.nuisance.iterate_values(part.phi)
+            }
             markers = segment.experiment.markers.names
-            places = segment.places_m(part.phi)
+            places = segment.marker_places_m(part.phi)
             places_m[segment.experiment.name] = dict(zip(markers, places, strict=True))
-        values = values_of(collocation, solution.q)
+        values = parameter_values(collocation, solution.q)
         return cls(Path(), values, nuisance, places_m, collocation.substeps)
 
-    def started(self, problem: Problem) -> Problem:
+    def apply_to_problem(self, problem: Problem) -> Problem:
         """Return the problem with these estimates as its guesses, clipped to its bounds.
 
         Raises
@@ -121,50 +123,52 @@ class Earlier:
         guesses = {i.name: float(np.clip(value, i.lower, i.upper)) for i, value in known.items()}
         return replace(problem, parameters=problem.parameters.with_guess(guesses))
 
-    def placed(self, collocation: Collocation) -> Collocation:
+    def apply_to_places(self, collocation: Collocation) -> Collocation:
         """Return the discretised problem with estimated markers starting at the earlier places."""
         places_m = []
-        for segment in collocation.segments:
-            here = segment.places_m(segment.guess_phi)
+        for segment in collocation.transcriptions:
+            here = segment.marker_places_m(segment.guess_phi)
             for m, place in self._known_places(segment).items():
                 here[m] = place
             places_m.append(here)
-        return collocation.placed_at(places_m)
+        return collocation.with_marker_places(places_m)
 
-    def _known_places(self, segment: Segment) -> dict[int, Array]:
+    def _known_places(self, segment: Transcription) -> dict[int, Array]:
         """Return earlier places (3,) of those markers of a segment whose places are estimated, by
         index.
         """
         places_m = self.places_m.get(segment.experiment.name, {})
         names = segment.experiment.markers.names
-        estimated = segment.chart.estimated.tolist()
+        estimated = segment.association.estimated.tolist()
         return {m: places_m[names[m]] for m in estimated if names[m] in places_m}
 
-    def nuisance_of(self, collocation: Collocation) -> tuple[Array, int]:
+    def apply_to_nuisance(self, collocation: Collocation) -> tuple[Array, int]:
         """Return p at the guess with the earlier nuisance parameters, and the number of these.
 
         Places of markers are those of the discretised problem.
         """
         p = collocation.guess_p
         matches = 0
-        for segment in collocation.segments:
-            for place, entry in zip(segment.local.places, segment.nuisance.entries, strict=True):
+        for segment in collocation.transcriptions:
+            for place, entry in zip(
+                segment.nuisance_indices.indices, segment.nuisance.entries, strict=True
+            ):
                 name = f"{segment.experiment.name}: {entry.label}"
                 if name in self.nuisance:
                     p[place] = self.nuisance[name] / entry.sigma
                     matches += 1
         return p, matches
 
-    def variables(self, collocation: Collocation) -> Array | None:
+    def simulated_variables(self, collocation: Collocation) -> Array | None:
         """Return the variables z of a simulation at the guess with the earlier nuisance parameters.
 
         None if no nuisance parameter or place matches, or if the simulation fails. Places of
         markers are those of the discretised problem.
         """
-        p, matches = self.nuisance_of(collocation)
-        matches += sum(len(self._known_places(segment)) for segment in collocation.segments)
+        p, matches = self.apply_to_nuisance(collocation)
+        matches += sum(len(self._known_places(segment)) for segment in collocation.transcriptions)
         if not matches:
             return None
-        p = np.clip(p, *collocation.bounds_p)
-        positions, failure = marched(collocation, p)
+        p = np.clip(p, *collocation.parameter_bounds)
+        positions, failure = simulate_trajectories(collocation, p)
         return None if failure is not None else collocation.pack(p, positions)

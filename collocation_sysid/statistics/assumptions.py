@@ -2,7 +2,8 @@
 wrong.
 
 An assumption is a row of `ASSUMPTIONS`: its standard deviation, and its effect on the equations of
-motion, c = Σ w F − M a, or on the prescribed displacements; `considered` propagates effects to the
+motion, c = Σ w F − M a, or on the prescribed displacements; `changes_of_nuisances` propagates
+effects to the
 residuals. Assumptions that change only the measurements (cameras, clocks) are nuisance parameters,
 see `recording.nuisance`. `Assumptions` is the table of the problem file in which users state
 standard deviations.
@@ -21,19 +22,19 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..checked import Options, Positive
 from ..fem.body import Body
-from ..fem.constants import GAMMA_R, bare
+from ..fem.constants import GAMMA_R, without_region
 from ..fem.materials import DAMPINGS, MATERIALS
-from ..fem.moduli import engineering
+from ..fem.moduli import engineering_constants
 from ..fem.rest_shape import RestShape
-from ..model.contact import Contact, contacts
+from ..model.contact import Contact, contact_terms
 from ..model.dynamics import Dynamics
 from ..model.force_term import States
 from ..model.parameters import Parameters
-from ..program.collocation import Part
-from ..program.reaction import forces_on, reactions
-from ..program.touches import on_surface
-from ..recording.grasp import free_motions
-from ..recording.nuisance import ROWS
+from ..program.collocation import ExperimentIterate
+from ..program.reaction import forces_on_dofs, reaction_forces
+from ..program.touches import surface_gaps_and_pressures
+from ..recording.grasp import free_rigid_motions
+from ..recording.nuisance import KINDS
 from ..section import ByForm, Section
 from .shape_error import (
     CORRELATION,
@@ -73,25 +74,25 @@ class Effect:
         Change of the forces at the evaluations [N]; None means no change.
     mass_kg : (3n,) array or None
         Change of the inertial masses, whose weight is not in `force_n` [kg]; None means no change.
-    stretched : float
+    time_stretch : float
         Relative change of the times in the inertia.
-    moved_m : (N, g) array or None
+    displacement_m : (N, g) array or None
         Change of the prescribed positions of the grasped dofs [m]; None means no change.
     """
 
     force_n: Array | None = None
     mass_kg: Array | None = None
-    stretched: float = 0.0
-    moved_m: Array | None = None
+    time_stretch: float = 0.0
+    displacement_m: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedExperiment:
     """One experiment at the answer, as the effects of assumptions need it.
 
     Attributes
     ----------
-    part : Part
+    iterate : ExperimentIterate
         The experiment at the answer.
     parameters : Parameters
         Shared parameters.
@@ -99,19 +100,19 @@ class Fitted:
         Correlation length of the surface's error over the longest extent of the body.
     """
 
-    part: Part
+    iterate: ExperimentIterate
     parameters: Parameters
     surface_correlation: float = CORRELATION
 
     @property
     def body(self) -> Body:
         """Body of the experiment."""
-        return self.part.segment.body
+        return self.iterate.segment.body
 
     @property
     def dynamics(self) -> Dynamics:
         """Equations of motion at the answer."""
-        return self.part.setting.dynamics
+        return self.iterate.equations.dynamics
 
     @property
     def theta(self) -> Array:
@@ -131,17 +132,17 @@ class Fitted:
     @cached_property
     def acceleration(self) -> Array:
         """Accelerations (N, 3n) of the rows [m/s²]."""
-        return self.dynamics.acceleration(self.part.x)
+        return self.dynamics.acceleration(self.iterate.x)
 
     @cached_property
     def states(self) -> tuple[Array, Array]:
         """States ξ [m] and velocities ν [m/s] at the evaluations, each (N, 3n); zero before
         the first.
         """
-        xi, nu = self.dynamics.evaluation_states(self.part.x)
-        return self.of_rows(xi), self.of_rows(nu)
+        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
+        return self.pad_rows(xi), self.pad_rows(nu)
 
-    def of_rows(self, evaluated: Array) -> Array:
+    def pad_rows(self, evaluated: Array) -> Array:
         """Return values (N, 3n) of all rows from those of the evaluations, zero before the
         first.
         """
@@ -149,8 +150,8 @@ class Fitted:
 
     def internal_n(
         self,
-        scale: float = 1.0,
-        slower: float = 1.0,
+        length_factor: float = 1.0,
+        time_factor: float = 1.0,
         theta: Array | None = None,
         body: Body | None = None,
     ) -> Array:
@@ -158,9 +159,9 @@ class Fitted:
 
         Parameters
         ----------
-        scale : float
+        length_factor : float
             Factor of lengths: positions and velocities are divided by it.
-        slower : float
+        time_factor : float
             Factor of times: velocities are divided by it.
         theta : (k,) array, optional
             Constants of the body; those of the answer by default.
@@ -170,11 +171,16 @@ class Fitted:
         undamped = (self.theta if theta is None else theta).copy()
         undamped[list(self.body.tied_shares)] = 0.0
         dynamics = self.dynamics.with_theta(undamped)
-        histories = dynamics.forces_along(dynamics.histories(self.part.x)).past
-        xi, nu = dynamics.evaluation_states(self.part.x)
+        histories = dynamics.forces_with_histories(dynamics.histories(self.iterate.x)).memory_state
+        xi, nu = dynamics.evaluation_states(self.iterate.x)
         evaluated = self.body if body is None else body
-        return self.of_rows(
-            evaluated.force(xi / scale, nu / (scale * slower), undamped, carried=histories)
+        return self.pad_rows(
+            evaluated.force(
+                xi / length_factor,
+                nu / (length_factor * time_factor),
+                undamped,
+                memory_input=histories,
+            )
         )
 
     @cached_property
@@ -186,41 +192,47 @@ class Fitted:
     def stress_free_m(self) -> Array:
         """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]."""
         body = self.body
-        return body.nodes.points_m if body.inverse is None else self._inverse.positions_m
+        return (
+            body.nodes.points_m
+            if body.inverse_equilibrium is None
+            else self._rest_shape.positions_m
+        )
 
     @cached_property
-    def _inverse(self) -> RestShape:
+    def _rest_shape(self) -> RestShape:
         """Stress-free shape that follows from a mesh made under gravity."""
-        assert self.body.inverse is not None
-        return self.body.inverse.shape(self.theta)
+        assert self.body.inverse_equilibrium is not None
+        return self.body.inverse_equilibrium.solve(self.theta)
 
-    def of_reference(self, moved_m: Array) -> Array:
+    def force_change_by_reference(self, moved_m: Array) -> Array:
         """Return the first-order change (N, 3n) of the material's forces if the stress-free
         positions change by (n, 3) [m].
         """
         largest = float(np.abs(moved_m).max(initial=0.0))
         if not largest:
-            return np.zeros_like(self.part.x)
-        step = SMALL_STRAIN * self.part.segment.length_m / largest
+            return np.zeros_like(self.iterate.x)
+        step = SMALL_STRAIN * self.iterate.segment.length_m / largest
         own = self.stress_free_m + step * moved_m[: len(self.stress_free_m)]
         other = self.body.with_stress_free(own)
         return (self.internal_n(body=other) - self.internal_force_n) / step
 
-    def of_heavier_scan(self) -> Array:
+    def force_change_by_scan_weight(self) -> Array:
         """Return the change (N, 3n) of forces per relative change of the weight during the
         scan; zero unless the mesh was made under gravity.
         """
-        if self.body.inverse is None:
-            return np.zeros_like(self.part.x)
-        return self.of_reference(self.body.inverse.weight_slope(self.theta))
+        if self.body.inverse_equilibrium is None:
+            return np.zeros_like(self.iterate.x)
+        return self.force_change_by_reference(
+            self.body.inverse_equilibrium.weight_sensitivity(self.theta)
+        )
 
     @cached_property
     def surface_modes_m(self) -> Array:
         """Displacements (modes, n, 3) of the nodes if the surface is off by the thickness
         of the body, for each mode [m].
         """
-        segment = self.part.segment
-        gaps_m = on_surface(segment.experiment, self.theta, self.part.x)[0]
+        segment = self.iterate.segment
+        gaps_m = surface_gaps_and_pressures(segment.experiment, self.theta, self.iterate.x)[0]
         nearest = np.fmin.reduce(gaps_m, axis=0)
         is_touched = np.nan_to_num(nearest, nan=np.inf) < segment.length_m
         known = np.unique(self.body.mesh.surface[is_touched])
@@ -228,28 +240,28 @@ class Fitted:
         return thickness_m(self.body) * modes
 
     @cached_property
-    def likely_held(self) -> Index:
+    def likely_support_dofs(self) -> Index:
         """Dofs that were probably supported while the mesh was made: those prescribed in
         the recording, or else the lowest nodes.
         """
-        prescribed = self.part.setting.held.dofs
+        prescribed = self.iterate.equations.prescribed.dofs
         own = prescribed[prescribed < self.body.nodes.points_m.size]
         points_m = self.body.nodes.points_m
-        if len(free_motions(points_m, _held_mask(own, len(points_m)))):
-            gravity = self.part.segment.experiment.gravity_m_s2
+        if len(free_rigid_motions(points_m, _dof_mask(own, len(points_m)))):
+            gravity = self.iterate.segment.experiment.gravity_m_s2
             nodes = standing_nodes(self.body, gravity)
             return (3 * nodes[:, None] + np.arange(3)).ravel()
         return own
 
-    def weight_of(self, mass_kg: Array) -> Array:
+    def weight_and_drag(self, mass_kg: Array) -> Array:
         """Return weight and γ_m damping (N, 3n) of masses (3n,) [N]."""
-        return mass_kg * (self.gravity - self.body.tied_drag(self.theta) * self.states[1])
+        return mass_kg * (self.gravity - self.body.tied_damping_rate(self.theta) * self.states[1])
 
     @property
     def buoyancy_n(self) -> Array:
         """Buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
         lifted = -self.dynamics.mass.displaced_kg * self.gravity
-        return np.broadcast_to(lifted, self.part.x.shape)
+        return np.broadcast_to(lifted, self.iterate.x.shape)
 
     @property
     def added_mass_kg(self) -> Array:
@@ -269,25 +281,29 @@ class Fitted:
     @cached_property
     def grasp_force_n(self) -> Array:
         """Reaction forces (N, g) on the grasped dofs [N]; zero while they are not prescribed."""
-        dofs = self.part.setting.held.dofs
-        x = self.part.x
-        force = forces_on(self.dynamics, x, dofs)
-        mass = self.dynamics.mass.kg[:, dofs]
-        reaction_n = reactions(self.dynamics, mass, force, self.acceleration[:, dofs])
-        return np.where(np.isnan(self.part.setting.held.positions_m), 0.0, reaction_n)
+        dofs = self.iterate.equations.prescribed.dofs
+        x = self.iterate.x
+        force = forces_on_dofs(self.dynamics, x, dofs)
+        mass = self.dynamics.mass.inertia_kg[:, dofs]
+        reaction_n = reaction_forces(self.dynamics, mass, force, self.acceleration[:, dofs])
+        return np.where(np.isnan(self.iterate.equations.prescribed.positions_m), 0.0, reaction_n)
 
     @cached_property
     def contacts(self) -> dict[int, Contact]:
         """Contact forces derived from an energy, by their index among the further forces."""
-        further = enumerate(self.dynamics.forces.further)
-        return {k: each for k, each in further if isinstance(each, Contact) and not each.relaxed}
+        further = enumerate(self.dynamics.forces.external_terms)
+        return {
+            k: each
+            for k, each in further
+            if isinstance(each, Contact) and not each.is_complementarity
+        }
 
-    def contact_n(self, number: int) -> Array:
-        """Return the forces (N, 3n) of one of `contacts` at the evaluations [N]."""
-        xi, nu = self.dynamics.evaluation_states(self.part.x)
-        forces = self.dynamics.evaluated
-        term = forces.further[number]
-        return self.of_rows(term.force(forces.states(xi, nu)(term)))
+    def contact_n(self, index: int) -> Array:
+        """Return the forces (N, 3n) of one of `contact_terms` at the evaluations [N]."""
+        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
+        forces = self.dynamics.evaluated_forces
+        term = forces.external_terms[index]
+        return self.pad_rows(term.force(forces.states_of_terms(xi, nu)(term)))
 
     @cached_property
     def proportional_s(self) -> Array:
@@ -303,10 +319,12 @@ class Fitted:
     @cached_property
     def young_pa(self) -> float:
         """Young's modulus of the softest part at small strain [Pa]."""
-        return min(engineering(*moduli)[0] for moduli in self.body.lame(self.theta).values())
+        return min(
+            engineering_constants(*moduli)[0] for moduli in self.body.lame(self.theta).values()
+        )
 
 
-def _held_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
+def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
     """Return the mask (n, 3) of the coordinates of n nodes that are among the dofs."""
     mask = np.zeros(3 * nodes, dtype=bool)
     mask[dofs] = True
@@ -326,32 +344,32 @@ class Assumption:
     sigma : float or None
         Default standard deviation, as in a careful laboratory; None if the effect counts only where
         a problem states its deviation.
-    said : str
+    description : str
         Description.
     effect : callable
         Returns the effect of one unit, from an experiment at the answer and the index of the
         component; None if there is no effect in this experiment.
-    axes : str
+    component_names : str
         Names of components with independent errors, separated by spaces; empty if there is one.
     """
 
     name: str
     unit: str
     sigma: float | None
-    said: str
-    effect: Callable[[Fitted, int], Effect | None]
-    axes: str = ""
+    description: str
+    effect: Callable[[FittedExperiment, int], Effect | None]
+    component_names: str = ""
 
     @property
     def components(self) -> tuple[str, ...]:
         """Names of the components, each after that of the assumption."""
-        return tuple(f"{self.name} {a}" for a in self.axes.split()) or (self.name,)
+        return tuple(f"{self.name} {a}" for a in self.component_names.split()) or (self.name,)
 
 
 # What each changes ------------------------------------------------------------------------------
 
 
-def _size(at: Fitted, _: int) -> Effect:
+def _size(at: FittedExperiment, _: int) -> Effect:
     """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
 
     From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
@@ -364,44 +382,49 @@ def _size(at: Fitted, _: int) -> Effect:
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
     force = force / (2 * SMALL)
     # Of a body made under gravity the deflection over the size grows with the weight over s².
-    heavier = at.of_heavier_scan() * (-2.0 if at.body.has_stated_mass else 1.0)
+    heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_stated_mass else 1.0)
     mass = (0.0 if at.body.has_stated_mass else 3.0) * at.own_mass_kg
     for number, contact in at.contacts.items():
-        stated = contact.contact.obstacle.stiffness_pa_m is not None
+        stated = contact.law_of_contact.obstacle.stiffness_pa_m is not None
         force += (2.0 if stated else 1.0) * at.contact_n(number)
-    segment = at.part.segment
-    turns: Array = np.nan_to_num(segment.grasping.poses[0])
-    arms_m = segment.grasping.places(at.part.phi)[0] - segment.nuisance.grasp_pivot_m
+    segment = at.iterate.segment
+    turns: Array = np.nan_to_num(segment.prescribed_motion.pose_rows[0])
+    arms_m = (
+        segment.prescribed_motion.displaced_nodes(at.iterate.phi)[0]
+        - segment.nuisance.grasp_pivot_m
+    )
     displacement_m = np.einsum("tgj,gj->tg", turns, arms_m)
-    for obstacle, shift_m in obstacle_shifts_m(at.part):
-        obstacle_dofs = np.searchsorted(segment.grasping.dofs, obstacle.dofs)
+    for obstacle, shift_m in obstacle_shifts_m(at.iterate):
+        obstacle_dofs = np.searchsorted(segment.prescribed_motion.dofs, obstacle.prescribed_dofs)
         displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
     air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
     return Effect(
-        force + heavier + at.weight_of(mass) + air,
+        force + heavier + at.weight_and_drag(mass) + air,
         mass + 3.0 * at.added_mass_kg,
-        moved_m=displacement_m,
+        displacement_m=displacement_m,
     )
 
 
-def _mass(at: Fitted, _: int) -> Effect | None:
+def _mass(at: FittedExperiment, _: int) -> Effect | None:
     """Effect of a body that is heavier by a share; None if a density is estimated."""
-    if any(part.free_density for part in at.body.parts):
+    if any(part.has_free_density for part in at.body.parts):
         return None
-    return Effect(at.weight_of(at.own_mass_kg) + at.of_heavier_scan(), at.own_mass_kg)
+    return Effect(
+        at.weight_and_drag(at.own_mass_kg) + at.force_change_by_scan_weight(), at.own_mass_kg
+    )
 
 
-def _density_gradient(at: Fitted, axis: int) -> Effect:
+def _density_gradient(at: FittedExperiment, axis: int) -> Effect:
     """Effect of a density that is higher at one end of the body and lower at the other, by
     a share.
     """
     place = at.body.nodes_m[:, axis]
     middle = np.average(place, weights=at.own_mass_kg[::3])
     mass = at.own_mass_kg * np.repeat((place - middle) / np.abs(place - middle).max(), 3)
-    return Effect(at.weight_of(mass), mass)
+    return Effect(at.weight_and_drag(mass), mass)
 
 
-def _anisotropy(at: Fitted, axis: int) -> Effect:
+def _anisotropy(at: FittedExperiment, axis: int) -> Effect:
     """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
     strain e along it.
 
@@ -427,52 +450,55 @@ def _anisotropy(at: Fitted, axis: int) -> Effect:
     return Effect(force)
 
 
-def _drift(at: Fitted, _: int) -> Effect:
+def _drift(at: FittedExperiment, _: int) -> Effect:
     """Effect of a stiffness that is higher at the end than at the beginning, by a share."""
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
 
 
-def _pace(at: Fitted, _: int) -> Effect | None:
+def _time_scale(at: FittedExperiment, _: int) -> Effect | None:
     """Effect of clocks that are fast by a share, so that less time passes than they show;
     None for a static experiment.
     """
-    if at.part.segment.experiment.static:
+    if at.iterate.segment.experiment.is_static:
         return None
-    slower = at.internal_n(slower=1 + SMALL)
-    faster = at.internal_n(slower=1 - SMALL)
-    drag = at.body.tied_drag(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
+    slower = at.internal_n(time_factor=1 + SMALL)
+    faster = at.internal_n(time_factor=1 - SMALL)
+    drag = at.body.tied_damping_rate(at.theta) * at.dynamics.mass.damped_kg * at.states[1]
     air = 2.0 * at.air_drag_n
-    return Effect((faster - slower) / (2 * SMALL) - drag + air, stretched=-1.0)
+    return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
 
 
-def _poisson(at: Fitted, _: int) -> Effect | None:
+def _poisson(at: FittedExperiment, _: int) -> Effect | None:
     """Effect of a larger Poisson's ratio where it is stated; None where it is estimated."""
     items = {item.name: item for item in at.parameters.items}
     stated = {
         name
         for name, item in items.items()
-        if bare(name) == "poisson" and (items[item.tied.to] if item.tied else item).fixed
+        if without_region(name) == "poisson"
+        and (items[item.tied.to] if item.tied else item).is_fixed
     }
     if not stated:
         return None
-    values = at.parameters.values(at.part.q)
+    values = at.parameters.values(at.iterate.q)
     larger, smaller = (
-        at.internal_n(theta=at.body.theta({n: v + way * (n in stated) for n, v in values.items()}))
+        at.internal_n(
+            theta=at.body.theta_from_values({n: v + way * (n in stated) for n, v in values.items()})
+        )
         for way in (SMALL, -SMALL)
     )
     return Effect((larger - smaller) / (2 * SMALL))
 
 
-def _grip(at: Fitted, _: int) -> Effect | None:
+def _grip(at: FittedExperiment, _: int) -> Effect | None:
     """Effect of a compliant layer of the body's own material in the grips; None without a grip.
 
     A grasp that prescribes some axes only is a platen or a plane of symmetry, not a grip.
     """
-    prescribed = at.part.setting.held
-    holding = at.part.segment.experiment.gripping
-    gripped = [grasp.dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
+    prescribed = at.iterate.equations.prescribed
+    holding = at.iterate.segment.experiment.body_grasps
+    gripped = [grasp.prescribed_dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
     if not gripped:
         return None
     area_m2 = at.body.dof_volume_m3[prescribed.dofs] ** (2 / 3)
@@ -481,48 +507,48 @@ def _grip(at: Fitted, _: int) -> Effect | None:
     displacement_m[:, is_gripped] = -at.grasp_force_n[:, is_gripped] / (
         at.young_pa * area_m2[is_gripped]
     )
-    return Effect(moved_m=displacement_m)
+    return Effect(displacement_m=displacement_m)
 
 
-def _driven(at: Fitted) -> NDArray[np.bool_]:
+def _is_driven(at: FittedExperiment) -> NDArray[np.bool_]:
     """Return the mask (g,) of grasped dofs whose prescribed position changes."""
-    goals = at.part.setting.held.positions_m
+    goals = at.iterate.equations.prescribed.positions_m
     return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
 
 
-def _machine(at: Fitted, _: int) -> Effect | None:
+def _machine(at: FittedExperiment, _: int) -> Effect | None:
     """Effect of the compliance of a test bench: displacements are measured behind its
     frame. None for dynamic experiments.
     """
-    experiment = at.part.segment.experiment
-    prescribed = at.part.setting.held
-    if not experiment.static or not (driven := _driven(at)).any():
+    experiment = at.iterate.segment.experiment
+    prescribed = at.iterate.equations.prescribed
+    if not experiment.is_static or not (driven := _is_driven(at)).any():
         return None
     displacement_m = np.zeros_like(at.grasp_force_n)
     for grasp in experiment.grasps:
         for axis in range(3):
             here = np.flatnonzero(
-                np.isin(prescribed.dofs, grasp.dofs) & (prescribed.dofs % 3 == axis)
+                np.isin(prescribed.dofs, grasp.prescribed_dofs) & (prescribed.dofs % 3 == axis)
             )
             if driven[here].any():
                 displacement_m[:, here] = -at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
-    return Effect(moved_m=displacement_m)
+    return Effect(displacement_m=displacement_m)
 
 
-def _platen_friction(at: Fitted, _: int) -> Effect | None:
+def _platen_friction(at: FittedExperiment, _: int) -> Effect | None:
     """Effect of friction on nodes that slide along platens, perpendicular to the loading axis; None
     without platens.
 
     Planes of symmetry have no normal force in the loading direction, and no friction.
     """
-    experiment = at.part.segment.experiment
-    prescribed = at.part.setting.held
-    if not experiment.static:
+    experiment = at.iterate.segment.experiment
+    prescribed = at.iterate.equations.prescribed
+    if not experiment.is_static:
         return None
-    pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_driven(at)] % 3)}
+    pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_is_driven(at)] % 3)}
     platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
-    force = np.zeros_like(at.part.x)
-    x = at.part.x
+    force = np.zeros_like(at.iterate.x)
+    x = at.iterate.x
     start = at.body.nodes_m.ravel()
     for grasp in platens:
         across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
@@ -536,37 +562,37 @@ def _platen_friction(at: Fitted, _: int) -> Effect | None:
     return Effect(force) if platens else None
 
 
-def _contact_stiffness(at: Fitted, _: int) -> Effect | None:
+def _contact_stiffness(at: FittedExperiment, _: int) -> Effect | None:
     """Return the effect of rigid contact in place of the pressure law, to first order."""
     if not at.contacts:
         return None
-    xi, nu = at.dynamics.evaluation_states(at.part.x)
-    forces = at.dynamics.evaluated
+    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
+    forces = at.dynamics.evaluated_forces
     change_n = np.zeros_like(xi)
-    for contact in contacts(at.part.segment.experiment):
-        if not contact.relaxed:
-            change_n += contact.rigid_limit_n(forces.states(xi, nu)(contact))
-    return Effect(at.of_rows(change_n))
+    for contact in contact_terms(at.iterate.segment.experiment):
+        if not contact.is_complementarity:
+            change_n += contact.rigid_limit_n(forces.states_of_terms(xi, nu)(contact))
+    return Effect(at.pad_rows(change_n))
 
 
-def _buoyancy(at: Fitted, _: int) -> Effect | None:
+def _buoyancy(at: FittedExperiment, _: int) -> Effect | None:
     """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
     return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
 
 
-def _added_mass(at: Fitted, _: int) -> Effect | None:
+def _added_mass(at: FittedExperiment, _: int) -> Effect | None:
     """Return the effect of more added mass, as a share of that in the model; None in a vacuum."""
-    if at.part.segment.experiment.static or not at.added_mass_kg.any():
+    if at.iterate.segment.experiment.is_static or not at.added_mass_kg.any():
         return None
     return Effect(mass_kg=at.added_mass_kg)
 
 
-def _air_drag(at: Fitted, _: int) -> Effect | None:
+def _air_drag(at: FittedExperiment, _: int) -> Effect | None:
     """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
-    return Effect(at.air_drag_n) if at.part.segment.experiment.has_air_drag else None
+    return Effect(at.air_drag_n) if at.iterate.segment.experiment.has_air_drag else None
 
 
-def _other_damping(at: Fitted, law: str) -> Effect | None:
+def _other_damping(at: FittedExperiment, law: str) -> Effect | None:
     """Effect of replacing the stated damping law by another with the same γ_r.
 
     Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
@@ -577,7 +603,7 @@ def _other_damping(at: Fitted, law: str) -> Effect | None:
     is_damped = any(
         constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
     )
-    if at.part.segment.experiment.static or not is_damped:
+    if at.iterate.segment.experiment.is_static or not is_damped:
         return None
     parts = tuple(
         replace(part, damping=DAMPINGS[law])
@@ -587,41 +613,49 @@ def _other_damping(at: Fitted, law: str) -> Effect | None:
     )
     if all(own.damping is other.damping for own, other in zip(body.parts, parts, strict=True)):
         return None
-    xi, nu = at.dynamics.evaluation_states(at.part.x)
-    histories = at.dynamics.forces_along(at.dynamics.histories(at.part.x)).past
+    xi, nu = at.dynamics.evaluation_states(at.iterate.x)
+    histories = at.dynamics.forces_with_histories(at.dynamics.histories(at.iterate.x)).memory_state
     forces_n = (
-        each.force(xi, nu, at.theta, carried=histories) for each in (body.with_parts(parts), body)
+        each.force(xi, nu, at.theta, memory_input=histories)
+        for each in (body.with_parts(parts), body)
     )
-    return Effect(at.of_rows(next(forces_n) - next(forces_n)))
+    return Effect(at.pad_rows(next(forces_n) - next(forces_n)))
 
 
-def _objective_damping(at: Fitted, number: int) -> Effect | None:
+def _objective_damping(at: FittedExperiment, index: int) -> Effect | None:
     """Effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`."""
-    return _other_damping(at, OBJECTIVE_DAMPINGS[number])
+    return _other_damping(at, OBJECTIVE_DAMPINGS[index])
 
 
-def _rayleigh_damping(at: Fitted, _: int) -> Effect | None:
+def _rayleigh_damping(at: FittedExperiment, _: int) -> Effect | None:
     """Effect of Rayleigh damping, which is not objective, instead of the stated law."""
     return _other_damping(at, "rayleigh")
 
 
-def _rest_shape(at: Fitted, axis: int) -> Effect | None:
+def _rest_shape(at: FittedExperiment, axis: int) -> Effect | None:
     """Effect of a mesh that was made under the body's own weight along one of its axes.
 
     None if the problem states the stress-free shape.
     """
     if at.body.rest_shape is not None:
         return None
-    return Effect(at.of_reference(sag_m(at.body, at.theta, at.likely_held, axis)))
+    return Effect(
+        at.force_change_by_reference(sag_m(at.body, at.theta, at.likely_support_dofs, axis))
+    )
 
 
-def _surface(at: Fitted, mode: int) -> Effect:
+def _surface(at: FittedExperiment, mode: int) -> Effect:
     """Effect of an error of the surface along its normal, by one mode of a smooth random field."""
     moved_m = at.surface_modes_m[mode]
-    grasping = at.part.segment.grasping
-    turns: Array = np.nan_to_num(grasping.poses[0])
-    offsets_m = moved_m.ravel()[3 * (at.part.setting.held.dofs // 3)[:, None] + np.arange(3)]
-    return Effect(at.of_reference(moved_m), moved_m=np.einsum("tgj,gj->tg", turns, offsets_m))
+    grasping = at.iterate.segment.prescribed_motion
+    turns: Array = np.nan_to_num(grasping.pose_rows[0])
+    offsets_m = moved_m.ravel()[
+        3 * (at.iterate.equations.prescribed.dofs // 3)[:, None] + np.arange(3)
+    ]
+    return Effect(
+        at.force_change_by_reference(moved_m),
+        displacement_m=np.einsum("tgj,gj->tg", turns, offsets_m),
+    )
 
 
 # fmt: off
@@ -639,7 +673,7 @@ ASSUMPTIONS = (
         "stiffness along one axis over that across", _anisotropy, "x y z"),
     Assumption("stiffness_drift", "1", 0.02,
         "stiffness at the end over that at the beginning", _drift),
-    Assumption("time_scale", "1", 1e-4, "pace of all clocks", _pace),
+    Assumption("time_scale", "1", 1e-4, "pace of all clocks", _time_scale),
     Assumption("poisson", "", 0.02, "Poisson's ratio, where it is stated", _poisson),
     Assumption("damping_law", "1", 1.0,
         "damping force of another objective law, in its difference from the stated one",
@@ -691,11 +725,11 @@ Nuisance parameters of recordings, by their names, count where they are not esti
 Attributes
 ----------
 """
-_FIELDS = [(row.name, row.sigma, f"{row.said} [{row.unit or 1}]") for row in ASSUMPTIONS]
-_FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in ROWS]
+_FIELDS = [(row.name, row.sigma, f"{row.description} [{row.unit or 1}]") for row in ASSUMPTIONS]
+_FIELDS += [(row.name, row.considered, f"{row.said} [{row.unit}]") for row in KINDS]
 
 
-class _Stated(Options):
+class _AssumptionsBase(Options):
     """Methods of the table of standard deviations."""
 
     @classmethod
@@ -726,7 +760,7 @@ class _Stated(Options):
 if TYPE_CHECKING:
 
     @dataclass(frozen=True, init=False)
-    class Assumptions(_Stated):
+    class Assumptions(_AssumptionsBase):
         """Standard deviations of all assumptions and nuisance parameters, one field per row
         of `ASSUMPTIONS` and of `recording.nuisance.ROWS`.
         """
@@ -746,7 +780,7 @@ else:
             )
             for name, sigma, _ in _FIELDS
         ],
-        bases=(_Stated,),
+        bases=(_AssumptionsBase,),
         frozen=True,
         kw_only=True,
         namespace={

@@ -35,9 +35,9 @@ from scipy.linalg import matmul_toeplitz
 
 from ..arrays import Array
 from .distributions import chi2_sf, normal_isf
-from .linearised import FitBlock, Information, LinearisedFit
+from .linearised import Information, LinearisedFit, ResidualBlock
 from .noise import ROUNDING
-from .spatial import spatial_errors
+from .spatial import estimate_spatial_correlation
 
 Mask = NDArray[np.bool_]
 
@@ -82,7 +82,9 @@ class LaggedProducts:
         solution = np.linalg.lstsq(self.expected, self.products - beyond)[0]
         return self.split(solution.astype(np.float64))
 
-    def beyond(self, fit: LinearisedFit, information: Information, tails: Sequence[Array]) -> Array:
+    def long_lag_products(
+        self, fit: LinearisedFit, information: Information, tails: Sequence[Array]
+    ) -> Array:
         """Return the contribution (K,) of autocovariances at longer lags to the products.
 
         It is tr(D_k M C M) with their Toeplitz matrix C, whose k-th diagonals are zero.
@@ -101,9 +103,9 @@ class LaggedProducts:
         overlap = []
         total = np.zeros(self.shifted.shape[1:])
         for block, slope, last, tail in zip(
-            fit.blocks, information.slopes, self.lags, tails, strict=True
+            fit.blocks, information.scaled_jacobians, self.lags, tails, strict=True
         ):
-            smoothed = along_time(tail, slope) * block.channels[2][:, :, None]
+            smoothed = toeplitz_product(tail, slope) * block.channels[2][:, :, None]
             total += np.einsum("tcr,tcs->rs", slope, smoothed, optimize=True)
             overlap += [
                 np.vdot(slope[k:], smoothed[: len(slope) - k])
@@ -132,7 +134,7 @@ def lagged_products(
     shifted = []
     diagonal_counts = []
     overlaps = []
-    for block, slope, last in zip(fit.blocks, information.slopes, lags, strict=True):
+    for block, slope, last in zip(fit.blocks, information.scaled_jacobians, lags, strict=True):
         residual, _, present = block.channels
         width = slope.shape[2]
         within = np.zeros((last + 1, width, width))
@@ -162,27 +164,27 @@ def lagged_products(
     return LaggedProducts(tuple(lags), np.array(products), expected, shifted)
 
 
-def along_time(autocorrelation: Array, values: Array) -> Array:
+def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
     """Return the product of the Toeplitz matrix of an autocorrelation (T,) with values (T, …)."""
     columns = values.reshape(len(values), -1)
     product = np.asarray(matmul_toeplitz(autocorrelation, columns), dtype=np.float64)
     return product.reshape(values.shape)
 
 
-def _lagged(columns: Array, seen: Mask, lag: int) -> Array:
+def _lagged(columns: Array, is_present: Mask, lag: int) -> Array:
     """Return D_k times the columns (T, r) of one channel, at its present samples."""
     if lag == 0:
         return columns
     shifted = np.zeros_like(columns)
     shifted[lag:] += columns[:-lag]
     shifted[:-lag] += columns[lag:]
-    return shifted * seen[:, None]
+    return shifted * is_present[:, None]
 
 
 # Autoregression -----------------------------------------------------------------------------
 
 
-def autoregression(autocovariance: Array, samples: float) -> Array:
+def fit_autoregression(autocovariance: Array, samples: float) -> Array:
     """Return the coefficients of the autoregression with the least Schwarz criterion, by Levinson's
     recursion.
 
@@ -211,7 +213,7 @@ def autoregression(autocovariance: Array, samples: float) -> Array:
     return best
 
 
-def autocorrelation(coefficients: Array, samples: int) -> Array:
+def process_autocorrelation(coefficients: Array, samples: int) -> Array:
     """Return the autocorrelation (samples,) of an autoregressive process, from its
     Yule–Walker equations.
     """
@@ -267,25 +269,29 @@ class Dependence:
     space_p: float = 1.0
 
     @property
-    def in_time(self) -> bool:
+    def is_correlated_in_time(self) -> bool:
         """Whether the errors persist, significantly and noticeably."""
         limit = float(normal_isf(SIGNIFICANCE / 2)) * self.lag1_deviation
         return abs(self.lag1) > max(limit, NOTICEABLE)
 
     @property
-    def among_channels(self) -> bool:
+    def is_correlated_among_channels(self) -> bool:
         """Whether markers or axes have errors in common, significantly."""
         return self.shared_p < SIGNIFICANCE
 
     @property
-    def in_space(self) -> bool:
+    def is_correlated_in_space(self) -> bool:
         """Whether errors of neighbours on the surface are correlated, significantly."""
         return self.space_p < SIGNIFICANCE
 
     @property
-    def found(self) -> bool:
+    def is_correlated(self) -> bool:
         """Whether the errors are correlated in any of these ways."""
-        return self.in_time or self.among_channels or self.in_space
+        return (
+            self.is_correlated_in_time
+            or self.is_correlated_among_channels
+            or self.is_correlated_in_space
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,51 +300,51 @@ class ErrorProcess:
 
     Attributes
     ----------
-    along_time : (T,) array
+    autocorrelation : (T,) array
         Autocorrelation by lag; the first is one.
-    among_channels : (3M, 3M) array
+    channel_covariance : (3M, 3M) array
         Covariance at one time.
     order : int
         Order of the autoregression.
     samples : float
-        Number of independent samples in time that `among_channels` is estimated from.
+        Number of independent samples in time that `channel_covariance` is estimated from.
     degrees_of_freedom : float
         Degrees of freedom of the mean variance.
     """
 
-    along_time: Array
-    among_channels: Array
+    autocorrelation: Array
+    channel_covariance: Array
     order: int
     samples: float
     degrees_of_freedom: float
 
 
-def dependence(fit: LinearisedFit, information: Information) -> Dependence:
+def test_dependence(fit: LinearisedFit, information: Information) -> Dependence:
     """Test the residuals for correlation in time, among channels and in space."""
-    if fit.chi_squared <= ROUNDING**2 * fit.measurements:
+    if fit.chi_squared <= ROUNDING**2 * fit.measurement_count:
         return Dependence(0.0, np.inf, 1.0)
-    pairs = zip(fit.blocks, information.slopes, strict=True)
-    tested = (each for each in pairs if not each[0].noise_at_least_stated)
-    over_space = [moments for each in tested if (moments := spatial_errors(*each))]
-    space_p = min((len(over_space) * moments.p for moments in over_space), default=1.0)
+    pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
+    tested = (each for each in pairs if not each[0].has_noise_floor)
+    over_space = [moments for each in tested if (moments := estimate_spatial_correlation(*each))]
+    space_p = min((len(over_space) * moments.p_value for moments in over_space), default=1.0)
     moments = lagged_products(fit, information, [1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
     products = pool @ moments.products
     expected = pool @ moments.expected @ pool.T
     if not expected[1, 1] > 0:  # nothing follows on anything
-        return Dependence(0.0, np.inf, _shared_p(fit), space_p)
+        return Dependence(0.0, np.inf, _channel_correlation_p(fit), space_p)
     variance = products[0] / expected[0, 0]
     lag1_variance = (products[1] - variance * expected[1, 0]) / expected[1, 1]
     return Dependence(
         lag1=float(np.clip(lag1_variance / variance, -1.0, 1.0)),  # corrected, it may be beyond
         lag1_deviation=float(np.sqrt(2 / expected[1, 1])),
-        shared_p=_shared_p(fit),
+        shared_p=_channel_correlation_p(fit),
         space_p=space_p,
     )
 
 
-def _shared_p(fit: LinearisedFit) -> float:
+def _channel_correlation_p(fit: LinearisedFit) -> float:
     """Return the p-value of the Lagrange-multiplier test of Breusch and Pagan (1980) on all
     pairs of channels; 1 without pairs.
     """
@@ -363,12 +369,12 @@ def error_processes(fit: LinearisedFit, information: Information) -> tuple[Error
     autocovariances = moments.autocovariances()
     for _ in range(ROUNDS):
         tails = [
-            _tail(block, gamma, order)
+            _long_lag_autocovariances(block, gamma, order)
             for block, gamma, order in zip(fit.blocks, autocovariances, orders, strict=True)
         ]
         before, autocovariances = (
             autocovariances,
-            moments.autocovariances(moments.beyond(fit, information, tails)),
+            moments.autocovariances(moments.long_lag_products(fit, information, tails)),
         )
         if np.allclose(
             np.concatenate(autocovariances), np.concatenate(before), rtol=SETTLED, atol=0
@@ -377,46 +383,46 @@ def error_processes(fit: LinearisedFit, information: Information) -> tuple[Error
     return tuple(
         _error_process(block, slope, gamma[: order + 1])
         for block, slope, gamma, order in zip(
-            fit.blocks, information.slopes, autocovariances, orders, strict=True
+            fit.blocks, information.scaled_jacobians, autocovariances, orders, strict=True
         )
     )
 
 
-def _tail(block: FitBlock, autocovariance: Array, order: int) -> Array:
+def _long_lag_autocovariances(block: ResidualBlock, autocovariance: Array, order: int) -> Array:
     """Return the autocovariances (T,) at lags beyond those given, and zero up to there."""
-    coefficients = _coefficients(block, autocovariance[: order + 1])
-    tail = max(0.0, autocovariance[0]) * autocorrelation(coefficients, len(block.t_s))
+    coefficients = _autoregression_of(block, autocovariance[: order + 1])
+    tail = max(0.0, autocovariance[0]) * process_autocorrelation(coefficients, len(block.t_s))
     tail[: len(autocovariance)] = 0.0
     return tail
 
 
-def _coefficients(block: FitBlock, autocovariance: Array) -> Array:
+def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
     """Return the coefficients of the autoregression of a block's errors."""
     residual, _, present = block.channels
-    channels = _effective_channels(_among_channels(residual, present))
-    return autoregression(autocovariance, _samples(present) * channels)
+    channels = _effective_channels(_channel_covariance(residual, present))
+    return fit_autoregression(autocovariance, _mean_sample_count(present) * channels)
 
 
-def _samples(present: NDArray[np.bool_]) -> float:
+def _mean_sample_count(present: NDArray[np.bool_]) -> float:
     """Return the mean number of samples of the channels that have any."""
     return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 
-def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
+def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) -> ErrorProcess:
     """Estimate the error process of one block from autocovariances of its errors."""
     residual, _, present = block.channels
-    over_space = spatial_errors(block, slope)
+    over_space = estimate_spatial_correlation(block, slope)
     measured = present.any(axis=0)
     raw_variance = float(np.sum(residual**2)) / max(1, present.sum())
     if not autocovariance[0] > 0:  # the fit leaves too little to be corrected
         autocovariance = np.array([raw_variance])
-    coefficients = _coefficients(block, autocovariance)
-    along = autocorrelation(coefficients, len(residual))
+    coefficients = _autoregression_of(block, autocovariance)
+    along = process_autocorrelation(coefficients, len(residual))
     innovation, known = _innovations(residual, present, coefficients)
-    channels = _among_channels(innovation, known)
+    channels = _channel_covariance(innovation, known)
     weight = present.sum(axis=0)
     if not weight @ np.diag(channels) > 0:  # no run of samples is long enough
-        channels = _among_channels(residual, present)
+        channels = _channel_covariance(residual, present)
         known = present
     level = weight @ np.diag(channels)
     channels *= autocovariance[0] * weight.sum() / level if level > 0 else 0.0
@@ -424,22 +430,22 @@ def _error_process(block: FitBlock, slope: Array, autocovariance: Array) -> Erro
         # Samples are too few to tell a covariance by themselves.
         covariance = over_space.covariance
         freedom = len(residual) * over_space.freedom
-        if block.noise_at_least_stated and np.trace(covariance) < len(covariance):
+        if block.has_noise_floor and np.trace(covariance) < len(covariance):
             covariance = np.eye(len(covariance))
             freedom = np.inf
         return ErrorProcess(
-            along_time=along,
-            among_channels=covariance,
+            autocorrelation=along,
+            channel_covariance=covariance,
             order=len(coefficients),
             samples=np.inf,
             degrees_of_freedom=freedom,
         )
     fitted = float(np.sum(slope**2))
     memory = 1 + 2 * float(np.sum(along[1:] ** 2))
-    independent = _samples(present) * _effective_channels(channels)
+    independent = _mean_sample_count(present) * _effective_channels(channels)
     return ErrorProcess(
-        along_time=along,
-        among_channels=channels,
+        autocorrelation=along,
+        channel_covariance=channels,
         order=len(coefficients),
         samples=max(1.0, (known.sum() - fitted) / max(1, measured.sum())),
         degrees_of_freedom=max(1.0, (independent - fitted) / memory),
@@ -477,15 +483,17 @@ def score_covariance(
     directions = information.fit.root[:shared].T
     total = information.prior.copy()
     variance_of_variance = np.zeros(directions.shape[1])
-    for slope, process in zip(information.slopes, processes, strict=True):
+    for slope, process in zip(information.scaled_jacobians, processes, strict=True):
         shape = slope.shape[0] * slope.shape[1], slope.shape[2]
-        smoothed = along_time(process.along_time, slope)
-        mixed = np.einsum("cd,tdr->tcr", process.among_channels, smoothed)
+        smoothed = toeplitz_product(process.autocorrelation, slope)
+        mixed = np.einsum("cd,tdr->tcr", process.channel_covariance, smoothed)
         part = slope.reshape(shape).T @ mixed.reshape(shape)
         total += (part + part.T) / 2
         for k, direction in enumerate(directions.T):
             by_time = slope @ direction
-            share = process.among_channels @ (by_time.T @ along_time(process.along_time, by_time))
+            share = process.channel_covariance @ (
+                by_time.T @ toeplitz_product(process.autocorrelation, by_time)
+            )
             variance = np.trace(share)
             spread = np.sum(share * share.T)
             if spread > 0:
@@ -513,7 +521,7 @@ def _innovations(
     return innovation * is_known, is_known
 
 
-def _among_channels(residual: Array, present: NDArray[np.bool_]) -> Array:
+def _channel_covariance(residual: Array, present: NDArray[np.bool_]) -> Array:
     """Return the covariance (3M, 3M) of channels over samples that both have, made positive
     semidefinite.
     """

@@ -19,11 +19,11 @@ import numpy as np
 from ..arrays import Array
 from ..model.parameters import Parameters
 from .combined import NORMAL_95, Interval, combine, widened
-from .considered import Changes
+from .considered import ResidualChanges
 from .distributions import student_ppf
-from .estimates import Coordinate, Estimate
-from .linearised import LinearisedFit, least_squares
-from .numerical import NumericalError, shifts
+from .estimates import Estimate, IntervalCoordinate
+from .linearised import LinearisedFit, least_squares_of_fit
+from .numerical import DiscretisationError, estimate_changes
 from .uncertainty import Uncertainty
 
 NOISE = "noise"
@@ -48,7 +48,7 @@ class BudgetLine:
         Standard uncertainty due to all sources.
     systematic : float
         Standard deviation of the systematic effects and of the differences between recordings, in
-        the coordinate of the estimate, see `Coordinate`.
+        the coordinate of the estimate, see `IntervalCoordinate`.
     known_effect : float
         Correction for known effects in the same coordinate, contained in `value`.
     """
@@ -60,7 +60,9 @@ class BudgetLine:
     systematic: float
     known_effect: float = 0.0
 
-    def widened(self, source: str, deviation: float, at: Coordinate) -> BudgetLine:
+    def with_source(
+        self, source: str, deviation: float, coordinate: IntervalCoordinate
+    ) -> BudgetLine:
         """Return the budget with one more source of variance.
 
         Parameters
@@ -69,44 +71,44 @@ class BudgetLine:
             Name of the source.
         deviation : float
             Its standard deviation in the coordinate of the estimate.
-        at : Coordinate
+        coordinate : IntervalCoordinate
             That coordinate.
         """
-        low, high = map(at.at, self.combined95)
+        low, high = map(coordinate.from_value, self.combined95)
         known_variance = ((high - low) / 2 / NORMAL_95) ** 2
         total = known_variance + deviation**2
         shares = {name: share * known_variance / total for name, share in self.shares.items()}
         shares[source] = deviation**2 / total
-        least, most = widened((low, high), at.at(self.value), deviation)
+        least, most = widened((low, high), coordinate.from_value(self.value), deviation)
         return BudgetLine(
             self.value,
             _ranked(shares),
-            (at.value(least), at.value(most)),
-            (most - least) / 2 / NORMAL_95 / at.slope(self.value),
+            (coordinate.to_value(least), coordinate.to_value(most)),
+            (most - least) / 2 / NORMAL_95 / coordinate.derivative(self.value),
             float(np.hypot(self.systematic, deviation)),
             self.known_effect,
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Sources:
+class VarianceSources:
     """Covariances and sensitivities from which budgets are computed.
 
     Attributes
     ----------
     names : (a,) tuple of str
         Names of the assumptions with their components.
-    moved : (nq, a) array
+    sensitivities : (nq, a) array
         Changes of the shared parameters q if each is off by its standard deviation.
-    free : (nq, nq) array
+    covariance_free : (nq, nq) array
         Covariance of q for the stated noise, with free nuisance parameters.
-    known : (nq, nq) array
+    covariance_known : (nq, nq) array
         Covariance of q for the stated noise, with known nuisance parameters.
-    by_q : mapping of str to (nq,) array
+    derivatives : mapping of str to (nq,) array
         Derivatives of each estimate.
-    wider : (nq,) array
+    widening : (nq,) array
         Factor by which intervals are widened because recordings disagree.
-    between : (nq, b) array
+    recording_sensitivities : (nq, b) array
         Changes of q with the differences of parameters between recordings, in their standard
         deviations.
     freedom : int
@@ -116,32 +118,32 @@ class Sources:
     """
 
     names: tuple[str, ...]
-    moved: Array
-    free: Array
-    known: Array
-    by_q: Mapping[str, Array]
-    wider: Array
-    between: Array
+    sensitivities: Array
+    covariance_free: Array
+    covariance_known: Array
+    derivatives: Mapping[str, Array]
+    widening: Array
+    recording_sensitivities: Array
     freedom: int = 0
     means: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(
+    def from_fit(
         cls,
         fit: LinearisedFit,
-        assumed: Changes,
+        assumed: ResidualChanges,
         parameters: Parameters,
         q: Array,
         uncertainty: Uncertainty,
         means: Mapping[str, float] | None = None,
-    ) -> Sources:
+    ) -> VarianceSources:
         """Compute the sources of a fit.
 
         Parameters
         ----------
         fit : LinearisedFit
             The fit at its answer.
-        assumed : Changes
+        assumed : ResidualChanges
             Changes of its residuals by the assumptions.
         parameters : Parameters
             Shared parameters.
@@ -152,29 +154,30 @@ class Sources:
         means : mapping of str to float, optional
             Known effects over their standard deviations; None if there are none.
         """
-        free = np.flatnonzero(~fit.at_bound)
-        shared = free[free < fit.shared]
-        all_free, known = (np.zeros((fit.shared, fit.shared)) for _ in range(2))
-        information = least_squares(fit).information
+        free = np.flatnonzero(~fit.is_at_bound)
+        shared = free[free < fit.shared_count]
+        all_free, known = (np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2))
+        information = least_squares_of_fit(fit).information
         for own, here in ((all_free, free), (known, shared)):
             inverse = np.linalg.pinv(information[np.ix_(here, here)], hermitian=True)
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]
-        moved = shifts(fit, assumed.blocks)[: fit.shared]
-        by_q = _slopes(fit, parameters, q)
+        moved = estimate_changes(fit, assumed.blocks)[: fit.shared_count]
+        by_q = _estimate_derivatives(fit, parameters, q)
         scatter = uncertainty.scatter
-        between = np.zeros((fit.shared, 0))
+        between = np.zeros((fit.shared_count, 0))
         freedom = 0
         if scatter is not None:
-            between = scatter.between[: fit.shared]
+            between = scatter.sensitivities[: fit.shared_count]
             freedom = len(scatter.recordings) - 1
-        wider = uncertainty.wider
+        wider = uncertainty.widening
         known_effects = dict(means or {})
         return cls(
             assumed.names, moved, all_free, known, by_q, wider, between, freedom, known_effects
         )
 
-    def of_noise(self, by_q: Array) -> tuple[float, float]:
-        """Return shares of the statistical variance of an estimate with the derivative `by_q`
+    def noise_shares(self, by_q: Array) -> tuple[float, float]:
+        """Return shares of the statistical variance of an estimate with the derivative
+        `derivatives`
         (nq,).
 
         Returns
@@ -183,17 +186,21 @@ class Sources:
             Share that would remain with known nuisance parameters; and share that would remain if
             recordings agreed.
         """
-        widened = self.wider * by_q
+        widened = self.widening * by_q
         known, all_free, all_widened = (
             float(g @ of_q @ g)
-            for g, of_q in ((by_q, self.known), (by_q, self.free), (widened, self.free))
+            for g, of_q in (
+                (by_q, self.covariance_known),
+                (by_q, self.covariance_free),
+                (widened, self.covariance_free),
+            )
         )
         if not all_free > 0:
             return 1.0, 1.0
-        agreed = 1.0 if (self.wider == 1).all() else all_free / all_widened
+        agreed = 1.0 if (self.widening == 1).all() else all_free / all_widened
         return float(np.clip(known / all_free, 0.0, 1.0)), agreed
 
-    def of_recordings(self, by_q: Array, others: float, told: float) -> float:
+    def variance_between_recordings(self, by_q: Array, others: float, counted: float) -> float:
         """Return the variance due to differences of parameters between recordings, beyond what is
         counted already.
 
@@ -205,55 +212,55 @@ class Sources:
             Derivatives of the estimate.
         others : float
             Variance of all other sources.
-        told : float
+        counted : float
             Variance between recordings that is counted already.
         """
-        more = max(0.0, float(np.sum((by_q @ self.between) ** 2)) - told)
+        more = max(0.0, float(np.sum((by_q @ self.recording_sensitivities) ** 2)) - counted)
         if not more:
             return 0.0
         freedom = self.freedom * ((others + more) / more) ** 2
         return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
 
     def known_effect(self, by_q: Array) -> float:
-        """Return the correction for known effects of an estimate with the derivative `by_q`
+        """Return the correction for known effects of an estimate with the derivative `derivatives`
         (nq,).
         """
         sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
-        return float(by_q @ self.moved @ sizes)
+        return float(by_q @ self.sensitivities @ sizes)
 
-    def of_assumed(self, by_q: Array) -> dict[str, float]:
+    def variances_of_assumptions(self, by_q: Array) -> dict[str, float]:
         """Return the variance by each assumption, its components summed, of an estimate
-        with the derivative `by_q` (nq,).
+        with the derivative `derivatives` (nq,).
         """
         variances: dict[str, float] = {}
-        for name, way in zip(self.names, by_q @ self.moved, strict=True):
+        for name, way in zip(self.names, by_q @ self.sensitivities, strict=True):
             row = name.partition(" ")[0]
             variances[row] = variances.get(row, 0.0) + float(way) ** 2
         return variances
 
 
 def budget(
-    sources: Sources,
+    sources: VarianceSources,
     uncertainty: Uncertainty,
-    numerical: Mapping[str, NumericalError],
+    numerical: Mapping[str, DiscretisationError],
     parameters: Parameters,
 ) -> dict[str, BudgetLine]:
     """Return the uncertainty budget of every estimate that has a statistical interval, by name.
 
     Parameters
     ----------
-    sources : Sources
+    sources : VarianceSources
         What moves the estimates beside the noise.
     uncertainty : Uncertainty
         Statistical uncertainty of the fit.
-    numerical : mapping of estimate to NumericalError
+    numerical : mapping of estimate to DiscretisationError
         Discretisation errors; estimates without an entry have none, or an unknown one.
     parameters : Parameters
         The parameters of the problem, with their coordinates and bounds.
     """
     lines = {}
     for name, estimate in {**uncertainty.estimates, **uncertainty.derived}.items():
-        by_q = sources.by_q[name]
+        by_q = sources.derivatives[name]
         if estimate.statistical95 is not None and by_q.any():
             lines[name] = _line(name, estimate, sources, numerical.get(name), parameters)
     return lines
@@ -262,8 +269,8 @@ def budget(
 def _line(
     name: str,
     estimate: Estimate,
-    sources: Sources,
-    error: NumericalError | None,
+    sources: VarianceSources,
+    error: DiscretisationError | None,
     parameters: Parameters,
 ) -> BudgetLine:
     """Return the budget of one estimate that has a statistical interval."""
@@ -272,18 +279,20 @@ def _line(
     ends = estimate.statistical95
     if error is not None and error.interval95 is not None:
         ends = error.interval95
-    at = Coordinate.of(name, (estimate.value, *estimate.statistical95, *ends), linear)
+    at = IntervalCoordinate.for_estimate(
+        name, (estimate.value, *estimate.statistical95, *ends), linear
+    )
     noise = _variance(at, estimate.value, estimate.statistical95)
     middle = estimate.value if error is None else error.extrapolated
-    by_q = sources.by_q[name]
-    own, agreed = sources.of_noise(by_q)
+    by_q = sources.derivatives[name]
+    own, agreed = sources.noise_shares(by_q)
     excess = noise * (1 - agreed)
     parts = {NOISE: noise * agreed * own, NUISANCES: noise * agreed * (1 - own)}
     parts[NUMERICAL] = max(0.0, _variance(at, middle, ends) - noise)
-    by_coordinate = by_q * at.slope(estimate.value)
-    by_assumption = sources.of_assumed(by_coordinate)
+    by_coordinate = by_q * at.derivative(estimate.value)
+    by_assumption = sources.variances_of_assumptions(by_coordinate)
     others = sum(parts.values()) + sum(by_assumption.values())
-    between = sources.of_recordings(by_coordinate, others, excess)
+    between = sources.variance_between_recordings(by_coordinate, others, excess)
     systematic = float(np.sqrt(sum(by_assumption.values()) + between))
     variances = parts | {BETWEEN: excess + between} | by_assumption
     total = sum(variances.values())
@@ -309,10 +318,10 @@ def _line(
     )
 
 
-def _variance(at: Coordinate, middle: float, ends: Interval) -> float:
+def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
     """Return the variance of a 95 % interval, one end of which may be cut off by a bound."""
-    centre = at.at(middle)
-    low, high = map(at.at, ends)
+    centre = at.from_value(middle)
+    low, high = map(at.from_value, ends)
     if np.isclose(centre - low, high - centre, rtol=1e-6):
         return ((high - low) / 2 / NORMAL_95) ** 2
     return float(np.mean([((centre - low) / NORMAL_95) ** 2, ((high - centre) / NORMAL_95) ** 2]))
@@ -323,36 +332,37 @@ def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
     return dict(sorted(shares.items(), key=lambda part: -part[1]))
 
 
-def _slopes(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
+def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
     """Return the derivatives (nq,) of each estimate by q, by name."""
     values = parameters.values(q)
     slopes = {name: np.zeros(len(q)) for name in values}
     for k, item in enumerate(parameters.free):
-        slopes[item.name][k] = item.per_value(values[item.name])
+        slopes[item.name][k] = item.value_derivative(values[item.name])
     for item in parameters.items:
         if item.tied is not None:
             slopes[item.name] = item.tied.ratio * slopes[item.tied.to]
-    return slopes | dict(fit.derived.by_q)
+    return slopes | dict(fit.derived.derivatives)
 
 
-def largest_first(shares: Mapping[str, Mapping[str, float]], least: float) -> list[str]:
-    """Return the sources with at least a share `least` in the variance of some estimate, the
+def main_sources(shares: Mapping[str, Mapping[str, float]], minimum_share: float) -> list[str]:
+    """Return the sources with at least a share `minimum_share` in the variance of some estimate,
+    the
     largest first.
 
     Parameters
     ----------
     shares : mapping of str to mapping of str to float
         Shares by estimate and source.
-    least : float
+    minimum_share : float
         Smallest share of interest.
     """
     largest: dict[str, float] = {}
     for source, share in (each for line in shares.values() for each in line.items()):
         largest[source] = max(share, largest.get(source, 0.0))
-    return sorted((s for s in largest if largest[s] >= least), key=lambda s: -largest[s])
+    return sorted((s for s in largest if largest[s] >= minimum_share), key=lambda s: -largest[s])
 
 
-def worded(source: str) -> str:
+def source_label(source: str) -> str:
     """Return the name of a source as text, without unit suffix."""
     unit = next((u for u in ("_m_n", "_1_m2", "_rad", "_m", "_s") if source.endswith(u)), "")
     return source.removesuffix(unit).replace("_", " ")

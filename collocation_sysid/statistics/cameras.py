@@ -18,9 +18,9 @@ from scipy.spatial import KDTree
 from ..arrays import Array
 from ..errors import InputError
 from ..program.camera_alignment import thinned
-from ..program.sighting import wide_m
-from ..program.skin import Skin
-from ..recording.depth import Depth, points_of
+from ..program.sighting import initial_gate_m
+from ..program.skin import VisibleSurface
+from ..recording.depth import Depth, points_from_image
 from ..recording.experiment import Experiment
 from .hypothesis import Hypothesis
 
@@ -47,7 +47,7 @@ COLLAPSED = 50
 
 
 @dataclass(frozen=True)
-class Seeing:
+class CameraDescription:
     """Pose and units of a camera.
 
     Attributes
@@ -65,26 +65,26 @@ class Seeing:
     factor: float = 1.0
 
 
-def _scaled(seeing: Seeing, by: float) -> Seeing:
+def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:
     """Return the description with the translation of the pose scaled."""
     pose = seeing.pose.copy()
-    pose[:3, 3] *= by
+    pose[:3, 3] *= factor
     return replace(seeing, pose=pose)
 
 
-def _turned(seeing: Seeing, turn: list[list[int]]) -> Seeing:
+def _rotated(seeing: CameraDescription, rotation: list[list[int]]) -> CameraDescription:
     """Return the description with the camera's frame rotated by a matrix (3, 3)."""
     pose = seeing.pose.copy()
-    pose[:3, :3] = pose[:3, :3] @ np.array(turn, dtype=float)
+    pose[:3, :3] = pose[:3, :3] @ np.array(rotation, dtype=float)
     return replace(seeing, pose=pose)
 
 
-def _with_factor(seeing: Seeing, factor: float) -> Seeing:
+def _with_factor(seeing: CameraDescription, factor: float) -> CameraDescription:
     """Return the description with another factor of the points."""
     return replace(seeing, factor=factor)
 
 
-Undo = Callable[[Seeing], Seeing]
+Undo = Callable[[CameraDescription], CameraDescription]
 # What may be wrong, as its sentence has it, and how it is undone. Of one kind only one can be so;
 # likelier kinds come first.
 MISTAKES: tuple[dict[str, Undo], ...] = (
@@ -99,7 +99,7 @@ MISTAKES: tuple[dict[str, Undo], ...] = (
         ),
     },
     {
-        f"camera.pose were of a frame with {axes} ({EXPECTED})": partial(_turned, turn=turn)
+        f"camera.pose were of a frame with {axes} ({EXPECTED})": partial(_rotated, rotation=turn)
         for axes, turn in FRAMES.items()
     },
     {
@@ -110,7 +110,7 @@ MISTAKES: tuple[dict[str, Undo], ...] = (
             lambda s: replace(s, factor=1 / MILLI)
         ),
     },
-    {"camera.pose were in mm (state it in m)": partial(_scaled, by=MILLI)},
+    {"camera.pose were in mm (state it in m)": partial(_scaled, factor=MILLI)},
 )
 
 # Wrong units by other powers of ten than a thousand: looked for alone, as they are rare.
@@ -130,11 +130,13 @@ def require_depth_units(experiment: Experiment) -> None:
     distances were a power of ten larger or smaller.
     """
     for depth in experiment.depths:
-        view = _OneCamera(experiment, depth)
-        if view.share(view.stated) >= HARDLY:
+        view = _CameraTrial(experiment, depth)
+        if view.visible_share(view.stated) >= HARDLY:
             continue
         factors = [10.0**k for k in range(-LARGEST_POWER, LARGEST_POWER + 1) if k]
-        shares = {factor: view.share(_with_factor(view.stated, factor)) for factor in factors}
+        shares = {
+            factor: view.visible_share(_with_factor(view.stated, factor)) for factor in factors
+        }
         factor = max(factors, key=lambda each: shares[each])
         if shares[factor] < (HARDLY if view.collapsed else WELL):
             continue
@@ -149,30 +151,30 @@ def require_depth_units(experiment: Experiment) -> None:
         )
 
 
-def camera_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
+def camera_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield hypotheses for depth cameras that see hardly anything of the body."""
     for depth in experiment.depths:
-        view = _OneCamera(experiment, depth)
-        here = view.share(view.stated)
+        view = _CameraTrial(experiment, depth)
+        here = view.visible_share(view.stated)
         if here >= HARDLY:
             continue
         data = {"percent": 100 * here, "within_mm": 1e3 * view.within_m}
         of = f"'{depth.name}' of '{experiment.name}'"
         code = "camera"
         strength = 1 / max(here, MILLI)
-        if mistakes := view.likeliest():
+        if mistakes := view.best_corrections():
             either = "; or if ".join(" and ".join(names) for names in mistakes)
             data = {"mistakes": either}
             code = "camera/likely"
         yield Hypothesis(code, of, data, strength=strength)
 
 
-class _OneCamera:
+class _CameraTrial:
     """Test of other descriptions of one camera.
 
     Attributes
     ----------
-    stated : Seeing
+    stated : CameraDescription
         Description as stated.
     within_m : float
         Points within this distance of the undeformed body may belong to it [m].
@@ -182,7 +184,7 @@ class _OneCamera:
         Whether too few points are left to be near much of the body.
     """
 
-    stated: Seeing
+    stated: CameraDescription
     within_m: float
     points_m: float
     body_m: float
@@ -190,42 +192,44 @@ class _OneCamera:
 
     def __init__(self, experiment: Experiment, depth: Depth) -> None:
         camera = depth.camera
-        self.skin = Skin.of(experiment.body, depth)
+        self.skin = VisibleSurface.from_body(experiment.body, depth)
         self.pinhole = camera.matrix is not None
-        self.shape_m = self.skin.first_m(experiment, depth)
-        points_m = depth.points_m[depth.first]
-        image_m = depth.images_m[depth.first] if len(depth.images_m) else None
+        self.shape_m = self.skin.initial_positions_m(experiment, depth)
+        points_m = depth.points_m[depth.first_sample_with_points]
+        image_m = depth.images_m[depth.first_sample_with_points] if len(depth.images_m) else None
         if len(points_m) < COLLAPSED and image_m is not None:
-            points_m = points_of(image_m, camera)
+            points_m = points_from_image(image_m, camera)
         self.tree = KDTree(thinned(points_m))
         self.collapsed = len(points_m) < COLLAPSED
         carrier = np.eye(4)
         if camera.poses is not None:
-            rotations, translations = camera.poses.at(depth.times[[depth.first]])
+            rotations, translations = camera.poses.at(
+                depth.sample_times_s[[depth.first_sample_with_points]]
+            )
             carrier[:3, :3] = rotations[0]
             carrier[:3, 3] = translations[0]
-        self.stated = Seeing(carrier, camera.pose)
-        self.within_m = wide_m(self.shape_m)
+        self.stated = CameraDescription(carrier, camera.pose)
+        self.within_m = initial_gate_m(self.shape_m)
         eye_m = (carrier @ camera.pose)[:3, 3]
         self.points_m = float(np.median(np.linalg.norm(points_m, axis=1)))
         self.body_m = float(np.median(np.linalg.norm(self.shape_m - eye_m, axis=1)))
 
-    def share(self, seeing: Seeing) -> float:
+    def visible_share(self, seeing: CameraDescription) -> float:
         """Return the share of the surface facing the camera that has points nearby, for a
         description.
         """
         motion = seeing.carrier @ seeing.pose
         turn = motion[:3, :3]
         eye_m = motion[:3, 3]
-        is_facing = self.skin.facing(self.shape_m, eye_m if self.pinhole else None)
+        is_facing = self.skin.is_facing(self.shape_m, eye_m if self.pinhole else None)
         if not is_facing.any():
             return 0.0
-        middles_m = self.shape_m[self.skin.flat[is_facing]].mean(axis=1)
+        middles_m = self.shape_m[self.skin.flat_triangles[is_facing]].mean(axis=1)
         in_camera = (middles_m - eye_m) @ turn / seeing.factor
         nearest, _ = self.tree.query(in_camera, distance_upper_bound=self.within_m / seeing.factor)
         return float(np.isfinite(nearest).mean())
 
-    def likeliest(self) -> list[tuple[str, ...]]:
+    def best_corrections(self) -> list[tuple[str, ...]]:
         """Return the combinations of one mistake, or else of two, whose correction makes the body
         visible, best first.
 
@@ -235,7 +239,7 @@ class _OneCamera:
         for count in (1, 2):
             alone = (POWERS,) if count == 1 else ()
             shares = {
-                names: self.share(self._without(names))
+                names: self.visible_share(self._corrected(names))
                 for kinds in combinations((*MISTAKES, *alone), count)
                 for names in product(*kinds)
             }
@@ -244,7 +248,7 @@ class _OneCamera:
                 return sorted(well, key=lambda names: -shares[names])
         return []
 
-    def _without(self, mistakes: tuple[str, ...]) -> Seeing:
+    def _corrected(self, mistakes: tuple[str, ...]) -> CameraDescription:
         """Return the stated description with some mistakes corrected."""
         undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
         return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.stated)

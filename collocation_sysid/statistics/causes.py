@@ -20,13 +20,13 @@ from ..errors import InputError, SimulationError
 from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
-from ..program.any_stiffness import Described
+from ..program.any_stiffness import StatedMotion
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
-from .hypothesis import Hypothesis, Trial, clock, ranked
-from .modal import ModalComparison, doubts, gravity_mistakes
-from .plausible import against_the_load
+from .hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
+from .modal import ModalComparison, find_misspecifications_by_modes, gravity_hypotheses
+from .plausible import load_sign_hypotheses
 from .wrench_causes import wrench_causes
 
 # RMS residual in standard deviations up to which there is nothing to explain.
@@ -57,7 +57,7 @@ SAME_LAG_S = 5e-4
 SHORTEST = 4
 
 
-def likely_causes(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
+def find_misspecifications(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
     """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
     are noise.
 
@@ -74,71 +74,90 @@ def likely_causes(solution: Solution, budget: int | None = None) -> tuple[Hypoth
     tuple of Hypothesis
         `strength` is the factor by which the misfit decreases without the mistake.
     """
-    fitted = [segment.experiment for segment in solution.collocation.segments]
+    fitted = [segment.experiment for segment in solution.collocation.transcriptions]
     misfits = [_misfit(e, read) for e, read in zip(fitted, solution.readings_m, strict=True)]
     hypotheses = [
         *wrench_causes(solution),
-        *(cause for e in fitted for cause in against_the_load(e)),
+        *(cause for e in fitted for cause in load_sign_hypotheses(e)),
     ]
     if max(misfits) > NOISE:
         worst = fitted[int(np.argmax(misfits))]
-        hypotheses += doubts(worst, solution.parameters, solution.collocation.huber)
+        hypotheses += find_misspecifications_by_modes(
+            worst, solution.parameters, solution.collocation.huber
+        )
         if max((each.strength for each in hypotheses), default=0.0) < CERTAIN:
-            hypotheses += _refitted(solution, worst, budget)
-    return ranked(hypotheses)
+            hypotheses += _refit_hypotheses(solution, worst, budget)
+    return rank(hypotheses)
 
 
-def _refitted(solution: Solution, experiment: Experiment, budget: int | None) -> list[Hypothesis]:
+def _refit_hypotheses(
+    solution: Solution, experiment: Experiment, budget: int | None
+) -> list[Hypothesis]:
     """Return the hypotheses without which the experiment fits far better."""
     given = first_samples(experiment, MOST_SAMPLES)
-    alone = _Alone(solution, given, budget)
+    alone = _Refitter(solution, given, budget)
     fitted_m = alone.fit(given)
     if fitted_m is None:
         return []
-    trial = Trial(_misfit(given, fitted_m), alone.left, BETTER, least=1.0, noise=NOISE)
+    trial = HypothesisTest(
+        _misfit(given, fitted_m),
+        alone.misfit_after_refit,
+        BETTER,
+        smallest_misfit=1.0,
+        noise_level=NOISE,
+    )
     of = f"'{experiment.name}'"
-    lags = [] if given.static else _best_lag(alone, given, fitted_m, of)
-    comparison = ModalComparison.of(given, solution.parameters)
-    turned = [] if comparison is None else _other_gravity(given, comparison)
-    return [*trial.of([*lags, *_slip(given, fitted_m, of), *turned, *_other_layers(given, of)])]
+    lags = [] if given.is_static else _clock_hypotheses(alone, given, fitted_m, of)
+    comparison = ModalComparison.from_experiment(given, solution.parameters)
+    turned = [] if comparison is None else _gravity_hypotheses(given, comparison)
+    return [
+        *trial.accepted(
+            [
+                *lags,
+                *_slip_hypotheses(given, fitted_m, of),
+                *turned,
+                *_grasp_layer_hypotheses(given, of),
+            ]
+        )
+    ]
 
 
-def _other_gravity(given: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
+def _gravity_hypotheses(stated: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
     """Yield the direction of gravity that suits the natural modes best, as a hypothesis."""
-    others = gravity_mistakes(comparison.given)
-    nearest = min(others, key=lambda each: comparison.misfit_m(each.without), default=None)
+    others = gravity_hypotheses(comparison.stated)
+    nearest = min(others, key=lambda each: comparison.misfit_m(each.corrected), default=None)
     if nearest is not None:
-        gravity_m_s2 = nearest.without.gravity_m_s2
-        yield replace(nearest, without=replace(given, gravity_m_s2=gravity_m_s2))
+        gravity_m_s2 = nearest.corrected.gravity_m_s2
+        yield replace(nearest, corrected=replace(stated, gravity_m_s2=gravity_m_s2))
 
 
-def _other_layers(given: Experiment, of: str) -> Iterator[Hypothesis]:
+def _grasp_layer_hypotheses(stated: Experiment, of: str) -> Iterator[Hypothesis]:
     """Yield hypotheses of grasps one layer of elements deeper or less deep."""
     for deeper, deep in ((True, "deeper"), (False, "less deep")):
-        if (layered := _one_layer(given, deeper)) is not None:
+        if (layered := _with_shifted_grasps(stated, deeper)) is not None:
             yield Hypothesis("grasp-layer", of, {"deep": deep}, layered)
 
 
-def _slip(given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
+def _slip_hypotheses(stated: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
     """Yield the hypothesis that one marker slipped, if its residuals change abruptly; the
     experiment is then refitted without it.
     """
-    residual = _residual(given, read)
-    described = Described.of(given)
+    residual = _residual(stated, fitted_m)
+    described = StatedMotion.from_experiment(stated)
     if described is not None:
         residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
-    clearest = [_step(residual[:, m]) for m in range(residual.shape[1])]
+    clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
     m = int(np.argmax([ratio for ratio, _ in clearest]))
     if clearest[m][0] < SLIP or residual.shape[1] < 2:
         return
-    tracks = np.array(given.markers.positions_m)
+    tracks = np.array(stated.markers.positions_m)
     tracks[:, m] = np.nan
-    data = {"marker": given.markers.names[m], "t_s": given.t_s[clearest[m][1]]}
-    without = replace(given, markers=replace(given.markers, positions_m=tracks))
+    data = {"marker": stated.markers.names[m], "t_s": stated.t_s[clearest[m][1]]}
+    without = replace(stated, markers=replace(stated.markers, positions_m=tracks))
     yield Hypothesis("marker-slip", of, data, without)
 
 
-def _step(residual: Array) -> tuple[float, int]:
+def _largest_step(residual: Array) -> tuple[float, int]:
     """Return by what factor two means explain residuals (T, 3) better than one, and the
     sample at which the second begins.
     """
@@ -157,21 +176,21 @@ def _step(residual: Array) -> tuple[float, int]:
     return float(np.sqrt(one / max(two, 1e-30))), int(present[k + 1])
 
 
-class _Alone:
+class _Refitter:
     """Fits of one experiment at a time from the problem's guess, with a limited number of
     sweeps.
     """
 
-    def __init__(self, solution: Solution, given: Experiment, sweeps: int | None) -> None:
+    def __init__(self, solution: Solution, stated: Experiment, sweeps: int | None) -> None:
         self.collocation = solution.collocation
-        fitted = [segment.experiment for segment in self.collocation.segments]
+        fitted = [segment.experiment for segment in self.collocation.transcriptions]
         rows = sum(len(experiment.t_s) for experiment in fitted)
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
-        work = EFFORT * self.each * rows // len(given.t_s)
+        work = EFFORT * self.each * rows // len(stated.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
         self.known: dict[Experiment, Array | None] = {}
-        if len(fitted) == 1 and len(given.t_s) == rows:
-            self.known[given] = solution.readings_m[0]
+        if len(fitted) == 1 and len(stated.t_s) == rows:
+            self.known[stated] = solution.readings_m[0]
 
     def fit(self, experiment: Experiment) -> Array | None:
         """Return the fitted markers (T, M, 3) [m]; None if there is no fit. Results are cached."""
@@ -179,7 +198,7 @@ class _Alone:
             self.known[experiment] = self._fit(experiment)
         return self.known[experiment]
 
-    def left(self, experiment: Experiment) -> float | None:
+    def misfit_after_refit(self, experiment: Experiment) -> float | None:
         """Return the misfit after a refit; None if there is no fit."""
         fitted_m = self.fit(experiment)
         return None if fitted_m is None else _misfit(experiment, fitted_m)
@@ -199,31 +218,33 @@ class _Alone:
         return solution.readings_m[0] if ended else None
 
 
-def _best_lag(alone: _Alone, given: Experiment, read: Array, of: str) -> Iterator[Hypothesis]:
+def _clock_hypotheses(
+    alone: _Refitter, stated: Experiment, fitted_m: Array, of: str
+) -> Iterator[Hypothesis]:
     """Yield the clock lag for which residuals and velocities agree best, after a few refits."""
-    least = _misfit(given, read)
+    least = _misfit(stated, fitted_m)
     lag_s = 0.0
-    shifted = given
+    shifted = stated
     best = None
     for _ in range(CLOCK_REFITS):
-        more_s = _lag_s(shifted, read)
+        more_s = _marker_lag_s(shifted, fitted_m)
         lag_s += more_s
         if abs(more_s) < SAME_LAG_S:
             break
-        later = with_lag(given, lag_s)
+        later = with_pose_lag(stated, lag_s)
         fitted = None if later is None else alone.fit(later)
         if later is None or fitted is None:
             break
         shifted = later
-        read = fitted
-        if (now := _misfit(shifted, read)) < least:
-            best = clock(of, lag_s, shifted)
+        fitted_m = fitted
+        if (now := _misfit(shifted, fitted_m)) < least:
+            best = clock_hypothesis(of, lag_s, shifted)
             least = now
     if best is not None:
         yield best
 
 
-def with_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
+def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
     """Return the experiment with its poses `lag_s` later [s]; None if too few samples remain."""
     t_s = experiment.t_s
     is_covered = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
@@ -234,7 +255,7 @@ def with_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
         return replace(
             experiment,
             t_s=t_s[is_covered],
-            grasps=[replace(g, poses=_later(g, t_s, lag_s)) for g in experiment.grasps],
+            grasps=[replace(g, poses=_delayed_poses(g, t_s, lag_s)) for g in experiment.grasps],
             markers=replace(
                 markers, t_s=t_s[is_covered], positions_m=markers.positions_m[is_covered]
             ),
@@ -243,7 +264,7 @@ def with_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
         return None
 
 
-def _later(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
+def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
     """Return the poses of a grasp, `lag_s` later [s]."""
     poses = grasp.poses
     if len(poses.t_s) < 2:
@@ -261,19 +282,19 @@ def _later(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
     )
 
 
-def _lag_s(experiment: Experiment, read: Array) -> float:
+def _marker_lag_s(experiment: Experiment, predicted_m: Array) -> float:
     """Return by how much the markers lag behind the fit [s]: Σ r·v / Σ v·v of residuals and
     velocities.
     """
-    v = np.gradient(read, experiment.timestep_s, axis=0)
+    v = np.gradient(predicted_m, experiment.timestep_s, axis=0)
     residual = np.where(
-        np.isfinite(experiment.markers.positions_m), _residual(experiment, read), 0.0
+        np.isfinite(experiment.markers.positions_m), _residual(experiment, predicted_m), 0.0
     )
-    moving = np.where(experiment.markers.present[..., None], v, 0.0)
+    moving = np.where(experiment.markers.is_present[..., None], v, 0.0)
     return float(np.sum(residual * moving) / max(np.sum(moving**2), 1e-300))
 
 
-def _one_layer(experiment: Experiment, deeper: bool) -> Experiment | None:
+def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | None:
     """Return the experiment with every grasp one layer of elements deeper or less deep;
     None if that is impossible.
     """
@@ -296,14 +317,16 @@ def _one_layer(experiment: Experiment, deeper: bool) -> Experiment | None:
         return None
 
 
-def _residual(experiment: Experiment, read: Array) -> Array:
+def _residual(experiment: Experiment, predicted_m: Array) -> Array:
     """Return fitted less measured markers (T, M, 3) [m], NaN where missing."""
     return np.where(
-        experiment.markers.present[..., None], read - experiment.markers.positions_m, np.nan
+        experiment.markers.is_present[..., None],
+        predicted_m - experiment.markers.positions_m,
+        np.nan,
     )
 
 
-def _misfit(experiment: Experiment, read: Array) -> float:
+def _misfit(experiment: Experiment, predicted_m: Array) -> float:
     """Return the root mean square of the residuals in standard deviations."""
-    scaled = _residual(experiment, read) / experiment.markers.sigma_m[:, None]
-    return root_mean(scaled[experiment.markers.present] ** 2)
+    scaled = _residual(experiment, predicted_m) / experiment.markers.sigma_m[:, None]
+    return root_mean(scaled[experiment.markers.is_present] ** 2)

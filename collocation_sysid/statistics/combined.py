@@ -4,7 +4,8 @@ The combined interval is the one to publish. It contains three independent contr
 statistical part (noise of the measurements, nuisance parameters), the discretisation error (time
 step, and mesh where it was refined), and the systematic effects of the budget (type B evaluation,
 JCGM 100:2008, 4.3). All three are added in quadrature in the coordinate in which the parameter is
-estimated, its logarithm as a rule, see `Coordinate`. The known part of the discretisation error is
+estimated, its logarithm as a rule, see `IntervalCoordinate`. The known part of the discretisation
+error is
 corrected, not only budgeted (ibid., 3.2.4): the reported value is the extrapolated one.
 """
 
@@ -14,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .estimates import Coordinate, Estimate
-from .numerical import NumericalError
+from .estimates import Estimate, IntervalCoordinate
+from .numerical import DiscretisationError
 
 # Half width of a normal distribution's 95 % interval, in standard deviations.
 NORMAL_95 = 1.96
@@ -54,7 +55,7 @@ class CombinedEstimate:
 def combine(
     name: str,
     estimate: Estimate,
-    error: NumericalError | None,
+    error: DiscretisationError | None,
     systematic: float | None,
     *,
     known_effect: float = 0.0,
@@ -69,7 +70,7 @@ def combine(
         Name of a parameter or derived modulus.
     estimate : Estimate
         The optimum of the discretised problem with its statistical uncertainty.
-    error : NumericalError or None
+    error : DiscretisationError or None
         Discretisation error; None if it is unknown or zero.
     systematic : float or None
         Standard deviation of all systematic effects together, in the coordinate of the estimate;
@@ -85,36 +86,36 @@ def combine(
     -------
     CombinedEstimate
     """
-    if estimate.at_bound:
+    if estimate.is_at_bound:
         return CombinedEstimate(estimate.value, None, None)
     is_corrected = error is not None or known_effect != 0.0
     known = [estimate.value, *(estimate.statistical95 or ())]
     corrections = () if error is None else (error.extrapolated, *(error.interval95 or ()))
-    at = Coordinate.of(name, (*known, *corrections), linear)
-    optimum = at.at(estimate.value)
-    centre = optimum if error is None else at.at(error.extrapolated)
+    at = IntervalCoordinate.for_estimate(name, (*known, *corrections), linear)
+    optimum = at.from_value(estimate.value)
+    centre = optimum if error is None else at.from_value(error.extrapolated)
     centre += known_effect
-    value = _within(bounds, at.value(centre)) if is_corrected else estimate.value
-    correction = at.value(centre) - at.value(centre - known_effect) if known_effect else None
+    value = _clip(bounds, at.to_value(centre)) if is_corrected else estimate.value
+    correction = at.to_value(centre) - at.to_value(centre - known_effect) if known_effect else None
     spread = estimate.statistical_std_error
     if spread is not None:
-        spread *= at.slope(estimate.value) / at.slope(at.value(centre))
+        spread *= at.derivative(estimate.value) / at.derivative(at.to_value(centre))
     if estimate.statistical95 is None:
         return CombinedEstimate(value, spread, None, known_correction=correction)
-    low, high = (at.at(end) + centre - optimum for end in estimate.statistical95)
+    low, high = (at.from_value(end) + centre - optimum for end in estimate.statistical95)
     statistical95 = _interval(at, low, high, bounds)
     if not is_corrected:
         least, most = estimate.statistical95
-        statistical95 = _within(bounds, least), _within(bounds, most)
+        statistical95 = _clip(bounds, least), _clip(bounds, most)
     if systematic is None:
         return CombinedEstimate(value, spread, statistical95, known_correction=correction)
     if error is not None and error.interval95 is not None:
-        low, high = map(at.at, error.interval95)
+        low, high = map(at.from_value, error.interval95)
         low = low + known_effect
         high = high + known_effect
     low, high = widened((low, high), centre, systematic)
     combined95 = _interval(at, low, high, bounds)
-    deviation = (high - low) / 2 / NORMAL_95 / at.slope(at.value(centre))
+    deviation = (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
     return CombinedEstimate(value, spread, statistical95, deviation, combined95, correction)
 
 
@@ -136,12 +137,12 @@ def widened(ends: Interval, centre: float, deviation: float) -> Interval:
     return centre - below, centre + above
 
 
-def _within(bounds: Interval, value: float) -> float:
+def _clip(bounds: Interval, value: float) -> float:
     """Return a value clipped to bounds."""
     low, high = bounds
     return float(min(max(value, low), high))
 
 
-def _interval(at: Coordinate, low: float, high: float, bounds: Interval) -> Interval:
+def _interval(at: IntervalCoordinate, low: float, high: float, bounds: Interval) -> Interval:
     """Return the interval between two coordinates as values clipped to bounds."""
-    return _within(bounds, at.value(low)), _within(bounds, at.value(high))
+    return _clip(bounds, at.to_value(low)), _clip(bounds, at.to_value(high))

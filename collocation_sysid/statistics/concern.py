@@ -21,20 +21,20 @@ class Topic:
 
     Attributes
     ----------
-    about : str
+    title : str
         Title.
     page : str
         Topic of the page with more information, see `pages`.
-    cure : str
+    remedy : str
         Remedy, in a sentence or two.
-    said : mapping of str to str
+    messages : mapping of str to str
         Message for the rest of the code, with placeholders for the data.
     """
 
-    about: str
+    title: str
     page: str
-    cure: str
-    said: Mapping[str, str]
+    remedy: str
+    messages: Mapping[str, str]
 
 
 MODE = "the first mode of '{experiment}' ({frequency_hz:.3g} Hz at the guess)"
@@ -406,7 +406,7 @@ TOPICS: Mapping[str, Topic] = {
 }
 
 
-def sentence_of(code: str, data: Mapping[str, Any]) -> str:
+def message_of(code: str, data: Mapping[str, Any]) -> str:
     """Return the message of a code with its data.
 
     If the data contain "of", the message begins with that subject; if they contain "nearer", the
@@ -414,7 +414,7 @@ def sentence_of(code: str, data: Mapping[str, Any]) -> str:
     """
     topic, _, rest = code.partition("/")
     shown = {k: listed(v) if isinstance(v, (list, tuple)) else v for k, v in data.items()}
-    said = TOPICS[topic].said[rest].format(**shown)
+    said = TOPICS[topic].messages[rest].format(**shown)
     nearer = f" ({data['nearer']:.2g} times nearer)" if "nearer" in data else ""
     return f"{data['of']}: {said}{nearer}" if data.get("of") else said
 
@@ -443,16 +443,16 @@ class Concern:
         return self.code.partition("/")[0]
 
     @property
-    def sentence(self) -> str:
+    def message(self) -> str:
         """Message of the concern for the user."""
-        return sentence_of(self.code, self.data)
+        return message_of(self.code, self.data)
 
 
-def concerned(found: bool, gross: bool, code: str, **data: Any) -> list[Concern]:
-    """Return a list with a concern if `found`, graded "doubtful" if `gross` and else
+def concern_if(is_present: bool, is_gross: bool, code: str, **data: Any) -> list[Concern]:
+    """Return a list with a concern if `is_present`, graded "doubtful" if `is_gross` and else
     "check"; otherwise an empty list.
     """
-    return [Concern(code, "doubtful" if gross else "check", data)] if found else []
+    return [Concern(code, "doubtful" if is_gross else "check", data)] if is_present else []
 
 
 def topics_of(concerns: Iterable[Concern]) -> dict[str, Topic]:

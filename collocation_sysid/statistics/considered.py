@@ -16,16 +16,16 @@ import numpy as np
 
 from ..arrays import Array, Index
 from ..fem.body import Linearisation
-from ..program.channel import Forced, Motion
-from ..program.collocation import Collocation, Part
+from ..program.channel import ObservedMotion, ReactionForces
+from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
-from ..program.reaction import HeldForces
-from ..program.reading import Reading
-from ..program.sweep import Columns, Forward, GraspMotion, Sweep
+from ..program.reaction import GraspForces
+from ..program.reading import MeasurementResidual
+from ..program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, SweepColumns
 from ..recording.experiment import Experiment
-from ..recording.nuisance import ROWS
-from .assumptions import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, Fitted
-from .linearised import linearised_fit
+from ..recording.nuisance import KINDS
+from .assumptions import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, FittedExperiment
+from .linearised import linearise_fit
 from .shape_error import CORRELATION
 
 # A threshold of Huber's loss that no residual reaches.
@@ -33,7 +33,7 @@ UNWEIGHTED = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class _Changed(Columns):
+class _EffectColumns(SweepColumns):
     """Right-hand sides of a forward substitution by changes of forces and of equations.
 
     Attributes
@@ -47,7 +47,7 @@ class _Changed(Columns):
     forces_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
     rows_n: Array = field(default_factory=lambda: np.zeros(0))  # (N, 3n, c)
 
-    def sides(
+    def right_hand_sides(
         self,
         rows: slice,
         at: Linearisation,
@@ -55,11 +55,11 @@ class _Changed(Columns):
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """Return R (k, free, c) and F_R (k, 3n, c), see `Columns.sides`."""
+        """Return R (k, free, c) and F_R (k, 3n, c), see `QuantityTable.right_hand_sides`."""
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
 
-class Changes(NamedTuple):
+class ResidualChanges(NamedTuple):
     """Changes of the residuals of a fit if assumptions are off by their standard deviations.
 
     Attributes
@@ -73,17 +73,19 @@ class Changes(NamedTuple):
     names: tuple[str, ...]
     blocks: list[Array]
 
-    def without(self, assumptions: Iterable[str]) -> Changes:
+    def without(self, assumptions: Iterable[str]) -> ResidualChanges:
         """Return the changes without some assumptions, each with all its components."""
         excluded = set(assumptions)
         remaining = [
             k for k, name in enumerate(self.names) if name.partition(" ")[0] not in excluded
         ]
         names = tuple(self.names[k] for k in remaining)
-        return Changes(names, [block[..., remaining] for block in self.blocks])
+        return ResidualChanges(names, [block[..., remaining] for block in self.blocks])
 
 
-def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float | None]) -> Changes:
+def changes_of_assumptions(
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+) -> ResidualChanges:
     """Return the changes of the residuals by all assumptions of a fit.
 
     Parameters
@@ -100,37 +102,39 @@ def assumed(collocation: Collocation, z: Array, deviations: Mapping[str, float |
     stated = [(row, s) for row, s in rows if s is not None]
     correlation = deviations.get(CORRELATION_KEY) or CORRELATION
     of_bodies = changed_residuals(collocation, z, stated, surface_correlation=correlation)
-    of_nuisances = considered(collocation, z, deviations)
+    of_nuisances = changes_of_nuisances(collocation, z, deviations)
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
     blocks = [np.concatenate(each, axis=3) for each in both]
-    return Changes(of_bodies.names + of_nuisances.names, blocks)
+    return ResidualChanges(of_bodies.names + of_nuisances.names, blocks)
 
 
-def considered(
+def changes_of_nuisances(
     collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
-) -> Changes:
+) -> ResidualChanges:
     """Return the changes of the residuals by nuisance parameters that are not estimated;
-    arguments as in `assumed`.
+    arguments as in `changes_of_assumptions`.
     """
 
     def widened(experiment: Experiment) -> Experiment:
         nuisance = experiment.nuisance
-        sigmas = {row: deviations.get(row.name, row.considered) for row in ROWS}
+        sigmas = {row: deviations.get(row.name, row.considered) for row in KINDS}
         more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
         return replace(experiment, nuisance=replace(nuisance, **more))
 
     wider = [widened(experiment) for experiment in collocation.experiments]
     wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
     p, positions = collocation.unpack(z)
-    values = dict(zip(collocation.names, p.tolist(), strict=True))
-    at = wide.pack(np.array([values.get(name, 0.0) for name in wide.names]), positions)
-    new = np.array([k for k, name in enumerate(wide.names) if name not in values], dtype=np.int64)
+    values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
+    at = wide.pack(np.array([values.get(name, 0.0) for name in wide.parameter_names]), positions)
+    new = np.array(
+        [k for k, name in enumerate(wide.parameter_names) if name not in values], dtype=np.int64
+    )
     names: dict[int, str] = {}
-    for segment in wide.segments:
-        own = zip(segment.places[wide.nq :], segment.nuisance.entries, strict=True)
+    for segment in wide.transcriptions:
+        own = zip(segment.parameter_indices[wide.nq :], segment.nuisance.entries, strict=True)
         names |= {int(place): entry.row.name for place, entry in own}
-    blocks = [block.slope[..., new] for block in linearised_fit(wide, at).blocks]
-    return Changes(tuple(names[k] for k in new.tolist()), blocks)
+    blocks = [block.jacobian[..., new] for block in linearise_fit(wide, at).blocks]
+    return ResidualChanges(tuple(names[k] for k in new.tolist()), blocks)
 
 
 @one_blas_thread()
@@ -140,7 +144,7 @@ def changed_residuals(
     assumptions: Sequence[tuple[Assumption, float]],
     *,
     surface_correlation: float = CORRELATION,
-) -> Changes:
+) -> ResidualChanges:
     """Return the changes of the residuals by some assumptions.
 
     Parameters
@@ -156,25 +160,27 @@ def changed_residuals(
     """
     names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
-    for part in collocation.parts(z):
-        at = Fitted(part, collocation.parameters, surface_correlation)
+    for part in collocation.iterates(z):
+        at = FittedExperiment(part, collocation.parameters, surface_correlation)
         effects = [
             (row.effect(at, axis), sigma)
             for row, sigma in assumptions
             for axis in range(len(row.components))
         ]
-        changes += _changes(at, effects)
-    return Changes(names, changes)
+        changes += _changes_by_effects(at, effects)
+    return ResidualChanges(names, changes)
 
 
-def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iterator[Array]:
+def _changes_by_effects(
+    fitted: FittedExperiment, effects: Sequence[tuple[Effect | None, float]]
+) -> Iterator[Array]:
     """Yield the changes (T, M, 3, a) of the residuals of each measurement by effects, each
     with its standard deviation; None has no effect.
     """
-    part = at.part
+    part = fitted.iterate
     count = len(effects)
     segment = part.segment
-    prescribed = part.setting.held
+    prescribed = part.equations.prescribed
     x = part.x
     forces = np.zeros((*x.shape, count))
     rows = np.zeros((*x.shape, count))
@@ -185,31 +191,33 @@ def _changes(at: Fitted, effects: Sequence[tuple[Effect | None, float]]) -> Iter
         if effect.force_n is not None:
             forces[..., k] = sigma * effect.force_n
         if effect.mass_kg is not None:
-            rows[..., k] -= sigma * effect.mass_kg * at.acceleration
-        if effect.stretched:
-            mass = at.dynamics.mass.kg
-            rows[..., k] += 2 * sigma * effect.stretched * mass * at.acceleration
-        if effect.moved_m is not None:
+            rows[..., k] -= sigma * effect.mass_kg * fitted.acceleration
+        if effect.time_stretch:
+            mass = fitted.dynamics.mass.inertia_kg
+            rows[..., k] += 2 * sigma * effect.time_stretch * mass * fitted.acceleration
+        if effect.displacement_m is not None:
             displacements_m[..., k] = sigma * np.where(
-                np.isnan(prescribed.positions_m), 0.0, effect.moved_m
+                np.isnan(prescribed.positions_m), 0.0, effect.displacement_m
             )
-    forces[: at.dynamics.first_row] = rows[: at.dynamics.first_row] = 0.0
+    forces[: fitted.dynamics.first_row] = rows[: fitted.dynamics.first_row] = 0.0
     solver = Sweep(segment)
-    columns = _Changed(
-        part.setting,
+    columns = _EffectColumns(
+        part.equations,
         count,
-        by_p=False,
-        grasped=GraspMotion.along(solver, prescribed.dofs, displacements_m),
+        has_parameters=False,
+        prescribed=PrescribedColumns.from_columns(solver, prescribed.dofs, displacements_m),
         forces_n=forces,
         rows_n=rows,
     )
-    for reading, _, looked, by in followed(part, solver, columns, rows[:, segment.sensed_dofs]):
-        yield reading.changes(looked, by, part.phi)
+    for reading, _, looked, by in propagate_columns(
+        part, solver, columns, rows[:, segment.sensed_dofs]
+    ):
+        yield reading.residual_changes(looked, by, part.phi)
 
 
-def followed(
-    part: Part, solver: Sweep, columns: Columns, inertia_n: Array | float = 0.0
-) -> Iterator[tuple[Reading, Motion, Array, Array]]:
+def propagate_columns(
+    iterate: ExperimentIterate, solver: Sweep, columns: SweepColumns, inertia_n: Array | float = 0.0
+) -> Iterator[tuple[MeasurementResidual, ObservedMotion, Array, Array]]:
     """Propagate columns of a forward substitution to the observables.
 
     Yields, for each measurement: the measurement model, its motion, the values of its observable,
@@ -217,36 +225,38 @@ def followed(
 
     Parameters
     ----------
-    part : Part
+    iterate : ExperimentIterate
         The experiment at the answer.
     solver : Sweep
         Factorised time steps.
-    columns : Columns
+    columns : QuantityTable
         Right-hand sides, not by parameters.
     inertia_n : (N, g, c) array or 0
         Changes of the equations of motion of the sensed dofs, which reaction forces do not contain
         [N].
     """
-    segment = part.segment
-    x = part.x
-    phi = part.phi
-    sensed = HeldForces.nothing(len(x), len(segment.sensed_dofs), columns.count)
-    response = part.sensing.read_along(Forward(solver, columns, held=sensed).rows(x), sensed)
+    segment = iterate.segment
+    x = iterate.x
+    phi = iterate.phi
+    sensed = GraspForces.zeros(len(x), len(segment.sensed_dofs), columns.count)
+    response = iterate.observation.response_of_rows(
+        ForwardSubstitution(solver, columns, grasp_forces=sensed).iterate_rows(x), sensed
+    )
     numbers = np.arange(columns.count)
     size = columns.count + len(phi)
-    motions = part.sensing.moving(x, response, by_p=False)
-    for reading, motion in zip(segment.readings, motions, strict=True):
-        motion = _with_inertia(motion, inertia_n)
-        values, slopes = reading.channel.linearised(motion, phi, numbers, size)
-        yield reading, motion, values, slopes.by[..., : columns.count]
+    motions = iterate.observation.linearised_motions(x, response, is_by_parameters=False)
+    for reading, motion in zip(segment.residuals, motions, strict=True):
+        motion = _without_row_changes(motion, inertia_n)
+        values, slopes = reading.observable.linearise(motion, phi, numbers, size)
+        yield reading, motion, values, slopes.by_common[..., : columns.count]
 
 
-def _with_inertia(motion: Motion, inertia_n: Array | float) -> Motion:
+def _without_row_changes(motion: ObservedMotion, inertia_n: Array | float) -> ObservedMotion:
     """Return the motion with `inertia_n` subtracted from the changes of its reaction forces."""
 
-    def forced() -> Forced:
-        lacking = motion.forced
+    def forced() -> ReactionForces:
+        lacking = motion.reactions
         assert lacking.reaction_by is not None  # along columns
         return replace(lacking, reaction_by=lacking.reaction_by - inertia_n)
 
-    return Motion(motion.x, forced, motion.by)
+    return ObservedMotion(motion.x, forced, motion.changes)

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from .concern import Concern
 from .distributions import beta_sf, chi2_isf, normal_isf
-from .linearised import FitBlock, LinearisedFit, Mask, information
-from .noise import NoiseLevel, noise_level
+from .linearised import LinearisedFit, Mask, ResidualBlock, factorise_information
+from .noise import NoiseLevel, estimate_noise_level
 
 # Level of the tests for patterns.
 SIGNIFICANCE = 0.01
@@ -93,34 +93,36 @@ class MarkerDiagnosis:
     sentence: str
 
 
-def diagnose(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
+def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
     """Diagnose every marker that was measured, experiment by experiment."""
-    level = noise_level(fit, information(fit))
-    alone = {outlier.series: outlier for outlier in reversed(set_apart(fit)[1])}
+    level = estimate_noise_level(fit, factorise_information(fit))
+    alone = {outlier.series: outlier for outlier in reversed(remove_outliers(fit)[1])}
     return tuple(
-        _diagnose(block, marker, fit.shared, _estimated(fit, block), level, alone)
+        _diagnose_marker(
+            block, marker, fit.shared_count, _estimated_kinds(fit, block), level, alone
+        )
         for block in fit.blocks
-        if block.stated == "sigma_m"
-        for marker in np.flatnonzero(block.present.any(axis=0)).tolist()
+        if block.sigma_key == "sigma_m"
+        for marker in np.flatnonzero(block.is_present.any(axis=0)).tolist()
     )
 
 
-def _estimated(fit: LinearisedFit, block: FitBlock) -> tuple[bool, bool]:
+def _estimated_kinds(fit: LinearisedFit, block: ResidualBlock) -> tuple[bool, bool]:
     """Return whether marker offsets, and a time shift, of the experiment are estimated."""
-    kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared :]]
+    kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared_count :]]
     return any(k.startswith("offset") for k in kinds), any(k.startswith("time") for k in kinds)
 
 
-def _diagnose(
-    block: FitBlock,
+def _diagnose_marker(
+    block: ResidualBlock,
     marker: int,
     shared: int,
-    estimated: tuple[bool, bool],
+    estimated_kinds: tuple[bool, bool],
     level: NoiseLevel,
-    alone: Mapping[str, Outlier],
+    outliers: Mapping[str, Outlier],
 ) -> MarkerDiagnosis:
     """Diagnose one marker of a block."""
-    present = block.present[:, marker]
+    present = block.is_present[:, marker]
     name = f"{block.name}/{block.marker_names[marker]}"
     residual = block.residual[:, marker] * block.sigma_m[marker]
     samples = int(present.sum())
@@ -131,14 +133,14 @@ def _diagnose(
     frequency = 0.0
     peak = 0.0
     early = np.zeros(len(residual), dtype=bool)
-    if not block.static:
+    if not block.is_static:
         frequency, peak = _largest_peak(varying, block.t_s)
         early = block.t_s <= block.t_s[0] + EARLY_TIME * (block.t_s[-1] - block.t_s[0])
     diagnosis = MarkerDiagnosis(
         experiment=block.name,
         marker=block.marker_names[marker],
         samples=samples,
-        wild=int(block.wild[:, marker].sum()),
+        wild=int(block.is_outlier[:, marker].sum()),
         rms_m=_rms_m(block, marker),
         noise_factor=level.factors[name],
         offset_m=mean,
@@ -149,12 +151,12 @@ def _diagnose(
         early_share=float(np.sum(residual[early] ** 2) / total),
         sentence="",
     )
-    if name in alone:
-        message = alone[name].concern.sentence.removeprefix(f"{name}: ")
+    if name in outliers:
+        message = outliers[name].concern.message.removeprefix(f"{name}: ")
         return replace(diagnosis, sentence=f"{name}: {1e3 * diagnosis.rms_m:.2g} mm RMS; {message}")
     pairs = int(np.sum(present[1:] & present[:-1]))
-    motion = block.slope[:, marker, :, :shared].reshape(len(residual), -1)
-    message = _suggestion(diagnosis, pairs, block, motion, estimated)
+    motion = block.jacobian[:, marker, :, :shared].reshape(len(residual), -1)
+    message = _message(diagnosis, pairs, block, motion, estimated_kinds)
     if diagnosis.wild > MOST_WILD * samples:
         message += (
             f"; {diagnosis.wild} samples are beyond Huber's threshold: exchanged labels, or "
@@ -163,12 +165,12 @@ def _diagnose(
     return replace(diagnosis, sentence=message)
 
 
-def _rms_m(block: FitBlock, marker: int) -> float:
+def _rms_m(block: ResidualBlock, marker: int) -> float:
     """Return the root mean square distance of a marker from its measurements [m], including
     outliers.
     """
     misfit = block.residual if block.misfit is None else block.misfit
-    squares = np.sum(misfit[:, marker] ** 2) / block.present[:, marker].sum()
+    squares = np.sum(misfit[:, marker] ** 2) / block.is_present[:, marker].sum()
     return float(block.sigma_m[marker] * np.sqrt(squares))
 
 
@@ -205,38 +207,44 @@ def _largest_peak(varying: Array, t_s: Array) -> tuple[float, float]:
     return centre / record_s, float(weights.sum() / total)
 
 
-def _suggestion(
-    found: MarkerDiagnosis, pairs: int, block: FitBlock, motion: Array, estimated: tuple[bool, bool]
+def _message(
+    diagnosis: MarkerDiagnosis,
+    pairs: int,
+    block: ResidualBlock,
+    motion: Array,
+    estimated: tuple[bool, bool],
 ) -> str:
     """Return the message for a marker without outlier."""
     t_s = block.t_s
-    name = f"{found.experiment}/{found.marker}"
-    size = f"{1e3 * found.rms_m:.2g} mm RMS"
-    if found.rms_m < ROUNDING_M:
+    name = f"{diagnosis.experiment}/{diagnosis.marker}"
+    size = f"{1e3 * diagnosis.rms_m:.2g} mm RMS"
+    if diagnosis.rms_m < ROUNDING_M:
         return f"{name}: fits to rounding"
-    persistent = pairs > 0 and abs(found.lag1) > normal_isf(SIGNIFICANCE / 2) / np.sqrt(3 * pairs)
-    shifted = found.constant_share > chi2_isf(SIGNIFICANCE, 3) / (3 * found.samples)
+    persistent = pairs > 0 and abs(diagnosis.lag1) > normal_isf(SIGNIFICANCE / 2) / np.sqrt(
+        3 * pairs
+    )
+    shifted = diagnosis.constant_share > chi2_isf(SIGNIFICANCE, 3) / (3 * diagnosis.samples)
     if not persistent and not shifted:
-        return f"{name}: {size}, {_white(found)}"
-    if found.constant_share > DOMINANT:
-        offset = 1e3 * np.linalg.norm(found.offset_m)
+        return f"{name}: {size}, {_white_noise_message(diagnosis)}"
+    if diagnosis.constant_share > DOMINANT:
+        offset = 1e3 * np.linalg.norm(diagnosis.offset_m)
         cause = (
-            f"{100 * found.constant_share:.0f} % of its power is constant: its place on the body "
+            f"{100 * diagnosis.constant_share:.0f} % of its power is constant: its place on the body "
             f"is off by {offset:.2g} mm; {'widen the prior of' if estimated[0] else 'estimate'} "
             "marker_offsets"
         )
-    elif found.early_share > DOMINANT:
+    elif diagnosis.early_share > DOMINANT:
         end_s = EARLY_TIME * (t_s[-1] - t_s[0])
         cause = (
-            f"{100 * found.early_share:.0f} % of its power is in the first {end_s:.2g} s: the "
+            f"{100 * diagnosis.early_share:.0f} % of its power is in the first {end_s:.2g} s: the "
             "start state or the release time is off"
         )
         cause += "" if estimated[1] else "; estimate time_shift"
-    elif found.oscillating_share > DOMINANT:
-        cause = _oscillation(found, t_s, motion)
-    elif persistent and found.lag1 > DOMINANT:
+    elif diagnosis.oscillating_share > DOMINANT:
+        cause = _oscillation_message(diagnosis, t_s, motion)
+    elif persistent and diagnosis.lag1 > DOMINANT:
         cause = "it drifts slowly: creep of the material, or slip in the grasp, is not modelled"
-        if block.static:
+        if block.is_static:
             cause = (
                 "it changes with the load: the material law or the boundary conditions at the "
                 "grasps are wrong"
@@ -246,12 +254,12 @@ def _suggestion(
     return f"{name}: {size}; {cause}"
 
 
-def _white(found: MarkerDiagnosis) -> str:
+def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
     """Return the description of white residuals by their size; a few samples may differ
     from σ by chance.
     """
-    factor = found.noise_factor
-    chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * found.samples)
+    factor = diagnosis.noise_factor
+    chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * diagnosis.samples)
     if factor > max(AS_STATED, 1 + chance):
         return f"white, but {factor:.2g} times as large as sigma_m says"
     if factor < min(1 / AS_STATED, 1 - chance):
@@ -259,20 +267,20 @@ def _white(found: MarkerDiagnosis) -> str:
     return "white, as noise should be"
 
 
-def _oscillation(found: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
+def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
     """Return the description of oscillating residuals, compared with the frequency of the
     motion.
     """
-    share = f"{100 * found.oscillating_share:.0f} % of its power"
+    share = f"{100 * diagnosis.oscillating_share:.0f} % of its power"
     record_s = (t_s[1] - t_s[0]) * len(t_s)
-    if found.frequency_hz * record_s < FEWEST_PERIODS:
+    if diagnosis.frequency_hz * record_s < FEWEST_PERIODS:
         return (
             f"{share} is a slow drift: creep of the material, or slip in the grasp, is not in "
             "the model"
         )
-    message = f"{share} oscillates at {found.frequency_hz:.3g} Hz"
+    message = f"{share} oscillates at {diagnosis.frequency_hz:.3g} Hz"
     of_motion, _ = _largest_peak(motion - motion.mean(axis=0), t_s)
-    if abs(found.frequency_hz - of_motion) <= SAME_FREQUENCY * of_motion:
+    if abs(diagnosis.frequency_hz - of_motion) <= SAME_FREQUENCY * of_motion:
         return f"{message}, with the motion: the model's stiffness, damping or mass differ"
     return f"{message}, unlike the motion: a vibration or a mode that the model lacks"
 
@@ -303,7 +311,7 @@ class Outlier:
         Its share in the power of its marker's residuals.
     deviations : float
         Its residual over σ.
-    first_relaxed : bool
+    is_relaxed_start : bool
         Whether it is the first sample of a body with memory, which is assumed relaxed there.
     """
 
@@ -312,40 +320,42 @@ class Outlier:
     t_s: float
     share: float
     deviations: float
-    first_relaxed: bool
+    is_relaxed_start: bool
 
     @property
     def concern(self) -> Concern:
         """Concern about this sample, with the remedy."""
-        code = "residuals/first" if self.first_relaxed else "residuals/outlier"
+        code = "residuals/first" if self.is_relaxed_start else "residuals/outlier"
         data = {"t_s": self.t_s, "deviations": self.deviations, "percent": 100 * self.share}
         return Concern(code, data={"of": self.series, **data})
 
 
-def set_apart(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
+def remove_outliers(fit: LinearisedFit) -> tuple[LinearisedFit, tuple[Outlier, ...]]:
     """Return the fit without its outliers, and the outliers; the same fit if there are none."""
     blocks = []
     outliers = []
     for block in fit.blocks:
-        for marker in np.flatnonzero(block.present.any(axis=0)).tolist():
-            allowed = max(1, int(EXCEPTIONS * block.present[:, marker].sum()))
-            while allowed and (outlier := _outlier(block, marker, RARE / len(fit.blocks))):
+        for marker in np.flatnonzero(block.is_present.any(axis=0)).tolist():
+            allowed = max(1, int(EXCEPTIONS * block.is_present[:, marker].sum()))
+            while allowed and (outlier := _find_outlier(block, marker, RARE / len(fit.blocks))):
                 outliers.append(outlier)
-                block = _without(block, marker, outlier.sample)
+                block = _without_sample(block, marker, outlier.sample)
                 allowed = allowed - 1
         blocks.append(block)
     return (replace(fit, blocks=tuple(blocks)), tuple(outliers)) if outliers else (fit, ())
 
 
-def _outlier(block: FitBlock, marker: int, rare: float) -> Outlier | None:
+def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Outlier | None:
     """Return the sample that dominates a marker's residuals; None if none does."""
     power = np.sum(block.residual[:, marker] ** 2, axis=1)
-    count = int(block.present[:, marker].sum())
+    count = int(block.is_present[:, marker].sum())
     sample = int(power.argmax())
     share = float(power[sample] / max(power.sum(), 1e-300))
-    freedom = int(block.seen[:, marker].sum()) / count / 2  # half the coordinates of a sample
-    chance = count * block.present.shape[1] * beta_sf(share, freedom, (count - 1) * freedom)
-    if count < FEWEST_SAMPLES or share < MOST or chance > rare:
+    freedom = (
+        int(block.is_measured[:, marker].sum()) / count / 2
+    )  # half the coordinates of a sample
+    chance = count * block.is_present.shape[1] * beta_sf(share, freedom, (count - 1) * freedom)
+    if count < FEWEST_SAMPLES or share < MOST or chance > significance:
         return None
     return Outlier(
         f"{block.name}/{block.marker_names[marker]}",
@@ -353,20 +363,20 @@ def _outlier(block: FitBlock, marker: int, rare: float) -> Outlier | None:
         float(block.t_s[sample]),
         share,
         float(np.sqrt(power[sample])),
-        block.relaxed_first and sample == 0,
+        block.is_relaxed_at_start and sample == 0,
     )
 
 
-def _without(block: FitBlock, marker: int, sample: int) -> FitBlock:
+def _without_sample(block: ResidualBlock, marker: int, sample: int) -> ResidualBlock:
     """Return the block without one sample of a marker."""
-    is_kept: Mask = np.ones(block.present.shape, dtype=bool)
+    is_kept: Mask = np.ones(block.is_present.shape, dtype=bool)
     is_kept[sample, marker] = False
     each = is_kept[..., None]
     return replace(
         block,
-        present=block.present & is_kept,
+        is_present=block.is_present & is_kept,
         residual=block.residual * each,
-        slope=block.slope * each[..., None],
+        jacobian=block.jacobian * each[..., None],
         misfit=None if block.misfit is None else block.misfit * each,
-        components=block.seen & each,
+        components=block.is_measured & each,
     )

@@ -16,12 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..fem.constants import MODE, SHARE, TAU, bare, constant_named, is_damping, is_mode
+from ..fem.constants import (
+    MODE,
+    SHARE,
+    TAU,
+    constant_named,
+    is_damping,
+    is_field_coefficient,
+    without_region,
+)
 from ..model.parameters import Parameter, Parameters
 from .autocorrelation import Dependence
-from .linearised import Derived, LinearisedFit
+from .linearised import DerivedModuli, LinearisedFit
 from .noise import Noise, NoiseLevel
-from .scatter import Scatter
+from .scatter import RecordingComparison
 
 Mask = NDArray[np.bool_]
 
@@ -49,7 +57,7 @@ class Estimate:
     statistical95 : (lower, upper) or None
         95 % interval due to noise and nuisance parameters, within what is physically possible. It
         may exist, and be wide, where there is no `statistical_std_error`.
-    at_bound : bool
+    is_at_bound : bool
         Whether the value, or one it follows from, ended at a bound.
     reason : str or None
         Why an estimated value has no `statistical_std_error`.
@@ -58,21 +66,21 @@ class Estimate:
     value: float
     statistical_std_error: float | None = None
     statistical95: tuple[float, float] | None = None
-    at_bound: bool = False
+    is_at_bound: bool = False
     reason: str | None = None
 
 
 @dataclass(frozen=True)
-class Coordinate:
-    """Coordinate in which an interval is symmetric: the logarithm, ln ν/(½ − ν) (`odds`),
-    or the value itself (`linear`).
+class IntervalCoordinate:
+    """Coordinate in which an interval is symmetric: the logarithm, ln ν/(½ − ν) (`is_odds`),
+    or the value itself (`is_linear`).
     """
 
-    odds: bool
-    linear: bool
+    is_odds: bool
+    is_linear: bool
 
     @classmethod
-    def of(cls, name: str, values: Iterable[float], linear: bool) -> Coordinate:
+    def for_estimate(cls, name: str, values: Iterable[float], linear: bool) -> IntervalCoordinate:
         """Return the coordinate for an estimate.
 
         Parameters
@@ -85,29 +93,29 @@ class Coordinate:
             Whether the parameter is its own coordinate.
         """
         lowest = min(values)
-        return cls(bare(name) == "poisson" and lowest > 0, linear or lowest <= 0)
+        return cls(without_region(name) == "poisson" and lowest > 0, linear or lowest <= 0)
 
-    def slope(self, value: float) -> float:
+    def derivative(self, value: float) -> float:
         """Return the derivative of the coordinate by the value."""
-        if self.odds:
+        if self.is_odds:
             return 0.5 / (value * (0.5 - value))
-        return 1.0 if self.linear else 1 / value
+        return 1.0 if self.is_linear else 1 / value
 
-    def at(self, value: float) -> float:
+    def from_value(self, value: float) -> float:
         """Return the coordinate of a value."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.odds:
+            if self.is_odds:
                 return float(np.log(value / (0.5 - value)))
-            return value if self.linear else float(np.log(value))
+            return value if self.is_linear else float(np.log(value))
 
-    def value(self, x: float) -> float:
+    def to_value(self, x: float) -> float:
         """Return the value of a coordinate."""
-        if self.odds:
+        if self.is_odds:
             return float(0.5 / (1 + np.exp(-x)))
-        return x if self.linear else float(np.exp(x))
+        return x if self.is_linear else float(np.exp(x))
 
 
-def correlation_of(covariance: Array) -> Array:
+def correlation_from_covariance(covariance: Array) -> Array:
     """Return the correlations (n, n); NaN where a variance is zero or not finite."""
     deviation = np.sqrt(np.diag(covariance))
     deviation[~np.isfinite(deviation) | (deviation == 0)] = np.nan
@@ -115,7 +123,7 @@ def correlation_of(covariance: Array) -> Array:
 
 
 def user_estimates(
-    parameters: Parameters, q: Array, of_q: Array, bounded: Mask, quantiles: Array
+    parameters: Parameters, q: Array, covariance_q: Array, is_at_bound: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
     """Return the estimates of the user's parameters by name, except the mode coefficients of
     fields.
@@ -126,29 +134,29 @@ def user_estimates(
         Shared parameters.
     q : (nq,) array
         Estimates in the solver's coordinates.
-    of_q : (nq, nq) array
+    covariance_q : (nq, nq) array
         Covariance of q.
-    bounded : (nq,) array of bool
+    is_at_bound : (nq,) array of bool
         Whether each is at a bound.
     quantiles : (nq,) array
         Half widths of the 95 % intervals in standard deviations.
     """
     values = parameters.values(q).items()
-    estimates = {name: Estimate(value) for name, value in values if not is_mode(name)}
-    partners = np.abs(np.nan_to_num(correlation_of(of_q)))
+    estimates = {name: Estimate(value) for name, value in values if not is_field_coefficient(name)}
+    partners = np.abs(np.nan_to_num(correlation_from_covariance(covariance_q)))
     np.fill_diagonal(partners, 0.0)
-    partners[:, [is_mode(item.name) for item in parameters.free]] = 0.0
+    partners[:, [is_field_coefficient(item.name) for item in parameters.free]] = 0.0
     for k, item in enumerate(parameters.free):
         if item.name not in estimates:
             continue
-        value = item.value(float(q[k]))
-        if bounded[k]:
-            estimates[item.name] = _at_bound(value)
+        value = item.from_coordinate(float(q[k]))
+        if is_at_bound[k]:
+            estimates[item.name] = _estimate_at_bound(value)
             continue
-        deviation = float(np.sqrt(of_q[k, k]))
-        estimate = _of_parameter(item, value, deviation, float(quantiles[k]))
+        deviation = float(np.sqrt(covariance_q[k, k]))
+        estimate = _parameter_estimate(item, value, deviation, float(quantiles[k]))
         other = int(np.argmax(partners[k]))
-        relative = deviation * item.per_value(value) / max(abs(value), 1e-300)
+        relative = deviation * item.value_derivative(value) / max(abs(value), 1e-300)
         if estimate.statistical_std_error is None or estimate.statistical95 is None:
             pass
         elif estimate.statistical95[0] <= item.lower and estimate.statistical95[1] >= item.upper:
@@ -157,53 +165,57 @@ def user_estimates(
         elif partners[k, other] > CONFOUNDED and relative > CONFOUNDED_DEVIATION:
             reason = (
                 f"confounded with {parameters.free[other].name} "
-                f"(correlation {correlation_of(of_q)[k, other]:.3f})"
+                f"(correlation {correlation_from_covariance(covariance_q)[k, other]:.3f})"
             )
             estimate = Estimate(value, None, estimate.statistical95, reason=reason)
         estimates[item.name] = estimate
     for item in parameters.items:
         if item.tied is not None:
-            estimates[item.name] = _multiplied(estimates[item.tied.to], item.tied.ratio)
+            estimates[item.name] = _scaled_estimate(estimates[item.tied.to], item.tied.ratio)
     return estimates
 
 
-def relative_slopes(parameters: Parameters, q: Array) -> Array:
+def relative_derivatives(parameters: Parameters, q: Array) -> Array:
     """Return the derivative (nq,) of each parameter by its q over its size: 1 for a
     logarithm and for a field's mode coefficient.
     """
     slopes = []
     for item, coordinate in zip(parameters.free, q, strict=True):
-        value = item.value(float(coordinate))
-        size = 1.0 if is_mode(item.name) else max(abs(value), 1e-300)
-        slopes.append(item.per_value(value) / size)
+        value = item.from_coordinate(float(coordinate))
+        size = 1.0 if is_field_coefficient(item.name) else max(abs(value), 1e-300)
+        slopes.append(item.value_derivative(value) / size)
     return np.array(slopes)
 
 
 def derived_estimates(
-    derived: Derived, of_q: Array, bounded: Mask, quantiles: Array
+    derived: DerivedModuli, covariance_q: Array, is_at_bound: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
     """Return the estimates of the moduli that follow from the parameters, by the delta method."""
     estimates = {}
     for name, value in derived.values.items():
-        gradient = derived.by_q[name]
+        gradient = derived.derivatives[name]
         used = np.flatnonzero(gradient)
-        if bounded[used].any():
-            estimates[name] = _at_bound(value)
+        if is_at_bound[used].any():
+            estimates[name] = _estimate_at_bound(value)
         elif not len(used) or not value > 0:
             estimates[name] = Estimate(value)
         else:
-            variance = gradient[used] @ of_q[np.ix_(used, used)] @ gradient[used]
+            variance = gradient[used] @ covariance_q[np.ix_(used, used)] @ gradient[used]
             deviation = float(np.sqrt(variance)) / value
-            estimates[name] = _estimate(name, value, deviation, float(quantiles[used].max()))
+            estimates[name] = _logarithmic_estimate(
+                name, value, deviation, float(quantiles[used].max())
+            )
     return estimates
 
 
-def _of_parameter(item: Parameter, value: float, deviation: float, quantile: float) -> Estimate:
+def _parameter_estimate(
+    item: Parameter, value: float, deviation: float, quantile: float
+) -> Estimate:
     """Return the estimate of a parameter whose q has the standard deviation `deviation`."""
     if item.scale == "log":
-        return _estimate(item.name, value, deviation, quantile)
-    if bare(item.name) == "poisson" and value > 0:
-        return _estimate(item.name, value, deviation * item.unit / value, quantile)
+        return _logarithmic_estimate(item.name, value, deviation, quantile)
+    if without_region(item.name) == "poisson" and value > 0:
+        return _logarithmic_estimate(item.name, value, deviation * item.unit / value, quantile)
     if not deviation <= UNDETERMINED:
         return Estimate(value, reason="the data do not determine it")
     spread = deviation * item.unit
@@ -213,7 +225,7 @@ def _of_parameter(item: Parameter, value: float, deviation: float, quantile: flo
     )
 
 
-def _multiplied(estimate: Estimate, ratio: float) -> Estimate:
+def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
     """Return the estimate multiplied by a number."""
     ends = estimate.statistical95 and sorted(
         (ratio * estimate.statistical95[0], ratio * estimate.statistical95[1])
@@ -224,29 +236,29 @@ def _multiplied(estimate: Estimate, ratio: float) -> Estimate:
         if estimate.statistical_std_error is None
         else abs(ratio) * estimate.statistical_std_error,
         None if not ends else (ends[0], ends[1]),
-        estimate.at_bound,
+        estimate.is_at_bound,
         estimate.reason,
     )
 
 
-def _at_bound(value: float) -> Estimate:
+def _estimate_at_bound(value: float) -> Estimate:
     """Return the estimate of a value at a bound, without error bars."""
     return Estimate(
-        value, at_bound=True, reason="it ended at a bound, or follows from one that did"
+        value, is_at_bound=True, reason="it ended at a bound, or follows from one that did"
     )
 
 
-def _estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
+def _logarithmic_estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
     """Return the estimate of a value whose logarithm has the standard deviation `deviation`."""
     if not deviation <= UNDETERMINED:  # or NaN
         return Estimate(value, reason="the data do not determine it")
-    at = Coordinate.of(name, [value], linear=False)
-    reach = min(quantile * deviation * value * at.slope(value), UNDETERMINED)
-    low, high = (at.value(at.at(value) + way * reach) for way in (-1, 1))
+    at = IntervalCoordinate.for_estimate(name, [value], linear=False)
+    reach = min(quantile * deviation * value * at.derivative(value), UNDETERMINED)
+    low, high = (at.to_value(at.from_value(value) + way * reach) for way in (-1, 1))
     reason = f"its 95 % interval spans more than a factor of {WIDE_FACTOR:g}"
-    if at.odds:
+    if at.is_odds:
         reason = "its 95 % interval covers nearly all of (0, 0.5)"
-    if high - low > WIDE_POISSON if at.odds else high > WIDE_FACTOR * low:
+    if high - low > WIDE_POISSON if at.is_odds else high > WIDE_FACTOR * low:
         return Estimate(value, None, (low, high), reason=reason)
     return Estimate(value, value * deviation, (low, high))
 
@@ -264,7 +276,7 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
     for item in (each for each in parameters.free if each.name in estimates):
         name = item.name
         estimate = estimates[item.name]
-        if estimate.at_bound:
+        if estimate.is_at_bound:
             nearer = min(
                 ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
             )
@@ -282,10 +294,10 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
             )
         elif estimate.statistical_std_error is None:
             reasons[name] = str(estimate.reason)
-    return [*notes, *_unidentifiable(reasons)]
+    return [*notes, *_unidentifiable_notes(reasons)]
 
 
-def _unidentifiable(reasons: Mapping[str, str]) -> list[str]:
+def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
     """Return one note for each parameter that is not identifiable, and one for two
     confounded with each other.
     """
@@ -315,11 +327,11 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
     """
     notes = []
     for name, share in estimates.items():
-        if bare(name) != SHARE.name:
+        if without_region(name) != SHARE.name:
             continue
         branch = name.removesuffix(f".{SHARE.name}")
         tau = estimates.get(f"{branch}.{TAU.name}")
-        if share.at_bound and share.value < 1e-6:
+        if share.is_at_bound and share.value < 1e-6:
             notes.append(
                 f"no memory found: the share of {branch} ended at 0, and its relaxation time "
                 "means nothing; leave that branch out"
@@ -329,7 +341,7 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
                 f"no memory is told from none: the share of {branch} may be 0, and is at most "
                 f"{share.statistical95[1]:.2g} (95 %)"
             )
-        elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
+        elif (share.is_at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
                 f"{branch} relaxes within {tau.value:.2g} s, slower than the longest recording of "
                 f"{longest_s:.2g} s: its share and long-term moduli follow from its beginning "
@@ -338,13 +350,13 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
     return notes
 
 
-def size_notes(asked: str, kind: Noise, level: NoiseLevel, errors: str) -> list[str]:
+def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> list[str]:
     """Return notes on residuals larger or smaller than the stated σ, and how the error bars account
     for that.
 
     Parameters
     ----------
-    asked : str
+    requested : str
         Requested source of the noise, see `ErrorModel`.
     kind : str
         Source that is used, see `ErrorBasis`.
@@ -353,12 +365,12 @@ def size_notes(asked: str, kind: Noise, level: NoiseLevel, errors: str) -> list[
     errors : {"independent", "autocorrelated"}
         Correlation of the errors.
     """
-    if asked == "estimated" or level.kind == "given":
+    if requested == "estimated" or level.suggested_noise == "given":
         return []
     factor = float(np.sqrt(level.pooled))
-    stated = level.stated
+    stated = level.sigma_key
     low, high = (pick(level.factors, key=level.factors.__getitem__) for pick in (min, max))
-    if level.unequal and level.factors[high] > NOTEWORTHY**2 * level.factors[low]:
+    if level.is_unequal and level.factors[high] > NOTEWORTHY**2 * level.factors[low]:
         least = f"{level.factors[low]:.2g} ({low})"
         most = f"{level.factors[high]:.2g} ({high})"
         size = f"between {least} and {most} times as large as {stated} says"
@@ -374,22 +386,22 @@ def size_notes(asked: str, kind: Noise, level: NoiseLevel, errors: str) -> list[
     elif factor > 1:
         so = "the error bars are too small by about that much; check "
         so += f"{stated} and the model, or use noise = 'auto'"
-    elif asked == "given":
+    elif requested == "given":
         so = f"the error bars keep to {stated}, as asked for"
     else:
         so = f"the residuals are not independent, so the error bars keep to {stated}"
     return [f"the residuals are {size}; {so}"]
 
 
-def correlation_notes(asked: str, errors: str, found: Dependence) -> list[str]:
+def correlation_notes(requested: str, errors: str, dependence: Dependence) -> list[str]:
     """Return notes on correlated residuals, and how the error bars account for that."""
-    if not found.found or (errors != "autocorrelated" and asked != "independent"):
+    if not dependence.is_correlated or (errors != "autocorrelated" and requested != "independent"):
         return []
     pattern = "have parts that markers or axes share"
-    if found.in_space:
+    if dependence.is_correlated_in_space:
         pattern = "are alike where they are near each other on the surface"
-    if found.in_time:
-        pattern = f"persist from sample to sample (autocorrelation {found.lag1:.2f})"
+    if dependence.is_correlated_in_time:
+        pattern = f"persist from sample to sample (autocorrelation {dependence.lag1:.2f})"
     if errors == "autocorrelated":
         return [
             f"the residuals {pattern}: noise seldom does, so something is missing in the "
@@ -401,20 +413,20 @@ def correlation_notes(asked: str, errors: str, found: Dependence) -> list[str]:
     ]
 
 
-def scatter_notes(fit: LinearisedFit, scatter: Scatter | None) -> list[str]:
+def disagreement_notes(fit: LinearisedFit, scatter: RecordingComparison | None) -> list[str]:
     """Return notes on parameters on which the recordings disagree."""
     if scatter is None:
         return []
     return [
-        f"the recordings disagree on {told_of(fit.names[k])} (χ² {scatter.chi_squared[k]:.3g} for "
-        f"{scatter.freedom[k]} degrees of freedom): model error decides, and its interval holds "
+        f"the recordings disagree on {display_name(fit.names[k])} (χ² {scatter.chi_squared[k]:.3g} for "
+        f"{scatter.degrees_of_freedom[k]} degrees of freedom): model error decides, and its interval holds "
         "what they disagree by"
-        for k in np.flatnonzero(scatter.disagreeing).tolist()
+        for k in np.flatnonzero(scatter.is_disagreeing).tolist()
     ]
 
 
-def told_of(name: str) -> str:
+def display_name(name: str) -> str:
     """Return the name of an estimated parameter for messages; a mode coefficient is
     described by its field.
     """
-    return f"the {MODE.name} (share {name})" if is_mode(name) else name
+    return f"the {MODE.name} (share {name})" if is_field_coefficient(name) else name

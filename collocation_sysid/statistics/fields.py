@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 from ..arrays import Array, Index
 from ..fem.body import Body
 from ..fem.field import ALL_MODULI, FieldModes
-from ..fem.moduli import engineering
-from ..fem.two_phase import PhaseFinding, TwoPhaseModes
-from ..model.generated import Generated
+from ..fem.moduli import engineering_constants
+from ..fem.two_phase import PhaseSummary, TwoPhaseModes
+from ..model.generated import GeneratedFunction
 from ..model.parameters import NOTHING, Parameters, ThetaMap
 from ..program.collocation import Collocation
 from .concern import Concern
-from .estimates import relative_slopes
-from .linearised import information, linearised_fit
+from .estimates import relative_derivatives
+from .linearised import factorise_information, linearise_fit
 from .uncertainty import Uncertainty
 
 # The data determine an element if its interval is less than this share of the prior's.
@@ -55,12 +55,12 @@ ENDS = (0.025, 0.975)
 AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 
-def phase_concerns(phases: PhaseFinding, name: str) -> list[Concern]:
+def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
     """Return concerns about a two-phase field: no contrast, few elements, or a bad fit.
 
     Parameters
     ----------
-    phases : PhaseFinding
+    phases : PhaseSummary
         Result of the two-phase field.
     name : str
         Name of the constant, with its region in front.
@@ -98,15 +98,15 @@ class FieldEstimate:
         bars.
     quantile : float
         Half width of the 95 % intervals in standard deviations.
-    shares : (m,) array
+    coefficients : (m,) array
         Mode coefficients a.
     covariance : (m, m) array
         Their covariance.
-    stated : float or None
+    stated_density_kg_m3 : float or None
         Stated density that the deviation refers to [kg/m³]; None for other constants.
-    ends : (lower, upper) or None
+    sampled_intervals : (lower, upper) or None
         Ends (k,) of the 95 % intervals from samples; None if they follow from the deviation.
-    phases : PhaseFinding or None
+    phases : PhaseSummary or None
         Result of a two-phase field; None for a smooth field.
     """
 
@@ -116,36 +116,36 @@ class FieldEstimate:
     value: Array
     deviation: Array
     quantile: float
-    shares: Array
+    coefficients: Array
     covariance: Array
-    stated: float | None = None
-    ends: tuple[Array, Array] | None = None
-    phases: PhaseFinding | None = None
+    stated_density_kg_m3: float | None = None
+    sampled_intervals: tuple[Array, Array] | None = None
+    phases: PhaseSummary | None = None
 
     @property
-    def ci95(self) -> tuple[Array, Array]:
+    def statistical95(self) -> tuple[Array, Array]:
         """Lower and upper ends (k,) of the 95 % intervals."""
-        if self.ends is not None:
-            return self.ends
-        if self.stated is not None:
-            half_width = self.quantile * self.deviation * self.stated
+        if self.sampled_intervals is not None:
+            return self.sampled_intervals
+        if self.stated_density_kg_m3 is not None:
+            half_width = self.quantile * self.deviation * self.stated_density_kg_m3
             return self.value - half_width, self.value + half_width
         factor = np.exp(self.quantile * self.deviation)
         return self.value / factor, self.value * factor
 
     @property
-    def over_prior(self) -> Array:
+    def deviation_over_prior(self) -> Array:
         """Standard deviation (k,) over that of the prior about the mean."""
         prior = self.modes.field.deviation if self.phases is None else self.phases.deviation
         return self.deviation / prior
 
     @property
-    def told(self) -> NDArray[np.bool_]:
+    def is_informed(self) -> NDArray[np.bool_]:
         """Mask (k,) of the elements that the data determine better than the prior."""
-        return self.over_prior < TOLD
+        return self.deviation_over_prior < TOLD
 
     @property
-    def identified(self) -> int:
+    def identified_modes(self) -> int:
         """Number of independent modes whose variance the data halve at least, compared with
         the prior.
         """
@@ -157,26 +157,26 @@ class FieldEstimate:
         """Table (k, 4): value, ends of its interval, and its standard deviation over that
         of the prior.
         """
-        return np.column_stack([self.value, *self.ci95, self.over_prior])
+        return np.column_stack([self.value, *self.statistical95, self.deviation_over_prior])
 
     @cached_property
-    def _of_data(self) -> tuple[Array, Array]:
+    def _data_information(self) -> tuple[Array, Array]:
         """Information H of the data alone, and the score b, see the module's documentation."""
         values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
         # Rounding, or error bars that are wider than the fit's: no less than nothing.
         values = np.clip(values, 1e-12, 1.0)
         alone = vectors * (1 / values - 1) @ vectors.T
-        return alone, vectors @ ((vectors.T @ self.shares) / values)
+        return alone, vectors @ ((vectors.T @ self.coefficients) / values)
 
     @cached_property
-    def _beyond_prior(self) -> bool:
+    def _is_wider_than_prior(self) -> bool:
         """Whether error bars exceed the prior, because residuals are much larger than the
         noise; then there is no valid evidence.
         """
         known = self.covariance
         return not np.isfinite(known).all() or np.linalg.eigvalsh(known)[-1] > WIDER
 
-    def likelier(self, length_m: float | None = None, factor: float = 1.0) -> float:
+    def log_evidence_ratio(self, length_m: float | None = None, factor: float = 1.0) -> float:
         """Return ln Z(D) − ln Z(I) for another correlation length [m], or for the amplitude times a
         factor.
 
@@ -189,18 +189,20 @@ class FieldEstimate:
         factor : float
             Factor of the amplitude.
         """
-        if self.phases is not None or self._beyond_prior or length_m == self.modes.length_m:
+        if self.phases is not None or self._is_wider_than_prior or length_m == self.modes.length_m:
             return 0.0
-        size = len(self.shares)
+        size = len(self.coefficients)
         prior = factor**2 * np.eye(size)
         if length_m is not None:
-            other = np.linalg.lstsq(self.modes.shapes, self.modes.at(length_m).shapes, rcond=None)
+            other = np.linalg.lstsq(
+                self.modes.shapes, self.modes.with_length(length_m).shapes, rcond=None
+            )
             prior = factor**2 * other[0] @ other[0].T
-        return self._evidence(prior) - self._evidence(np.eye(size))
+        return self._log_evidence(prior) - self._log_evidence(np.eye(size))
 
-    def _evidence(self, prior: Array) -> float:
+    def _log_evidence(self, prior: Array) -> float:
         """Return ln Z(D) for a prior covariance D (m, m)."""
-        alone, score = self._of_data
+        alone, score = self._data_information
         both = np.eye(len(alone)) + alone @ prior
         return float(score @ prior @ np.linalg.solve(both, score) - np.linalg.slogdet(both)[1]) / 2
 
@@ -211,10 +213,10 @@ class FieldEstimate:
             return phase_concerns(self.phases, self.name)
         amplitude = self.modes.field.deviation
         contradicted = dict[str, dict[str, float]]()
-        best = max(AMPLITUDES, key=lambda factor: self.likelier(factor=factor))
-        if best > 1 and self.likelier(factor=best) > LIKELIER:
+        best = max(AMPLITUDES, key=lambda factor: self.log_evidence_ratio(factor=factor))
+        if best > 1 and self.log_evidence_ratio(factor=best) > LIKELIER:
             contradicted["amplitude"] = {"stated": amplitude, "likely": best * amplitude}
-        if self.likelier(self.modes.length_m / 2) > LIKELIER:
+        if self.log_evidence_ratio(self.modes.length_m / 2) > LIKELIER:
             contradicted["length"] = {
                 "stated": self.modes.length_m,
                 "likely": self.modes.length_m / 2,
@@ -230,8 +232,8 @@ class FieldEstimate:
         return told
 
 
-def fields_of(
-    body: Body, parameters: Parameters, q: Array, known: Uncertainty | Array | None
+def field_estimates(
+    body: Body, parameters: Parameters, q: Array, uncertainty: Uncertainty | Array | None
 ) -> list[FieldEstimate]:
     """Return the estimates of all fields of a body.
 
@@ -243,39 +245,39 @@ def fields_of(
         Shared parameters.
     q : (nq,) array
         Estimates in the solver's coordinates.
-    known : Uncertainty, (nq, nq) array or None
+    uncertainty : Uncertainty, (nq, nq) array or None
         Error bars, or covariance of q; None gives no error bars.
     """
     size = len(q)
     names = [item.name for item in parameters.free]
     covariance = np.full((size, size), np.nan)
     quantile = np.nan
-    if isinstance(known, Uncertainty):
-        sizes = relative_slopes(parameters, q)
-        covariance = known.covariance / np.outer(sizes, sizes)
-        quantile = float(np.nanmax(known.quantiles))
-    elif known is not None:
-        covariance = known
+    if isinstance(uncertainty, Uncertainty):
+        sizes = relative_derivatives(parameters, q)
+        covariance = uncertainty.covariance / np.outer(sizes, sizes)
+        quantile = float(np.nanmax(uncertainty.quantiles))
+    elif uncertainty is not None:
+        covariance = uncertainty
         quantile = 1.96
     estimates = []
     constants = ThetaMap(parameters, body)
     theta = constants.theta(q)
-    by_q = constants.slopes(q)
+    by_q = constants.jacobian(q)
     for number, part in enumerate(body.parts):
         if (modes := part.field) is None:
             continue
-        coefficients = body.mode_places[number]
-        mean, slopes = _mean(constants, number, modes).slopes(q, NOTHING)
+        coefficients = body.field_slices[number]
+        mean, slopes = _mean_logarithm(constants, number, modes).evaluate_with_jacobian(q, NOTHING)
         local = mean[0] + modes.logarithms(theta[coefficients])
         stated = None
         if part.stress_field is None:
             stated = part.density_kg_m3
-        gradient = slopes + modes.slopes(theta[coefficients]) @ by_q[coefficients]
+        gradient = slopes + modes.jacobian(theta[coefficients]) @ by_q[coefficients]
         # What is at a bound has no variance: it is taken for known.
         used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
         own = gradient[:, used]
         variance = np.einsum("ei,ij,ej->e", own, covariance[np.ix_(used, used)], own)
-        deviation = np.sqrt(variance + modes.left_out**2)
+        deviation = np.sqrt(variance + modes.omitted_deviation**2)
         free = [names.index(name) for name in [*body.constants][coefficients] if name in names]
         values = np.exp(local) if stated is None else stated * local
         estimate = FieldEstimate(
@@ -283,11 +285,11 @@ def fields_of(
             modes=modes,
             cells=part.cells,
             value=values,
-            deviation=deviation if known is not None else np.full_like(deviation, np.nan),
+            deviation=deviation if uncertainty is not None else np.full_like(deviation, np.nan),
             quantile=quantile,
-            shares=theta[coefficients],
+            coefficients=theta[coefficients],
             covariance=covariance[np.ix_(free, free)],
-            stated=stated,
+            stated_density_kg_m3=stated,
         )
         if isinstance(modes, TwoPhaseModes):
             contrast = theta[coefficients.stop - 1]
@@ -318,7 +320,7 @@ def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float)
     lower, upper = np.exp(np.quantile(samples.logarithms, ENDS, axis=0))
     # Half of the elements of either phase would differ by half the contrast's logarithm.
     typical = np.log(contrast) ** 2 / 4 + samples.contrasts.var() / 2
-    finding = PhaseFinding(
+    finding = PhaseSummary(
         contrast=_quantiles(np.exp(samples.contrasts)),
         volume_m3=_quantiles(samples.volumes_m3),
         deviation=float(np.sqrt(typical)),
@@ -329,7 +331,7 @@ def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float)
     return replace(
         estimate,
         deviation=samples.logarithms.std(axis=0),
-        ends=(np.minimum(lower, estimate.value), np.maximum(upper, estimate.value)),
+        sampled_intervals=(np.minimum(lower, estimate.value), np.maximum(upper, estimate.value)),
         phases=finding,
     )
 
@@ -340,22 +342,22 @@ def _quantiles(values: Array) -> tuple[float, float, float]:
     return float(lower), float(median), float(upper)
 
 
-def fields_by_information(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
+def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
     """Return the field estimates at a solution by name, with the covariance for independent
     errors of the stated σ.
     """
-    covariance = information(linearised_fit(collocation, z)).fit.covariance()
+    covariance = factorise_information(linearise_fit(collocation, z)).fit.covariance()
     nq = collocation.nq
     estimates = dict[str, FieldEstimate]()
-    for body in dict.fromkeys(segment.body for segment in collocation.segments):
+    for body in dict.fromkeys(segment.body for segment in collocation.transcriptions):
         known = covariance[:nq, :nq]
-        for field in fields_of(body, collocation.parameters, z[:nq], known):
+        for field in field_estimates(body, collocation.parameters, z[:nq], known):
             estimates.setdefault(field.name, field)
     return estimates
 
 
 def mean_logarithm(
-    body: Body, parameters: Parameters, q: Array, *, number: int, names: Sequence[str]
+    body: Body, parameters: Parameters, q: Array, *, part_index: int, names: Sequence[str]
 ) -> tuple[float, Array]:
     """Return the logarithm of the mean of a part's field, and its derivatives by some parameters.
 
@@ -367,32 +369,38 @@ def mean_logarithm(
         Shared parameters.
     q : (nq,) array
         Estimates in the solver's coordinates.
-    number : int
+    part_index : int
         Index of the part, which must have a field.
     names : sequence of str
         Names of the estimated parameters of the derivatives, in their order.
     """
-    modes = body.parts[number].field
+    modes = body.parts[part_index].field
     assert modes is not None
-    mean, slopes = _mean(ThetaMap(parameters, body), number, modes).slopes(q, NOTHING)
+    mean, slopes = _mean_logarithm(
+        ThetaMap(parameters, body), part_index, modes
+    ).evaluate_with_jacobian(q, NOTHING)
     free = [item.name for item in parameters.free]
     return float(mean[0]), slopes.reshape(-1)[[free.index(name) for name in names]]
 
 
-def _mean(constants: ThetaMap, number: int, modes: FieldModes) -> Generated:
+def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> GeneratedFunction:
     """Return the generated logarithm of the mean of a part's field as a function of q; of a
     density, the density over the stated one.
     """
     body = constants.body
-    part = constants.body.parts[number]
+    part = constants.body.parts[part_index]
 
     def logarithm(q: ca.SX, _: ca.SX) -> ca.SX:
-        own = body.split(constants.expression(q))[number]
+        own = body.split_theta(constants.expression(q))[part_index]
         if part.stress_field is None:
-            return own[part.of_gamma_m + 1] / part.density_kg_m3 if part.free_density else ca.SX(1)
+            return (
+                own[part.gamma_m_index + 1] / part.density_kg_m3
+                if part.has_free_density
+                else ca.SX(1)
+            )
         if modes.field.parameter != ALL_MODULI:
-            return ca.log(own[modes.scaled[0]])
+            return ca.log(own[modes.scaled_indices[0]])
         lame = part.material.lame(own[: len(part.material.constants)])
-        return ca.log(engineering(lame[0], lame[1])[0])
+        return ca.log(engineering_constants(lame[0], lame[1])[0])
 
-    return Generated(logarithm, len(constants.parameters.free), 0)
+    return GeneratedFunction(logarithm, len(constants.parameters.free), 0)

@@ -23,11 +23,11 @@ class Hypothesis:
     ----------
     code : str
         Cause and how it shows, such as "marker-slip/alone".
-    of : str
+    subject : str
         What is described, as the beginning of the message; may be empty.
     data : mapping of str to value
         Values of the placeholders in the message.
-    without : Any
+    corrected : Any
         Description with the mistake corrected, of the type that its test expects; None if no test
         is needed.
     handicap : float
@@ -37,9 +37,9 @@ class Hypothesis:
     """
 
     code: str
-    of: str = ""
+    subject: str = ""
     data: Mapping[str, Any] = field(default_factory=dict)
-    without: Any = None
+    corrected: Any = None
     handicap: float = 1.0
     strength: float = 0.0
 
@@ -49,65 +49,67 @@ class Hypothesis:
         return self.code.partition("/")[0]
 
     @property
-    def sentence(self) -> str:
+    def message(self) -> str:
         """Message with the likely mistake and the remedy."""
-        return self.concern().sentence
+        return self.concern().message
 
     def concern(self, grade: Grade = "check") -> Concern:
         """Return the hypothesis as a concern of a given grade."""
-        tried = {} if self.without is None else {"nearer": self.strength}
-        of = {"of": self.of} if self.of else {}
+        tried = {} if self.corrected is None else {"nearer": self.strength}
+        of = {"of": self.subject} if self.subject else {}
         return Concern(f"description/{self.code}", grade, {**of, **self.data, **tried})
 
     def as_dict(self) -> dict[str, Any]:
         """Return cause, message and strength for JSON and tables."""
-        return {"cause": self.cause, "sentence": self.sentence, "strength": self.strength}
+        return {"cause": self.cause, "sentence": self.message, "strength": self.strength}
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class HypothesisTest:
     """Test of hypotheses by the misfit that remains.
 
     Attributes
     ----------
     misfit : float
         Misfit of the description as stated.
-    left : callable
+    misfit_of : callable
         Returns the misfit of a corrected description; None if it is unknown.
-    better : float
+    required_factor : float
         Factor by which the misfit must decrease.
-    least : float
+    smallest_misfit : float
         Smallest meaningful misfit; smaller ones count as this.
-    noise : float
+    noise_level : float
         If the misfit decreases from above this level to below it, any factor suffices.
     """
 
     misfit: float
-    left: Callable[[Any], float | None]
-    better: float
-    least: float = 0.0
-    noise: float = 0.0
+    misfit_of: Callable[[Any], float | None]
+    required_factor: float
+    smallest_misfit: float = 0.0
+    noise_level: float = 0.0
 
-    def of(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
+    def accepted(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
         """Iterate over the hypotheses that fit far better, with their strength."""
         for each in hypotheses:
-            if (misfit := self.left(each.without)) is None:
+            if (misfit := self.misfit_of(each.corrected)) is None:
                 continue
-            strength = self.misfit / max(self.least, misfit) / each.handicap
-            if strength > self.better or misfit < self.noise < self.misfit:
+            strength = self.misfit / max(self.smallest_misfit, misfit) / each.handicap
+            if strength > self.required_factor or misfit < self.noise_level < self.misfit:
                 yield replace(each, strength=strength)
 
 
-def clock(of: str, lag_s: float, without: Any, handicap: float = 1.0) -> Hypothesis:
+def clock_hypothesis(
+    subject: str, lag_s: float, corrected: Any, handicap: float = 1.0
+) -> Hypothesis:
     """Return the hypothesis that the markers' clock is late by `lag_s` [s] (negative:
     early) compared with the poses.
     """
     when, do = ("late", "add") if lag_s > 0 else ("early", "subtract")
     data = {"when": when, "by_ms": 1e3 * abs(lag_s), "do": do}
-    return Hypothesis("clock", of, data, without, handicap)
+    return Hypothesis("clock", subject, data, corrected, handicap)
 
 
-def ranked(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
+def rank(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
     """Return each cause once, with its strongest hypothesis, strongest first."""
     strongest: dict[str, Hypothesis] = {}
     for each in sorted(hypotheses, key=lambda each: -each.strength):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import listed
-from ..fem.constants import bare, is_mode
+from ..fem.constants import is_field_coefficient, without_region
 from ..fem.moduli import ELASTIC
 from .estimates import CONFOUNDED, Estimate
 from .uncertainty import Uncertainty
@@ -27,38 +27,40 @@ MEMBER = 0.2
 HOPELESS = 1e4
 
 
-def verdicts(uncertainty: Uncertainty) -> tuple[str, ...]:
+def identifiability_sentences(uncertainty: Uncertainty) -> tuple[str, ...]:
     """Return sentences about each parameter and about combinations of parameters, with 95 %
     intervals.
 
     Sentences on parameters at a bound or not identifiable are the same as in the notes.
     """
     open_ends = [note for note in uncertainty.notes if note.split()[0] in uncertainty.names]
-    combined = _combinations(uncertainty)
+    combined = _combination_sentences(uncertainty)
     in_other_terms = _other_convention(uncertainty) if open_ends or combined else []
-    return (*_one_by_one(uncertainty), *combined, *in_other_terms, *open_ends)
+    return (*_single_sentences(uncertainty), *combined, *in_other_terms, *open_ends)
 
 
-def _one_by_one(uncertainty: Uncertainty) -> list[str]:
+def _single_sentences(uncertainty: Uncertainty) -> list[str]:
     """Return the sentence about the parameters that are determined, with their precision."""
     factors = {
         name: factor
         for name in uncertainty.names
         if name in uncertainty.estimates
-        and (factor := _factor(uncertainty.estimates[name])) is not None
+        and (factor := _interval_factor(uncertainty.estimates[name])) is not None
     }
-    well = [f"{name} to {_spread(f)}" for name, f in factors.items() if f <= WELL_FIXED]
-    badly = [f"{name} only to {_spread(f)}" for name, f in factors.items() if f > WELL_FIXED]
+    well = [f"{name} to {_precision_text(f)}" for name, f in factors.items() if f <= WELL_FIXED]
+    badly = [
+        f"{name} only to {_precision_text(f)}" for name, f in factors.items() if f > WELL_FIXED
+    ]
     parts = [listed(part) for part in (well, badly) if part]
     return [f"the data determine {'; '.join(parts)} (95 %, statistical)"] if parts else []
 
 
-def _combinations(uncertainty: Uncertainty) -> list[str]:
+def _combination_sentences(uncertainty: Uncertainty) -> list[str]:
     """Return sentences about confounded parameters, one for each eigenvector with a small
     eigenvalue.
     """
     deviations = np.sqrt(np.diag(uncertainty.covariance))
-    modes = np.array([is_mode(name) for name in uncertainty.names], dtype=bool)
+    modes = np.array([is_field_coefficient(name) for name in uncertainty.names], dtype=bool)
     known = np.flatnonzero(np.isfinite(deviations) & (deviations > 0) & ~modes)
     if len(known) < 2:
         return []
@@ -73,12 +75,12 @@ def _combinations(uncertainty: Uncertainty) -> list[str]:
         widths = (uncertainty.quantiles * deviations)[known[members]]
         if len(members) == 2 or (len(members) > 2 and widths.max() > np.log(WELL_FIXED)):
             sentences.append(
-                _combination(uncertainty, known[members], max(value, 0.0), vector[members])
+                _combination_sentence(uncertainty, known[members], max(value, 0.0), vector[members])
             )
     return sentences
 
 
-def _combination(
+def _combination_sentence(
     uncertainty: Uncertainty, members: NDArray[np.intp], eigenvalue: float, vector: Array
 ) -> str:
     """Return the sentence about one combination of confounded parameters (members are indices)."""
@@ -95,7 +97,7 @@ def _combination(
         return f"{listed(names)} are confounded{how}: these data fix one combination of them"
     return (
         f"{listed(names)} are confounded{how}: only their combination "
-        f"{_product(names, weights / weights[largest])} is fixed, to {_spread(float(fixed))} (95 %)"
+        f"{_product_text(names, weights / weights[largest])} is fixed, to {_precision_text(float(fixed))} (95 %)"
     )
 
 
@@ -103,17 +105,19 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
     """Return the sentence about the moduli of the other elastic convention; none if no
     elastic constant is estimated.
     """
-    if not set(ELASTIC) & {bare(name) for name in uncertainty.names}:
+    if not set(ELASTIC) & {without_region(name) for name in uncertainty.names}:
         return []
     parts = []
     for name, estimate in uncertainty.derived.items():
-        factor = _factor(estimate)
+        factor = _interval_factor(estimate)
         if factor is not None:
-            parts.append(f"{name} {'only ' if factor > WELL_FIXED else ''}to {_spread(factor)}")
+            parts.append(
+                f"{name} {'only ' if factor > WELL_FIXED else ''}to {_precision_text(factor)}"
+            )
     return [f"in the other elastic pair: they fix {listed(parts)} (95 %)"] if parts else []
 
 
-def _factor(estimate: Estimate) -> float | None:
+def _interval_factor(estimate: Estimate) -> float | None:
     """Return the half width of the interval as a factor; None without one, or if it is too
     wide to be useful.
     """
@@ -123,14 +127,14 @@ def _factor(estimate: Estimate) -> float | None:
     return factor if factor < HOPELESS else None
 
 
-def _spread(factor: float) -> str:
+def _precision_text(factor: float) -> str:
     """Return an interval's half width, given as a factor, as text."""
     if factor < 1.5:
         return f"±{100 * (factor - 1):.2g} %"
     return f"within a factor of {factor:.2g}" if factor < HOPELESS else "no useful range"
 
 
-def _product(names: Sequence[str], powers: Array) -> str:
+def _product_text(names: Sequence[str], powers: Array) -> str:
     """Return a product of powers of parameters as text."""
     parts = []
     for name, power in zip(names, powers, strict=True):

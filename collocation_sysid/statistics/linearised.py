@@ -6,7 +6,7 @@ single experiments, such as the offset of a marker.
 
 The sensitivities of the trajectory, Z = dx/dp along the equations of motion, follow from the
 linearised constraints c_x Z + c_p = 0, solved forward in time by `program.sweep`; p are q and those
-φ of an experiment that change its motion, see `Segment.moving`.
+φ of an experiment that change its motion, see `Transcription.dynamic_parameters`.
 
 The information is factorised. With S the derivatives of all residuals and P those of the priors,
 the information is A = SᵀS + PᵀP. With a root L, A⁻¹ = L Lᵀ, and D = S L, DᵀD + LᵀPᵀP L = I: a
@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..fem.kernels import side_by_side
+from ..fem.kernels import map_experiments
 from ..model.parameters import ThetaMap
-from ..program.collocation import Collocation, Part
+from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
-from ..program.least_squares import LeastSquares
-from ..program.reaction import HeldForces
-from ..program.reading import as_weights
-from ..program.sensing import Response
+from ..program.least_squares import SquareRootInformation
+from ..program.reaction import GraspForces
+from ..program.reading import huber_as_weights
+from ..program.sensing import ObservableResponse
 from ..program.sweep import Sweep
 
 
@@ -45,13 +45,13 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
         If the equations of a step are singular.
     """
     return [
-        np.stack(list(Sweep(part.segment).sensitivities(part.x, part.setting)))
-        for part in collocation.parts(z)
+        np.stack(list(Sweep(part.segment).sensitivities(part.x, part.equations)))
+        for part in collocation.iterates(z)
     ]
 
 
 @one_blas_thread()
-def responses(collocation: Collocation, z: Array) -> list[Response]:
+def observable_responses(collocation: Collocation, z: Array) -> list[ObservableResponse]:
     """Return the changes of the observables of each experiment with its parameters, computed in
     parallel.
 
@@ -61,22 +61,22 @@ def responses(collocation: Collocation, z: Array) -> list[Response]:
         If the equations of a step are singular.
     """
 
-    def of(part: Part) -> Response:
-        segment = part.segment
-        grasp_forces = HeldForces.nothing(
-            len(part.x), len(segment.sensed_dofs), len(segment.moving)
+    def of(iterate: ExperimentIterate) -> ObservableResponse:
+        segment = iterate.segment
+        grasp_forces = GraspForces.zeros(
+            len(iterate.x), len(segment.sensed_dofs), len(segment.dynamic_parameters)
         )
-        rows = Sweep(segment).sensitivities(part.x, part.setting, grasp_forces)
-        return part.sensing.read_along(rows, grasp_forces)
+        rows = Sweep(segment).sensitivities(iterate.x, iterate.equations, grasp_forces)
+        return iterate.observation.response_of_rows(rows, grasp_forces)
 
-    return side_by_side(of, collocation.parts(z), collocation.threads)
+    return map_experiments(of, collocation.iterates(z), collocation.threads)
 
 
 def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
     """Return the derivatives d(markers)/dp of each experiment at its samples, (T, 3M, m),
-    see `Response`.
+    see `ObservableResponse`.
     """
-    return [response.looked[0] for response in responses(collocation, z)]
+    return [response.observed_changes[0] for response in observable_responses(collocation, z)]
 
 
 Mask = NDArray[np.bool_]
@@ -89,7 +89,7 @@ NO_STEP = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class FitBlock:
+class ResidualBlock:
     """Residuals of one measurement of an experiment, with derivatives at the answer.
 
     Markers are the entities of the measurement; a wrench sensor has two, force and torque [N, N m],
@@ -103,11 +103,11 @@ class FitBlock:
         Times of the samples [s], equally spaced unless static.
     marker_names : (M,) tuple of str
         Names of the markers.
-    present : (T, M) array of bool
+    is_present : (T, M) array of bool
         Samples that are compared.
     residual : (T, M, 3) array
         Residuals (h(x) − ŷ) / σ, zero where missing.
-    slope : (T, M, 3, p) array
+    jacobian : (T, M, 3, p) array
         Derivatives of the residuals by all p parameters, zero where missing.
     sigma_m : (M,) array
         Stated standard deviations.
@@ -116,108 +116,108 @@ class FitBlock:
         the same.
     components : (T, M, 3) array of bool or None
         Coordinates that exist; None if all three of a present sample do.
-    stated : str
+    sigma_key : str
         Key of σ in the problem: "sigma_m" for positions.
-    static : bool
+    is_static : bool
         Whether samples are equilibria, which have no frequency.
-    relaxed_first : bool
+    is_relaxed_at_start : bool
         Whether a memory is assumed relaxed at the first sample.
     places_m : (3M, 3) array or None
         Places of the channels on the undeformed body [m]; None if they have none.
     disturbances : (K, T, M, 3) array or None
         Samples of known errors of the residuals besides their noise, in units of σ.
-    noise_at_least_stated : bool
-        See `Reading`.
+    has_noise_floor : bool
+        See `MeasurementResidual`.
     """
 
     name: str
     t_s: Array
     marker_names: tuple[str, ...]
-    present: Mask
+    is_present: Mask
     residual: Array
-    slope: Array
+    jacobian: Array
     sigma_m: Array
     misfit: Array | None = None
     components: Mask | None = None
-    stated: str = "sigma_m"
-    static: bool = False
-    relaxed_first: bool = False
+    sigma_key: str = "sigma_m"
+    is_static: bool = False
+    is_relaxed_at_start: bool = False
     places_m: Array | None = None
     disturbances: Array | None = None
-    noise_at_least_stated: bool = False
+    has_noise_floor: bool = False
 
     @cached_property
-    def seen(self) -> Mask:
+    def is_measured(self) -> Mask:
         """Mask (T, M, 3) of the coordinates that exist."""
         if self.components is not None:
             return self.components
-        return np.repeat(self.present[..., None], 3, axis=2)
+        return np.repeat(self.is_present[..., None], 3, axis=2)
 
     @property
-    def wild(self) -> Mask:
+    def is_outlier(self) -> Mask:
         """Mask (T, M) of the samples beyond Huber's threshold."""
         if self.misfit is None:
-            return np.zeros(self.present.shape, dtype=bool)
+            return np.zeros(self.is_present.shape, dtype=bool)
         return np.linalg.norm(self.misfit, axis=2) > np.linalg.norm(self.residual, axis=2) + 1e-9
 
     @property
-    def weight(self) -> Array:
+    def root_weight(self) -> Array:
         """Square root (T, M, 1) of Huber's weights, which residuals and derivatives contain
         already.
         """
         if self.misfit is None:
-            return np.ones((*self.present.shape, 1))
+            return np.ones((*self.is_present.shape, 1))
         long, short = (np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual))
         share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
         return np.sqrt(share)[..., None]
 
     @property
-    def measurements(self) -> int:
+    def measurement_count(self) -> int:
         """Number of scalar measurements that are present."""
-        return int(self.seen.sum())
+        return int(self.is_measured.sum())
 
     @cached_property
     def channels(self) -> tuple[Array, Array, Mask]:
         """Residuals (T, 3M), derivatives (T, 3M, p) and presence (T, 3M); column 3 m + axis."""
-        samples, markers = self.present.shape
+        samples, markers = self.is_present.shape
         return (
             self.residual.reshape(samples, 3 * markers),
-            self.slope.reshape(samples, 3 * markers, self.slope.shape[-1]),
-            self.seen.reshape(samples, 3 * markers),
+            self.jacobian.reshape(samples, 3 * markers, self.jacobian.shape[-1]),
+            self.is_measured.reshape(samples, 3 * markers),
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Derived:
+class DerivedModuli:
     """Moduli that follow from the estimated parameters.
 
     Attributes
     ----------
     values : mapping of str to float
         Moduli by name.
-    by_q : mapping of str to (shared,) array
+    derivatives : mapping of str to (shared,) array
         Their derivatives by q.
     """
 
     values: Mapping[str, float]
-    by_q: Mapping[str, Array]
+    derivatives: Mapping[str, Array]
 
     @classmethod
-    def of(cls, constants: Iterable[ThetaMap], q: Array) -> Derived:
+    def from_bodies(cls, constants: Iterable[ThetaMap], q: Array) -> DerivedModuli:
         """Compute the moduli of several bodies at q."""
         values: dict[str, float] = {}
         by_q: dict[str, Array] = {}
         for each in constants:
-            moduli, slopes = each.derived(q)
+            moduli, slopes = each.derived_moduli(q)
             values |= dict(zip(each.derived_names, moduli.tolist(), strict=True))
             by_q |= dict(zip(each.derived_names, slopes, strict=True))
         return cls(values, by_q)
 
 
-def values_of(collocation: Collocation, q: Array) -> dict[str, float]:
+def parameter_values(collocation: Collocation, q: Array) -> dict[str, float]:
     """Return derived moduli and parameters by name, at q."""
-    constants = (segment.constants for segment in collocation.segments)
-    return {**Derived.of(constants, q).values, **collocation.parameters.values(q)}
+    constants = (segment.constants for segment in collocation.transcriptions)
+    return {**DerivedModuli.from_bodies(constants, q).values, **collocation.parameters.values(q)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,48 +226,48 @@ class LinearisedFit:
 
     Attributes
     ----------
-    blocks : tuple of FitBlock
+    blocks : tuple of ResidualBlock
         For each fitted experiment its markers, then its other measurements.
     names : (p,) tuple of str
         Shared parameters q, then φ with their unit in brackets: ``"gravity/offset Tip1 x [m]"``.
-    shared : int
+    shared_count : int
         Number of shared parameters.
-    prior_residual, prior_slope : (p,) arrays
+    prior_residual, prior_jacobian : (p,) arrays
         Residuals of the priors and their derivatives, in standard deviations; zero without a prior.
-    at_bound : (p,) array of bool
+    is_at_bound : (p,) array of bool
         Parameters that ended at a bound.
-    derived : Derived
+    derived : DerivedModuli
         Moduli that follow from the shared parameters.
-    of_phases : (shared, shared) array or None
+    phase_covariance : (shared, shared) array or None
         Covariance of q due to unknown phases of a two-phase field, in the solver's coordinates;
         None without such a field.
     """
 
-    blocks: tuple[FitBlock, ...]
+    blocks: tuple[ResidualBlock, ...]
     names: tuple[str, ...]
-    shared: int
+    shared_count: int
     prior_residual: Array
-    prior_slope: Array
-    at_bound: Mask
-    derived: Derived = field(default_factory=lambda: Derived({}, {}))
-    of_phases: Array | None = None
+    prior_jacobian: Array
+    is_at_bound: Mask
+    derived: DerivedModuli = field(default_factory=lambda: DerivedModuli({}, {}))
+    phase_covariance: Array | None = None
 
     @property
-    def measurements(self) -> int:
+    def measurement_count(self) -> int:
         """Number of scalar measurements that are present."""
-        return sum(block.measurements for block in self.blocks)
+        return sum(block.measurement_count for block in self.blocks)
 
-    def disturbed(self, samples: Iterable[Array | None]) -> LinearisedFit:
+    def with_disturbances(self, samples: Iterable[Array | None]) -> LinearisedFit:
         """Return the fit with samples of known errors of the residuals for each block; None
         where there are none.
         """
         pairs = zip(self.blocks, samples, strict=True)
         return replace(self, blocks=tuple(replace(b, disturbances=each) for b, each in pairs))
 
-    def after(self, step: Array) -> LinearisedFit:
+    def after_step(self, step: Array) -> LinearisedFit:
         """Return the fit after a step (p,) of all parameters, to first order."""
-        blocks_after = (replace(b, residual=b.residual + b.slope @ step) for b in self.blocks)
-        at_best = self.prior_residual + self.prior_slope * step
+        blocks_after = (replace(b, residual=b.residual + b.jacobian @ step) for b in self.blocks)
+        at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
     @property
@@ -276,7 +276,7 @@ class LinearisedFit:
         return float(sum(np.sum(block.residual**2) for block in self.blocks))
 
 
-def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
+def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """Linearise a fit at a solution.
 
     Parameters
@@ -291,47 +291,51 @@ def linearised_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     SimulationError
         If the equations of motion are singular.
     """
-    p = collocation.parameters_of(z)
+    p = collocation.parameters_from(z)
     blocks = []
-    for part, response in zip(collocation.parts(z), responses(collocation, z), strict=True):
+    for part, response in zip(
+        collocation.iterates(z), observable_responses(collocation, z), strict=True
+    ):
         segment = part.segment
         experiment = part.segment.experiment
-        relaxed = segment.body.remembers and bool(np.isinf(experiment.loaded_since_s))
-        linearised = part.sensing.linearised(part.x, response)
-        for reading, (misfit, by_own) in zip(segment.readings, linearised, strict=True):
-            residual, by_own = as_weights(misfit, by_own, reading.huber)
-            residual, misfit, by_own = map(reading.pooled, (residual, misfit, by_own))
+        relaxed = segment.body.has_memory and bool(np.isinf(experiment.loaded_since_s))
+        linearised = part.observation.linearise(part.x, response)
+        for reading, (misfit, by_own) in zip(segment.residuals, linearised, strict=True):
+            residual, by_own = huber_as_weights(misfit, by_own, reading.huber)
+            residual, misfit, by_own = map(reading.pool_values, (residual, misfit, by_own))
             slope = np.zeros((*residual.shape, len(p)))
-            slope[..., segment.places] = by_own
+            slope[..., segment.parameter_indices] = by_own
             blocks.append(
-                FitBlock(
+                ResidualBlock(
                     name=experiment.name,
                     t_s=reading.t_s,
-                    marker_names=reading.pool.names,
-                    present=np.asarray(reading.pool.components.any(axis=2)),
+                    marker_names=reading.pooled_groups.names,
+                    is_present=np.asarray(reading.pooled_groups.is_compared.any(axis=2)),
                     residual=residual,
-                    slope=slope,
-                    sigma_m=reading.pool.sigmas,
+                    jacobian=slope,
+                    sigma_m=reading.pooled_groups.sigmas,
                     misfit=misfit,
-                    components=reading.pool.components,
-                    stated=reading.stated,
-                    static=experiment.static,
-                    relaxed_first=relaxed,
-                    places_m=reading.pool.places_m,
-                    noise_at_least_stated=reading.noise_at_least_stated,
+                    components=reading.pooled_groups.is_compared,
+                    sigma_key=reading.sigma_key,
+                    is_static=experiment.is_static,
+                    is_relaxed_at_start=relaxed,
+                    places_m=reading.pooled_groups.places_m,
+                    has_noise_floor=reading.has_noise_floor,
                 )
             )
-    prior_residual, prior_slope = collocation.prior(p)
-    lower, upper = collocation.bounds_p
+    prior_residual, prior_slope = collocation.prior_residuals(p)
+    lower, upper = collocation.parameter_bounds
     return LinearisedFit(
         blocks=tuple(blocks),
-        names=collocation.names,
-        shared=collocation.nq,
+        names=collocation.parameter_names,
+        shared_count=collocation.nq,
         prior_residual=prior_residual,
-        prior_slope=prior_slope,
-        at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
-        derived=Derived.of((s.constants for s in collocation.segments), p[: collocation.nq]),
-        of_phases=_covariance_by_phases(collocation),
+        prior_jacobian=prior_slope,
+        is_at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
+        derived=DerivedModuli.from_bodies(
+            (s.constants for s in collocation.transcriptions), p[: collocation.nq]
+        ),
+        phase_covariance=_covariance_by_phases(collocation),
     )
 
 
@@ -341,7 +345,7 @@ def _covariance_by_phases(collocation: Collocation) -> Array | None:
     """
     names = [item.name for item in collocation.parameters.free]
     covariance: Array | None = None
-    for body in dict.fromkeys(segment.body for segment in collocation.segments):
+    for body in dict.fromkeys(segment.body for segment in collocation.transcriptions):
         for samples in body.phase_samples:
             places = [k for k, name in enumerate(samples.names) if name in names]
             own = [names.index(samples.names[k]) for k in places]
@@ -360,52 +364,52 @@ class Information:
 
     Attributes
     ----------
-    fit : LeastSquares
+    fit : SquareRootInformation
         Triangle of all rows; its root is L.
-    slopes : tuple of (T, 3M, r) arrays
+    scaled_jacobians : tuple of (T, 3M, r) arrays
         D = S L of each block; zero where missing.
     prior : (r, r) array
         Lᵀ PᵀP L.
     """
 
-    fit: LeastSquares
-    slopes: tuple[Array, ...]
+    fit: SquareRootInformation
+    scaled_jacobians: tuple[Array, ...]
     prior: Array
 
     @property
-    def fitted(self) -> float:
+    def determined_count(self) -> float:
         """Number of parameters that the data determine; one that a prior determines counts
         in part.
         """
-        return float(sum(np.sum(slope**2) for slope in self.slopes))
+        return float(sum(np.sum(slope**2) for slope in self.scaled_jacobians))
 
 
-def information(fit: LinearisedFit) -> Information:
+def factorise_information(fit: LinearisedFit) -> Information:
     """Factorise the information of a fit."""
-    all_rows = least_squares(fit)
+    all_rows = least_squares_of_fit(fit)
     slopes = tuple(block.channels[1] @ all_rows.root for block in fit.blocks)
-    prior = all_rows.root * fit.prior_slope[:, None]
+    prior = all_rows.root * fit.prior_jacobian[:, None]
     return Information(all_rows, slopes, prior.T @ prior)
 
 
-def least_squares(fit: LinearisedFit) -> LeastSquares:
+def least_squares_of_fit(fit: LinearisedFit) -> SquareRootInformation:
     """Return residuals and priors as a least-squares problem in a step of all parameters."""
-    of_all = rows_of(fit, range(len(fit.blocks)))
-    return of_all.add(fit.prior_residual, np.diag(fit.prior_slope))
+    of_all = least_squares_of_blocks(fit, range(len(fit.blocks)))
+    return of_all.with_rows(fit.prior_residual, np.diag(fit.prior_jacobian))
 
 
-def rows_of(fit: LinearisedFit, numbers: Iterable[int]) -> LeastSquares:
+def least_squares_of_blocks(fit: LinearisedFit, indices: Iterable[int]) -> SquareRootInformation:
     """Return the residuals of some blocks (indices) as a least-squares problem, without priors."""
-    problem = LeastSquares.none(len(fit.names))
-    for k in numbers:
+    problem = SquareRootInformation.empty(len(fit.names))
+    for k in indices:
         residual, slope, _ = fit.blocks[k].channels
-        problem = problem.add(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
+        problem = problem.with_rows(residual.ravel(), slope.reshape(residual.size, slope.shape[2]))
     return problem
 
 
-def best_step(fit: LinearisedFit) -> Array:
+def gauss_newton_step(fit: LinearisedFit) -> Array:
     """Return the step (p,) to the least squares of the linearised fit; parameters at a
     bound do not change.
     """
-    free = np.where(fit.at_bound, NO_STEP, np.inf)
-    return least_squares(fit).best(-free, free)
+    free = np.where(fit.is_at_bound, NO_STEP, np.inf)
+    return least_squares_of_fit(fit).minimiser(-free, free)

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..arrays import Array
 from .distributions import chi2_cdf, chi2_sf
-from .linearised import FitBlock, Information, LinearisedFit
+from .linearised import Information, LinearisedFit, ResidualBlock
 
 Noise = Literal["given", "estimated", "by-marker"]
 
@@ -46,7 +46,7 @@ class NoiseLevel:
     ----------
     names : (G,) tuple of str
         Markers that were measured, such as "swing/tip".
-    by_marker : (G,) array
+    variances : (G,) array
         Variance s_m² of each.
     freedoms : (G,) array
         Degrees of freedom of each.
@@ -60,14 +60,14 @@ class NoiseLevel:
         p-value of markers as different, if all are equal.
     shares : (G, r, r) array
         Matrices G_m.
-    extra : (r, r) array
+    known_score_covariance : (r, r) array
         Covariance of the score due to other known errors.
-    stated : str
+    sigma_key : str
         Key of σ in the problem.
     """
 
     names: tuple[str, ...]
-    by_marker: Array
+    variances: Array
     freedoms: Array
     pooled: float
     freedom: float
@@ -75,41 +75,41 @@ class NoiseLevel:
     smaller_p: float
     unequal_p: float
     shares: Array = field(repr=False)
-    extra: Array = field(repr=False)
-    stated: str = "sigma_m"
+    known_score_covariance: Array = field(repr=False)
+    sigma_key: str = "sigma_m"
 
     @property
-    def smaller(self) -> bool:
+    def is_smaller(self) -> bool:
         """Whether the residuals are significantly smaller than σ."""
         return self.smaller_p < SMALLER
 
     @property
-    def unequal(self) -> bool:
+    def is_unequal(self) -> bool:
         """Whether markers differ more than by chance."""
         return self.unequal_p < UNEQUAL
 
     @property
-    def kind(self) -> Noise:
+    def suggested_noise(self) -> Noise:
         """Source of the variance that the residuals suggest."""
-        if self.unequal:
+        if self.is_unequal:
             return "by-marker"
-        return "estimated" if self.larger_p < LARGER or self.smaller else "given"
+        return "estimated" if self.larger_p < LARGER or self.is_smaller else "given"
 
     @cached_property
     def factors(self) -> dict[str, float]:
         """Size of the errors of each marker over σ."""
-        return dict(zip(self.names, np.sqrt(self.by_marker).tolist(), strict=True))
+        return dict(zip(self.names, np.sqrt(self.variances).tolist(), strict=True))
 
     @property
     def unevenness(self) -> float:
         """Factor by which unequal markers increase the standard deviation of a mean over
         all of them; 1 if they are equal.
         """
-        if not self.unequal:
+        if not self.is_unequal:
             return 1.0
-        weights = self.by_marker * self.freedoms
+        weights = self.variances * self.freedoms
         equal = weights.sum() ** 2 / self.freedoms.sum()
-        return float(np.sqrt(np.sum(self.by_marker * weights) / equal))
+        return float(np.sqrt(np.sum(self.variances * weights) / equal))
 
     def score_covariance(
         self, kind: Noise, information: Information, shared: int
@@ -131,15 +131,15 @@ class NoiseLevel:
             LᵀB L, and degrees of freedom of the variances of shared parameters after Satterthwaite
             (1946); stated σ and priors are exact.
         """
-        exact = information.prior + self.extra
+        exact = information.prior + self.known_score_covariance
         if kind == "given":
             return exact + self.shares.sum(axis=0), np.full(shared, np.inf)
         if kind == "estimated":
             of_data = self.pooled * self.shares.sum(axis=0)
             return exact + of_data, np.full(shared, max(1.0, self.freedom))
-        total = exact + np.tensordot(self.by_marker, self.shares, 1)
+        total = exact + np.tensordot(self.variances, self.shares, 1)
         directions = information.fit.root[:shared]
-        parts = np.einsum("kr,grs,ks->kg", directions, self.shares, directions) * self.by_marker
+        parts = np.einsum("kr,grs,ks->kg", directions, self.shares, directions) * self.variances
         variance_of_variance = np.sum(parts**2 / np.maximum(self.freedoms, 1.0), axis=1)
         variances = np.einsum("kr,rs,ks->k", directions, total, directions)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -149,7 +149,7 @@ class NoiseLevel:
         return total, np.maximum(freedom, 1.0)
 
 
-def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
+def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
     """Compare the residuals of a fit with the stated σ.
 
     Parameters
@@ -164,19 +164,19 @@ def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
     counts = []
     shares = []
     stated = np.zeros_like(information.prior)
-    for block, slope in zip(fit.blocks, information.slopes, strict=True):
-        if block.noise_at_least_stated:
-            stated += _stated_noise(block, slope)
+    for block, slope in zip(fit.blocks, information.scaled_jacobians, strict=True):
+        if block.has_noise_floor:
+            stated += _stated_score_covariance(block, slope)
             continue
-        by_marker = slope.reshape(*block.present.shape, 3, slope.shape[2])
-        for m in np.flatnonzero(block.present.any(axis=0)).tolist():
+        by_marker = slope.reshape(*block.is_present.shape, 3, slope.shape[2])
+        for m in np.flatnonzero(block.is_present.any(axis=0)).tolist():
             rows = by_marker[:, m].reshape(3 * len(block.t_s), slope.shape[2])
             names.append(f"{block.name}/{block.marker_names[m]}")
-            squares.append(float(np.sum(block.residual[:, m] ** 2)) / shortened(block))
-            counts.append(int(block.seen[:, m].sum()))
+            squares.append(float(np.sum(block.residual[:, m] ** 2)) / shortened_power(block))
+            counts.append(int(block.is_measured[:, m].sum()))
             shares.append(rows.T @ rows)
-    of_score, besides = _besides(fit, information)
-    level = _level(
+    of_score, besides = _known_error_moments(fit, information)
+    level = _solve_noise_level(
         tuple(names),
         np.array(squares),
         np.array(counts, dtype=float),
@@ -185,31 +185,31 @@ def noise_level(fit: LinearisedFit, information: Information) -> NoiseLevel:
         information.prior + stated,
         of_score + stated,
     )
-    sigma_keys = [b.stated for b in fit.blocks if b.present.any() and not b.noise_at_least_stated]
+    sigma_keys = [b.sigma_key for b in fit.blocks if b.is_present.any() and not b.has_noise_floor]
     # That of places stands for all.
-    return replace(level, stated=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"))
+    return replace(level, sigma_key=min(sigma_keys, key="sigma_m".__ne__, default="sigma_m"))
 
 
-def _stated_noise(block: FitBlock, slope: Array) -> Array:
+def _stated_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     """Return the covariance (r, r) of the score due to a block whose noise is at least as stated.
 
     Residuals larger than stated increase it.
 
     Parameters
     ----------
-    block : FitBlock
+    block : ResidualBlock
         The block.
     slope : (T, 3M, r) array
         Its D = S L.
     """
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
-    left = max(1.0, block.measurements - float(np.trace(share)))
-    factor = max(1.0, float(np.sum(block.residual**2)) / shortened(block) / left)
+    left = max(1.0, block.measurement_count - float(np.trace(share)))
+    factor = max(1.0, float(np.sum(block.residual**2)) / shortened_power(block) / left)
     return factor * share
 
 
-def drawn(fit: LinearisedFit) -> list[Array]:
+def disturbance_samples(fit: LinearisedFit) -> list[Array]:
     """Return samples (K, T, M, 3) of known errors for every block; zero where there are
     none and where measurements are missing.
     """
@@ -218,11 +218,11 @@ def drawn(fit: LinearisedFit) -> list[Array]:
     samples_of_blocks = []
     for block, each in zip(fit.blocks, of_blocks, strict=True):
         samples = np.zeros((count, *block.residual.shape)) if each is None else each
-        samples_of_blocks.append(samples[:count] * block.seen)
+        samples_of_blocks.append(samples[:count] * block.is_measured)
     return samples_of_blocks
 
 
-def projected(information: Information, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
+def project_errors(information: Information, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
     """Return the effect of samples of errors on the fit.
 
     Parameters
@@ -238,7 +238,7 @@ def projected(information: Information, errors: Sequence[Array]) -> tuple[Array,
         Scores, and the residuals that remain after the fit.
     """
     flat = [each.reshape(len(each), each.shape[1], -1) for each in errors]
-    pairs = [*zip(flat, information.slopes, strict=True)]
+    pairs = [*zip(flat, information.scaled_jacobians, strict=True)]
     scores = np.sum([np.einsum("ktc,tcr->kr", e, slope) for e, slope in pairs], axis=0)
     remaining = [e - np.einsum("tcr,kr->ktc", slope, scores) for e, slope in pairs]
     return scores, [
@@ -246,17 +246,15 @@ def projected(information: Information, errors: Sequence[Array]) -> tuple[Array,
     ]
 
 
-def _besides(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
+def _known_error_moments(fit: LinearisedFit, information: Information) -> tuple[Array, Array]:
     """Return the covariance (r, r) of the score, and sums of squares (G, K) of each marker,
     due to known errors.
     """
-    is_used = [
-        block.present.any(axis=0) & (not block.noise_at_least_stated) for block in fit.blocks
-    ]
-    if not len((samples := drawn(fit))[0]):
+    is_used = [block.is_present.any(axis=0) & (not block.has_noise_floor) for block in fit.blocks]
+    if not len((samples := disturbance_samples(fit))[0]):
         return np.zeros_like(information.prior), np.zeros((int(np.concatenate(is_used).sum()), 1))
-    scores, remaining = projected(information, samples)
-    present = [block.seen for block in fit.blocks]
+    scores, remaining = project_errors(information, samples)
+    present = [block.is_measured for block in fit.blocks]
     sums = [
         np.sum((each * there) ** 2, axis=(1, 3))[:, used].T
         for each, there, used in zip(remaining, present, is_used, strict=True)
@@ -264,7 +262,7 @@ def _besides(fit: LinearisedFit, information: Information) -> tuple[Array, Array
     return scores.T @ scores / len(scores), np.concatenate(sums)
 
 
-def _level(
+def _solve_noise_level(
     names: tuple[str, ...],
     squares: Array,
     counts: Array,
@@ -297,7 +295,7 @@ def _level(
     statistic = float(squares.sum()) * freedom / max(float(means.sum()), 1e-300)
     return NoiseLevel(
         names=names,
-        by_marker=by_marker,
+        variances=by_marker,
         freedoms=freedoms,
         pooled=float(pooled),
         freedom=freedom,
@@ -307,7 +305,7 @@ def _level(
         if tested
         else 1.0,
         shares=shares,
-        extra=of_score,
+        known_score_covariance=of_score,
     )
 
 
@@ -325,13 +323,13 @@ def _bartlett(squares: Array, freedoms: Array) -> float:
     return float(chi2_sf(statistic / correction, count - 1))
 
 
-def shortened(block: FitBlock) -> float:
+def shortened_power(block: ResidualBlock) -> float:
     """Return the share of white noise's power that remains in residuals shortened by Huber's loss;
     1 without outliers.
 
     It is E min(χ², k²) / E χ² for three axes and the threshold k.
     """
-    if not block.wild.any():
+    if not block.is_outlier.any():
         return 1.0
-    squared = float(np.sum(block.residual[block.wild] ** 2, axis=1).max())
+    squared = float(np.sum(block.residual[block.is_outlier] ** 2, axis=1).max())
     return float(squared * chi2_sf(squared, 3) / 3 + chi2_cdf(squared, 5))

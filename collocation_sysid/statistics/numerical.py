@@ -34,8 +34,8 @@ from math import ceil
 import numpy as np
 
 from ..arrays import Array
-from ..program.least_squares import LeastSquares
-from .estimates import Coordinate, Estimate
+from ..program.least_squares import SquareRootInformation
+from .estimates import Estimate, IntervalCoordinate
 from .linearised import LinearisedFit
 
 # Roache's factor of safety for an observed order.
@@ -52,7 +52,7 @@ MOST_SUBSTEPS = 8
 
 
 @dataclass(frozen=True)
-class NumericalError:
+class DiscretisationError:
     """Discretisation error of one estimate.
 
     Attributes
@@ -75,7 +75,7 @@ class NumericalError:
     interval95: tuple[float, float] | None
 
 
-def known_kinds(errors: Iterable[NumericalError]) -> tuple[str, ...]:
+def known_kinds(errors: Iterable[DiscretisationError]) -> tuple[str, ...]:
     """Return which discretisation errors are known for some estimate: "step", "mesh"."""
     known = tuple(errors)
     of_step = any(error.step is not None for error in known)
@@ -84,14 +84,14 @@ def known_kinds(errors: Iterable[NumericalError]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Level:
+class RefinementLevel:
     """One solution on a finer discretisation.
 
     Attributes
     ----------
-    halved : {"step", "mesh"}
+    refined : {"step", "mesh"}
         What was refined.
-    times : int
+    halvings : int
         How often it was halved.
     timesteps, nodes : int
         Number of grid times, and of nodes of the bodies.
@@ -103,8 +103,8 @@ class Level:
         Parameters and derived moduli by name.
     """
 
-    halved: str
-    times: int
+    refined: str
+    halvings: int
     timesteps: int
     nodes: int
     iterations: int
@@ -118,23 +118,23 @@ class Refinement:
 
     Attributes
     ----------
-    errors : mapping of str to NumericalError
+    errors : mapping of str to DiscretisationError
         Errors by parameter or derived modulus.
-    levels : tuple of Level
+    levels : tuple of RefinementLevel
         Refined solutions; empty if the error of the step was estimated from a finer simulation.
     """
 
-    errors: Mapping[str, NumericalError]
-    levels: tuple[Level, ...] = ()
+    errors: Mapping[str, DiscretisationError]
+    levels: tuple[RefinementLevel, ...] = ()
 
     @property
-    def holds(self) -> tuple[str, ...]:
+    def contributions(self) -> tuple[str, ...]:
         """Contributions that its intervals contain: "noise", and of "step" and "mesh" what
         is known.
         """
         return ("noise", *known_kinds(self.errors.values()))
 
-    def worst(
+    def largest_correction(
         self,
         estimates: Mapping[str, Estimate],
         std_errors: Mapping[str, float | None] | None = None,
@@ -160,7 +160,7 @@ class Refinement:
         # Moduli that move alike differ by rounding: the first is the parameter itself.
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
-    def substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
+    def suggested_substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
         """Return the number of steps per sample that makes every correction small, if the errors
         belong to one step; at most `MOST_SUBSTEPS`.
 
@@ -171,18 +171,18 @@ class Refinement:
         order : float
             Order of the scheme.
         """
-        many = self.worst(estimates)[1]
+        many = self.largest_correction(estimates)[1]
         return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
 
 
 @dataclass(frozen=True)
-class _Limit:
+class _Extrapolation:
     """Extrapolation from the first of several values to their limit, with its uncertainty on both
     sides.
 
     Attributes
     ----------
-    way : float
+    change : float
         Limit less the first value.
     below, above : float
         Uncertainty below and above the limit.
@@ -190,13 +190,13 @@ class _Limit:
         Observed order; None if it was assumed.
     """
 
-    way: float = 0.0
+    change: float = 0.0
     below: float = 0.0
     above: float = 0.0
     order: float | None = None
 
     @classmethod
-    def of(cls, x: Sequence[float], order: float, least: float) -> _Limit:
+    def from_values(cls, x: Sequence[float], order: float, least: float) -> _Extrapolation:
         """Extrapolate values at steps or edge lengths halved repeatedly; a single value has no
         change.
 
@@ -229,14 +229,14 @@ class _Limit:
         return cls(float(changes.sum()) + remaining, uncertainty, uncertainty, observed_order)
 
 
-def numerical_error(
+def discretisation_error(
     name: str,
     estimate: Estimate,
     by_step: Sequence[float],
     by_mesh: Sequence[float],
     step_order: float = 2.0,
     linear: bool = False,
-) -> NumericalError:
+) -> DiscretisationError:
     """Compute the discretisation error from the values with finer steps and meshes.
 
     Parameters
@@ -253,34 +253,34 @@ def numerical_error(
         Whether the parameter is its own coordinate.
     """
     known = (estimate.value, *(estimate.statistical95 or ()), *by_step, *by_mesh)
-    at = Coordinate.of(name, known, linear)
-    x = at.at(estimate.value)
-    step = _Limit.of([x, *map(at.at, by_step)], step_order, step_order / 2)
-    mesh = _Limit.of([x, *map(at.at, by_mesh)], MESH_ORDER, LEAST_ORDER)
-    limit = x + step.way + mesh.way
+    at = IntervalCoordinate.for_estimate(name, known, linear)
+    x = at.from_value(estimate.value)
+    step = _Extrapolation.from_values([x, *map(at.from_value, by_step)], step_order, step_order / 2)
+    mesh = _Extrapolation.from_values([x, *map(at.from_value, by_mesh)], MESH_ORDER, LEAST_ORDER)
+    limit = x + step.change + mesh.change
     interval = None
     if estimate.statistical95 is not None:
-        low, high = map(at.at, estimate.statistical95)
+        low, high = map(at.from_value, estimate.statistical95)
         down = float(np.hypot((high - low) / 2, step.below + mesh.below))
         up = float(np.hypot((high - low) / 2, step.above + mesh.above))
-        interval = at.value(limit - down), at.value(limit + up)
-    return NumericalError(
+        interval = at.to_value(limit - down), at.to_value(limit + up)
+    return DiscretisationError(
         by_step[0] - estimate.value if by_step else None,
         by_mesh[0] - estimate.value if by_mesh else None,
         step.order,
         mesh.order,
-        at.value(limit),
+        at.to_value(limit),
         interval,
     )
 
 
-def numerical_errors(
+def discretisation_errors(
     estimates: Mapping[str, Estimate],
     by_step: Sequence[Mapping[str, float]],
     by_mesh: Sequence[Mapping[str, float]],
     step_order: float,
     linear: Container[str],
-) -> dict[str, NumericalError]:
+) -> dict[str, DiscretisationError]:
     """Return the discretisation errors of all estimates that change; fixed values and those at a
     bound are left out.
 
@@ -289,7 +289,7 @@ def numerical_errors(
     estimates : mapping of str to Estimate
         Answers.
     by_step, by_mesh : sequences of mappings of str to float
-        Values by name, see `numerical_error`.
+        Values by name, see `discretisation_error`.
     step_order : float
         Order of the scheme.
     linear : container of str
@@ -299,26 +299,26 @@ def numerical_errors(
     for name, estimate in estimates.items():
         steps, meshes = ([values[name] for values in level] for level in (by_step, by_mesh))
         if any(value != estimate.value for value in (*steps, *meshes)):
-            errors[name] = numerical_error(
+            errors[name] = discretisation_error(
                 name, estimate, steps, meshes, step_order, name in linear
             )
     return errors
 
 
-def changes_towards(fit: LinearisedFit, apart: Sequence[Array]) -> Array:
+def change_towards_observations(fit: LinearisedFit, residual_changes: Sequence[Array]) -> Array:
     """Return the change (p,) of the parameters if the predictions change by given residuals.
 
     Parameters
     ----------
     fit : LinearisedFit
         The fit.
-    apart : sequence of (T, M, 3) arrays
+    residual_changes : sequence of (T, M, 3) arrays
         Changes of the residuals of each block, in units of σ.
     """
-    return shifts(fit, [each[..., None] for each in apart])[:, 0]
+    return estimate_changes(fit, [each[..., None] for each in residual_changes])[:, 0]
 
 
-def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
+def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     """Return the changes (p, a) of the estimates with changes of the residuals; estimates at a
     bound do not change.
 
@@ -329,17 +329,19 @@ def shifts(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     changes : sequence of (T, M, 3, a) arrays
         Changes of the residuals of each block, in units of σ.
     """
-    free = np.flatnonzero(~fit.at_bound)
+    free = np.flatnonzero(~fit.is_at_bound)
     count = changes[0].shape[-1] if changes else 0
     if not free.size:
         return np.zeros((len(fit.names), count))
-    problem = LeastSquares.none(len(free)).add(np.zeros(len(free)), np.diag(fit.prior_slope[free]))
+    problem = SquareRootInformation.empty(len(free)).with_rows(
+        np.zeros(len(free)), np.diag(fit.prior_jacobian[free])
+    )
     score = np.zeros((len(free), count))
     for block, change in zip(fit.blocks, changes, strict=True):
-        slope = block.slope[..., free]
+        slope = block.jacobian[..., free]
         slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
-        problem = problem.add(np.zeros(len(slope)), slope)
-        weighted_change = change * block.weight[..., None] * block.seen[..., None]
+        problem = problem.with_rows(np.zeros(len(slope)), slope)
+        weighted_change = change * block.root_weight[..., None] * block.is_measured[..., None]
         score += slope.T @ weighted_change.reshape(len(slope), count)
     estimates = np.zeros((len(fit.names), count))
     estimates[free] = -problem.root @ (problem.root.T @ score)

@@ -76,7 +76,7 @@ USUAL = SamplerSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Faces:
+class InternalFaces:
     """Faces between two elements.
 
     Attributes
@@ -85,16 +85,16 @@ class Faces:
         Indices of the elements on both sides.
     weights : (F,) array
         Area over the mean area.
-    count : int
+    element_count : int
         Number E of elements.
     """
 
     pairs: Index
     weights: Array
-    count: int
+    element_count: int
 
     @classmethod
-    def of(cls, mesh: TetMesh, cells: Index) -> Faces:
+    def from_mesh(cls, mesh: TetMesh, cells: Index) -> InternalFaces:
         """Find the faces between some elements of a mesh, numbered in the order of `cells`."""
         corners = mesh.tetrahedra[cells]
         triples = np.sort(corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]], axis=2)
@@ -109,19 +109,19 @@ class Faces:
         return cls(np.column_stack([owner[first], owner[second]]), areas / areas.mean(), len(cells))
 
     @property
-    def neighbours(self) -> sp.csr_array:
+    def adjacency(self) -> sp.csr_array:
         """Sparse matrix (E, E) of the weights of the faces between elements."""
         i, j = self.pairs.T
         both = (np.r_[self.weights, self.weights], (np.r_[i, j], np.r_[j, i]))
-        return sp.csr_array(both, shape=(self.count, self.count))
+        return sp.csr_array(both, shape=(self.element_count, self.element_count))
 
     @property
-    def differences(self) -> sp.csr_array:
+    def jump_operator(self) -> sp.csr_array:
         """Sparse matrix (F, E) from values in elements to their jump across each face."""
         faces = np.arange(len(self.pairs))
         ends = np.r_[faces, faces], self.pairs.T.ravel()
         signs = np.repeat([1.0, -1.0], len(faces))
-        return sp.csr_array((signs, ends), shape=(len(faces), self.count))
+        return sp.csr_array((signs, ends), shape=(len(faces), self.element_count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ class ElementInformation:
 
 
 @dataclass(frozen=True, eq=False)
-class PhaseDraws:
+class PosteriorDraws:
     """Samples of one or several chains.
 
     Attributes
@@ -183,8 +183,11 @@ class PhaseDraws:
     accepted: float
 
 
-def start_phases(
-    data: ElementInformation, faces: Faces, volumes_m3: Array, settings: SamplerSettings = USUAL
+def initial_phases(
+    data: ElementInformation,
+    faces: InternalFaces,
+    volumes_m3: Array,
+    settings: SamplerSettings = USUAL,
 ) -> Array:
     """Return initial phases (E,) of 0 and 1 from the total-variation estimate of z, divided into
     two classes.
@@ -195,7 +198,7 @@ def start_phases(
     ----------
     data : ElementInformation
         Normal equations.
-    faces : Faces
+    faces : InternalFaces
         Faces between elements.
     volumes_m3 : (E,) array
         Volumes of the elements [m³].
@@ -205,7 +208,7 @@ def start_phases(
     inverse = np.linalg.pinv(data.of_p, hermitian=True)
     normal = data.of_z - data.mixed @ inverse @ data.mixed.T
     score = data.score_z - data.mixed @ (inverse @ data.score_p)
-    jumps = faces.differences
+    jumps = faces.jump_operator
     z = data.base
     for _ in range(settings.sharpenings):
         smoothed = np.sqrt((jumps @ z) ** 2 + settings.smallest_jump**2)
@@ -214,11 +217,11 @@ def start_phases(
         # No measurement tells the mean of z, which p has too.
         prior[np.diag_indices_from(prior)] += 1e-9 * np.trace(prior) / len(prior)
         z = np.linalg.solve(normal + prior, normal @ data.base - score)
-    above = z >= _two_classes(z, volumes_m3)
+    above = z >= _class_threshold(z, volumes_m3)
     return (above if volumes_m3[above].sum() <= volumes_m3.sum() / 2 else ~above).astype(float)
 
 
-def _two_classes(values: Array, weights: Array) -> float:
+def _class_threshold(values: Array, weights: Array) -> float:
     """Return the threshold between two classes with the least weighted variance within (Otsu)."""
     order = np.argsort(values)
     sorted_values = values[order]
@@ -229,9 +232,9 @@ def _two_classes(values: Array, weights: Array) -> float:
     return float(sorted_values[1:][np.argmax(below + above)])
 
 
-def draw_phases(
-    data: ElementInformation, faces: Faces, start: Array, settings: SamplerSettings = USUAL
-) -> PhaseDraws:
+def sample_phases(
+    data: ElementInformation, faces: InternalFaces, start: Array, settings: SamplerSettings = USUAL
+) -> PosteriorDraws:
     """Draw phases, contrast and parameters from their posterior, by several chains.
 
     The same arguments give the same samples.
@@ -240,16 +243,16 @@ def draw_phases(
     ----------
     data : ElementInformation
         Normal equations.
-    faces : Faces
+    faces : InternalFaces
         Faces between elements.
     start : (E,) array
         Initial phases, 0 or 1.
     settings : SamplerSettings
         Constants of the sampler.
     """
-    chains = [_chain(data, faces, start, seed, settings) for seed in range(settings.chains)]
+    chains = [_run_chain(data, faces, start, seed, settings) for seed in range(settings.chains)]
     phases = np.concatenate([chain.phases for chain in chains])
-    return PhaseDraws(
+    return PosteriorDraws(
         phases=phases,
         contrasts=np.concatenate([chain.contrasts for chain in chains]),
         changes=np.concatenate([chain.changes for chain in chains]),
@@ -259,16 +262,20 @@ def draw_phases(
     )
 
 
-def _chain(
-    data: ElementInformation, faces: Faces, start: Array, seed: int, settings: SamplerSettings
-) -> PhaseDraws:
+def _run_chain(
+    data: ElementInformation,
+    faces: InternalFaces,
+    start: Array,
+    seed: int,
+    settings: SamplerSettings,
+) -> PosteriorDraws:
     """Draw phases, contrast and parameters by one chain.
 
     Parameters
     ----------
     data : ElementInformation
         Normal equations.
-    faces : Faces
+    faces : InternalFaces
         Faces between elements.
     start : (E,) array
         Initial phases, 0 or 1.
@@ -281,7 +288,7 @@ def _chain(
     count = len(start)
     steps = max(settings.least_steps, settings.steps_per_element * count)
     limit = settings.largest_exponent
-    neighbours = faces.neighbours
+    neighbours = faces.adjacency
     degrees = np.asarray(neighbours.sum(axis=1)).ravel()
     diagonal = np.diag(data.of_z)
     constant = data.score_z - data.of_z @ data.base
@@ -345,7 +352,7 @@ def _chain(
             samples.append((phase.astype(np.int8), both, mean))
     phases = np.array([each[0] for each in samples])
     values = np.array([each[1] for each in samples])
-    return PhaseDraws(
+    return PosteriorDraws(
         phases=phases,
         contrasts=values[:, -1],
         changes=values[:, :-1],

@@ -40,7 +40,7 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
     edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
     _, labels = connected_components(edges, directed=False)
     parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
-    grasped_labels = [labels[grasp.nodes] for grasp in experiment.gripping]
+    grasped_labels = [labels[grasp.nodes] for grasp in experiment.body_grasps]
     loose = (
         ~np.isin(parts, np.concatenate(grasped_labels))
         if grasped_labels
@@ -75,5 +75,5 @@ def _gaps_m(obstacle: Obstacle, points_m: Array) -> Array:
     surface [m], negative inside.
     """
     point = ca.SX.sym("point", 3)
-    gap = ca.Function("gap", [point], [obstacle.shape.gap(point)])
+    gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
     return np.asarray(gap.map(len(points_m))(points_m.T), dtype=np.float64).ravel()

@@ -22,8 +22,8 @@ from scipy.optimize import linear_sum_assignment
 from ..arrays import Array, Index
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.moduli import engineering
-from ..program.any_stiffness import carrying
+from ..fem.moduli import engineering_constants
+from ..program.any_stiffness import carrying_grasp
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
 from ..recording.obstacle import Obstacle
@@ -41,7 +41,7 @@ SOFTEST_METAL_PA = 1e9
 IMPOSSIBLE = 100.0
 
 
-def oddities(body: Body) -> tuple[Hypothesis, ...]:
+def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
     """Return hypotheses about an implausible size or density of a body; mostly empty.
 
     Their strength is the factor by which the value is outside the plausible range.
@@ -70,12 +70,14 @@ def oddities(body: Body) -> tuple[Hypothesis, ...]:
         else f"a thousandth, {density_kg_m3 / 1e3:.4g}, if the mass was in g",
     }
     tried = (
-        Hypothesis("length-unit/size", data=size, strength=_outside(size_m, SIZES_M)),
-        Hypothesis("density", data=density, strength=_outside(density_kg_m3, DENSITIES_KG_M3)),
+        Hypothesis("length-unit/size", data=size, strength=_excess_factor(size_m, SIZES_M)),
+        Hypothesis(
+            "density", data=density, strength=_excess_factor(density_kg_m3, DENSITIES_KG_M3)
+        ),
     )
     for each in tried:
         if each.strength > IMPOSSIBLE:
-            raise InputError(each.sentence, None, "object")
+            raise InputError(each.message, None, "object")
     return tuple(each for each in tried if each.strength > 1)
 
 
@@ -87,20 +89,20 @@ def _likely_length(body: Body, *, too_large: bool) -> str:
     return f"object.length_unit, {unit}"
 
 
-def odd_material(body: Body, theta: Array) -> Hypothesis | None:
+def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
     """Return the hypothesis that no material is as dense and as soft as a body with constants θ;
     None if one may be.
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
     density_kg_m3 = float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
-    young_pa = max(float(engineering(*lame)[0]) for lame in body.lame(theta).values())
+    young_pa = max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())
     if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:
         return None
     return Hypothesis("density/metal", data={"density_kg_m3": density_kg_m3, "young_pa": young_pa})
 
 
-def _outside(value: float, limits: tuple[float, float]) -> float:
+def _excess_factor(value: float, limits: tuple[float, float]) -> float:
     """Return the factor by which a value is outside limits; below 1 inside."""
     return max(limits[0] / value, value / limits[1])
 
@@ -114,13 +116,13 @@ FEWEST_SAMPLES = 3
 TOUCHING = 0.05
 
 
-def against_the_load(experiment: Experiment) -> Iterator[Hypothesis]:
+def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield hypotheses of a wrong sign, where displacement and load of a static experiment are
     anticorrelated.
 
     Dynamic experiments are not tested, because of inertia.
     """
-    for k, grasp in enumerate(experiment.grasps if experiment.static else (), start=1):
+    for k, grasp in enumerate(experiment.grasps if experiment.is_static else (), start=1):
         if grasp.wrench is None:
             continue
         shifts_m = grasp.poses.at(grasp.wrench.t_s)[1]
@@ -148,8 +150,9 @@ def _pushing_axis(grasp: Grasp, shifts_m: Array) -> str:
     its force is not in world axes.
     """
     moved_m = np.ptp(shifts_m, axis=0)
-    pushes = isinstance(grasp, Obstacle) and grasp.wrench is not None
-    if not pushes or not moved_m.any() or grasp.wrench.frame != "world":
+    if not isinstance(grasp, Obstacle) or grasp.wrench is None:
+        return ""
+    if not moved_m.any() or grasp.wrench.frame != "world":
         return ""
     return "xyz"[int(moved_m.argmax())]
 
@@ -162,15 +165,15 @@ LIVELY = 0.9
 FEWEST = 8
 
 
-def steps(experiment: Experiment) -> Iterator[Hypothesis]:
+def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield hypotheses of poses that jump and of markers that slip."""
     if len(experiment.markers.positions_m) < FEWEST:
         return
-    if (grasp := carrying(experiment)) is not None:
-        carried_m = grasp.poses.carry(_corners(experiment), experiment.t_s)
-        yield from _jump(experiment, carried_m)
+    if (grasp := carrying_grasp(experiment)) is not None:
+        carried_m = grasp.poses.carried_positions(_marker_box_m(experiment), experiment.t_s)
+        yield from _pose_jump_hypotheses(experiment, carried_m)
         yield from _common_jump(experiment, carried_m)
-    yield from _slips(experiment)
+    yield from _slip_hypotheses(experiment)
 
 
 def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesis]:
@@ -185,8 +188,8 @@ def _common_jump(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesi
     sizes = step_sizes(tracks_m[rows]).min(axis=1)
     k = int(sizes.argmax())
     carried = step_sizes(carried_m[rows]).max(axis=1)[k]
-    usual_m = max(_lively(sizes), float(carried), 2 * float(np.median(sigma_m)))
-    yield from _sudden("markers-jump", experiment, int(rows[k]), float(sizes[k]), usual_m)
+    usual_m = max(_usual_change(sizes), float(carried), 2 * float(np.median(sigma_m)))
+    yield from _step_hypothesis("markers-jump", experiment, int(rows[k]), float(sizes[k]), usual_m)
 
 
 # Motion of markers that may be none, over the size of the body.
@@ -205,7 +208,7 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
         return
     is_held_throughout = (grasp.from_s <= t_s[0] and grasp.until_s >= t_s[-1] for grasp in grasps)
     motions = [part for grasp in grasps for part in grasp.poses.at(t_s)]
-    loads = [experiment.node_forces_n(t_s), experiment.tied_mass_kg(t_s)]
+    loads = [experiment.stated_node_forces_n(t_s), experiment.point_mass_at_nodes_kg(t_s)]
     if (
         not grasps
         or not all(is_held_throughout)
@@ -214,7 +217,7 @@ def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
         return
     markers = experiment.markers
     size_m = float(np.ptp(experiment.body.nodes_m, axis=0).max())
-    is_measured = markers.present.sum(axis=0) >= FEWEST_SAMPLES
+    is_measured = markers.is_present.sum(axis=0) >= FEWEST_SAMPLES
     if not is_measured.any():
         return
     tracks_m = markers.positions_m[:, is_measured]
@@ -231,11 +234,11 @@ def _changes(values: Array) -> bool:
     return bool(np.ptp(values, axis=0).max(initial=0.0) > 1e-9)
 
 
-def _corners(experiment: Experiment) -> Array:
+def _marker_box_m(experiment: Experiment) -> Array:
     """Return two corners (2, 3) of the bounding box of the markers' places on the
     undeformed body [m].
     """
-    places = experiment.markers.observe(experiment.body.nodes_m)
+    places = experiment.markers.predict_positions(experiment.body.nodes_m)
     return np.vstack([places.min(axis=0), places.max(axis=0)])
 
 
@@ -248,21 +251,21 @@ def step_sizes(x: Array) -> Array:
     return np.sqrt(np.maximum(opposite, 0.0))
 
 
-def _jump(experiment: Experiment, carried: Array) -> Iterator[Hypothesis]:
+def _pose_jump_hypotheses(experiment: Experiment, carried_m: Array) -> Iterator[Hypothesis]:
     """Yield the hypothesis of the largest jump of points (T, m, 3) carried by the poses, if
     the markers do not follow it.
     """
-    sizes = step_sizes(carried).max(axis=1)
+    sizes = step_sizes(carried_m).max(axis=1)
     k = int(sizes.argmax())
     markers = step_sizes(experiment.markers.positions_m)[k]
-    moved = np.linalg.norm(np.diff(carried, 2, axis=0), axis=2).max(axis=1)
+    moved = np.linalg.norm(np.diff(carried_m, 2, axis=0), axis=2).max(axis=1)
     sigma_m = float(np.median(experiment.markers.sigma_m))
     if np.isfinite(markers).any():
-        usual_m = max(_lively(moved), float(np.nanmedian(markers)), 2 * sigma_m)
-        yield from _sudden("pose-jump", experiment, k, float(sizes[k]), usual_m)
+        usual_m = max(_usual_change(moved), float(np.nanmedian(markers)), 2 * sigma_m)
+        yield from _step_hypothesis("pose-jump", experiment, k, float(sizes[k]), usual_m)
 
 
-def _slips(experiment: Experiment) -> Iterator[Hypothesis]:
+def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield a hypothesis for each marker that steps alone and stays displaced."""
     markers = experiment.markers
     sizes = step_sizes(markers.positions_m)
@@ -273,12 +276,12 @@ def _slips(experiment: Experiment) -> Iterator[Hypothesis]:
         others = np.delete(sizes[k], m)
         size_m = float(sizes[k, m])
         most_m = float(others[np.isfinite(others)].max(initial=0.0))
-        usual_m = max(_lively(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
-        if _lasts(markers.positions_m, m, k + 2, size_m):
-            yield from _sudden("marker-slip/alone", experiment, k, size_m, usual_m, name)
+        usual_m = max(_usual_change(sizes[:, m]), most_m, 2 * float(markers.sigma_m[m]))
+        if _is_lasting(markers.positions_m, m, k + 2, size_m):
+            yield from _step_hypothesis("marker-slip/alone", experiment, k, size_m, usual_m, name)
 
 
-def _sudden(
+def _step_hypothesis(
     code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
 ) -> Iterator[Hypothesis]:
     """Yield the hypothesis of a step between samples k + 1 and k + 2, if it is far larger
@@ -289,7 +292,7 @@ def _sudden(
         yield Hypothesis(code, f"'{experiment.name}'", data, strength=size_m / usual_m)
 
 
-def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
+def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
     """Whether the marker's distances from the others remain changed after a sample."""
     to_others = np.linalg.norm(tracks - tracks[:, marker : marker + 1], axis=2)
     others = np.delete(to_others, marker, axis=1)
@@ -302,7 +305,7 @@ def _lasts(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
     return bool(np.abs(change).max(initial=0.0) > 0.3 * step_m)
 
 
-def _lively(sizes: Array) -> float:
+def _usual_change(sizes: Array) -> float:
     """Return the 90 % quantile of changes without the largest three; 0 if there are no others."""
     rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
     return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
@@ -314,7 +317,9 @@ CLEARLY = 2.5
 TAMED = 0.2
 
 
-def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypothesis, ...]:
+def name_exchange_hypotheses(
+    experiment: Experiment, huber: float | None = None
+) -> tuple[Hypothesis, ...]:
     """Return hypotheses that names of markers are exchanged for a part of the recording.
 
     Parameters
@@ -324,7 +329,7 @@ def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypot
     huber : float, optional
         Threshold of Huber's loss, which tolerates short exchanges; None means a quadratic loss.
     """
-    order, strength = _orders(experiment)
+    order, strength = _marker_identities(experiment)
     kinds, counts = np.unique(order, axis=0, return_counts=True)
     right = kinds[int(np.argmax(np.where((kinds == order[0]).all(axis=1), 2, 1) * counts))]
     wrong = order != right
@@ -347,12 +352,12 @@ def exchanges(experiment: Experiment, huber: float | None = None) -> tuple[Hypot
     return (Hypothesis("markers-exchanged/later", f"'{experiment.name}'", data, strength=strength),)
 
 
-def _orders(experiment: Experiment) -> tuple[Index, float]:
+def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
     """Return the identity (T, M) of each marker among those of the first samples, and the
     factor by which exchanged names fit better.
     """
     markers = experiment.markers
-    grasp = carrying(experiment)
+    grasp = carrying_grasp(experiment)
     in_grasp_m = np.array(markers.positions_m)
     if grasp is not None:
         rotations, translations_m = grasp.poses.at(experiment.t_s)
@@ -363,7 +368,7 @@ def _orders(experiment: Experiment) -> tuple[Index, float]:
     for k, now_m in enumerate(in_grasp_m):
         is_present = np.isfinite(now_m[:, 0])
         known = np.flatnonzero(is_present & np.isfinite(last_m[:, 0]))
-        chosen, clearly = _chosen(last_m[known], now_m[known], markers.sigma_m[known])
+        chosen, clearly = _best_assignment(last_m[known], now_m[known], markers.sigma_m[known])
         if clearly > CLEARLY:
             order[k:, known] = order[k, known[chosen]]
             strength = max(strength, clearly)
@@ -371,7 +376,7 @@ def _orders(experiment: Experiment) -> tuple[Index, float]:
     return order, strength
 
 
-def _chosen(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Index, float]:
+def _best_assignment(before_m: Array, now_m: Array, sigma_m: Array) -> tuple[Index, float]:
     """Return the assignment of markers to those of the sample before, and the factor by
     which it is nearer than no exchange.
     """

@@ -17,12 +17,12 @@ from scipy.interpolate import CubicSpline, interp1d
 from scipy.special import binom
 
 from ..arrays import Array
-from ..program.collocation import Collocation, Part
+from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
-from ..program.sweep import Columns, Sweep
+from ..program.sweep import Sweep, SweepColumns
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
-from .considered import followed
+from .considered import propagate_columns
 from .linearised import LinearisedFit
 
 # Samples of D η.
@@ -53,26 +53,26 @@ class PoseNoise:
         Standard deviation of the translations [m].
     sigma_rad : float
         Standard deviation of the rotations [rad].
-    judged : bool
+    is_estimated : bool
         Whether it was estimated from the roughness of the poses instead of stated.
     """
 
     experiment: str
     sigma_m: float
     sigma_rad: float
-    judged: bool
+    is_estimated: bool
 
     @property
-    def sentence(self) -> str:
+    def message(self) -> str:
         """Message for the user about the assumed pose noise."""
-        how = "estimated from their roughness" if self.judged else "as stated"
+        how = "estimated from their roughness" if self.is_estimated else "as stated"
         return (
             f"the error bars of '{self.experiment}' allow for noise of the poses of "
             f"{1e3 * self.sigma_m:.2g} mm and {np.degrees(self.sigma_rad):.2g}°, {how}"
         )
 
 
-def roughness(poses: PoseSequence) -> tuple[float, float]:
+def estimate_pose_noise(poses: PoseSequence) -> tuple[float, float]:
     """Estimate the standard deviations [m] and [rad] of white noise in poses.
 
     Uses differences of fifth order, in which a smooth motion hardly shows; zero if rounding of a
@@ -80,7 +80,7 @@ def roughness(poses: PoseSequence) -> tuple[float, float]:
     """
     if len(poses.t_s) < 4 * ORDER:
         return 0.0, 0.0
-    turns = poses.turns
+    turns = poses.rotation_steps
     sizes = [np.diff(poses.positions_m, ORDER, axis=0), np.diff(turns, ORDER - 1, axis=0)]
     scale = np.sqrt(binom(2 * ORDER, ORDER))
     # The median of squares, so that a jump or a stroke does not count as noise.
@@ -115,88 +115,99 @@ def with_pose_noise(
     """
     draws: list[Array | None] = []
     noises: list[PoseNoise] = []
-    for part in collocation.parts(z):
+    for part in collocation.iterates(z):
         noise_of_grasps = [
-            _noise(part.segment.experiment.name, g) for g in part.segment.experiment.grasps
+            _grasp_noise(part.segment.experiment.name, g) for g in part.segment.experiment.grasps
         ]
-        disturbances: list[Array | None] = [None] * len(part.segment.readings)
+        disturbances: list[Array | None] = [None] * len(part.segment.residuals)
         if any(noise.sigma_m or noise.sigma_rad for noise in noise_of_grasps):
-            drawn = _drawn(part, noise_of_grasps, np.random.default_rng(seed))
+            drawn = _residual_samples(part, noise_of_grasps, np.random.default_rng(seed))
             if any(np.sqrt(np.mean(each**2)) >= NEGLIGIBLE for each in drawn):
                 disturbances = [*drawn]
         draws += disturbances
         if disturbances[0] is not None:
             noises += [noise for noise in noise_of_grasps if noise.sigma_m or noise.sigma_rad]
-    return fit.disturbed(draws), tuple(noises)
+    return fit.with_disturbances(draws), tuple(noises)
 
 
-def _noise(name: str, grasp: Grasp) -> PoseNoise:
+def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
     """Return the noise of a grasp's poses, as stated or else as estimated."""
-    rough_m, rough_rad = roughness(grasp.poses)
+    rough_m, rough_rad = estimate_pose_noise(grasp.poses)
     sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
     sigma_rad = rough_rad if grasp.sigma_rad is None else grasp.sigma_rad
     return PoseNoise(name, sigma_m, sigma_rad, grasp.sigma_m is None)
 
 
-def _drawn(part: Part, noises: Sequence[PoseNoise], rng: np.random.Generator) -> list[Array]:
+def _residual_samples(
+    iterate: ExperimentIterate, noises: Sequence[PoseNoise], rng: np.random.Generator
+) -> list[Array]:
     """Return samples (K, T, M, 3) of the changes of each measurement's residuals."""
-    segment = part.segment
-    prescribed = part.setting.held
+    segment = iterate.segment
+    prescribed = iterate.equations.prescribed
     numbers = prescribed.positions_m.size * 8
     count = int(np.clip(BYTES / numbers, FEWEST_DRAWS, DRAWS))
     displacements_m = np.zeros((*prescribed.positions_m.shape, count))
     pose_errors = []
     for grasp, noise in zip(segment.experiment.grasps, noises, strict=True):
-        shifts, turns = _poses_drawn(part, grasp, noise, rng, count)
-        _add_noise(displacements_m, part, grasp, shifts, turns)
+        shifts, turns = _pose_samples(iterate, grasp, noise, rng, count)
+        _add_displacements(displacements_m, iterate, grasp, shifts, turns)
         pose_errors.append((grasp, shifts, turns))
     solver = Sweep(segment)
     changes = []
-    columns = Columns.along(solver, part.setting, displacements_m)
-    for reading, motion, values, by in followed(part, solver, columns):
+    columns = SweepColumns.from_prescribed(solver, iterate.equations, displacements_m)
+    for reading, motion, values, by in propagate_columns(iterate, solver, columns):
         for grasp, shifts, turns in pose_errors:
-            by = by + reading.channel.carried(grasp, motion, part.phi, shifts, turns)
-        changes.append(np.moveaxis(reading.changes(values, by, part.phi), 3, 0))
+            by = by + reading.observable.frame_changes(grasp, motion, iterate.phi, shifts, turns)
+        changes.append(np.moveaxis(reading.residual_changes(values, by, iterate.phi), 3, 0))
     return changes
 
 
-def _poses_drawn(
-    part: Part, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator, count: int
+def _pose_samples(
+    iterate: ExperimentIterate, grasp: Grasp, noise: PoseNoise, rng: np.random.Generator, count: int
 ) -> tuple[Array, Array]:
     """Return samples of translation and rotation errors of the poses at grid times, each
     (N, c, 3); zero while the grasp does not hold.
     """
-    t_s = part.segment.dynamics.t_s
+    t_s = iterate.segment.dynamics.t_s
     samples = np.zeros((2, len(t_s), count, 3))
     if len(grasp.poses.t_s) > 1:
-        rows = np.flatnonzero(grasp.holds(t_s))
+        rows = np.flatnonzero(grasp.is_active(t_s))
         white = rng.normal(size=(2, len(grasp.poses.t_s), 3 * count))
         for own, sigma, values in zip(
             samples, (noise.sigma_m, noise.sigma_rad), white, strict=True
         ):
-            between = _between(grasp.poses, sigma * values, t_s[rows])
+            between = _interpolate(grasp.poses, sigma * values, t_s[rows])
             own[rows] = between.reshape(len(rows), count, 3)
     return samples[0], samples[1]
 
 
-def _add_noise(moved: Array, part: Part, grasp: Grasp, shifts: Array, turns: Array) -> None:
-    """Add the displacements of a grasp's nodes due to pose errors to `moved` (N, g, c), in
+def _add_displacements(
+    displacements_m: Array,
+    iterate: ExperimentIterate,
+    grasp: Grasp,
+    shifts: Array,
+    rotations: Array,
+) -> None:
+    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m` (N, g, c),
+    in
     place.
     """
-    segment = part.segment
-    prescribed = part.setting.held
+    segment = iterate.segment
+    prescribed = iterate.equations.prescribed
     t_s = segment.dynamics.t_s
-    count = moved.shape[2]
-    rows = np.flatnonzero(grasp.holds(t_s))
-    dofs = np.searchsorted(prescribed.dofs, grasp.dofs)
+    count = displacements_m.shape[2]
+    rows = np.flatnonzero(grasp.is_active(t_s))
+    dofs = np.searchsorted(prescribed.dofs, grasp.prescribed_dofs)
     arms = grasp.poses.at(t_s[rows])[0] @ segment.body.nodes_m[grasp.nodes].T
     arms = np.moveaxis(arms, 1, 2)
-    change = shifts[rows, None] + np.cross(turns[rows, None], arms[:, :, None])
-    change = change[..., grasp.columns]  # (rows, nodes, c, axes)
-    moved[np.ix_(rows, dofs)] += np.moveaxis(change, 3, 2).reshape(len(rows), len(dofs), count)
+    change = shifts[rows, None] + np.cross(rotations[rows, None], arms[:, :, None])
+    change = change[..., grasp.axis_indices]  # (rows, nodes, c, axes)
+    displacements_m[np.ix_(rows, dofs)] += np.moveaxis(change, 3, 2).reshape(
+        len(rows), len(dofs), count
+    )
 
 
-def _between(poses: PoseSequence, values: Array, t_s: Array) -> Array:
+def _interpolate(poses: PoseSequence, values: Array, t_s: Array) -> Array:
     """Return values (m, …) at the poses' times interpolated to times, as the poses are."""
     if poses.interpolation == "smooth" and len(poses.t_s) > 3:
         return CubicSpline(poses.t_s, values)(t_s)

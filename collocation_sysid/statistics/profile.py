@@ -19,8 +19,8 @@ from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
 from ..model.parameters import Parameter
 from .distributions import chi2_isf
-from .estimates import relative_slopes
-from .linearised import LinearisedFit, least_squares
+from .estimates import relative_derivatives
+from .linearised import LinearisedFit, least_squares_of_fit
 from .uncertainty import Uncertainty
 
 SolveFixed = Callable[[str, float], float]
@@ -50,7 +50,7 @@ class Profile:
     interval : (lower or None, upper or None)
         95 % interval; None where it is open, because the loss does not rise so far up to the last
         value.
-    sentence : str
+    message : str
         Message for the user.
     """
 
@@ -59,10 +59,10 @@ class Profile:
     losses: Array
     threshold: float
     interval: tuple[float | None, float | None]
-    sentence: str
+    message: str
 
 
-def profile(
+def compute_profile(
     solve_fixed: SolveFixed,
     parameter: str,
     best: tuple[float, float],
@@ -121,20 +121,20 @@ def profile(
     step = 2 * deviation if np.isfinite(deviation) and deviation > 0 else 0.1
     lower, upper = (
         None
-        if (way := _end(rise, side * step, float(np.log(bound / value)))) is None
+        if (way := _find_end(rise, side * step, float(np.log(bound / value)))) is None
         else float(value * np.exp(way))
         for side, bound in zip((-1, 1), bounds, strict=True)
     )
     values = np.array(sorted(losses_by_value))
     losses = np.array([losses_by_value[at] for at in values.tolist()])
-    message = _sentence(parameter, (lower, upper), bounds)
+    message = _message(parameter, (lower, upper), bounds)
     if losses.min() < loss - 1e-3 * max(1.0, abs(loss)):
         better = values[int(np.argmin(losses))]
         message += f"; at {better:.4g} the loss is lower than at the answer: solve again from there"
     return Profile(parameter, values, losses, threshold, (lower, upper), message)
 
 
-def _end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
+def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
     """Return where the loss has risen enough, on one side; None if it has not at the bound."""
     inside = 0.0
     nearer = min if step > 0 else max
@@ -150,7 +150,7 @@ def _end(rise: Callable[[float], float], step: float, bound: float) -> float | N
     return None
 
 
-def _sentence(
+def _message(
     parameter: str,
     interval: tuple[float | None, float | None],
     bounds: tuple[float, float],
@@ -173,7 +173,7 @@ def _sentence(
     )
 
 
-def profile_of(
+def profile_of_solution(
     solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, name: str
 ) -> Profile:
     """Compute the profile likelihood of an estimated parameter of a solution.
@@ -196,24 +196,24 @@ def profile_of(
     item = parameters.free[k]
 
     def solve_fixed(_: str, value: float) -> float:
-        return _loss_with(solution, item, value)
+        return _loss_with_fixed(solution, item, value)
 
-    return profile(
+    return compute_profile(
         solve_fixed,
         name,
-        (solution.parameters[name], _loss(solution)),
+        (solution.parameters[name], _loss_of(solution)),
         (item.lower, item.upper),
         float(np.sqrt(variance)),
         _noise_scale(solution, fit, uncertainty, k),
     )
 
 
-def _loss(solution: Solution) -> float:
+def _loss_of(solution: Solution) -> float:
     """Return the loss of a solution, with priors."""
     return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
 
 
-def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
+def _loss_with_fixed(solution: Solution, item: Parameter, value: float) -> float:
     """Return the smallest loss with one parameter fixed at a value, from the answer;
     infinite if the solve does not converge.
     """
@@ -228,12 +228,12 @@ def _loss_with(solution: Solution, item: Parameter, value: float) -> float:
         mean, deviation = item.prior
         deviation_from_prior = np.log(value / mean) if item.scale == "log" else value - mean
         prior = (deviation_from_prior / deviation) ** 2
-    return _loss(refit) + float(prior)
+    return _loss_of(refit) + float(prior)
 
 
 def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
     """Return the variance of the estimate over that for the stated σ; 1 if it is not finite."""
-    size = relative_slopes(solution.collocation.parameters, solution.q)[k]
-    stated_error = size * least_squares(fit).errors[k]
+    size = relative_derivatives(solution.collocation.parameters, solution.q)[k]
+    stated_error = size * least_squares_of_fit(fit).standard_errors[k]
     scale = float(uncertainty.covariance[k, k] / stated_error**2)
     return scale if np.isfinite(scale) else 1.0

@@ -3,8 +3,9 @@ estimates.
 
 A relaxed assumption joins the linearised fit as one or several nuisance parameters: its prior has
 the deviation of the uncertainty budget, or a multiple of it, and its derivatives are the changes of
-the residuals if the assumption is wrong, see `considered`. `routine_probes` uses this in every
-solve, `probes` for a deeper check.
+the residuals if the assumption is wrong, see `changes_of_nuisances`. `routine_probes` uses this in
+every
+solve, `deep_probes` for a deeper check.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import Array
-from ..fem.constants import is_mode, is_modulus
-from ..program.collocation import Collocation, Part
-from .assumptions import Fitted
+from ..fem.constants import is_field_coefficient, is_modulus
+from ..program.collocation import Collocation, ExperimentIterate
+from .assumptions import FittedExperiment
 from .budget import BudgetLine
-from .considered import Changes, assumed
+from .considered import ResidualChanges, changes_of_assumptions
 from .estimates import Estimate
-from .linearised import Derived, LinearisedFit, best_step, least_squares
+from .linearised import DerivedModuli, LinearisedFit, gauss_newton_step, least_squares_of_fit
 from .scatter import TELLING
-from .uncertainty import ErrorModel, Uncertainty, uncertainty_of
+from .uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRIFT = "stiffness_drift"
 # Share of the range of the load by which it may return in a static recording that still counts as
@@ -36,7 +37,7 @@ Kind = Literal["window", "recording", "assumption"]
 
 
 @dataclass(frozen=True)
-class Move:
+class EstimateChange:
     """Change of an estimate in a refit.
 
     Attributes
@@ -69,7 +70,7 @@ class Probe:
         Name of the window, of the recording, or of the assumption with its component.
     chi_squared : float
         Decrease of χ², with the stated σ and with priors.
-    moves : mapping of str to Move
+    moves : mapping of str to EstimateChange
         Changes of the estimates that the refit determines.
     size, size_error : float or None
         Estimated error of a relaxed assumption in its unit, and its standard error; None for parts
@@ -87,7 +88,7 @@ class Probe:
     kind: Kind
     name: str
     chi_squared: float
-    moves: Mapping[str, Move]
+    moves: Mapping[str, EstimateChange]
     size: float | None = None
     size_error: float | None = None
     told: tuple[str, ...] = ()
@@ -104,7 +105,7 @@ class Probe:
 
 
 @dataclass(frozen=True, eq=False)
-class Answered:
+class SolvedFit:
     """A fit at its answer, with the data that probes need.
 
     Attributes
@@ -115,7 +116,7 @@ class Answered:
         The answer.
     fit : LinearisedFit
         The linearised fit.
-    errors : ErrorModel
+    error_model : ErrorModel
         Assumptions about the errors.
     statistical : mapping of str to Estimate
         Estimates with statistical intervals.
@@ -123,47 +124,49 @@ class Answered:
         Uncertainty budgets.
     deviations : mapping of str to float or None
         Standard deviations of all assumptions and nuisance parameters; None if exact.
-    changes : Changes
+    changes : ResidualChanges
         Changes of the residuals by these assumptions, see `probed_changes`.
     """
 
     collocation: Collocation
     z: Array
     fit: LinearisedFit
-    errors: ErrorModel
+    error_model: ErrorModel
     statistical: Mapping[str, Estimate]
     budget: Mapping[str, BudgetLine]
     deviations: Mapping[str, float | None]
-    changes: Changes
+    changes: ResidualChanges
 
-    def found(self, fit: LinearisedFit, p: Array) -> Uncertainty:
+    def uncertainty_of_refit(self, fit: LinearisedFit, p: Array) -> Uncertainty:
         """Return estimates and error bars of another fit at its parameters p (p,)."""
-        q = p[: fit.shared]
-        constants = (segment.constants for segment in self.collocation.segments)
-        fit = replace(fit, derived=Derived.of(constants, q))
-        return uncertainty_of(fit, self.collocation.parameters, q, self.errors)
+        q = p[: fit.shared_count]
+        constants = (segment.constants for segment in self.collocation.transcriptions)
+        fit = replace(fit, derived=DerivedModuli.from_bodies(constants, q))
+        return uncertainty_from_fit(fit, self.collocation.parameters, q, self.error_model)
 
-    def moves(self, found: Uncertainty) -> dict[str, Move]:
+    def changes_of_estimates(self, uncertainty: Uncertainty) -> dict[str, EstimateChange]:
         """Return the changes of the estimates that a refit determines, by name."""
         changes = {}
-        for name, each in {**found.estimates, **found.derived}.items():
+        for name, each in {**uncertainty.estimates, **uncertainty.derived}.items():
             error = each.statistical_std_error
             joint = self.statistical[name]
             if error and error < TELLING * abs(each.value):
                 change = each.value - joint.value
                 combined95 = self.budget[name].combined95 if name in self.budget else None
-                of_statistical = _share(change, joint.statistical95)
-                of_combined = _share(change, combined95)
-                changes[name] = Move(each.value, error, change, of_statistical, of_combined)
+                of_statistical = _share_of_interval(change, joint.statistical95)
+                of_combined = _share_of_interval(change, combined95)
+                changes[name] = EstimateChange(
+                    each.value, error, change, of_statistical, of_combined
+                )
         return changes
 
     @property
-    def p(self) -> Array:
+    def parameters(self) -> Array:
         """All parameters (p,) at the answer."""
-        return self.collocation.parameters_of(self.z)
+        return self.collocation.parameters_from(self.z)
 
 
-def _share(change: float, interval: tuple[float, float] | None) -> float | None:
+def _share_of_interval(change: float, interval: tuple[float, float] | None) -> float | None:
     """Return a change over the half width of an interval; None without one."""
     return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
 
@@ -175,8 +178,8 @@ def probed_changes(
     collocation: Collocation,
     z: Array,
     deviations: Mapping[str, float | None],
-    changes: Changes | None = None,
-) -> Changes:
+    changes: ResidualChanges | None = None,
+) -> ResidualChanges:
     """Return the changes of the residuals by each assumption that the data can test.
 
     In a static recording whose load only rises, or only falls, "stiffer at the end" and "stiffer at
@@ -191,31 +194,31 @@ def probed_changes(
         The answer.
     deviations : mapping of str to float or None
         Standard deviation of each assumption or nuisance parameter; None if exact.
-    changes : Changes, optional
-        Result of `assumed` for these deviations, if it is known.
+    changes : ResidualChanges, optional
+        Result of `changes_of_assumptions` for these deviations, if it is known.
     """
-    known = assumed(collocation, z, deviations) if changes is None else changes
+    known = changes_of_assumptions(collocation, z, deviations) if changes is None else changes
     columns = [k for k, name in enumerate(known.names) if name == DRIFT]
     if not columns:
         return known
     blocks = iter(known.blocks)
     masked = []
-    for part in collocation.parts(z):
-        hidden = part.segment.experiment.static and has_monotonic_load(part, collocation)
-        for _ in part.segment.readings:
+    for part in collocation.iterates(z):
+        hidden = part.segment.experiment.is_static and has_monotonic_load(part, collocation)
+        for _ in part.segment.residuals:
             change = next(blocks)
             if hidden:
                 change = change.copy()
                 change[..., columns] = 0.0
             masked.append(change)
-    return Changes(known.names, masked)
+    return ResidualChanges(known.names, masked)
 
 
-def has_monotonic_load(part: Part, collocation: Collocation) -> bool:
+def has_monotonic_load(iterate: ExperimentIterate, collocation: Collocation) -> bool:
     """Whether the internal forces of a static recording only grow, or only shrink, in time;
     true for very few samples.
     """
-    load_n = np.linalg.norm(Fitted(part, collocation.parameters).internal_n(), axis=1)
+    load_n = np.linalg.norm(FittedExperiment(iterate, collocation.parameters).internal_n(), axis=1)
     if len(load_n) < FEWEST_SAMPLES:
         return True
     steps = np.diff(load_n)
@@ -223,8 +226,8 @@ def has_monotonic_load(part: Part, collocation: Collocation) -> bool:
     return bool((steps >= -slack).all() or (steps <= slack).all())
 
 
-def with_freedom(
-    fit: LinearisedFit, changes: Changes, name: str, widening: float = 1.0
+def with_relaxed_assumption(
+    fit: LinearisedFit, changes: ResidualChanges, name: str, widening: float = 1.0
 ) -> LinearisedFit:
     """Return a fit in which an assumption is one more nuisance parameter, or several of its name.
 
@@ -232,7 +235,7 @@ def with_freedom(
     ----------
     fit : LinearisedFit
         The fit.
-    changes : Changes
+    changes : ResidualChanges
         Changes of its residuals by the assumptions, each off by its standard deviation, which is
         the unit of the new parameters.
     name : str
@@ -243,55 +246,55 @@ def with_freedom(
     columns = [k for k, other in enumerate(changes.names) if other == name]
     blocks = []
     for block, change in zip(fit.blocks, changes.blocks, strict=True):
-        more = change[..., columns] * (block.weight * block.seen)[..., None]
-        blocks.append(replace(block, slope=np.concatenate([block.slope, more], axis=3)))
+        more = change[..., columns] * (block.root_weight * block.is_measured)[..., None]
+        blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
     count = len(columns)
     return replace(
         fit,
         blocks=tuple(blocks),
         names=(*fit.names, *(f"{name} {k}" for k in range(count))),
         prior_residual=np.append(fit.prior_residual, np.zeros(count)),
-        prior_slope=np.append(fit.prior_slope, np.full(count, 1 / widening)),
-        at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
+        prior_jacobian=np.append(fit.prior_jacobian, np.full(count, 1 / widening)),
+        is_at_bound=np.append(fit.is_at_bound, np.zeros(count, dtype=bool)),
     )
 
 
-def relaxed_probe(at: Answered, name: str, wide: LinearisedFit, p: Array) -> Probe:
+def relaxed_probe(answered: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> Probe:
     """Return the optimum of a fit with one assumption relaxed, by one linear step.
 
     Parameters
     ----------
-    at : Answered
+    answered : SolvedFit
         The fit.
     name : str
         The assumption with its component.
     wide : LinearisedFit
-        Result of `with_freedom`, linearised at p.
+        Result of `with_relaxed_assumption`, linearised at p.
     p : (p,) array
         All parameters without those of the assumption.
 
     Returns
     -------
     Probe
-        Its size is that of the most significant amplitude, if there are several. `told` is empty.
+        Its size is that of the most significant amplitude, if there are several. `report` is empty.
     """
-    first = len(at.fit.names)
-    step = best_step(wide)
-    after = wide.after(step)
+    first = len(answered.fit.names)
+    step = gauss_newton_step(wide)
+    after = wide.after_step(step)
     own = step[first:]
-    uncertainty = at.found(after, p + step[:first])
-    before = least_squares(at.fit)
-    remaining = least_squares(after)
+    uncertainty = answered.uncertainty_of_refit(after, p + step[:first])
+    before = least_squares_of_fit(answered.fit)
+    remaining = least_squares_of_fit(after)
     decrease = before.loss(np.zeros(first)) - remaining.loss(np.zeros(len(step)))
-    unit = at.deviations[assumption_of(name)] or 1.0
-    errors = np.array([*uncertainty.nuisance.values()][first - wide.shared :])
+    unit = answered.deviations[assumption_name(name)] or 1.0
+    errors = np.array([*uncertainty.nuisance.values()][first - wide.shared_count :])
     worst = int(np.argmax(np.nan_to_num(np.abs(own) / errors)))
-    probe = Probe("assumption", name, decrease, at.moves(uncertainty))
+    probe = Probe("assumption", name, decrease, answered.changes_of_estimates(uncertainty))
     probe = replace(probe, size=float(unit * own[worst]), size_error=float(unit * errors[worst]))
-    return replace(probe, relevance=relevance(at, probe))
+    return replace(probe, relevance=relevance(answered, probe))
 
 
-def relevance(at: Answered, probe: Probe) -> float:
+def relevance(answered: SolvedFit, probe: Probe) -> float:
     """Return the largest change of an estimate by a probe, in half widths of its statistical
     interval.
 
@@ -300,16 +303,16 @@ def relevance(at: Answered, probe: Probe) -> float:
     """
     shares = [0.0]
     for name, move in probe.moves.items():
-        if move.of_statistical95 is None or is_mode(name):
+        if move.of_statistical95 is None or is_field_coefficient(name):
             continue
         shares.append(abs(move.of_statistical95))
-        interval = at.statistical[name].statistical95
+        interval = answered.statistical[name].statistical95
         if probe.name == DRIFT and is_modulus(name) and interval is not None:
             half_width = max((interval[1] - interval[0]) / 2, 1e-300)
             shares.append(abs(0.5 * (probe.size or 0.0) * move.value) / half_width)
     return max(shares)
 
 
-def assumption_of(name: str) -> str:
+def assumption_name(name: str) -> str:
     """Return the name of an assumption without its component."""
     return name.partition(" ")[0]

@@ -2,7 +2,8 @@
 
 A drift of the stiffness and a rate of the cameras' clock join the linearised fit as one more column
 each, see `relaxation`. The uncertainty budget needs these columns anyway, so that a probe costs one
-least-squares problem and no simulation. `probes` (``solve --probe``) relaxes all other assumptions,
+least-squares problem and no simulation. `deep_probes` (``solve --probe``) relaxes all other
+assumptions,
 refits parts of the data, and follows effects that are too large for one linear step.
 
 A probe is *significant* if its amplitude is farther from zero than noise explains, and *relevant*
@@ -18,9 +19,9 @@ from dataclasses import replace
 
 from ..recording.nuisance import CLOCK_RATE
 from .assumptions import ASSUMPTIONS
-from .considered import Changes
+from .considered import ResidualChanges
 from .distributions import normal_isf
-from .relaxation import DRIFT, Answered, Probe, relaxed_probe, with_freedom
+from .relaxation import DRIFT, Probe, SolvedFit, relaxed_probe, with_relaxed_assumption
 
 # Assumptions that are probed in every solve: both can be wrong while the residuals look white, bias
 # the estimates, and are determined by a single recording.
@@ -54,32 +55,32 @@ def probed_deviations(deviations: Mapping[str, float | None]) -> dict[str, float
     return {**deviations, **{name: usual[name] for name in exact}}
 
 
-def routine_probes(answered: Answered) -> tuple[Probe, ...]:
+def routine_probes(answered: SolvedFit) -> tuple[Probe, ...]:
     """Relax each routine assumption by one linear step from the answer.
 
     Parameters
     ----------
-    answered : Answered
+    answered : SolvedFit
         The fit. An assumption that has no column in its `changes`, because it is estimated or has
         no effect, is not probed.
 
     Returns
     -------
     tuple of Probe
-        Probes with `routine` set; `told` is empty where the amplitude is not significant.
+        Probes with `routine` set; `report` is empty where the amplitude is not significant.
     """
-    limit = significance(answered.changes)
+    limit = significance_limit(answered.changes)
     probes = []
     for name in ROUTINE:
-        wide = with_freedom(answered.fit, answered.changes, name, WIDENING)
-        if any(block.slope[..., len(answered.fit.names) :].any() for block in wide.blocks):
-            probe = relaxed_probe(answered, name, wide, answered.p)
+        wide = with_relaxed_assumption(answered.fit, answered.changes, name, WIDENING)
+        if any(block.jacobian[..., len(answered.fit.names) :].any() for block in wide.blocks):
+            probe = relaxed_probe(answered, name, wide, answered.parameters)
             significant = (name,) if probe.is_beyond(limit) else ()
             probes.append(replace(probe, routine=True, told=significant))
     return tuple(probes)
 
 
-def significance(changes: Changes) -> float:
+def significance_limit(changes: ResidualChanges) -> float:
     """Return the least significant amplitude of a routine probe, in its standard errors.
 
     Bonferroni's bound over all amplitudes: a drift has one, the clock rate one for each recording.

@@ -14,8 +14,8 @@ import numpy as np
 from ..arrays import Array
 from ..errors import listed
 from ..fem.body import Body
-from ..fem.constants import DENSITY, bare, is_damping, is_density, is_modulus, symbol_of
-from ..methods.scan import SOFT_PA, usual_parameters
+from ..fem.constants import DENSITY, is_damping, is_density, is_modulus, symbol_of, without_region
+from ..methods.scan import SOFT_PA, typical_parameters
 from ..model.parameters import Parameters, ThetaMap
 from ..recording.experiment import Experiment
 from .concern import Concern, Grade
@@ -25,42 +25,44 @@ from .distributions import chi2_isf
 LEFT = 1e-8
 
 
-def open_scale(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
+def parameters_of_open_scale(
+    experiments: Iterable[Experiment], parameters: Parameters
+) -> tuple[str, ...]:
     """Return the parameters of which only ratios can be determined, densities among them;
     mostly empty.
     """
     if not any(is_density(item.name) for item in parameters.free):
         return ()
-    return _moved(experiments, parameters, stated=False)
+    return _scaled_parameters(experiments, parameters, includes_stated=False)
 
 
 def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -> tuple[str, ...]:
     """Return the parameters that are determined relative to the stated densities only."""
-    return _moved(experiments, parameters, stated=True)
+    return _scaled_parameters(experiments, parameters, includes_stated=True)
 
 
 def scale_concerns(
     experiments: Iterable[Experiment], parameters: Parameters, grade: Grade = "check"
 ) -> list[Concern]:
     """Return a concern if the scale is not determined."""
-    names = open_scale(experiments, parameters)
+    names = parameters_of_open_scale(experiments, parameters)
     return [Concern("scale/unknown", grade, {"names": names})] if names else []
 
 
-def relative_sentence(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
+def relative_scale_note(experiments: Iterable[Experiment], parameters: Parameters) -> str | None:
     """Return the note that moduli are relative to the stated density; None if a force sets
     the scale, or the scale is open.
     """
     names = relative_moduli(experiments, parameters)
-    if not names or open_scale(experiments, parameters):
+    if not names or parameters_of_open_scale(experiments, parameters):
         return None
     verb = "is" if len(names) == 1 else "are"
     symbols = [symbol_of(name) for name in names]
     return f"no known force sets the scale: {listed(symbols)} {verb} relative to the stated density"
 
 
-def _moved(
-    experiments: Iterable[Experiment], parameters: Parameters, stated: bool
+def _scaled_parameters(
+    experiments: Iterable[Experiment], parameters: Parameters, includes_stated: bool
 ) -> tuple[str, ...]:
     """Return the free parameters that multiply all moduli and densities by a common factor; empty
     if data or priors determine the factor.
@@ -71,22 +73,22 @@ def _moved(
         Experiments; those for validation are ignored.
     parameters : Parameters
         Shared parameters.
-    stated : bool
+    includes_stated : bool
         Whether densities that are not estimated count as multiplied too.
     """
     fitted = [experiment for experiment in experiments if not experiment.validation]
     bodies = {id(e.body): e.body for e in fitted}
-    with_known_force = {id(e.body) for e in fitted if e.knows_a_force}
+    with_known_force = {id(e.body) for e in fitted if e.has_known_force}
     if len(with_known_force) == len(bodies):
         return ()
-    usual = usual_parameters(parameters, SOFT_PA)
+    usual = typical_parameters(parameters, SOFT_PA)
     slopes = []
     changes = []
     for key, body in bodies.items():
         constants = ThetaMap(usual, body)
         theta = constants.theta(usual.guess_q)
-        slope = constants.slopes(usual.guess_q)
-        change = _multiplied(body, theta, slope, stated)
+        slope = constants.jacobian(usual.guess_q)
+        change = _common_scaling(body, theta, slope, includes_stated)
         if key in with_known_force or change is None:
             change = np.zeros(len(slope))
         size = np.where(theta == 0, 1.0, np.abs(theta))
@@ -104,14 +106,15 @@ def _moved(
     return tuple(item.name for item, is_moved in zip(usual.free, moves, strict=True) if is_moved)
 
 
-def _multiplied(body: Body, theta: Array, slope: Array, stated: bool) -> Array | None:
+def _common_scaling(body: Body, theta: Array, slope: Array, is_stated: bool) -> Array | None:
     """Return the change of θ (k,) if all moduli and densities change by a common factor;
     None if a density cannot.
     """
-    if not stated and not all(part.free_density for part in body.parts):
+    if not is_stated and not all(part.has_free_density for part in body.parts):
         return None
     scaled = [
-        is_modulus(name) or (bare(name) == DENSITY.name and not (stated and not slope[place].any()))
+        is_modulus(name)
+        or (without_region(name) == DENSITY.name and not (is_stated and not slope[place].any()))
         for place, name in enumerate(body.constants)
     ]
     return np.where(scaled, theta, 0.0)
@@ -123,23 +126,23 @@ RARE = 1e-3
 HELD = 2.0
 
 
-def motionless(experiment: Experiment) -> bool:
+def is_motionless(experiment: Experiment) -> bool:
     """Whether neither grasps, loads nor markers change, except for noise."""
     markers = experiment.markers
     t_s = experiment.t_s
     sigma_m = float(np.median(markers.sigma_m)) if markers.names else 0.0
-    is_prescribed, positions_m = experiment.grasped(t_s)
+    is_prescribed, positions_m = experiment.prescribed_displacements(t_s)
     lasting = is_prescribed.all(axis=0)
     if (is_prescribed.any(axis=0) != lasting).any():
         return False
     displacement_m = np.ptp(positions_m[:, lasting], axis=0)
     if displacement_m.size and displacement_m.max() > HELD * sigma_m:
         return False
-    if np.ptp(experiment.tied_mass_kg(t_s), axis=0).any():
+    if np.ptp(experiment.point_mass_at_nodes_kg(t_s), axis=0).any():
         return False
-    if np.ptp(experiment.node_forces_n(t_s), axis=0).any():
+    if np.ptp(experiment.stated_node_forces_n(t_s), axis=0).any():
         return False
-    present = markers.present[..., None]
+    present = markers.is_present[..., None]
     counts = np.maximum(present.sum(axis=0), 1)
     mean = np.where(present, markers.positions_m, 0.0).sum(axis=0) / counts
     deviations = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
@@ -148,15 +151,15 @@ def motionless(experiment: Experiment) -> bool:
     return bool(np.sum(deviations**2) <= chi2_isf(RARE, max(freedom, 1.0)))
 
 
-def stillness_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
+def static_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
     """Return a concern if nothing moves in the fitted recordings, so that damping cannot be
     determined.
     """
     fitted = [experiment for experiment in experiments if not experiment.validation]
     damping = [item.name for item in parameters.free if is_damping(item.name)]
-    if not fitted or not damping or not all(e.static or motionless(e) for e in fitted):
+    if not fitted or not damping or not all(e.is_static or is_motionless(e) for e in fitted):
         return []
-    code = "static" if all(experiment.static for experiment in fitted) else "still"
+    code = "static" if all(experiment.is_static for experiment in fitted) else "still"
     names = [f"'{e.name}'" for e in fitted]
     verb = "is" if len(fitted) == 1 else "are"
     data = {"names": names, "verb": verb, "damping": damping}

@@ -35,7 +35,13 @@ from scipy.optimize import nnls
 
 from ..arrays import Array, Index
 from .distributions import chi2_sf
-from .linearised import FitBlock, LinearisedFit, best_step, least_squares, rows_of
+from .linearised import (
+    LinearisedFit,
+    ResidualBlock,
+    gauss_newton_step,
+    least_squares_of_blocks,
+    least_squares_of_fit,
+)
 
 # Probability that consistent recordings are reported to disagree, for all parameters together.
 SIGNIFICANT = 0.01
@@ -47,57 +53,57 @@ SILENT = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Scatter:
+class RecordingComparison:
     """Comparison of single recordings, in the solver's coordinates.
 
     Attributes
     ----------
     recordings : (n,) tuple of str
         Names.
-    away : (n, nq) array
+    differences : (n, nq) array
         Estimates from each alone less the joint ones; NaN where it does not determine them.
     deviations : (n, nq) array
         Their standard deviations; NaN likewise.
-    between : (p, nq n) array
+    sensitivities : (p, nq n) array
         Changes of the joint estimates if a parameter differs in one recording by its standard
         deviation between recordings.
     """
 
     recordings: tuple[str, ...]
-    away: Array
+    differences: Array
     deviations: Array
-    between: Array
+    sensitivities: Array
 
     @property
     def chi_squared(self) -> Array:
         """χ² of the disagreement on each parameter (nq,)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             weight = np.nan_to_num(1 / self.deviations**2)
-            mean = np.nansum(weight * self.away, axis=0) / weight.sum(axis=0)
-        return np.nansum(weight * np.nan_to_num(self.away - mean) ** 2, axis=0)
+            mean = np.nansum(weight * self.differences, axis=0) / weight.sum(axis=0)
+        return np.nansum(weight * np.nan_to_num(self.differences - mean) ** 2, axis=0)
 
     @property
-    def freedom(self) -> NDArray[np.int64]:
+    def degrees_of_freedom(self) -> NDArray[np.int64]:
         """Degrees of freedom (nq,) of χ²."""
         return np.maximum(np.isfinite(self.deviations).sum(axis=0) - 1, 0)
 
     @property
-    def disagreeing(self) -> NDArray[np.bool_]:
+    def is_disagreeing(self) -> NDArray[np.bool_]:
         """Mask (nq,) of the parameters on which the recordings disagree more than by chance."""
-        freedom = self.freedom
+        freedom = self.degrees_of_freedom
         p = chi2_sf(self.chi_squared, np.maximum(freedom, 1))
         return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
 
-    def widened(self, variances: Array) -> Array:
+    def widen(self, variances: Array) -> Array:
         """Return variances (nq,) of q of the joint fit, increased where recordings disagree."""
-        ratio = self.chi_squared / np.maximum(self.freedom, 1)
+        ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
             enough = np.maximum(variances, ratio * np.minimum(variances, of_all))
-        return np.where(self.disagreeing, enough, variances)
+        return np.where(self.is_disagreeing, enough, variances)
 
 
-def recordings_of(fit: LinearisedFit) -> dict[str, list[int]]:
+def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
     """Return the indices of the blocks of each recording, by its name."""
     blocks: dict[str, list[int]] = {}
     for k, block in enumerate(fit.blocks):
@@ -109,15 +115,17 @@ def single_fits(fit: LinearisedFit) -> Iterator[tuple[LinearisedFit, Array]]:
     """Iterate over the fits to each recording alone, each with its parameters less the
     joint ones.
     """
-    for name, numbers in recordings_of(fit).items():
+    for name, numbers in blocks_by_recording(fit).items():
         # What recordings share they have to find alone, too.
-        mine = [other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared :]]
-        columns = np.r_[np.arange(fit.shared), fit.shared + np.flatnonzero(mine)]
-        yield part_fit(fit, [fit.blocks[k] for k in numbers], columns)
+        mine = [
+            other.startswith((f"{name}: ", "shared")) for other in fit.names[fit.shared_count :]
+        ]
+        columns = np.r_[np.arange(fit.shared_count), fit.shared_count + np.flatnonzero(mine)]
+        yield fit_part(fit, [fit.blocks[k] for k in numbers], columns)
 
 
-def part_fit(
-    fit: LinearisedFit, blocks: Sequence[FitBlock], columns: Index
+def fit_part(
+    fit: LinearisedFit, blocks: Sequence[ResidualBlock], columns: Index
 ) -> tuple[LinearisedFit, Array]:
     """Return the fit of some parameters to some data alone, and these parameters less the joint
     ones.
@@ -128,28 +136,30 @@ def part_fit(
     ----------
     fit : LinearisedFit
         The joint fit.
-    blocks : sequence of FitBlock
+    blocks : sequence of ResidualBlock
         Data of the part.
     columns : array
         Indices of the parameters that are fitted.
     """
     prior_residual, prior_slope = (
-        np.where(columns < fit.shared, 0.0, prior[columns])
-        for prior in (fit.prior_residual, fit.prior_slope)
+        np.where(columns < fit.shared_count, 0.0, prior[columns])
+        for prior in (fit.prior_residual, fit.prior_jacobian)
     )
     alone = replace(
         fit,
-        blocks=tuple(replace(each, slope=each.slope[..., columns]) for each in blocks),
+        blocks=tuple(replace(each, jacobian=each.jacobian[..., columns]) for each in blocks),
         names=tuple(fit.names[k] for k in columns),
         prior_residual=prior_residual,
-        prior_slope=prior_slope,
-        at_bound=np.zeros(len(columns), dtype=bool),
+        prior_jacobian=prior_slope,
+        is_at_bound=np.zeros(len(columns), dtype=bool),
     )
-    step = best_step(alone)
-    return alone.after(step), step
+    step = gauss_newton_step(alone)
+    return alone.after_step(step), step
 
 
-def scatter_of(fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]) -> Scatter:
+def compare_recordings(
+    fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]
+) -> RecordingComparison:
     """Compare recordings by the result of each alone.
 
     Parameters
@@ -165,25 +175,25 @@ def scatter_of(fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array
     is_determined = deviations < TELLING
     with np.errstate(invalid="ignore"):
         excess = variances / independent
-    return Scatter(
+    return RecordingComparison(
         tuple(alone),
         np.where(is_determined, steps, np.nan),
         np.where(is_determined, deviations, np.nan),
-        _between(fit, [*alone], np.where(np.isfinite(excess), excess, 1.0)),
+        _sensitivities_to_differences(fit, [*alone], np.where(np.isfinite(excess), excess, 1.0)),
     )
 
 
-def _between(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
-    """Return `Scatter.between` (p, nq n); zero for parameters at a bound."""
-    own = [rows_of(fit, recordings_of(fit)[name]) for name in names]
+def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
+    """Return `RecordingComparison.sensitivities` (p, nq n); zero for parameters at a bound."""
+    own = [least_squares_of_blocks(fit, blocks_by_recording(fit)[name]) for name in names]
     each = np.array([o.information for o in own])
     scores = np.array([o.score for o in own])
-    together = least_squares(fit)
+    together = least_squares_of_fit(fit)
     information = together.information
     score = together.score
-    free = np.flatnonzero(~fit.at_bound)
+    free = np.flatnonzero(~fit.is_at_bound)
     inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
-    shared = free[free < fit.shared]
+    shared = free[free < fit.shared_count]
     excess_scatter = np.zeros(len(shared))
     by_each = np.zeros((len(shared), len(shared)))
     for row, k in enumerate(shared.tolist()):
@@ -202,7 +212,7 @@ def _between(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
         by_each[row] = [np.trace(m.T @ projection @ m) for m in by_own]
     sizes = np.where(np.diag(by_each) > 0, np.diag(by_each), 1.0)
     variances = nnls(by_each / np.sqrt(np.outer(sizes, sizes)), excess_scatter / np.sqrt(sizes))[0]
-    sensitivities = np.zeros((len(fit.names), fit.shared, len(names)))
+    sensitivities = np.zeros((len(fit.names), fit.shared_count, len(names)))
     for k, tau in zip(shared, np.sqrt(variances / np.sqrt(sizes)), strict=True):
         sensitivities[free, k] = -tau * inverse @ each[:, free, k].T
     return sensitivities.reshape(len(fit.names), -1)

@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 
 from ..arrays import Array, Index
 from ..fem.body import Body
-from ..fem.mesh import Nodes
-from ..fem.node_force import surface_of
+from ..fem.mesh import ElementNodes
+from ..fem.node_force import surface_shares
 
 # Modes of the error of the surface: with the correlation length below they have most of its
 # variance, and each costs one evaluation of the forces and one column of a sweep.
@@ -71,23 +71,23 @@ def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) ->
     correlation : float
         Correlation length over the longest extent.
     """
-    corners = Nodes.corners(body.mesh)
-    area_m2, normals = surface_of(corners)
+    corners = ElementNodes.corners(body.mesh)
+    area_m2, normals = surface_shares(corners)
     surface = np.flatnonzero(area_m2 > 0)
     fields = np.zeros((len(corners.points_m), SURFACE_MODES))
     length_m = correlation * float(extents_m(corners.points_m)[0])
-    own = _correlated(corners.points_m[surface], area_m2[surface], length_m)
+    own = _correlation_modes(corners.points_m[surface], area_m2[surface], length_m)
     fields[surface, : own.shape[1]] = own
     if known.size:
         away_m = KDTree(corners.points_m[known]).query(corners.points_m)[0]
         fields *= 1 - np.exp(-((away_m / (KNOWN_WITHIN * length_m)) ** 2))[:, None]
     displacements = fields[:, :, None] * normals[:, None, :]
-    harmonic = _harmonic(corners, surface, displacements.reshape(len(fields), -1))
+    harmonic = _harmonic_extension(corners, surface, displacements.reshape(len(fields), -1))
     of_corners = harmonic.reshape(len(fields), SURFACE_MODES, 3)
-    return _of_all_nodes(body, of_corners.transpose(1, 0, 2))
+    return _extend_to_all_nodes(body, of_corners.transpose(1, 0, 2))
 
 
-def _correlated(points_m: Array, weights: Array, length_m: float) -> Array:
+def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Array:
     """Return the strongest modes (n, SURFACE_MODES or fewer) of a correlated field, scaled
     by their standard deviations.
     """
@@ -108,7 +108,7 @@ def _correlated(points_m: Array, weights: Array, length_m: float) -> Array:
     return covariance(points_m, points_m[chosen]) @ scaled
 
 
-def _harmonic(nodes: Nodes, surface: Index, values: Array) -> Array:
+def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> Array:
     """Return values (n, m) with those inside the surface replaced by the solution of
     Laplace's equation on the mesh graph.
     """
@@ -128,16 +128,16 @@ def _harmonic(nodes: Nodes, surface: Index, values: Array) -> Array:
     return extended
 
 
-def _of_all_nodes(body: Body, of_corners: Array) -> Array:
+def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
     """Return fields (m, n, 3) at all nodes from those at the corners; nodes of obstacle
     frames have zero.
     """
-    fields = np.zeros((len(of_corners), *body.nodes_m.shape))
-    corners = of_corners.shape[1]
-    fields[:, :corners] = of_corners
+    fields = np.zeros((len(corner_fields), *body.nodes_m.shape))
+    corners = corner_fields.shape[1]
+    fields[:, :corners] = corner_fields
     ends = body.nodes.ends
     if len(ends):
-        fields[:, corners : corners + len(ends)] = of_corners[:, ends].mean(axis=2)
+        fields[:, corners : corners + len(ends)] = corner_fields[:, ends].mean(axis=2)
     return fields
 
 
@@ -151,7 +151,7 @@ def standing_nodes(body: Body, gravity_m_s2: Array) -> Index:
     return np.flatnonzero(height_m <= low_m + STANDING * max(np.ptp(height_m), 1e-300))
 
 
-def sag_m(body: Body, theta: Array, held: Index, axis: int) -> Array:
+def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
     """Return the difference (n, 3) of stress-free shape and mesh if the mesh sagged along one of
     its axes, X − Y [m].
 
@@ -164,7 +164,7 @@ def sag_m(body: Body, theta: Array, held: Index, axis: int) -> Array:
         The body.
     theta : (k,) array
         Constants of the body.
-    held : (k,) array
+    support_dofs : (k,) array
         Dofs that were supported.
     axis : int
         Index of the axis along which gravity acted.
@@ -172,7 +172,7 @@ def sag_m(body: Body, theta: Array, held: Index, axis: int) -> Array:
     own = body.nodes.points_m.size
     x = np.asarray(body.nodes_m, dtype=float)
     stiffness = -body.linearise(x, np.zeros_like(x), theta).by_position[0]
-    free = np.setdiff1d(np.arange(own), held)
+    free = np.setdiff1d(np.arange(own), support_dofs)
     matrix = sp.csc_array(body.pattern.matrix(stiffness)[free][:, free])
     weight_n = np.zeros(own)
     weight_n[axis::3] = GRAVITY_M_S2 * body.mass_of_dofs(theta)[:own][axis::3]

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..model.contact import Contact
-from ..program.part import Part
+from ..program.part import ExperimentIterate
 from ..recording.obstacle import Obstacle
 
 # Rows whose gaps are evaluated together.
@@ -42,9 +42,9 @@ class FirstContact:
     normal: Array
 
     @classmethod
-    def in_motion(cls, contact: Contact, x: Array) -> FirstContact:
+    def from_motion(cls, contact: Contact, x: Array) -> FirstContact:
         """Find first contact in a motion x (N, 3n), or the nearest approach if there is none."""
-        law = contact.contact
+        law = contact.law_of_contact
         nearest_m = np.inf
         row = 0
         for first in range(0, len(x), ROWS_AT_ONCE):
@@ -58,9 +58,9 @@ class FirstContact:
             if len(touching):
                 break
         y = contact.points.vectors(x[row : row + 1])
-        gaps_m, slopes = law.distance.slopes(y, np.zeros((0, *y.shape[1:])))
+        gaps_m, slopes = law.gap_function.evaluate_with_jacobian(y, np.zeros((0, *y.shape[1:])))
         gaps_m = gaps_m[0, 0]
-        weights = law.surface.area_m2 * contact.pressing(x[row : row + 1])[0, 0]
+        weights = law.surface.area_m2 * contact.scaled_pressures(x[row : row + 1])[0, 0]
         if not weights.any():
             weights = (gaps_m == gaps_m.min()).astype(float)
         weights = weights / weights.sum()
@@ -72,30 +72,33 @@ class FirstContact:
         return cls(row, place_m, normal / max(float(np.linalg.norm(normal)), 1e-9))
 
 
-def obstacle_shifts_m(part: Part) -> Iterator[tuple[Obstacle, Array]]:
+def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Array]]:
     """Yield each obstacle with the shift (N, 3) per relative size that preserves first contact [m].
 
     The body scales about the middle of its grasps. Along axes that no grasp prescribes, it scales
     about the place of its first contact; if several obstacles touch it at the same time, about that
     of the one that moves least.
     """
-    experiment = part.segment.experiment
-    forces = part.setting.dynamics.forces
-    t_s = part.setting.dynamics.t_s[: len(part.x)]
-    contacts = [term for term in forces.further if isinstance(term, Contact)]
+    experiment = iterate.segment.experiment
+    forces = iterate.equations.dynamics.forces
+    t_s = iterate.equations.dynamics.t_s[: len(iterate.x)]
+    contacts = [term for term in forces.external_terms if isinstance(term, Contact)]
     if not contacts:
         return
-    first_contacts = [FirstContact.in_motion(contact, part.x) for contact in contacts]
-    travels_m = [np.ptp(part.x[:, c.contact.obstacle.dofs], axis=0).max() for c in contacts]
+    first_contacts = [FirstContact.from_motion(contact, iterate.x) for contact in contacts]
+    travels_m = [
+        np.ptp(iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0).max()
+        for c in contacts
+    ]
     support = min(
         zip((each.row for each in first_contacts), travels_m, range(len(contacts)), strict=True)
     )
-    prescribed_axes = set("".join(grasp.axes for grasp in experiment.gripping))
+    prescribed_axes = set("".join(grasp.axes for grasp in experiment.body_grasps))
     free = np.array([axis not in prescribed_axes for axis in "xyz"])
     for contact, each in zip(contacts, first_contacts, strict=True):
-        obstacle = contact.contact.obstacle
+        obstacle = contact.law_of_contact.obstacle
         turn, shift = (values[0] for values in experiment.rigid_motion(t_s[each.row]))
-        pivot_m = turn @ part.segment.nuisance.grasp_pivot_m + shift
+        pivot_m = turn @ iterate.segment.nuisance.grasp_pivot_m + shift
         pivot_m = np.where(free, first_contacts[support[-1]].place_m, pivot_m)
         way_m = each.normal * (each.normal @ (each.place_m - pivot_m))
         turns, _ = obstacle.poses.at(t_s)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..arrays import Array
 from .distributions import chi2_sf
-from .linearised import FitBlock
+from .linearised import ResidualBlock
 
 # Correlated shares a that are tried.
 SHARES = (0.25, 0.5, 0.75, 0.95)
@@ -33,7 +33,7 @@ MOST_SAMPLES = 20
 
 
 @dataclass(frozen=True, eq=False)
-class SpatialErrors:
+class SpatialCorrelation:
     """Spatial correlation of the errors of one sample of a block.
 
     Attributes
@@ -42,7 +42,7 @@ class SpatialErrors:
         Covariance of its channels, in units of σ².
     length_m : float
         Correlation length ℓ [m].
-    p : float
+    p_value : float
         p-value of the likelihood ratio, for independent errors.
     freedom : float
         Degrees of freedom of the variance.
@@ -50,16 +50,16 @@ class SpatialErrors:
 
     covariance: Array
     length_m: float
-    p: float
+    p_value: float
     freedom: float
 
 
-def spatial_errors(block: FitBlock, slope: Array) -> SpatialErrors | None:
+def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialCorrelation | None:
     """Estimate the spatial correlation of a block's errors.
 
     Parameters
     ----------
-    block : FitBlock
+    block : ResidualBlock
         The block.
     slope : (T, n, r) array
         Its D = S L, see `linearised`.
@@ -98,31 +98,31 @@ def spatial_errors(block: FitBlock, slope: Array) -> SpatialErrors | None:
     count = sum(len(z) for z, _, _ in contrasts)
     nearest = float(np.median(np.where(distances_m > 0, distances_m, np.inf).min(axis=1)))
     longest = max(LONGEST * float(distances_m.max()), 2 * nearest)
-    white, _ = _misfit(contrasts, 0.0, 1.0)
+    white, _ = _restricted_likelihood(contrasts, 0.0, 1.0)
     candidates = [
-        (*_misfit(contrasts, share, length), share, length)
+        (*_restricted_likelihood(contrasts, share, length), share, length)
         for share in SHARES
         for length in np.geomspace(nearest / 2, longest, LENGTHS)
     ]
     least, level, share, length = min(candidates)
     p = float(chi2_sf(max(0.0, white - least), 2))
-    shape = _shape(distances_m, share, float(length))
+    shape = _correlation_matrix(distances_m, share, float(length))
     share_known = count / max(1, sum(len(f) for _, f, _ in contrasts))
     freedom = max(
         1.0, len(contrasts) * share_known * np.trace(shape) ** 2 / float(np.sum(shape**2))
     )
-    return SpatialErrors(level * shape, float(length), p, freedom)
+    return SpatialCorrelation(level * shape, float(length), p, freedom)
 
 
-def _shape(apart: Array, share: float, length_m: float) -> Array:
-    """Return the correlation matrix (n, n) of distances `apart` (n, n) for a share a and a
+def _correlation_matrix(distances_m: Array, share: float, length_m: float) -> Array:
+    """Return the correlation matrix (n, n) of distances `distances_m` (n, n) for a share a and a
     length [m].
     """
-    return (1 - share) * np.eye(len(apart)) + share * np.exp(-apart / length_m)
+    return (1 - share) * np.eye(len(distances_m)) + share * np.exp(-distances_m / length_m)
 
 
-def _misfit(
-    left: list[tuple[Array, Array, Array]], share: float, length_m: float
+def _restricted_likelihood(
+    contrasts: list[tuple[Array, Array, Array]], share: float, length_m: float
 ) -> tuple[float, float]:
     """Return −2 log-likelihood up to a constant, and the variance s² that maximises the
     likelihood.
@@ -130,8 +130,8 @@ def _misfit(
     squares = 0.0
     logarithms = 0.0
     count = 0
-    for z, free, distances_m in left:
-        root = np.linalg.cholesky(free.T @ _shape(distances_m, share, length_m) @ free)
+    for z, free, distances_m in contrasts:
+        root = np.linalg.cholesky(free.T @ _correlation_matrix(distances_m, share, length_m) @ free)
         squares += float(np.sum(np.linalg.solve(root, z) ** 2))
         logarithms += 2 * float(np.log(np.diag(root)).sum())
         count += len(z)

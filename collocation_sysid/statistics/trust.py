@@ -18,14 +18,14 @@ from ..display import short
 from ..errors import listed
 from ..fem.constants import symbol_of, unit_of
 from ..program.stability import Instability
-from ..program.touches import Touch
+from ..program.touches import ContactSummary
 from ..recording.experiment import Experiment
-from ..recording.turning import FAST, fastest_turn
-from .budget import worded
-from .concern import Concern, concerned
+from ..recording.turning import WARNING_ANGLE_RAD, fastest_rotation
+from .budget import source_label
+from .concern import Concern, concern_if
 from .diagnostics import MOST_WILD, MarkerDiagnosis
 from .distributions import chi2_sf, normal_isf
-from .estimates import Estimate, told_of
+from .estimates import Estimate, display_name
 from .hypothesis import Hypothesis
 from .noise import NoiseLevel
 from .numerical import Refinement
@@ -100,7 +100,7 @@ NUMERICAL = "scheme/step", "mesh/refined"
 
 
 @dataclass(frozen=True)
-class Trust:
+class Assessment:
     """Concerns, the gravest first, and the resulting verdict.
 
     Attributes
@@ -113,9 +113,9 @@ class Trust:
     TOLD: ClassVar = ("verdict", "reasons")
 
     @classmethod
-    def of(cls, concerns: Iterable[Concern]) -> Trust:
+    def from_concerns(cls, concerns: Iterable[Concern]) -> Assessment:
         """Build from concerns; duplicates are removed and the gravest come first."""
-        by_message = {concern.sentence: concern for concern in reversed([*concerns])}
+        by_message = {concern.message: concern for concern in reversed([*concerns])}
         gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
         return cls(tuple(gravest))
 
@@ -130,13 +130,13 @@ class Trust:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Messages of the concerns, in the order of `concerns`."""
-        return tuple(concern.sentence for concern in self.concerns)
+        """Messages of the concerns, in the order of `solution_concerns`."""
+        return tuple(concern.message for concern in self.concerns)
 
-    def joined(self, other: Trust) -> Trust:
+    def combined_with(self, other: Assessment) -> Assessment:
         """Return the graver of two verdicts, with the reasons of both."""
         light, grave = sorted((other, self), key=lambda t: get_args(Verdict).index(t.verdict))
-        return Trust.of((*grave.concerns, *light.concerns))
+        return Assessment.from_concerns((*grave.concerns, *light.concerns))
 
 
 def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
@@ -144,7 +144,7 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     more than a factor of two without one.
     """
     return [
-        replace(cause, of=f"likely: {cause.of}").concern(
+        replace(cause, subject=f"likely: {cause.subject}").concern(
             "doubtful" if cause.strength > CERTAIN else "check"
         )
         for cause in causes
@@ -167,34 +167,34 @@ def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     no_noise = persistent or shared or not np.isfinite(dependence.lag1_deviation)
     # Residuals of exactly zero are those of no measurement at all.
     smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not is_used
-    stated = level.stated
+    stated = level.sigma_key
     return [
         *(outlier.concern for outlier in uncertainty.outliers),
-        *concerned(
+        *concern_if(
             is_used and persistent,
             factor > GROSS_MISFIT,
             "residuals/persist",
             autocorrelation=dependence.lag1,
         ),
-        *concerned(is_used and not persistent, False, "residuals/shared"),
-        *concerned(
+        *concern_if(is_used and not persistent, False, "residuals/shared"),
+        *concern_if(
             larger, factor > GROSS_MISFIT and no_noise, "noise/larger", factor=factor, stated=stated
         ),
-        *concerned(smaller, False, "noise/smaller", factor=1 / (factor or 1.0), stated=stated),
-        *_uneven_concerns(level),
-        *_scatter_concerns(uncertainty),
+        *concern_if(smaller, False, "noise/smaller", factor=1 / (factor or 1.0), stated=stated),
+        *_noisy_marker_concerns(level),
+        *_disagreement_concerns(uncertainty),
     ]
 
 
-def _scatter_concerns(uncertainty: Uncertainty) -> list[Concern]:
+def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """Return a concern if recordings disagree on shared parameters."""
     scatter = uncertainty.scatter
-    disagreeing = [] if scatter is None else np.flatnonzero(scatter.disagreeing).tolist()
-    names = [told_of(uncertainty.names[k]) for k in disagreeing]
-    return concerned(bool(names), False, "residuals/recordings", names=names)
+    disagreeing = [] if scatter is None else np.flatnonzero(scatter.is_disagreeing).tolist()
+    names = [display_name(uncertainty.names[k]) for k in disagreeing]
+    return concern_if(bool(names), False, "residuals/recordings", names=names)
 
 
-def _uneven_concerns(level: NoiseLevel) -> list[Concern]:
+def _noisy_marker_concerns(level: NoiseLevel) -> list[Concern]:
     """Return a concern if markers are much noisier than the others."""
     if not level.unequal_p < RARE:
         return []
@@ -214,17 +214,17 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
-    bounded = [name for name, estimate in estimates.items() if estimate.at_bound]
+    bounded = [name for name, estimate in estimates.items() if estimate.is_at_bound]
     undetermined = [
         name
         for name, estimate in estimates.items()
-        if not estimate.at_bound and estimate.statistical_std_error is None
+        if not estimate.is_at_bound and estimate.statistical_std_error is None
     ]
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
     return [
-        *concerned(bool(bounded), several, code, names=bounded),
-        *concerned(
+        *concern_if(bool(bounded), several, code, names=bounded),
+        *concern_if(
             bool(undetermined),
             len(undetermined) == len(estimates),
             "information/none",
@@ -251,7 +251,7 @@ def numerical_concerns(
     """
     if refinement is None:
         return []
-    worst, largest = refinement.worst(optimum, combined_std_errors)
+    worst, largest = refinement.largest_correction(optimum, combined_std_errors)
     if largest <= MOVED:
         return []
     value = optimum[worst].value
@@ -287,10 +287,10 @@ def probe_concerns(probes: Iterable[Probe], corrections: Mapping[str, float]) ->
     if not alarming:
         return []
     worst, *others = alarming
-    instead = listed(f"{worded(p.name)} ({p.chi_squared:.3g})" for p in others)
+    instead = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others)
     data = {
-        "assumption": RELAXED.get(worst.name, f"{worded(worst.name)} is as stated"),
-        "name": worded(worst.name),
+        "assumption": RELAXED.get(worst.name, f"{source_label(worst.name)} is as stated"),
+        "name": source_label(worst.name),
         "size": short(worst.size or 0.0),
         "size_error": short(worst.size_error or 0.0),
         "chi_squared": worst.chi_squared,
@@ -309,11 +309,11 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
     return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
 
 
-def marker_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
+def outlier_share_concerns(diagnoses: Iterable[MarkerDiagnosis]) -> list[Concern]:
     """Return a concern if too many samples are beyond Huber's threshold."""
     diagnoses_list = tuple(diagnoses)
     share = sum(d.wild for d in diagnoses_list) / max(1, sum(d.samples for d in diagnoses_list))
-    return concerned(share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share)
+    return concern_if(share > WILD, share > HARDLY_TAME, "residuals/wild", percent=100 * share)
 
 
 def nuisance_concerns(
@@ -336,8 +336,8 @@ def nuisance_concerns(
     for name, phi, lowest, highest in items:
         deviation = abs(float(phi))
         limited = not lowest + 1e-3 < phi < highest - 1e-3
-        concerns += concerned(limited, True, "nuisance/limit", name=name)
-        concerns += concerned(
+        concerns += concern_if(limited, True, "nuisance/limit", name=name)
+        concerns += concern_if(
             deviation > limit and not limited,
             deviation > ABSURD,
             "nuisance/far",
@@ -363,23 +363,23 @@ def camera_pose_concerns(names: Sequence[str], deviations: Sequence[float]) -> l
         return []
     worst = int(np.argmax(np.abs(deviations)))
     deviation = abs(float(deviations[worst]))
-    return concerned(
+    return concern_if(
         deviation > CAMERA_FAR, False, "nuisance/camera", name=names[worst], deviations=deviation
     )
 
 
-def outline_concerns(camera: str, apart_px: Array) -> list[Concern]:
+def outline_concerns(camera: str, distances_px: Array) -> list[Concern]:
     """Return a concern if the outline of the body differs from the edges in a camera's images.
 
     Parameters
     ----------
     camera : str
         Name of the depth camera and of its experiment, for the message.
-    apart_px : (n,) array
+    distances_px : (n,) array
         Distances of outline points from the edges in the images [pixels].
     """
-    share = float(np.mean(np.abs(apart_px) > OUTLINE_FAR_PX)) if len(apart_px) else 0.0
-    return concerned(
+    share = float(np.mean(np.abs(distances_px) > OUTLINE_FAR_PX)) if len(distances_px) else 0.0
+    return concern_if(
         share > OUTLINE_SHARE,
         False,
         "residuals/outline",
@@ -401,7 +401,7 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
     prior_s : float
         Standard deviation of its prior [s].
     """
-    return concerned(
+    return concern_if(
         abs(shift_s) > LATE * prior_s,
         False,
         "nuisance/clock",
@@ -411,8 +411,8 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
     )
 
 
-def rollout_concerns(
-    name: str, rms_m: float, fit_rms_m: float, noise_rms_m: float, fitted: bool
+def forward_simulation_concerns(
+    name: str, rms_m: float, fit_rms_m: float, noise_rms_m: float, is_fitted: bool
 ) -> list[Concern]:
     """Return a concern if the forward simulation of an experiment is much worse than the fit.
 
@@ -426,20 +426,20 @@ def rollout_concerns(
         The same distance of the fit, or for a prediction of the fits of other experiments [m].
     noise_rms_m : float
         Distance that noise alone would give [m]; without both there is no concern.
-    fitted : bool
+    is_fitted : bool
         Whether the experiment was fitted; if not, the simulation is a prediction.
     """
     yardstick_m = max(fit_rms_m, noise_rms_m)
     if not yardstick_m:  # nothing of the kind is measured
         return []
-    if not fitted:
+    if not is_fitted:
         times = rms_m / yardstick_m
         gross = times > GROSS_PREDICTION
-        return concerned(
+        return concern_if(
             times > PREDICTION, gross, "roll-out/predicted", experiment=name, times=times
         )
     missed = float(np.sqrt(max(0.0, rms_m**2 - fit_rms_m**2))) / yardstick_m
-    return concerned(
+    return concern_if(
         missed > ROLLOUT,
         missed > GROSS_ROLLOUT,
         "roll-out/misses",
@@ -479,7 +479,7 @@ def prediction_concerns(
         Root mean square difference with its unit, for the message.
     """
     is_chance = float(chi2_sf(numbers * tame_sigmas**2, numbers)) > RARE
-    return concerned(
+    return concern_if(
         tame_sigmas > MISFIT and not is_chance,
         tame_sigmas > GROSS_MISFIT,
         "prediction/misses",
@@ -491,17 +491,17 @@ def prediction_concerns(
     )
 
 
-def stability_concerns(found: Iterable[Instability]) -> list[Concern]:
+def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:
     """Return concerns about states of the answer in which disturbances grow."""
     concerns: list[Concern] = []
-    for each in found:
+    for each in instabilities:
         grows = each.e_foldings > E_FOLDINGS
         grossly = each.e_foldings > GROSS_E_FOLDINGS
-        concerns += concerned(grows, grossly, "stability/grows", **vars(each))
+        concerns += concern_if(grows, grossly, "stability/grows", **vars(each))
     return concerns
 
 
-def contact_concerns(found: Iterable[Touch], guess: str = "") -> list[Concern]:
+def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> list[Concern]:
     """Return concerns about obstacles that are never touched, or by too few faces to resolve the
     contact.
 
@@ -510,21 +510,31 @@ def contact_concerns(found: Iterable[Touch], guess: str = "") -> list[Concern]:
 
     Parameters
     ----------
-    found : iterable of Touch
+    summaries : iterable of ContactSummary
         Contact summaries.
     guess : str
         Text that refers to the guess, such as " at the guess"; empty for an answer.
     """
     concerns: dict[tuple[str, str], list[Concern]] = {}
-    for each in sorted(found, key=lambda touch: touch.faces):
+    for each in sorted(summaries, key=lambda touch: touch.face_count):
         data = {"experiment": each.experiment, "obstacle": each.obstacle, "guess": guess}
-        coarse = 0 < each.faces < FEWEST_FACES
-        numbers = {"faces": each.faces, "face_mm": each.face_mm}
+        coarse = 0 < each.face_count < FEWEST_FACES
+        numbers = {"faces": each.face_count, "face_mm": each.face_mm}
         for one in (
-            *concerned(not each.faces, not guess, "contact/never", mm=1e3 * each.gap_m, **data),
-            *concerned(coarse, False, "contact/coarse", **numbers, **data),
-            *concerned(bool(guess) and each.pressed, False, "contact/pressed", **data),
-            *concerned(bool(guess and each.lost_s), False, "contact/lost", t_s=each.lost_s, **data),
+            *concern_if(
+                not each.face_count, not guess, "contact/never", mm=1e3 * each.gap_m, **data
+            ),
+            *concern_if(coarse, False, "contact/coarse", **numbers, **data),
+            *concern_if(
+                bool(guess) and each.is_initially_in_contact, False, "contact/pressed", **data
+            ),
+            *concern_if(
+                bool(guess and each.separation_s),
+                False,
+                "contact/lost",
+                t_s=each.separation_s,
+                **data,
+            ),
         ):
             concerns.setdefault((one.code, each.obstacle), []).append(one)
     return [
@@ -533,13 +543,16 @@ def contact_concerns(found: Iterable[Touch], guess: str = "") -> list[Concern]:
     ]
 
 
-def turn_concerns(
-    experiment: Experiment, substeps: int, far: float = FAST, code: str = "scheme/turns"
+def rotation_step_concerns(
+    experiment: Experiment,
+    substeps: int,
+    limit_rad: float = WARNING_ANGLE_RAD,
+    code: str = "scheme/turns",
 ) -> list[Concern]:
-    """Return a concern if a grasp rotates by more than `far` [rad] within a step of the grid."""
-    turn = fastest_turn(experiment, substeps)
+    """Return a concern if a grasp rotates by more than `limit_rad` [rad] within a step of the grid."""
+    turn = fastest_rotation(experiment, substeps)
     numbers = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
-    return concerned(turn.angle_rad > far, False, code, **vars(turn), **numbers)
+    return concern_if(turn.angle_rad > limit_rad, False, code, **vars(turn), **numbers)
 
 
 def scheme_concerns(
@@ -559,7 +572,7 @@ def scheme_concerns(
         Relative change of the period by the scheme.
     """
     return [
-        *concerned(
+        *concern_if(
             added_ratio > max(DAMPING_SHARE * damping_ratio, LITTLE_DAMPING),
             added_ratio > GROSS_DAMPING_SHARE * damping_ratio,
             "scheme/damping",
@@ -567,7 +580,7 @@ def scheme_concerns(
             added=added_ratio,
             damping=damping_ratio,
         ),
-        *concerned(
+        *concern_if(
             abs(period_error) > PERIOD_ERROR,
             abs(period_error) > GROSS_PERIOD_ERROR,
             "scheme/period",
@@ -577,7 +590,7 @@ def scheme_concerns(
     ]
 
 
-def noise_rms_m(sigma_m: Array, samples: Array, fitted: float) -> float:
+def rms_expected_from_noise_m(sigma_m: Array, samples: Array, parameter_count: float) -> float:
     """Return the RMS distance of markers that noise alone would leave, √(3 (1 − p/N)) σ, pooled
     [m].
 
@@ -585,11 +598,11 @@ def noise_rms_m(sigma_m: Array, samples: Array, fitted: float) -> float:
     ----------
     sigma_m, samples : (M,) arrays
         Stated σ and number of samples of the markers of all experiments.
-    fitted : float
+    parameter_count : float
         Number p of parameters that the data determine, of N = 3 Σ samples measurements.
     """
     if not samples.sum():
         return 0.0
     total = float(samples.sum())
-    remaining = max(0.0, 1 - fitted / (3 * total))
+    remaining = max(0.0, 1 - parameter_count / (3 * total))
     return float(np.sqrt(3 * remaining * (samples @ sigma_m**2) / total))

@@ -9,11 +9,13 @@ The block of the shared parameters q is reported; nuisance parameters of single 
 by what they could have explained. For independent errors of the stated σ, C is A⁻¹. If the
 residuals are larger or smaller than σ, Cov(e) = s² I with their variance s², and where markers
 differ each has its own variance (see `noise`); intervals are then Student's. If a test finds the
-residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The output
+residuals correlated, in time or among markers, Cov(e) is that of `process_autocorrelation`. The
+output
 states which was used.
 
-Use `covariance` at a solution, or `uncertainty_of` where the linearised fit is known. Estimated
-marker places have error bars too, see `places_of`.
+Use `uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised fit is known.
+Estimated
+marker places have error bars too, see `marker_places`.
 """
 
 from __future__ import annotations
@@ -30,28 +32,34 @@ from ..checked import Options
 from ..errors import InputError
 from ..fem.constants import constant_named, is_damping
 from ..model.parameters import Parameters
-from ..program.collocation import Collocation, Part
+from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
-from .autocorrelation import Dependence, dependence, error_processes, score_covariance
-from .diagnostics import Outlier, set_apart
+from .autocorrelation import Dependence, error_processes, score_covariance, test_dependence
+from .diagnostics import Outlier, remove_outliers
 from .distributions import student_ppf
 from .estimates import (
     UNDETERMINED,
     Estimate,
+    correlation_from_covariance,
     correlation_notes,
-    correlation_of,
     derived_estimates,
+    disagreement_notes,
     memory_notes,
+    noise_notes,
     parameter_notes,
-    relative_slopes,
-    scatter_notes,
-    size_notes,
+    relative_derivatives,
     user_estimates,
 )
-from .linearised import Information, LinearisedFit, information, least_squares, linearised_fit
-from .noise import Noise, NoiseLevel, drawn, noise_level, projected
+from .linearised import (
+    Information,
+    LinearisedFit,
+    factorise_information,
+    least_squares_of_fit,
+    linearise_fit,
+)
+from .noise import Noise, NoiseLevel, disturbance_samples, estimate_noise_level, project_errors
 from .pose_noise import with_pose_noise
-from .scatter import Scatter, recordings_of, scatter_of, single_fits
+from .scatter import RecordingComparison, blocks_by_recording, compare_recordings, single_fits
 
 Errors = Literal["independent", "autocorrelated"]
 
@@ -98,7 +106,8 @@ class ErrorBasis:
     dependence : Dependence
         Tests of the residuals for correlation.
     outliers : tuple of Outlier
-        Single samples that dominate the residuals of their marker; `dependence` leaves them out.
+        Single samples that dominate the residuals of their marker; `test_dependence` leaves them
+        out.
     """
 
     noise: Noise
@@ -141,9 +150,9 @@ class Uncertainty(ErrorBasis):
         Measurements less parameters; one that a prior determines counts in part.
     notes : tuple of str
         Notes for the user.
-    wider : (nq,) array
+    widening : (nq,) array
         Factor by which intervals are widened because recordings disagree; 1 if they agree.
-    scatter : Scatter or None
+    scatter : RecordingComparison or None
         Comparison of single recordings; None unless there are several.
     """
 
@@ -158,8 +167,8 @@ class Uncertainty(ErrorBasis):
     chi_squared: float
     degrees_of_freedom: float
     notes: tuple[str, ...]
-    wider: Array
-    scatter: Scatter | None = None
+    widening: Array
+    scatter: RecordingComparison | None = None
 
     @property
     def reduced_chi_squared(self) -> float:
@@ -167,7 +176,9 @@ class Uncertainty(ErrorBasis):
         return self.chi_squared / max(1.0, self.degrees_of_freedom)
 
 
-def covariance(collocation: Collocation, z: Array, errors: ErrorModel = AUTO) -> Uncertainty:
+def uncertainty_at(
+    collocation: Collocation, z: Array, error_model: ErrorModel = AUTO
+) -> Uncertainty:
     """Return the uncertainty of the parameters at a solution, including noise of the poses.
 
     Parameters
@@ -176,7 +187,7 @@ def covariance(collocation: Collocation, z: Array, errors: ErrorModel = AUTO) ->
         The program.
     z : (variables,) array
         The optimum, which satisfies the equations of motion.
-    errors : ErrorModel
+    error_model : ErrorModel
         Assumptions about the errors.
 
     Raises
@@ -186,13 +197,13 @@ def covariance(collocation: Collocation, z: Array, errors: ErrorModel = AUTO) ->
     SimulationError
         If the equations of motion are singular.
     """
-    fit, _ = with_pose_noise(linearised_fit(collocation, z), collocation, z)
-    return uncertainty_of(fit, collocation.parameters, z[: collocation.nq], errors)
+    fit, _ = with_pose_noise(linearise_fit(collocation, z), collocation, z)
+    return uncertainty_from_fit(fit, collocation.parameters, z[: collocation.nq], error_model)
 
 
 @one_blas_thread()
-def uncertainty_of(
-    fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel = AUTO
+def uncertainty_from_fit(
+    fit: LinearisedFit, parameters: Parameters, q: Array, error_model: ErrorModel = AUTO
 ) -> Uncertainty:
     """Return the uncertainty of the parameters from the linearised fit.
 
@@ -204,7 +215,7 @@ def uncertainty_of(
         Shared parameters.
     q : (nq,) array
         Estimates in the solver's coordinates.
-    errors : ErrorModel
+    error_model : ErrorModel
         Assumptions about the errors. With noise "estimated" only the ratios of the stated σ matter.
         With "auto" σ is scaled where residuals are larger or clearly smaller, separately for each
         marker where markers differ. The size of correlated errors always follows from the
@@ -216,27 +227,27 @@ def uncertainty_of(
     InputError
         If the noise is to be estimated from fewer measurements than parameters.
     """
-    factored = information(fit)
-    shared = fit.shared
-    freedom = fit.measurements - round(factored.fitted, 9)
-    if errors.noise == "estimated" and freedom < 1:
+    factored = factorise_information(fit)
+    shared = fit.shared_count
+    freedom = fit.measurement_count - round(factored.determined_count, 9)
+    if error_model.noise == "estimated" and freedom < 1:
         raise InputError(
-            f"the noise cannot be estimated from {fit.measurements} measurements of "
+            f"the noise cannot be estimated from {fit.measurement_count} measurements of "
             f"{len(fit.names)} parameters; give sigma_m and use noise = 'given'"
         )
-    all_free, quantiles, basis = _error_bars(fit, factored, errors)
-    of_all, bounded = _known(all_free, fit, parameters, q)
-    scatter = _scatter(fit, parameters, q, errors)
-    of_q, quantiles, wider = _widened(of_all[:shared, :shared], quantiles, scatter)
+    all_free, quantiles, basis = _error_bars(fit, factored, error_model)
+    of_all, bounded = _reported_covariance(all_free, fit, parameters, q)
+    scatter = _compare_recordings(fit, parameters, q, error_model)
+    of_q, quantiles, wider = _widen_by_scatter(of_all[:shared, :shared], quantiles, scatter)
     estimates = user_estimates(parameters, q, of_q, bounded, quantiles)
     longest_s = max((float(np.ptp(block.t_s)) for block in fit.blocks), default=0.0)
-    sizes = relative_slopes(parameters, q)
+    sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
     return Uncertainty(
         **vars(basis),
         names=fit.names[:shared],
         covariance=of_q * np.outer(sizes, sizes),
-        correlation=correlation_of(of_q),
+        correlation=correlation_from_covariance(of_q),
         quantiles=quantiles,
         estimates=estimates,
         derived=derived_estimates(fit.derived, of_q, bounded, quantiles),
@@ -247,43 +258,43 @@ def uncertainty_of(
         notes=(
             *parameter_notes(parameters, estimates),
             *memory_notes(estimates, longest_s),
-            *size_notes(errors.noise, basis.noise, basis.level, basis.errors),
-            *correlation_notes(errors.errors, basis.errors, basis.dependence),
-            *scatter_notes(fit, scatter),
+            *noise_notes(error_model.noise, basis.noise, basis.level, basis.errors),
+            *correlation_notes(error_model.errors, basis.errors, basis.dependence),
+            *disagreement_notes(fit, scatter),
         ),
         scatter=scatter,
-        wider=wider,
+        widening=wider,
     )
 
 
 def _error_bars(
-    fit: LinearisedFit, factored: Information, asked: ErrorModel
+    fit: LinearisedFit, factored: Information, requested: ErrorModel
 ) -> tuple[Array, Array, ErrorBasis]:
     """Return the covariance of all parameters, the quantiles of the shared ones, and the
     error model used.
     """
-    level = noise_level(fit, factored)
-    without_outliers, outliers = set_apart(fit)
+    level = estimate_noise_level(fit, factored)
+    without_outliers, outliers = remove_outliers(fit)
     dependence_found, dependent = _dependence(without_outliers)
-    correlated = asked.errors == "autocorrelated" or (asked.errors == "auto" and dependent)
-    kind: Noise = level.kind if asked.noise == "auto" else asked.noise
-    if asked.noise == "auto" and correlated and level.pooled < 1:
+    correlated = requested.errors == "autocorrelated" or (requested.errors == "auto" and dependent)
+    kind: Noise = level.suggested_noise if requested.noise == "auto" else requested.noise
+    if requested.noise == "auto" and correlated and level.pooled < 1:
         kind = "given"
-    of_score, freedom = level.score_covariance(kind, factored, fit.shared)
+    of_score, freedom = level.score_covariance(kind, factored, fit.shared_count)
     covariance = factored.fit.covariance(of_score)
     used = "independent"
     if correlated:
-        of_score, few_freedom = _autocorrelated(fit, factored, kind, level)
+        of_score, few_freedom = _correlated_score_covariance(fit, factored, kind, level)
         persistent = factored.fit.covariance(of_score)
-        before, after = (np.diag(each)[: fit.shared] for each in (covariance, persistent))
+        before, after = (np.diag(each)[: fit.shared_count] for each in (covariance, persistent))
         widens = (after > CONSEQUENCE**2 * before).any()
-        if asked.errors == "autocorrelated" or kind != "given" or widens:
+        if requested.errors == "autocorrelated" or kind != "given" or widens:
             covariance = persistent
             freedom = few_freedom
             used = "autocorrelated"
-    if fit.of_phases is not None:
+    if fit.phase_covariance is not None:
         covariance = covariance.copy()
-        covariance[: fit.shared, : fit.shared] += fit.of_phases
+        covariance[: fit.shared_count, : fit.shared_count] += fit.phase_covariance
     return (
         covariance,
         student_ppf(0.975, freedom),
@@ -291,7 +302,7 @@ def _error_bars(
     )
 
 
-def _known(
+def _reported_covariance(
     covariance: Array, fit: LinearisedFit, parameters: Parameters, q: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the covariance of all parameters as it is reported, and a mask (nq,) of shared
@@ -301,63 +312,65 @@ def _known(
     determine have infinite variance.
     """
     reported = covariance.copy()
-    shared = fit.shared
-    uninformed = _no_information(parameters, q, np.diag(covariance)[:shared])
-    at_bound = fit.at_bound.copy()
+    shared = fit.shared_count
+    uninformed = _has_no_information(parameters, q, np.diag(covariance)[:shared])
+    at_bound = fit.is_at_bound.copy()
     at_bound[:shared] &= ~uninformed
     reported[at_bound] = reported[:, at_bound] = np.nan
     of_q = reported[:shared, :shared]
     bounded = at_bound[:shared]
     undetermined = np.flatnonzero(
-        (np.diag(of_q) > UNDETERMINED**2) | (uninformed & fit.at_bound[:shared])
+        (np.diag(of_q) > UNDETERMINED**2) | (uninformed & fit.is_at_bound[:shared])
     )
     of_q[undetermined] = of_q[:, undetermined] = np.nan
     of_q[undetermined, undetermined] = np.inf
     return reported, bounded
 
 
-def _widened(of_q: Array, quantiles: Array, scatter: Scatter | None) -> tuple[Array, Array, Array]:
+def _widen_by_scatter(
+    covariance_q: Array, quantiles: Array, scatter: RecordingComparison | None
+) -> tuple[Array, Array, Array]:
     """Return covariance (nq, nq) and quantiles (nq,), larger where recordings disagree, and
     the factors (nq,) of the intervals.
     """
     if scatter is None:
-        return of_q, quantiles, np.ones(len(quantiles))
+        return covariance_q, quantiles, np.ones(len(quantiles))
     with np.errstate(invalid="ignore"):
-        factors = np.sqrt(scatter.widened(np.diag(of_q)) / np.diag(of_q))
-    factors = np.where(scatter.disagreeing, factors, 1.0)
-    of_few = np.maximum(quantiles, student_ppf(0.975, np.maximum(scatter.freedom, 1)))
-    wide = np.where(scatter.disagreeing, of_few, quantiles)
-    return of_q * np.outer(factors, factors), wide, factors * wide / quantiles
+        factors = np.sqrt(scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q))
+    factors = np.where(scatter.is_disagreeing, factors, 1.0)
+    of_few = np.maximum(quantiles, student_ppf(0.975, np.maximum(scatter.degrees_of_freedom, 1)))
+    wide = np.where(scatter.is_disagreeing, of_few, quantiles)
+    return covariance_q * np.outer(factors, factors), wide, factors * wide / quantiles
 
 
-def _scatter(
+def _compare_recordings(
     fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel
-) -> Scatter | None:
+) -> RecordingComparison | None:
     """Return the comparison of single recordings with their own error bars; None if there
     are fewer than two to compare.
     """
-    if len(recordings_of(fit)) < 2:
+    if len(blocks_by_recording(fit)) < 2:
         return None
     known = {}
-    sizes = relative_slopes(parameters, q)
+    sizes = relative_derivatives(parameters, q)
     for alone, step in single_fits(fit):
-        if alone.measurements <= len(alone.names):
+        if alone.measurement_count <= len(alone.names):
             continue
-        uncertainty = uncertainty_of(alone, parameters, q, errors)
-        independent = least_squares(alone).errors[: fit.shared] ** 2
+        uncertainty = uncertainty_from_fit(alone, parameters, q, errors)
+        independent = least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
         variances = np.diag(uncertainty.covariance) / sizes**2
-        known[alone.blocks[0].name] = step[: fit.shared], variances, independent
-    return scatter_of(fit, known) if len(known) > 1 else None
+        known[alone.blocks[0].name] = step[: fit.shared_count], variances, independent
+    return compare_recordings(fit, known) if len(known) > 1 else None
 
 
-def _no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
+def _has_no_information(parameters: Parameters, q: Array, variances: Array) -> NDArray[np.bool_]:
     """Return the mask (nq,) of dampings that could be a hundred times their usual value
     without being noticed.
     """
     uninformed = []
     for item, at, variance in zip(parameters.free, q, variances, strict=True):
         usual = constant_named(item.name).usual or 0.0
-        deviation = np.sqrt(variance) * item.per_value(item.value(float(at)))
+        deviation = np.sqrt(variance) * item.value_derivative(item.from_coordinate(float(at)))
         uninformed.append(is_damping(item.name) and not deviation <= UNINFORMED * usual)
     return np.array(uninformed, dtype=bool)
 
@@ -366,35 +379,35 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     """Return the tests of the residuals for correlation, and whether they show more than
     known disturbances explain.
     """
-    factored = information(fit)
-    level = noise_level(fit, factored)
-    tested = dependence(fit, factored)
+    factored = factorise_information(fit)
+    level = estimate_noise_level(fit, factored)
+    tested = test_dependence(fit, factored)
     tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.unevenness)
-    return tested, tested.found and not _expected(fit, factored, level, tested)
+    return tested, tested.is_correlated and not _is_explained(fit, factored, level, tested)
 
 
-def _expected(
-    fit: LinearisedFit, factored: Information, level: NoiseLevel, found: Dependence
+def _is_explained(
+    fit: LinearisedFit, factored: Information, level: NoiseLevel, result: Dependence
 ) -> bool:
     """Whether known disturbances (such as noise of the poses) explain residuals as
     correlated as those found.
     """
-    added = drawn(fit)
+    added = disturbance_samples(fit)
     if not len(added[0]):
         return False
     rng = np.random.default_rng(0)
     size = np.sqrt(max(1.0, level.pooled))
     errors = [
-        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.seen
+        (each[:REPLICAS] + size * rng.normal(size=each[:REPLICAS].shape)) * block.is_measured
         for each, block in zip(added, fit.blocks, strict=True)
     ]
-    _, residuals = projected(factored, errors)
+    _, residuals = project_errors(factored, errors)
     replicas = [
-        dependence(
+        test_dependence(
             replace(
                 fit,
                 blocks=tuple(
-                    replace(block, residual=each[k] * block.seen)
+                    replace(block, residual=each[k] * block.is_measured)
                     for block, each in zip(fit.blocks, residuals, strict=True)
                 ),
             ),
@@ -403,20 +416,20 @@ def _expected(
         for k in range(len(errors[0]))
     ]
     least, most = (pick(each.lag1 for each in replicas) for pick in (min, max))
-    return least <= found.lag1 <= most and found.shared_p >= min(r.shared_p for r in replicas)
+    return least <= result.lag1 <= most and result.shared_p >= min(r.shared_p for r in replicas)
 
 
-def _autocorrelated(
+def _correlated_score_covariance(
     fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
 ) -> tuple[Array, Array]:
     """Return the covariance (r, r) of the score for correlated errors, and degrees of
     freedom (shared,).
     """
-    of_score, freedom = score_covariance(factored, error_processes(fit, factored), fit.shared)
-    if kind == "given" or level.extra.any():
+    of_score, freedom = score_covariance(factored, error_processes(fit, factored), fit.shared_count)
+    if kind == "given" or level.known_score_covariance.any():
         # In no direction less than independent errors of the σ given bring, nor than those found
         # with what is known to add to them: an autoregression may miss that.
-        least, _ = level.score_covariance(kind, factored, fit.shared)
+        least, _ = level.score_covariance(kind, factored, fit.shared_count)
         root = np.linalg.cholesky(least + 1e-12 * np.eye(len(least)))
         over = np.linalg.solve(root, np.linalg.solve(root, of_score).T)
         values, vectors = np.linalg.eigh((over + over.T) / 2)
@@ -426,7 +439,7 @@ def _autocorrelated(
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class MarkerPlace:
     """Place of a marker on the undeformed body.
 
     Attributes
@@ -453,46 +466,48 @@ class Place:
         return self.given_m is not None
 
     @property
-    def moved_m(self) -> float | None:
+    def displacement_m(self) -> float | None:
         """Distance of the estimate from the stated place [m]; None if there is none."""
         given = self.given_m
         return None if given is None else float(np.linalg.norm(self.position_m - given))
 
 
-def places_of(part: Part, uncertainty: Uncertainty | None = None) -> dict[str, Place]:
+def marker_places(
+    iterate: ExperimentIterate, uncertainty: Uncertainty | None = None
+) -> dict[str, MarkerPlace]:
     """Return the places of an experiment's markers at a solution, by name; without
     `uncertainty` they have no errors.
     """
-    segment = part.segment
-    chart = segment.chart
+    segment = iterate.segment
+    chart = segment.association
     markers = segment.experiment.markers
-    errors = _std_errors_m(part, uncertainty)
+    errors = _std_errors_m(iterate, uncertainty)
     return {
-        name: Place(
+        name: MarkerPlace(
             position,
             None if errors is None or not np.isfinite(errors[m]).all() else errors[m],
             float(chart.sigma_m[m]),
-            chart.given_m[m] if markers.located[m] else None,
+            chart.prior_places_m[m] if markers.located[m] else None,
         )
         for m, (name, position) in enumerate(
-            zip(markers.names, segment.places_m(part.phi), strict=True)
+            zip(markers.names, segment.marker_places_m(iterate.phi), strict=True)
         )
     }
 
 
-def _std_errors_m(part: Part, uncertainty: Uncertainty | None) -> Array | None:
+def _std_errors_m(iterate: ExperimentIterate, uncertainty: Uncertainty | None) -> Array | None:
     """Return the standard errors (M, 3) of the markers' coordinates [m], or None without
     `uncertainty`.
     """
     if uncertainty is None:
         return None
-    segment = part.segment
-    chart = part.segment.chart
+    segment = iterate.segment
+    chart = iterate.segment.association
     row = {name: k for k, name in enumerate(uncertainty.nuisance)}
     at = np.array([row[name] for name in segment.nuisance.names], dtype=np.int64)
-    errors = np.zeros(chart.points_m.shape)
+    errors = np.zeros(chart.centre_places_m.shape)
     for m in chart.estimated:
-        indices = at[segment.markers.place_places[m]]
+        indices = at[segment.markers.coordinate_parameters[m]]
         of_phi = uncertainty.nuisance_covariance[np.ix_(indices, indices)]
         axes_m = chart.sigma_m[m] * chart.axes[m]
         errors[m] = np.sqrt(np.einsum("ik,kl,il->i", axes_m, of_phi, axes_m))

@@ -18,13 +18,13 @@ from ..errors import InputError, SimulationError
 from ..methods.continuation import first_samples
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
-from ..program.channel import Forced
-from ..program.collocation import Collocation, Part
-from ..program.segment import Segment
-from ..program.wrench import WrenchReading, without_sensors
+from ..program.channel import ReactionForces
+from ..program.collocation import Collocation, ExperimentIterate
+from ..program.segment import Transcription
+from ..program.wrench import WrenchResidual, without_grasp_sensors
 from ..recording.wrench import Frame, Wrench
 from .axes import OTHER_AXES
-from .hypothesis import Hypothesis, Trial
+from .hypothesis import Hypothesis, HypothesisTest
 
 # RMS residual in standard deviations that needs an explanation; a correct description must leave
 # less.
@@ -97,7 +97,9 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
     """Return hypotheses about wrongly described wrenches after a fit; empty if the wrenches fit."""
     if not any(map(_misses, solution.parts)):
         return []
-    with_markers = [s for s in solution.collocation.segments if s.experiment.markers.samples]
+    with_markers = [
+        s for s in solution.collocation.transcriptions if s.experiment.markers.sample_count
+    ]
     return _of_parts(
         _from_markers(solution.collocation, with_markers, ReducedSpace(max_iterations=MOST_SWEEPS))
     )
@@ -109,43 +111,46 @@ def wrench_mistakes(collocation: Collocation) -> list[Hypothesis]:
     The first samples of the experiments with markers and wrenches are fitted to their markers
     alone. Empty where that fit does not explain the markers.
     """
-    with_both = [s for s in collocation.segments if s.sensors and s.experiment.markers.samples]
+    with_both = [
+        s for s in collocation.transcriptions if s.sensors and s.experiment.markers.sample_count
+    ]
     shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
     if not shorter:
         return []
     beginning = replace(collocation, experiments=shorter)
     method = ReducedSpace(max_iterations=CHECKED_SWEEPS, tolerance=CHECKED_TOLERANCE)
-    parts = _from_markers(beginning, beginning.segments, method)
+    parts = _from_markers(beginning, beginning.transcriptions, method)
     return _of_parts([part for part in parts if _markers_misfit(part) < MARKERS_MISFIT])
 
 
-def _misses(part: Part) -> bool:
+def _misses(part: ExperimentIterate) -> bool:
     """Whether the residuals of a wrench exceed the noise."""
     # They are behind the markers.
-    pairs = zip(part.segment.sensors, part.looked[1:], strict=False)
+    pairs = zip(part.segment.sensors, part.observables[1:], strict=False)
     return any(
-        float(np.sum(sensor.residuals(looked, part.phi) ** 2)) > MISFIT**2 * sensor.present.sum()
+        float(np.sum(sensor.residuals(looked, part.phi) ** 2))
+        > MISFIT**2 * sensor.is_compared_by_component.sum()
         for sensor, looked in pairs
     )
 
 
-def _markers_misfit(part: Part) -> float:
+def _markers_misfit(part: ExperimentIterate) -> float:
     """Return the root mean square of the markers' residuals in standard deviations."""
-    residuals = part.segment.markers.residuals(part.looked[0], part.phi)
+    residuals = part.segment.markers.residuals(part.observables[0], part.phi)
     return float(
-        np.sqrt(np.sum(residuals**2) / max(1, 3 * part.segment.experiment.markers.samples))
+        np.sqrt(np.sum(residuals**2) / max(1, 3 * part.segment.experiment.markers.sample_count))
     )
 
 
 def _from_markers(
-    collocation: Collocation, seen: Sequence[Segment], method: ReducedSpace
-) -> list[Part]:
+    collocation: Collocation, seen: Sequence[Transcription], method: ReducedSpace
+) -> list[ExperimentIterate]:
     """Return experiments fitted to their markers alone, with the nuisance parameters of the
     wrenches at zero; empty if the fit fails.
     """
     if not seen:
         return []
-    without_wrenches = [without_sensors(segment.experiment) for segment in seen]
+    without_wrenches = [without_grasp_sensors(segment.experiment) for segment in seen]
     try:
         solution = method(replace(collocation, experiments=without_wrenches))
     except (InputError, SimulationError):
@@ -155,15 +160,15 @@ def _from_markers(
     for segment, part in zip(seen, solution.parts, strict=True):
         values = dict(zip(part.segment.nuisance.names, part.phi, strict=True))
         phi = np.array([values.get(name, 0.0) for name in segment.nuisance.names])
-        parts.append(Part(segment, part.q, phi, part.x))
+        parts.append(ExperimentIterate(segment, part.q, phi, part.x))
     return parts
 
 
-def _of_parts(parts: Sequence[Part]) -> list[Hypothesis]:
+def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
     """Return the hypotheses for all wrench sensors of experiments fitted to their markers alone."""
     hypotheses: list[Hypothesis] = []
     for part in parts:
-        forced = part.motion.forced
+        forced = part.motion.reactions
         for sensor in part.segment.sensors:
             hypotheses += _OneSensor(part, sensor, forced).causes()
     return hypotheses
@@ -179,23 +184,25 @@ class _OneSensor:
 
     Parameters
     ----------
-    part : Part
+    part : ExperimentIterate
         The experiment, fitted to its markers alone.
-    sensor : WrenchReading
+    sensor : WrenchResidual
         Measurement model of the sensor.
-    forced : Forced
+    forced : ReactionForces
         Predicted reaction forces.
     """
 
     scale_known: bool
 
-    def __init__(self, part: Part, sensor: WrenchReading, forced: Forced) -> None:
+    def __init__(
+        self, part: ExperimentIterate, sensor: WrenchResidual, forced: ReactionForces
+    ) -> None:
         segment = part.segment
         self.part = part
         self.sensor = sensor
         self.forced = forced
-        blind = without_sensors(segment.experiment)
-        self.scale_known = not segment.body.mass_slopes or blind.knows_a_force
+        blind = without_grasp_sensors(segment.experiment)
+        self.scale_known = not segment.body.mass_derivatives or blind.has_known_force
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
         self.given = _Trial(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
 
@@ -205,7 +212,9 @@ class _OneSensor:
         """
         misfit = self.misfit(self.given)
         if misfit > MISFIT:
-            yield from Trial(misfit, self.misfit, BETTER, least=1.0).of(self._mistakes())
+            yield from HypothesisTest(misfit, self.misfit, BETTER, smallest_misfit=1.0).accepted(
+                self._mistakes()
+            )
         else:
             yield from self._large_tare()
 
@@ -243,7 +252,7 @@ class _OneSensor:
         """
         wrench = trial.wrench
         sigmas = trial.wrench.sigmas
-        predicted = np.where(wrench.present, self._predicted(wrench), np.nan) / sigmas
+        predicted = np.where(wrench.is_measured, self._predicted(wrench), np.nan) / sigmas
         measured = np.where(np.isfinite(predicted), wrench.values / sigmas, np.nan)
         return _without_tare(measured, trial.tare), _without_tare(predicted, trial.tare)
 
@@ -254,7 +263,7 @@ class _OneSensor:
         at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
         if at not in self._known:
             phi = np.zeros(self.part.segment.nuisance.size)
-            self._known[at] = self.sensor.told(wrench).of_forced(self.forced, phi)
+            self._known[at] = self.sensor.with_samples(wrench).predict_reactions(self.forced, phi)
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:
@@ -293,9 +302,10 @@ class _OneSensor:
         )
         differences = (measured - factor * predicted)[:, TORQUES]
         is_measured = np.isfinite(differences)
-        return np.linalg.lstsq(factor * slopes[is_measured], differences[is_measured], rcond=1e-6)[
-            0
-        ]
+        solution = np.linalg.lstsq(
+            factor * slopes[is_measured], differences[is_measured], rcond=1e-6
+        )
+        return np.asarray(solution[0])
 
     def _mistakes(self) -> Iterator[Hypothesis]:
         """Yield each common mistake with the description that corrects it."""
@@ -308,7 +318,7 @@ class _OneSensor:
         values = np.array(wrench.values)
         yield hypothesis("wrench-sign", replace(wrench, values=-values))
         for what, columns in (("forces", FORCES), ("torques", TORQUES)):
-            if wrench.measured[columns].any():
+            if wrench.measured_components[columns].any():
                 yield hypothesis("wrench-sign/part", _multiplied(wrench, columns, -1.0), what=what)
         other: Frame = "grasp" if wrench.frame == "world" else "world"
         yield hypothesis("wrench-frame", replace(wrench, frame=other), other=other)
@@ -319,7 +329,7 @@ class _OneSensor:
             without = replace(wrench, values=turned)
             yield hypothesis("wrench-axes", without, ONE_OF_MANY, axes=axes)
         for what, units, columns in UNITS:
-            for unit, factor in units.items() if wrench.measured[columns].any() else ():
+            for unit, factor in units.items() if wrench.measured_components[columns].any() else ():
                 without = _multiplied(wrench, columns, factor)
                 yield hypothesis("wrench-unit", without, what=what, unit=unit, factor=factor)
         for what, columns in (
@@ -345,7 +355,7 @@ class _OneSensor:
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
             data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
             yield hypothesis("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
-        yield Hypothesis("wrench-tare", of, without=replace(self.given, tare=np.inf))
+        yield Hypothesis("wrench-tare", of, corrected=replace(self.given, tare=np.inf))
 
 
 def _without_tare(values: Array, tare: float) -> Array:

@@ -49,10 +49,10 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
-from collocation_sysid.fem.moduli import engineering as engineering_moduli
+from collocation_sysid.fem.moduli import engineering_constants as engineering_moduli
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameter, Parameters
-from collocation_sysid.recording import held_nodes
+from collocation_sysid.recording import prescribed_nodes
 from collocation_sysid.recording.nuisance import Nuisance
 from collocation_sysid.result.style import (
     BLACK,
@@ -66,10 +66,10 @@ from collocation_sysid.result.style import (
     new_figure,
 )
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.diagnostics import diagnose
-from collocation_sysid.statistics.linearised import linearised_fit
-from collocation_sysid.statistics.profile import profile_of
-from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_of
+from collocation_sysid.statistics.diagnostics import diagnose_markers
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.profile import profile_of_solution
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 mpl.rcParams["figure.dpi"] = 110
 HERE = [Path.cwd(), *Path.cwd().parents]
@@ -850,7 +850,7 @@ every = np.linspace(0, len(moved) - 1, 6).astype(int)
 for place, step in enumerate(every):
     x_mm, z_mm = 1e3 * moved[step][:, 0] + 205 * place, 1e3 * moved[step][:, 2]
     axes.triplot(x_mm, z_mm, surface, lw=0.3, color=SKY)
-    held = held_nodes(cylinder.grasps)
+    held = prescribed_nodes(cylinder.grasps)
     axes.plot(x_mm[held], z_mm[held], ".", color=BLACK, ms=3)
 sample_of = solution.collocation.substeps
 for place, step in enumerate(every):
@@ -899,7 +899,10 @@ assert rollout.rms_m < 1.1 * solution.rms_m
 
 # %%
 collocation = solution.collocation
-width, height = 3 * len(problem.bodies[0].nodes_m), collocation.segments[0].rows_per_time
+width, height = (
+    3 * len(problem.bodies[0].nodes_m),
+    collocation.transcriptions[0].constraints_per_time,
+)
 jacobian = collocation.jacobian(solution.z)
 figure, (left, right) = panels(2, height_mm=80)
 left.spy(jacobian[: 4 * height, : 4 + 4 * width], markersize=0.25, color=BLUE, aspect="auto")
@@ -910,7 +913,7 @@ for axes in (left, right):
     axes.xaxis.set_ticks_position("bottom")
     axes.grid(False)
     axes.spines[:].set_visible(True)
-rows, columns = collocation.constraints, collocation.variables
+rows, columns = collocation.constraint_count, collocation.variable_count
 print(f"{rows} × {columns}, of which {100 * jacobian.nnz / rows / columns:.2f} % are not zero")
 display(figure)
 
@@ -926,7 +929,7 @@ def fit(experiment, parameters=problem.parameters, scheme="midpoint", substeps=2
     program = cs.Collocation([experiment], parameters, scheme, substeps)
     found = ReducedSpace()(program)
     assert found.status.converged, found.message
-    return found, linearised_fit(found.collocation, found.z)
+    return found, linearise_fit(found.collocation, found.z)
 
 
 print("                    E Pa      ν      γ_r s   γ_m 1/s   RMS mm")
@@ -1033,12 +1036,12 @@ engineering = Parameters(
     )
 )
 poor_solution, poor_fit = fit(poor, engineering, substeps=1)  # its noise hides the step's error
-poor_uncertainty = uncertainty_of(poor_fit, engineering, poor_solution.q)
+poor_uncertainty = uncertainty_from_fit(poor_fit, engineering, poor_solution.q)
 table(poor_uncertainty.estimates)
 
 # %%
-profile = profile_of(poor_solution, poor_fit, poor_uncertainty, "poisson")
-print(profile.sentence)
+profile = profile_of_solution(poor_solution, poor_fit, poor_uncertainty, "poisson")
+print(profile.message)
 
 # %%
 figure, axes = panels(1, width_mm=110)
@@ -1078,11 +1081,13 @@ aware = replace(wrong, nuisance=Nuisance.none(camera_offset_m=0.005))
 offsets = {}
 for name, experiment in (("as told", wrong), ("offset estimated", aware)):
     found, local = fit(experiment)
-    bars = uncertainty_of(local, problem.parameters, found.q, ErrorModel("given", "independent"))
+    bars = uncertainty_from_fit(
+        local, problem.parameters, found.q, ErrorModel("given", "independent")
+    )
     offsets[name] = np.log(list(found.parameters.values())), np.sqrt(np.diag(bars.covariance))
     print(f"{name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(bars.estimates)
-first_unknown = 0.005 * found.collocation.parts(found.z)[0].phi[3 * tip]
+first_unknown = 0.005 * found.collocation.iterates(found.z)[0].phi[3 * tip]
 print(f"estimated offset of tip_1 along x: {1e3 * first_unknown:.2f} mm (truth 4)")
 assert abs(first_unknown - 0.004) < 0.0005
 
@@ -1109,7 +1114,7 @@ display(figure)
 off = np.abs(offsets["as told"][0] - truth_q) / offsets["as told"][1]
 assert (off[2:] > 4).all()
 _, local = fit(wrong)
-print(diagnose(local)[tip].sentence)
+print(diagnose_markers(local)[tip].sentence)
 
 # %% [markdown]
 # ## Noise with a memory
@@ -1153,7 +1158,7 @@ drifting = replace(
 )
 found, local = fit(drifting)
 for errors in ("independent", "auto"):
-    bars = uncertainty_of(local, problem.parameters, found.q, ErrorModel(errors=errors))
+    bars = uncertainty_from_fit(local, problem.parameters, found.q, ErrorModel(errors=errors))
     print(f"errors = {errors!r} → {bars.errors}")
     table(bars.estimates)
 print("\n".join(bars.notes))
@@ -1412,7 +1417,7 @@ _, local = fit(cylinder, engineering)
 (block,) = local.blocks
 alone = {}
 for i, name in enumerate(block.marker_names):
-    slopes = block.slope[:, i].reshape(-1, 4)
+    slopes = block.jacobian[:, i].reshape(-1, 4)
     for_young, for_poisson, *_ = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
     print(f"{name:9}: E to {100 * for_young:.2f} %, ν to {100 * for_poisson:.1f} %")
     alone[name] = for_young, for_poisson
@@ -1440,7 +1445,7 @@ for name, text in texts.items():
     (mine / "problem.toml").write_text(text)
     loaded = cs.Problem.read(mine / "problem.toml")
     found, local = fit(loaded.experiments[0], loaded.parameters)
-    bars = uncertainty_of(local, loaded.parameters, found.q, ErrorModel(errors="independent"))
+    bars = uncertainty_from_fit(local, loaded.parameters, found.q, ErrorModel(errors="independent"))
     spread[name] = np.sqrt(np.diag(bars.covariance))
     print(f"places {name}: RMS {1e3 * found.rms_m:.2f} mm")
     table(bars.estimates)

@@ -12,7 +12,8 @@ of a material, otherwise CasADi's; the environment variable ``COLLOCATION_SYSID_
 argument forces one.
 
 Kernels that are not in the cache are compiled at once, however small the body; for a body of fewer
-than `simd.REPAID` quadrature points without optimisation: the kernels of 48 elements, with second
+than `simd.OPTIMISED_FROM_POINTS` quadrature points without optimisation: the kernels of 48
+elements, with second
 derivatives, then take LLVM 0.5 s of processor time instead of 2.5 s. For larger bodies optimisation
 is worthwhile: 1,296 elements at 20 states are linearised in 9 ms instead of 16 ms.
 """
@@ -27,33 +28,40 @@ from typing import TYPE_CHECKING
 import casadi as ca
 
 from ...errors import InputError
-from .batch import Batch, CasadiEvaluator, Evaluator, VectorCodeError
-from .combine import Combiner, Plan, combine_natively, combine_with_numpy
-from .instances import Instances, instances_by_casadi, instances_natively
-from .threads import COMPILING, alone, at_once, available_threads, in_slices, side_by_side
+from .batch import CasadiEvaluator, Evaluator, KernelBatch, VectorCodeError
+from .combine import CombinationPlan, Combiner, combine_with_numpy, compile_combiner
+from .instances import Instances, compile_instance_evaluator, make_casadi_instance_evaluator
+from .threads import (
+    COMPILING,
+    available_threads,
+    concurrent_count,
+    map_experiments,
+    run_in_slices,
+    run_single_threaded,
+)
 
 if TYPE_CHECKING:
     from ...arrays import Index
-    from .skyline import Skyline
+    from .skyline import SkylineFactorisation
 
 __all__ = [
     "COMPILING",
     "EVALUATORS",
-    "Batch",
     "Evaluator",
     "EvaluatorChoice",
     "Instances",
+    "KernelBatch",
     "VectorCodeError",
-    "alone",
-    "at_once",
     "available_threads",
     "choose_evaluator",
-    "in_slices",
+    "concurrent_count",
     "make_combiner",
     "make_evaluator",
-    "make_instances",
+    "make_instance_evaluator",
     "make_skyline",
-    "side_by_side",
+    "map_experiments",
+    "run_in_slices",
+    "run_single_threaded",
 ]
 
 
@@ -74,14 +82,14 @@ def choose_evaluator(choice: str = "auto") -> str:
     InputError
         For an unknown choice, or "simd" without llvmlite.
     """
-    choice = _asked_for(choice)
+    choice = _requested_evaluator(choice)
     has_llvm = find_spec("llvmlite") is not None
     if choice == "simd" and not has_llvm:
         raise InputError("evaluator 'simd' needs llvmlite: pip install llvmlite, or use 'casadi'")
     return "casadi" if choice == "casadi" or not has_llvm else "simd"
 
 
-def _asked_for(choice: str) -> str:
+def _requested_evaluator(choice: str) -> str:
     """Return the choice, or for "auto" that of the environment variable.
 
     An `InputError` if unknown.
@@ -93,12 +101,12 @@ def _asked_for(choice: str) -> str:
     return choice
 
 
-def make_evaluator(batch: Batch, name: str) -> Evaluator:
+def make_evaluator(batch: KernelBatch, name: str) -> Evaluator:
     """Build the evaluator of a batch.
 
     Parameters
     ----------
-    batch : Batch
+    batch : KernelBatch
     name : {"simd", "casadi"}
 
     Raises
@@ -136,7 +144,7 @@ class EvaluatorChoice:
     def __init__(self, choice: str = "auto") -> None:
         self.name = choose_evaluator(choice)
         self.notes: tuple[str, ...] = ()
-        self._may_yield = _asked_for(choice) == "auto"
+        self._may_yield = _requested_evaluator(choice) == "auto"
 
     def check(self, function: ca.Function) -> None:
         """Check, without compiling, whether the evaluator supports all operations of a function.
@@ -150,14 +158,14 @@ class EvaluatorChoice:
         """
         if self.name == "casadi":
             return
-        from .instructions import check_operations
+        from .instructions import require_supported_operations
 
         try:
-            check_operations(function)
+            require_supported_operations(function)
         except VectorCodeError as error:
-            self._yield_to_casadi(error)
+            self._fall_back_to_casadi(error)
 
-    def make(self, batch: Batch) -> Evaluator:
+    def make_evaluator(self, batch: KernelBatch) -> Evaluator:
         """Build the evaluator of a batch; fall back to CasADi's if the kernel cannot be compiled.
 
         Raises
@@ -168,10 +176,10 @@ class EvaluatorChoice:
         try:
             return make_evaluator(batch, self.name)
         except VectorCodeError as error:
-            self._yield_to_casadi(error)
+            self._fall_back_to_casadi(error)
             return make_evaluator(batch, self.name)
 
-    def _yield_to_casadi(self, error: VectorCodeError) -> None:
+    def _fall_back_to_casadi(self, error: VectorCodeError) -> None:
         """Change to CasADi's evaluator with a note, or raise the error if "simd" was requested by
         name.
         """
@@ -185,7 +193,7 @@ class EvaluatorChoice:
         )
 
 
-def make_instances(function: ca.Function, compiled: bool) -> Instances:
+def make_instance_evaluator(function: ca.Function, compiled: bool) -> Instances:
     """Return an evaluator of a function at many instances.
 
     Parameters
@@ -197,21 +205,23 @@ def make_instances(function: ca.Function, compiled: bool) -> Instances:
     if compiled and choose_evaluator() == "simd":
         # What llvmlite raises where it cannot compile, and what there is no instruction for.
         with suppress(RuntimeError, VectorCodeError):
-            return instances_natively(function)
-    return instances_by_casadi(function)
+            return compile_instance_evaluator(function)
+    return make_casadi_instance_evaluator(function)
 
 
-def make_combiner(plan: Plan) -> Combiner:
+def make_combiner(plan: CombinationPlan) -> Combiner:
     """Return the loop that fills sparse values according to a plan, compiled if llvmlite can."""
     if find_spec("llvmlite"):
         try:
-            return combine_natively(plan)
+            return compile_combiner(plan)
         except RuntimeError:  # what llvmlite raises where it cannot compile
             pass
     return combine_with_numpy(plan)
 
 
-def make_skyline(size: int, rows: Index, columns: Index, source: Index) -> Skyline | None:
+def make_skyline(
+    size: int, rows: Index, columns: Index, source: Index
+) -> SkylineFactorisation | None:
     """Return the compiled factorisation of a skyline; None if llvmlite cannot compile it.
 
     Parameters
@@ -219,13 +229,13 @@ def make_skyline(size: int, rows: Index, columns: Index, source: Index) -> Skyli
     size : int
         Number of rows.
     rows, columns, source : (e,) int
-        See `skyline.Skyline`.
+        See `skyline.SkylineFactorisation`.
     """
     if not find_spec("llvmlite"):
         return None
-    from .skyline import Skyline
+    from .skyline import SkylineFactorisation
 
     try:
-        return Skyline(size, rows, columns, source)
+        return SkylineFactorisation(size, rows, columns, source)
     except RuntimeError:
         return None

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import InputError
-from ..kernel import PointKernel
+from ..kernel import ElementKernel
 from ..pattern import dofs_of
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class KernelBatch:
     """Kernel on a mesh, and the positions at which its outputs are summed.
 
     Attributes
     ----------
-    kernel : PointKernel
+    kernel : ElementKernel
     cells : (E, nodes)
         Node indices.
     geometry : (E, q, 3·nodes + 1)
@@ -31,16 +31,16 @@ class Batch:
         Position of every output entry in the result row of its time step.
     width : int
         Length of that row.
-    carried : (E, q, m), optional
+    data_columns : (E, q, m), optional
         Columns of the data of each point in the row of data of a time step.
     """
 
-    kernel: PointKernel
+    kernel: ElementKernel
     cells: NDArray[np.int64]
     geometry: Array
     destinations: NDArray[np.int64]
     width: int
-    carried: NDArray[np.int64] | None = None
+    data_columns: NDArray[np.int64] | None = None
 
 
 class Evaluator(Protocol):
@@ -55,7 +55,7 @@ class Evaluator(Protocol):
         out: Array,
         threads: int,
         add: bool = False,
-        carried: Array | None = None,
+        data_of_points: Array | None = None,
     ) -> None:
         """Overwrite `out`, or add to it.
 
@@ -71,7 +71,7 @@ class Evaluator(Protocol):
             Number of threads.
         add : bool
             Whether to add to `out`.
-        carried : (T, any) or (1, any), optional
+        data_of_points : (T, any) or (1, any), optional
             Data of the points, (1, any) if they are equal at all times.
         """
         ...
@@ -82,14 +82,14 @@ class VectorCodeError(InputError):
 
 
 class CasadiEvaluator:
-    """Evaluator of a `Batch` by CasADi's virtual machine: slower, but always available.
+    """Evaluator of a `KernelBatch` by CasADi's virtual machine: slower, but always available.
 
     Parameters
     ----------
-    batch : Batch
+    batch : KernelBatch
     """
 
-    def __init__(self, batch: Batch) -> None:
+    def __init__(self, batch: KernelBatch) -> None:
         count, points, size = batch.geometry.shape
         kernel = batch.kernel
         self._mapped = kernel.element_function(points).map(
@@ -98,8 +98,8 @@ class CasadiEvaluator:
         self._geometry = np.asfortranarray(batch.geometry.reshape(count * points, size).T)
         self._dofs = dofs_of(batch.cells).T
         self._carried = None
-        if batch.carried is not None:
-            self._carried = batch.carried.reshape(count * points, -1).T
+        if batch.data_columns is not None:
+            self._carried = batch.data_columns.reshape(count * points, -1).T
         destinations = batch.destinations.ravel()
         self._sum = sp.csr_array(
             (np.ones(len(destinations)), (destinations, np.arange(len(destinations)))),
@@ -113,13 +113,13 @@ class CasadiEvaluator:
         out: Array,
         threads: int,
         add: bool = False,
-        carried: Array | None = None,
+        data_of_points: Array | None = None,
     ) -> None:
         """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         for t in range(len(out)):
             inputs = [field[t][self._dofs] for field in fields]
-            if self._carried is not None and carried is not None:
-                point_data = [carried[t if len(carried) > 1 else 0][self._carried]]
+            if self._carried is not None and data_of_points is not None:
+                point_data = [data_of_points[t if len(data_of_points) > 1 else 0][self._carried]]
             else:
                 point_data = []
             outputs = self._mapped.call([*inputs, self._geometry, theta, *point_data])

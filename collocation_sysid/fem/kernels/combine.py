@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...arrays import Array, Index
 
 
-class Plan(Protocol):
+class CombinationPlan(Protocol):
     """Plan of the combinations, see `program.block_band.CombinePlan`."""
 
     @property
@@ -46,7 +46,7 @@ class Plan(Protocol):
 Combiner = Callable[[int, int, Array, Array, Array], None]
 
 
-def combine_with_numpy(plan: Plan) -> Combiner:
+def combine_with_numpy(plan: CombinationPlan) -> Combiner:
     """Return the reference combiner, one indexed NumPy statement for each task."""
 
     def combine(start: int, stop: int, a: Array, b: Array, values: Array) -> None:
@@ -68,12 +68,12 @@ def combine_with_numpy(plan: Plan) -> Combiner:
     return combine
 
 
-def combine_natively(plan: Plan) -> Combiner:
+def compile_combiner(plan: CombinationPlan) -> Combiner:
     """Return a compiled combiner with the same arguments and result as `combine_with_numpy`."""
-    from .jit import NativeCode, compiled
+    from .jit import NativeCode, compile_function
 
     signature = (*[ctypes.c_int64] * 3, *[ctypes.c_void_p] * 7)
-    run = compiled(NativeCode("combine", "combine", signature, _emit))
+    run = compile_function(NativeCode("combine", "combine", signature, _emit))
     constants = [
         array.ctypes.data for array in (plan.tasks, plan.coefficients, plan.targets, plan.sources)
     ]
@@ -102,7 +102,7 @@ def _emit() -> Any:
     """Return the LLVM module of the compiled loop over tasks."""
     from llvmlite import ir
 
-    from .jit import DOUBLES, I32S, I64, counting
+    from .jit import DOUBLES, I32S, I64, for_range
 
     module = ir.Module()
     i64s = I64.as_pointer()
@@ -114,7 +114,7 @@ def _emit() -> Any:
     for pointer in function.args[3:]:
         pointer.add_attribute("noalias")
     builder: Any = ir.IRBuilder(function.append_basic_block("entry"))
-    with counting(builder, start, stop, "task") as task:
+    with for_range(builder, start, stop, "task") as task:
         first = builder.mul(task, I64(5))
         out, begin, length, row, add = (
             builder.load(builder.gep(tasks, [builder.add(first, I64(k))])) for k in range(5)
@@ -129,7 +129,7 @@ def _emit() -> Any:
         targets_here, sources_here = (builder.gep(m, [begin]) for m in (targets, sources))
 
         def loop(accumulate: bool) -> None:
-            with counting(builder, I64(0), length, "entry") as i:
+            with for_range(builder, I64(0), length, "entry") as i:
                 source = builder.sext(builder.load(builder.gep(sources_here, [i])), I64)
                 target = builder.sext(builder.load(builder.gep(targets_here, [i])), I64)
                 new = builder.fadd(

@@ -22,7 +22,7 @@ BLOCK = 1024
 Instances = Callable[[list[Array]], list[Array]]
 
 
-def instances_by_casadi(function: ca.Function) -> Instances:
+def make_casadi_instance_evaluator(function: ca.Function) -> Instances:
     """Return the reference evaluator: the function mapped over instances by CasADi."""
     mapped: dict[int, ca.Function] = {}
 
@@ -51,7 +51,7 @@ def instances_by_casadi(function: ca.Function) -> Instances:
     return evaluate
 
 
-def instances_natively(function: ca.Function) -> Instances:
+def compile_instance_evaluator(function: ca.Function) -> Instances:
     """Return an evaluator in vector code, each lane of which is one instance.
 
     Raises
@@ -59,15 +59,15 @@ def instances_natively(function: ca.Function) -> Instances:
     VectorCodeError
         For operations that vector code does not support.
     """
-    from .instructions import check_operations
-    from .jit import NativeCode, address, compiled, vector_lanes
+    from .instructions import require_supported_operations
+    from .jit import NativeCode, address, compile_function, vector_lanes
 
-    check_operations(function)
+    require_supported_operations(function)
     lanes = vector_lanes()
     arrays = function.n_in() + function.n_out()
     key = f"instances {lanes} {hashlib.sha256(function.serialize().encode()).hexdigest()}"
     signature = (ctypes.c_int64, *[ctypes.c_void_p] * arrays)
-    run = compiled(NativeCode("instances", key, signature, lambda: _emit(function, lanes)))
+    run = compile_function(NativeCode("instances", key, signature, lambda: _emit(function, lanes)))
 
     def evaluate(inputs: list[Array]) -> list[Array]:
         count = inputs[0].shape[1]
@@ -90,8 +90,8 @@ def _emit(function: ca.Function, lanes: int) -> Any:
     """
     from llvmlite import ir
 
-    from .instructions import function_values
-    from .jit import DOUBLE, DOUBLES, I64, Builder, Value, counting
+    from .instructions import emit_function
+    from .jit import DOUBLE, DOUBLES, I64, Builder, Value, for_range
 
     module = ir.Module()
     vector = ir.VectorType(DOUBLE, lanes)
@@ -102,7 +102,7 @@ def _emit(function: ca.Function, lanes: int) -> Any:
     for place in places:
         place.add_attribute("noalias")
     b: Builder = ir.IRBuilder(run.append_basic_block("entry"))
-    with counting(b, I64(0), b.udiv(count, I64(lanes)), "block") as block:
+    with for_range(b, I64(0), b.udiv(count, I64(lanes)), "block") as block:
         first = b.mul(block, I64(lanes))
 
         def pointer(array: int, entry: int) -> Value:
@@ -112,7 +112,7 @@ def _emit(function: ca.Function, lanes: int) -> Any:
         def read(array: int, entry: int) -> Value:
             return b.load(pointer(array, entry), align=8)
 
-        for output, entry, value in function_values(b, function, vector, read):
+        for output, entry, value in emit_function(b, function, vector, read):
             b.store(value, pointer(function.n_in() + output, entry), align=8)
     b.ret_void()
     return module

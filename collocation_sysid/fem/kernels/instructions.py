@@ -56,7 +56,7 @@ FUSE = ("contract",)  # a product and a sum may become one instruction
 Emit = Callable[..., Value]  # of the builder and one or two operands
 
 
-def function_values(
+def emit_function(
     builder: Builder,
     function: ca.Function,
     vector: ir.VectorType,
@@ -85,7 +85,7 @@ def function_values(
     VectorCodeError
         For an operation that vector code does not support.
     """
-    check_operations(function)
+    require_supported_operations(function)
     work: dict[int, Value] = {}
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
@@ -101,7 +101,7 @@ def function_values(
             work[target[0]] = OPERATIONS[operation](builder, *(work[i] for i in source))
 
 
-def check_operations(function: ca.Function) -> None:
+def require_supported_operations(function: ca.Function) -> None:
     """Raise a `VectorCodeError` with their names if a function has operations without
     instructions.
     """
@@ -127,22 +127,22 @@ def _constant(vector: ir.VectorType, value: float) -> Value:
     return ir.Constant(vector, [float(value)] * vector.count)
 
 
-def _intrinsic(name: str) -> Emit:
+def _emit_intrinsic(name: str) -> Emit:
     """Return the emitter of a vector intrinsic of LLVM."""
 
     def emit(b: Builder, *operands: Value) -> Value:
         vector = operands[0].type
         full_name = f"llvm.{name}.v{vector.count}f64"
-        return b.call(_declared(b.module, full_name, vector, len(operands)), operands)
+        return b.call(_declare(b.module, full_name, vector, len(operands)), operands)
 
     return emit
 
 
-def _library(name: str) -> Emit:
+def _emit_library_call(name: str) -> Emit:
     """Return the emitter of a function of the C library, called lane by lane."""
 
     def emit(b: Builder, *operands: Value) -> Value:
-        function = _declared(b.module, name, DOUBLE, len(operands))
+        function = _declare(b.module, name, DOUBLE, len(operands))
         # Otherwise a call may set errno, and the compiler keeps even those that are repeated.
         function.attributes.add("readnone")
         result: Value = ir.Constant(operands[0].type, ir.Undefined)
@@ -154,13 +154,13 @@ def _library(name: str) -> Emit:
     return emit
 
 
-def _declared(module: ir.Module, name: str, kind: ir.Type, operands: int) -> ir.Function:
+def _declare(module: ir.Module, name: str, kind: ir.Type, operands: int) -> ir.Function:
     """Return a function of the module, declared if necessary."""
     declared = module.globals.get(name)
     return declared or ir.Function(module, ir.FunctionType(kind, [kind] * operands), name)
 
 
-def _compared(sign: str) -> Emit:
+def _emit_comparison(sign: str) -> Emit:
     """Return the emitter of a comparison, with the values 1 and 0."""
 
     def emit(b: Builder, x: Value, y: Value) -> Value:
@@ -190,7 +190,7 @@ def _sign(b: Builder, x: Value) -> Value:
 
 def _erfinv(b: Builder, x: Value) -> Value:
     """Emit the inverse error function."""
-    ((_, _, value),) = function_values(b, ERFINV, x.type, lambda *_: x)
+    ((_, _, value),) = emit_function(b, ERFINV, x.type, lambda *_: x)
     return value
 
 
@@ -246,7 +246,7 @@ OPERATIONS: dict[int, Emit] = {
     ca.OP_IF_ELSE_ZERO: lambda b, x, y: b.select(_is_true(b, x), y, _constant(y.type, 0.0)),
     ca.OP_SIGN: _sign,
     ca.OP_ERFINV: _erfinv,
-    **{operation: _compared(sign) for operation, sign in COMPARISONS.items()},
-    **{operation: _intrinsic(name) for operation, name in INTRINSICS.items()},
-    **{operation: _library(name) for operation, name in LIBRARY.items()},
+    **{operation: _emit_comparison(sign) for operation, sign in COMPARISONS.items()},
+    **{operation: _emit_intrinsic(name) for operation, name in INTRINSICS.items()},
+    **{operation: _emit_library_call(name) for operation, name in LIBRARY.items()},
 }

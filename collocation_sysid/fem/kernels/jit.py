@@ -35,11 +35,11 @@ I32S = I32.as_pointer()
 Builder = Value = Any  # llvmlite is not annotated, and what is inferred of it is wrong
 
 # Number of compiled functions kept in memory for further bodies.
-KEPT = 128
+FUNCTIONS_IN_MEMORY = 128
 
 
 @contextmanager
-def counting(builder: Builder, start: Value, stop: Value, name: str) -> Iterator[Value]:
+def for_range(builder: Builder, start: Value, stop: Value, name: str) -> Iterator[Value]:
     """Emit a loop over start ≤ i < stop; the context gives i."""
     before = builder.block
     head = builder.append_basic_block(f"{name}.head")
@@ -113,7 +113,7 @@ class NativeCode:
     signature : tuple of ctypes types
     build : callable
         Returns the LLVM module that defines `name`; called only if nothing is cached.
-    quickly : bool
+    is_unoptimised : bool
         Whether to compile without optimisation, in a fifth of the time; the function then takes up
         to twice as long.
     """
@@ -122,11 +122,11 @@ class NativeCode:
     key: str
     signature: tuple[type, ...]
     build: Callable[[], ir.Module] = field(compare=False)
-    quickly: bool = False
+    is_unoptimised: bool = False
 
 
-@lru_cache(KEPT)
-def compiled(code: NativeCode) -> CompiledFunction:
+@lru_cache(FUNCTIONS_IN_MEMORY)
+def compile_function(code: NativeCode) -> CompiledFunction:
     """Return the compiled function; the latest 128 are kept and shared by all bodies."""
     return CompiledFunction(code)
 
@@ -140,9 +140,9 @@ class CompiledFunction:
     """
 
     def __init__(self, code: NativeCode) -> None:
-        machine = _target_machine(code.quickly)
+        machine = _target_machine(code.is_unoptimised)
         self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        self._engine.add_object_file(llvm.ObjectFileRef.from_data(_cached_object(code, machine)))
+        self._engine.add_object_file(llvm.ObjectFileRef.from_data(_object_code(code, machine)))
         self._engine.finalize_object()
         address = self._engine.get_function_address(code.name)
         self._call = ctypes.CFUNCTYPE(None, *code.signature)(address)
@@ -160,20 +160,20 @@ def address(array: NDArray[Any]) -> int:
         return array.ctypes.data
 
 
-def _cached_object(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
+def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
     """Return the object code from the cache, or compile and store it."""
     host = f"{llvmlite_version} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} "
     host += llvm.get_host_cpu_features().flatten()
-    cache_key = f"{host}\n{_generation()}\n{code.key}" + "\nquickly" * code.quickly
-    code_bytes = load(cache_key)
+    cache_key = f"{host}\n{_source_digest()}\n{code.key}" + "\nquickly" * code.is_unoptimised
+    code_bytes = load_object(cache_key)
     if code_bytes is None:
-        code_bytes = _compile(code.build(), machine, code.quickly)
-        store(cache_key, code_bytes)
+        code_bytes = _compile(code.build(), machine, code.is_unoptimised)
+        store_object(cache_key, code_bytes)
     return code_bytes
 
 
 @cache
-def _generation() -> str:
+def _source_digest() -> str:
     """Return a digest of the source files of this folder, so that changes invalidate cached
     kernels.
     """
@@ -207,13 +207,13 @@ def cache_folder() -> Path:
     return Path(override) if override else user_cache_path("collocation_sysid")
 
 
-def load(key: str) -> bytes | None:
+def load_object(key: str) -> bytes | None:
     """Return the code stored for a key; None if there is none that can be trusted."""
     folder = cache_folder()
     if not folder.is_dir() or not _is_trusted(folder):
         return None
     try:
-        content = _read_own(folder / _file_name(key))
+        content = _read_private_file(folder / _file_name(key))
     except OSError:
         return None
     digest = content[:DIGEST_BYTES]
@@ -221,7 +221,7 @@ def load(key: str) -> bytes | None:
     return code if digest == _digest(key, code) else None
 
 
-def store(key: str, code: bytes) -> None:
+def store_object(key: str, code: bytes) -> None:
     """Store code in the cache; do nothing if the folder cannot be written or trusted."""
     folder = cache_folder()
     with suppress(OSError):
@@ -246,7 +246,7 @@ def _digest(key: str, code: bytes) -> bytes:
     return hashlib.sha256(hashlib.sha256(key.encode()).digest() + code).digest()
 
 
-def _read_own(path: Path) -> bytes:
+def _read_private_file(path: Path) -> bytes:
     """Return the content of a plain file that belongs to the user alone.
 
     An OSError for any other.
@@ -254,7 +254,7 @@ def _read_own(path: Path) -> bytes:
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     with os.fdopen(os.open(path, flags | getattr(os, "O_BINARY", 0)), "rb") as file:
         status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode) or _fault(status):
+        if not stat.S_ISREG(status.st_mode) or _ownership_fault(status):
             raise OSError(f"{path} is not a file of this user alone")
         return file.read()
 
@@ -263,12 +263,12 @@ def _is_trusted(folder: Path) -> bool:
     """Return whether nobody else can write in a folder or replace it; warn if somebody can."""
     fault = _folder_fault(folder.resolve())
     if fault is not None:
-        _warn(fault)
+        _warn_once(fault)
     return fault is None
 
 
 @cache
-def _warn(fault: str) -> None:
+def _warn_once(fault: str) -> None:
     """Warn once that compiled kernels are not stored."""
     warnings.warn(
         f"compiled kernels are not kept: {fault}; set COLLOCATION_SYSID_CACHE to a folder of "
@@ -280,28 +280,28 @@ def _warn(fault: str) -> None:
 
 def _folder_fault(folder: Path) -> str | None:
     """Return why others could put code in a folder, or replace the folder; None if they cannot."""
-    if (fault := _fault(folder.stat())) is not None:
+    if (fault := _ownership_fault(folder.stat())) is not None:
         return f"{folder} {fault}"
     for parent in folder.parents:
         status = parent.stat()
         # In a sticky folder, such as /tmp, nobody can move what is another's.
-        if (fault := _fault(status, or_root=True)) and not status.st_mode & stat.S_ISVTX:
+        if (fault := _ownership_fault(status, or_root=True)) and not status.st_mode & stat.S_ISVTX:
             return f"{parent}, which {folder} is in, {fault}"
     return None
 
 
-def _fault(found: os.stat_result, or_root: bool = False) -> str | None:
+def _ownership_fault(status: os.stat_result, or_root: bool = False) -> str | None:
     """Return why a file or folder is not the user's alone; None if it is.
 
     Parameters
     ----------
-    found : os.stat_result
+    status : os.stat_result
     or_root : bool
         Whether it may belong to root, too.
     """
     if not hasattr(os, "getuid"):
         return None  # Windows: the profile's access list keeps others out
     owners = {os.getuid(), 0} if or_root else {os.getuid()}
-    if found.st_uid not in owners:
+    if status.st_uid not in owners:
         return "belongs to another user"
-    return "can be written by others" if found.st_mode & OTHERS_WRITE else None
+    return "can be written by others" if status.st_mode & OTHERS_WRITE else None

@@ -19,9 +19,9 @@ import numpy as np
 from llvmlite import ir
 from numpy.typing import NDArray
 
-from ..kernel import Contraction, Phase, PointKernel
-from .batch import Array, Batch
-from .instructions import FUSE, function_values
+from ..kernel import Contraction, ElementKernel, Phase
+from .batch import Array, KernelBatch
+from .instructions import FUSE, emit_function
 from .jit import (
     DOUBLE,
     DOUBLES,
@@ -32,25 +32,25 @@ from .jit import (
     NativeCode,
     Value,
     address,
-    compiled,
-    counting,
+    compile_function,
+    for_range,
     vector_lanes,
 )
-from .threads import in_slices
+from .threads import run_in_slices
 
 # Number of quadrature points from which optimised code saves more time than its compilation takes.
-REPAID = 200
+OPTIMISED_FROM_POINTS = 200
 
 
 class SimdEvaluator:
-    """Evaluator of a `Batch` by native vector code, with time steps distributed over threads.
+    """Evaluator of a `KernelBatch` by native vector code, with time steps distributed over threads.
 
     Parameters
     ----------
-    batch : Batch
+    batch : KernelBatch
     """
 
-    def __init__(self, batch: Batch) -> None:
+    def __init__(self, batch: KernelBatch) -> None:
         lanes = vector_lanes()
         kernel = batch.kernel
         count = len(batch.cells)
@@ -70,19 +70,19 @@ class SimdEvaluator:
         self._points = batch.geometry.shape[1]
         self._fields = len(kernel.fields)
         self._carried = None
-        if batch.carried is not None:
-            self._carried = _block_major(batch.carried[lane_element], by_block)
+        if batch.data_columns is not None:
+            self._carried = _block_major(batch.data_columns[lane_element], by_block)
         tables = self._geometry, self._nodes, self._destinations
         self._tables = [address(table) for table in tables]
-        key = f"{lanes} {self._points} {hashlib.sha256(kernel.source.encode()).hexdigest()}"
+        key = f"{lanes} {self._points} {hashlib.sha256(kernel.serialized.encode()).hexdigest()}"
         # What points carry adds the length of its row, its places and itself.
         signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
-        if kernel.carried:
+        if kernel.point_data_count:
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         points = self._points
         build = partial(_emit_kernel, kernel, points, lanes)
-        quickly = count * points < REPAID
-        self._run = compiled(NativeCode("run", key, tuple(signature), build, quickly))
+        quickly = count * points < OPTIMISED_FROM_POINTS
+        self._run = compile_function(NativeCode("run", key, tuple(signature), build, quickly))
 
     def __call__(
         self,
@@ -91,14 +91,14 @@ class SimdEvaluator:
         out: Array,
         threads: int,
         add: bool = False,
-        carried: Array | None = None,
+        data_of_points: Array | None = None,
     ) -> None:
         """Sum the kernel over elements and points into `out` (T, width); see `Evaluator`."""
         addresses = [address(field) for field in fields]
         constants = [*self._tables, address(theta), address(out)]
-        if self._carried is not None and carried is not None:
-            length = carried.shape[1] if len(carried) > 1 else 0
-            constants += [length, address(self._carried), address(carried)]
+        if self._carried is not None and data_of_points is not None:
+            length = data_of_points.shape[1] if len(data_of_points) > 1 else 0
+            constants += [length, address(self._carried), address(data_of_points)]
         stride = fields[0].shape[1]
 
         def run(start: int, stop: int) -> None:
@@ -113,12 +113,12 @@ class SimdEvaluator:
                 *constants,
             )
 
-        in_slices(run, len(out), threads)
+        run_in_slices(run, len(out), threads)
 
 
-def _emit_kernel(kernel: PointKernel, points: int, lanes: int) -> ir.Module:
-    """Return the LLVM module of a kernel; see `_Emitter` for the arguments."""
-    return _Emitter(kernel, points, lanes).emit()
+def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:
+    """Return the LLVM module of a kernel; see `_SkylineEmitter` for the arguments."""
+    return _KernelEmitter(kernel, points, lanes).emit()
 
 
 def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray[np.int32]:
@@ -127,7 +127,7 @@ def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray
     return np.ascontiguousarray(np.swapaxes(blocked, 1, 2), dtype=np.int32)
 
 
-class _Layout:
+class _PhaseLayout:
     """Offsets of the pieces of a phase in their buffer, and of its outputs in the totals.
 
     Parameters
@@ -150,7 +150,7 @@ class _Layout:
         ]
         self.outputs = (first + np.cumsum([0, *outputs])).tolist()
 
-    def entries(self, first: int, how: Contraction, step: int) -> list[int]:
+    def output_offsets(self, first: int, how: Contraction, step: int) -> list[int]:
         """Return the offsets in the totals of outputs with a contraction, in steps of `step`
         entries.
 
@@ -170,7 +170,7 @@ class _Layout:
         ]
 
 
-class _Emitter:
+class _KernelEmitter:
     """Emitter of ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out,
     …)``.
 
@@ -179,14 +179,14 @@ class _Emitter:
 
     Parameters
     ----------
-    kernel : PointKernel
+    kernel : ElementKernel
     points : int
         Quadrature points of an element.
     lanes : int
         Number W of elements in a block.
     """
 
-    def __init__(self, kernel: PointKernel, points: int, lanes: int) -> None:
+    def __init__(self, kernel: ElementKernel, points: int, lanes: int) -> None:
         self.fields = len(kernel.fields)
         self.points = points
         self.lanes = lanes
@@ -194,20 +194,22 @@ class _Emitter:
         self.nodes = kernel.phases[0].nodes
         self.size = 3 * self.nodes
         # The kernel's own outputs come first among the totals.
-        self.last = _Layout(kernel.phases[-1], 0)
-        self.earlier: list[_Layout] = []
-        for phase in kernel.earlier:
+        self.last = _PhaseLayout(kernel.phases[-1], 0)
+        self.earlier: list[_PhaseLayout] = []
+        for phase in kernel.previous_phases:
             before = self.earlier[-1] if self.earlier else self.last
-            self.earlier.append(_Layout(phase, before.outputs[-1]))
+            self.earlier.append(_PhaseLayout(phase, before.outputs[-1]))
         # What they hold for the coupling, and for later phases.
         self.own = len(kernel.contractions)
         shared = [(phase, 0) for phase in self.earlier] + [(self.last, self.own)]
-        self.sums = [at for phase, k in shared for at in phase.entries(k, "none", 1)]
-        self.vectors = [at for phase, k in shared for at in phase.entries(k, "nodes", self.size)]
+        self.sums = [at for phase, k in shared for at in phase.output_offsets(k, "none", 1)]
+        self.vectors = [
+            at for phase, k in shared for at in phase.output_offsets(k, "nodes", self.size)
+        ]
         self.coupling = kernel.coupling
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
-        self.carried = kernel.carried
+        self.carried = kernel.point_data_count
         if self.carried:
             constants += [I64, I32S, DOUBLES]
         kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)
@@ -234,22 +236,22 @@ class _Emitter:
         combined = self._buffer(len(self.vectors) * self.size, "combined")
         geometry_size, theta_size = (self.last.sx.nnz_in(self.fields + k) for k in range(2))
         parameters = [self._splat(b.load(b.gep(theta, [I64(k)]))) for k in range(theta_size)]
-        with counting(b, t0, t1, "t") as t:
+        with for_range(b, t0, t1, "t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
             out_row = b.gep(out, [b.mul(t, out_stride)])
             with b.if_then(b.icmp_signed("==", add, I64(0))):
                 self._clear(out_row, out_stride)
-            with counting(b, I64(0), blocks, "block") as block:
+            with for_range(b, I64(0), blocks, "block") as block:
                 address = b.gep(nodes, [b.mul(block, I64(self.size // 3 * self.lanes))])
                 self._gather(rows, address, gathered)
-                with counting(b, I64(0), I64(total), "zero") as k:
+                with for_range(b, I64(0), I64(total), "zero") as k:
                     self._store(self.vector(None), totals, k)
                 first = b.mul(block, I64(self.points))
                 for phase in phases:
-                    with counting(b, first, b.add(first, I64(self.points)), "point") as point:
+                    with for_range(b, first, b.add(first, I64(self.points)), "point") as point:
                         address = b.gep(geometry, [b.mul(point, I64(geometry_size * self.lanes))])
-                        point_data = [self._carried(memory, t, point)] if memory else []
-                        self._pieces(
+                        point_data = [self._load_point_data(memory, t, point)] if memory else []
+                        self._evaluate_pieces(
                             phase, [*gathered, address, parameters, *point_data, totals], pieces
                         )
                         self._contract(phase, pieces, address, half, totals)
@@ -261,7 +263,7 @@ class _Emitter:
                 # Not left to the product with the volume, which makes NaN of what is infinite.
                 is_element = b.fcmp_ordered("!=", volume, zero)
                 targets = b.gep(destinations, [b.mul(block, I64(outputs * self.lanes))])
-                with counting(b, I64(0), I64(outputs), "output") as k:
+                with for_range(b, I64(0), I64(outputs), "output") as k:
                     value = b.select(is_element, self._load(totals, k), zero)
                     self._scatter(value, targets, k, out_row)
         b.ret_void()
@@ -308,7 +310,7 @@ class _Emitter:
     def _gather(self, rows: list, nodes: Value, gathered: list) -> None:
         """Load the three coordinates of every node of W elements, field by field."""
         b = self.builder
-        with counting(b, I64(0), I64(self.size // 3), "node") as node:
+        with for_range(b, I64(0), I64(self.size // 3), "node") as node:
             first = b.mul(node, I64(self.lanes))
             lanes = [
                 b.sext(b.load(b.gep(nodes, [b.add(first, I64(lane))])), I64)
@@ -331,7 +333,7 @@ class _Emitter:
             address = b.gep(row, [target])
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
-    def _carried(self, memory: list, t: Value, point: Value) -> list:
+    def _load_point_data(self, memory: list, t: Value, point: Value) -> list:
         """Return the data of a quadrature point of W elements at time step t."""
         b = self.builder
         length, places, rows = memory
@@ -347,7 +349,7 @@ class _Emitter:
             values.append(value)
         return values
 
-    def _pieces(self, phase: _Layout, inputs: list, pieces: Value) -> None:
+    def _evaluate_pieces(self, phase: _PhaseLayout, inputs: list, pieces: Value) -> None:
         """Evaluate the pieces of one quadrature point and store them."""
 
         def read(slot: int, entry: int) -> Value:
@@ -356,39 +358,43 @@ class _Emitter:
             place = self.sums[entry] if slot == len(inputs) - 1 else entry
             return self._load(inputs[slot], I64(place))
 
-        for piece, entry, value in function_values(self.builder, phase.sx, self.vector, read):
+        for piece, entry, value in emit_function(self.builder, phase.sx, self.vector, read):
             self._store(value, pieces, I64(phase.pieces[piece] + entry))
 
     def _contract(
-        self, phase: _Layout, pieces: Value, geometry: Value, half: Value, totals: Value
+        self, phase: _PhaseLayout, pieces: Value, geometry: Value, half: Value, totals: Value
     ) -> None:
         """Add the pieces of one quadrature point to the totals, contracted as in
         `kernel._contracted`.
         """
         b = self.builder
         for k, how in enumerate(phase.contractions):
-            piece_base = self._at(pieces, phase.pieces[k])
-            output_base = self._at(totals, phase.outputs[k])
+            piece_base = self._offset_pointer(pieces, phase.pieces[k])
+            output_base = self._offset_pointer(totals, phase.outputs[k])
             length = phase.lengths[k]
             if how == "none":
-                with counting(b, I64(0), I64(length), "entry") as entry:
-                    self._add(self._load(piece_base, entry), output_base, entry)
+                with for_range(b, I64(0), I64(length), "entry") as entry:
+                    self._accumulate(self._load(piece_base, entry), output_base, entry)
             elif how == "nodes":
-                with counting(b, I64(0), I64(self.nodes), "node") as node:
+                with for_range(b, I64(0), I64(self.nodes), "node") as node:
                     values = self._at_node(piece_base, length // 9, self._gradient(geometry, node))
                     for column, row, value in values:
                         first = I64(column * self.size + row)
-                        self._add(value, output_base, b.add(b.mul(node, I64(3)), first))
+                        self._accumulate(value, output_base, b.add(b.mul(node, I64(3)), first))
             else:
-                with counting(b, I64(0), I64(self.nodes), "column") as node:
+                with for_range(b, I64(0), I64(self.nodes), "column") as node:
                     gradient = self._gradient(geometry, node)
                     for column, row, value in self._at_node(piece_base, 9, gradient):
                         self._store(value, half, I64(column + 9 * row))
-                    self._block(half, gradient, node, node, output_base)
-                    with counting(b, b.add(node, I64(1)), I64(self.nodes), "row") as other:
-                        self._block(half, self._gradient(geometry, other), other, node, output_base)
+                    self._add_node_block(half, gradient, node, node, output_base)
+                    with for_range(b, b.add(node, I64(1)), I64(self.nodes), "row") as other:
+                        self._add_node_block(
+                            half, self._gradient(geometry, other), other, node, output_base
+                        )
 
-    def _block(self, half: Value, gradient: list, a: Value, node: Value, outputs: Value) -> None:
+    def _add_node_block(
+        self, half: Value, gradient: list, a: Value, node: Value, outputs: Value
+    ) -> None:
         """Add the rows of node a to the columns of a node, below the diagonal."""
         b = self.builder
         for column, row, value in self._at_node(half, 3, gradient):
@@ -396,7 +402,7 @@ class _Emitter:
                 continue
             c = b.add(b.mul(node, I64(3)), I64(column))
             r = b.add(b.mul(a, I64(3)), I64(row))
-            self._add(value, outputs, b.add(self._column_start(c), r))
+            self._accumulate(value, outputs, b.add(self._column_start(c), r))
 
     def _column_start(self, c: Value) -> Value:
         """Return c (2 size − c − 1) / 2, the offset of column c in a lower triangle, less its row
@@ -410,19 +416,22 @@ class _Emitter:
         b = self.builder
         for k, columns in enumerate(self._coefficients(coupling, totals)):
             how = self.last.contractions[k]
-            output_base = self._at(totals, self.last.outputs[k])
+            output_base = self._offset_pointer(totals, self.last.outputs[k])
             if how == "nodes":
-                self._combine(columns, totals, output_base, self._add)
+                self._combine(columns, totals, output_base, self._accumulate)
             elif how == "pairs":
                 self._combine(columns, totals, combined, self._store)
-                with counting(b, I64(0), I64(self.size), "column") as c:
+                with for_range(b, I64(0), I64(self.size), "column") as c:
                     factors = [
-                        (j * self.size, self._load(self._at(totals, self.vectors[j]), c))
+                        (
+                            j * self.size,
+                            self._load(self._offset_pointer(totals, self.vectors[j]), c),
+                        )
                         for j in columns
                     ]
                     start = b.gep(output_base, [b.mul(self._column_start(c), I64(self.lanes))])
-                    with counting(b, c, I64(self.size), "row") as r:
-                        self._add(self._combination(factors, combined, r), start, r)
+                    with for_range(b, c, I64(self.size), "row") as r:
+                        self._accumulate(self._combination(factors, combined, r), start, r)
 
     def _coefficients(self, coupling: ca.Function, totals: Value) -> list[dict[int, list]]:
         """Return for each output, column by column, offsets of node vectors and their
@@ -435,7 +444,7 @@ class _Emitter:
         def read(_: int, entry: int) -> Value:
             return self._load(totals, I64(self.sums[entry]))
 
-        for k, entry, value in function_values(self.builder, coupling, self.vector, read):
+        for k, entry, value in emit_function(self.builder, coupling, self.vector, read):
             row, column = entries[k][entry]
             columns[k].setdefault(column, []).append((self.vectors[row], value))
         return columns
@@ -445,8 +454,8 @@ class _Emitter:
     ) -> None:
         """Write combinations of node vectors to the columns of a matrix."""
         for column, factors in columns.items():
-            column_base = self._at(out, column * self.size)
-            with counting(self.builder, I64(0), I64(self.size), "entry") as entry:
+            column_base = self._offset_pointer(out, column * self.size)
+            with for_range(self.builder, I64(0), I64(self.size), "entry") as entry:
                 put(self._combination(factors, totals, entry), column_base, entry)
 
     def _combination(self, factors: list, base: Value, entry: Value) -> Value:
@@ -462,7 +471,7 @@ class _Emitter:
         """
         b = self.builder
         terms = [
-            b.fmul(self._load(self._at(base, place), entry), factor, flags=FUSE)
+            b.fmul(self._load(self._offset_pointer(base, place), entry), factor, flags=FUSE)
             for place, factor in factors
         ]
         return reduce(lambda x, y: b.fadd(x, y, flags=FUSE), terms)
@@ -487,10 +496,10 @@ class _Emitter:
         first = self.builder.mul(node, I64(3))
         return [self._load(geometry, self.builder.add(first, I64(axis))) for axis in range(3)]
 
-    def _at(self, base: Value, entry: int) -> Value:
+    def _offset_pointer(self, base: Value, entry: int) -> Value:
         """Return the pointer to the vector entry with a given offset."""
         return self.builder.gep(base, [I64(entry * self.lanes)])
 
-    def _add(self, value: Value, base: Value, entry: Value) -> None:
+    def _accumulate(self, value: Value, base: Value, entry: Value) -> None:
         """Add a value to a vector entry of a buffer."""
         self._store(self.builder.fadd(self._load(base, entry), value), base, entry)

@@ -31,8 +31,8 @@ from .jit import (
     NativeCode,
     Value,
     address,
-    compiled,
-    counting,
+    compile_function,
+    for_range,
     vector_lanes,
 )
 
@@ -44,7 +44,7 @@ LINE_BYTES = 64
 ARGUMENTS = {"fill": (1, 2, 5), "factorise": (2, 1, 4), "solve": (4, 1, 4)}
 
 
-class Skyline:
+class SkylineFactorisation:
     """Factorisation of matrices with a common skyline.
 
     A side holds a triangle: row k contains column k of the lower triangle, or row k of the upper
@@ -86,28 +86,28 @@ class Skyline:
         self._signs = np.where(rows < columns, -1.0, 1.0)[order]
         (self._reached,) = _addresses(self._reach)
         self._fixed = _addresses(self._source, self._places, self._signs)
-        self._kernels = {k: (_compiled("fill", k), _compiled("factorise", k)) for k in (1, 2)}
-        self._solve = _compiled("solve", 1)
+        self._kernels = {k: (_compile("fill", k), _compile("factorise", k)) for k in (1, 2)}
+        self._solve = _compile("solve", 1)
 
-    def room(self, sides: int) -> Room:
+    def allocate(self, sides: int) -> FactorMemory:
         """Return memory for the sides of a matrix: one for a symmetric matrix, otherwise two."""
         numbers = sides * math.prod(self.shape)
         size, width = self.shape
         memory = np.zeros(numbers + LINE_BYTES // 8)
         start = -memory.ctypes.data % LINE_BYTES // 8
-        return Room(
+        return FactorMemory(
             memory[start : start + numbers].reshape(sides, *self.shape),
             np.zeros((2, size + width)),
         )
 
-    def factorise(self, room: Room, symmetric: Array, skew: Array) -> tuple[Array, Array]:
+    def factorise(self, room: FactorMemory, symmetric: Array, skew: Array) -> tuple[Array, Array]:
         """Compute L and U without their unit diagonals in the given memory.
 
         For a symmetric matrix only L.
 
         Parameters
         ----------
-        room : Room
+        room : FactorMemory
             Memory; overwritten.
         symmetric, skew : array
             Values of the symmetric and skew parts of the matrix; `skew` is empty if there is none.
@@ -157,7 +157,7 @@ class Skyline:
         return rows[:, :size]
 
 
-class Room:
+class FactorMemory:
     """Memory of one factorisation.
 
     Parameters
@@ -179,17 +179,19 @@ def _addresses(*arrays: NDArray[Any]) -> list[int]:
     return [address(array) for array in arrays]
 
 
-def _compiled(name: str, sides: int) -> CompiledFunction:
+def _compile(name: str, sides: int) -> CompiledFunction:
     """Return one of the compiled functions "fill", "factorise" and "solve"."""
-    emit: Callable[[_Emitter], ir.Module] = getattr(_Emitter, name)
+    emit: Callable[[_SkylineEmitter], ir.Module] = getattr(_SkylineEmitter, name)
     integers, *arrays = ARGUMENTS[name]
     lanes = vector_lanes()
     signature = (*[ctypes.c_int64] * integers, *[ctypes.c_void_p] * sum(arrays))
     key = f"skyline {name} {sides} {lanes}"
-    return compiled(NativeCode(name, key, signature, lambda: emit(_Emitter(lanes, sides))))
+    return compile_function(
+        NativeCode(name, key, signature, lambda: emit(_SkylineEmitter(lanes, sides)))
+    )
 
 
-class _Emitter:
+class _SkylineEmitter:
     """Emitter of the loops over vectors of matrix rows.
 
     Parameters
@@ -220,7 +222,7 @@ class _Emitter:
         """
         count, source, places, signs, symmetric, skew, lower, upper = self._begin("fill")
         b = self.b
-        with counting(b, I64(0), count, "entry") as k:
+        with for_range(b, I64(0), count, "entry") as k:
             origin, place = (b.load(b.gep(array, [k])) for array in (source, places))
             value = b.load(b.gep(symmetric, [origin]))
             if self.count == 1:
@@ -242,10 +244,10 @@ class _Emitter:
         self.absolute = ir.Function(self.module, kind, f"llvm.fabs.v{self.lanes}f64")
         b = self.b
         groups = b.sdiv(size, I64(PIVOTS))
-        with counting(b, I64(0), groups, "group") as group:
+        with for_range(b, I64(0), groups, "group") as group:
             first = b.mul(group, I64(PIVOTS))
             self._eliminate([b.add(first, I64(p)) for p in range(PIVOTS)])
-        with counting(b, b.mul(groups, I64(PIVOTS)), size, "rest") as pivot:
+        with for_range(b, b.mul(groups, I64(PIVOTS)), size, "rest") as pivot:
             self._eliminate([pivot])
         b.ret_void()
         return self.module
@@ -259,7 +261,7 @@ class _Emitter:
             for later in pivots[p + 1 :]:
                 self._subtract([pivot], later, last)
         next_row = b.add(pivots[-1], I64(1))
-        with counting(b, next_row, b.add(last, I64(1)), "row") as row:
+        with for_range(b, next_row, b.add(last, I64(1)), "row") as row:
             self._subtract(pivots, row, last)
 
     def _scale(self, pivot: Value, last: Value) -> None:
@@ -269,10 +271,10 @@ class _Emitter:
         b = self.b
         diagonal = b.load(self._entry(self.sides[0], pivot, pivot))
         b.store(diagonal, b.gep(self.pivots, [pivot]))
-        inverse = self._spread(b.fdiv(DOUBLE(1.0), diagonal))
+        inverse = self._splat(b.fdiv(DOUBLE(1.0), diagonal))
         lanes = ir.Constant(ir.VectorType(I64, self.lanes), list(range(self.lanes)))
         with self._vectors(pivot, last) as start:
-            after = b.icmp_signed(">", lanes, self._spread(b.sub(pivot, start)))
+            after = b.icmp_signed(">", lanes, self._splat(b.sub(pivot, start)))
             places = [self._entry(side, pivot, start) for side in self.sides]
             nothing = ir.Constant(self.vector, [0.0] * self.lanes)
             values = [b.select(after, self._load(place), nothing) for place in places]
@@ -293,13 +295,15 @@ class _Emitter:
         for pivot in pivots:
             diagonal = b.load(b.gep(self.pivots, [pivot]))
             row_entries = [b.load(self._entry(side, pivot, row)) for side in reversed(self.sides)]
-            scales.append([self._spread(b.fmul(diagonal, value)) for value in row_entries])
+            scales.append([self._splat(b.fmul(diagonal, value)) for value in row_entries])
         with self._vectors(row, last) as start:
             for k, side in enumerate(self.sides):
                 target = self._entry(side, row, start)
                 value = self._load(target)
                 for pivot, scale in zip(pivots, scales, strict=True):
-                    value = self._less(value, self._load(self._entry(side, pivot, start)), scale[k])
+                    value = self._multiply_subtract(
+                        value, self._load(self._entry(side, pivot, start)), scale[k]
+                    )
                 self._store(value, target)
 
     def solve(self) -> Any:
@@ -311,26 +315,34 @@ class _Emitter:
         kind = ir.FunctionType(DOUBLE, [DOUBLE, self.vector])
         total = ir.Function(self.module, kind, f"llvm.vector.reduce.fadd.v{self.lanes}f64")
         dot = b.alloca(self.vector)
-        with counting(b, I64(0), size, "forward") as k:
+        with for_range(b, I64(0), size, "forward") as k:
             last = b.load(b.gep(reach, [k]))
-            with counting(b, I64(0), columns, "column") as column:
+            with for_range(b, I64(0), columns, "column") as column:
                 right = b.gep(rows, [b.mul(column, stride)])
-                loaded = self._spread(b.load(b.gep(right, [k])))
+                loaded = self._splat(b.load(b.gep(right, [k])))
                 with self._vectors(k, last) as start:
                     place = b.gep(right, [start])
                     factor = self._entry(first, k, start)
-                    self._store(self._less(self._load(place), self._load(factor), loaded), place)
-        with counting(b, I64(0), size, "backward") as done:
+                    self._store(
+                        self._multiply_subtract(self._load(place), self._load(factor), loaded),
+                        place,
+                    )
+        with for_range(b, I64(0), size, "backward") as done:
             k = b.sub(b.sub(size, I64(1)), done)
             last = b.load(b.gep(reach, [k]))
             diagonal = b.load(b.gep(pivots, [k]))
-            with counting(b, I64(0), columns, "column") as column:
+            with for_range(b, I64(0), columns, "column") as column:
                 right = b.gep(rows, [b.mul(column, stride)])
                 b.store(ir.Constant(self.vector, [0.0] * self.lanes), dot)
                 with self._vectors(k, last) as start:
                     loaded = b.gep(right, [start])
                     factor = self._entry(second, k, start)
-                    b.store(self._less(b.load(dot), self._load(loaded), self._load(factor)), dot)
+                    b.store(
+                        self._multiply_subtract(
+                            b.load(dot), self._load(loaded), self._load(factor)
+                        ),
+                        dot,
+                    )
                 solution = b.gep(right, [k])
                 scaled = b.fdiv(b.load(solution), diagonal)
                 b.store(b.call(total, [scaled, b.load(dot)], fastmath=("reassoc",)), solution)
@@ -343,7 +355,7 @@ class _Emitter:
         b = self.b
         lanes = I64(self.lanes)
         stop = b.add(b.sdiv(last, lanes), I64(1))
-        with counting(b, b.sdiv(first, lanes), stop, "vector") as k:
+        with for_range(b, b.sdiv(first, lanes), stop, "vector") as k:
             yield b.mul(k, lanes)
 
     def _entry(self, side: Value, row: Value, place: Value) -> Value:
@@ -361,11 +373,11 @@ class _Emitter:
         """Store a vector at a pointer."""
         self.b.store(value, self.b.bitcast(place, self.vector.as_pointer()), align=8)
 
-    def _less(self, value: Value, x: Value, y: Value) -> Value:
+    def _multiply_subtract(self, value: Value, x: Value, y: Value) -> Value:
         """Return value − x y."""
         return self.b.fsub(value, self.b.fmul(x, y, flags=FUSE), flags=FUSE)
 
-    def _spread(self, value: Value) -> Value:
+    def _splat(self, value: Value) -> Value:
         """Return a vector of equal numbers."""
         nothing = ir.Constant(ir.VectorType(value.type, self.lanes), ir.Undefined)
         zeros = ir.Constant(ir.VectorType(I32, self.lanes), [0] * self.lanes)

@@ -1,6 +1,7 @@
 """Distribution of time steps, or of experiments, over threads.
 
-`in_slices` distributes consecutive time steps of one evaluation; `side_by_side` distributes whole
+`run_in_slices` distributes consecutive time steps of one evaluation; `map_experiments` distributes
+whole
 experiments, each of which then runs on one thread.
 """
 
@@ -41,13 +42,13 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
 
 
-def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None:
+def run_in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None:
     """Call ``run(start, stop)`` on consecutive slices of ``range(count)``, one per thread.
 
     Raises
     ------
     KeyboardInterrupt
-        On a thread of `side_by_side`, if another experiment was interrupted.
+        On a thread of `map_experiments`, if another experiment was interrupted.
     """
     if (stop := getattr(_alone, "stop", None)) is not None and stop.is_set():
         raise KeyboardInterrupt
@@ -63,15 +64,15 @@ def in_slices(run: Callable[[int, int], None], count: int, threads: int) -> None
         other.result()
 
 
-def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:
+def map_experiments(run: Callable[[T], R], items: Sequence[T], threads: int) -> list[R]:
     """Return ``run(item)`` of every item, in their order.
 
-    Each item runs on one thread, see `at_once`.
+    Each item runs on one thread, see `concurrent_count`.
 
     Much of the work of an experiment is too short to release and acquire the interpreter lock: more
     experiments than cores at a time fill the gaps.
     """
-    count = at_once(len(items), threads)
+    count = concurrent_count(len(items), threads)
     if count == 1:
         return [run(item) for item in items]
 
@@ -79,7 +80,7 @@ def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> lis
 
     def passed(item: T) -> R:
         _alone.stop = stop
-        return alone(run, item)
+        return run_single_threaded(run, item)
 
     with ThreadPoolExecutor(count) as pool:
         try:
@@ -89,13 +90,13 @@ def side_by_side(run: Callable[[T], R], items: Sequence[T], threads: int) -> lis
             raise
 
 
-def alone(run: Callable[..., R], *arguments: Any) -> R:
+def run_single_threaded(run: Callable[..., R], *arguments: Any) -> R:
     """Return ``run(*arguments)``, and start no further threads from this thread from now on."""
     _alone.whole = True
     return run(*arguments)
 
 
-def at_once(items: int, threads: int) -> int:
+def concurrent_count(items: int, threads: int) -> int:
     """Return how many of these items run at the same time."""
     if threads == 1 or getattr(_alone, "whole", False):
         return 1

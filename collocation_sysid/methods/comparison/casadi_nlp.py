@@ -88,28 +88,28 @@ class CasadiSolver(Options):
         recorder = Recorder(self.name, collocation, watch, self.max_time_s)
         plugin = self.name.removeprefix(PREFIX)
         with recorder.stopwatch.building():
-            program = collocation.made_explicit()
+            program = collocation.with_lifted_variables()
         return nlpsol.solve(
             recorder,
             program,
             start=start,
             plugin=plugin,
-            hessian=_curvature(program, self.hessian),
+            hessian=_hessian_values(program, self.hessian),
             settings=self._settings,
             statuses=self.statuses,
-            judged=partial(_judged, collocation),
+            judge=partial(_judge, collocation),
         )
 
     def _settings(self, functions: NlpFunctions) -> dict[str, Any]:
         """Return the options of the plugin with its cache of functions."""
         cache = {n: functions.function(n, *o.split()) for n, o in self.functions.items()}
-        settings = {"cache": cache, **self._own_settings()}
+        settings = {"cache": cache, **self._plugin_settings()}
         for name, value in self.casadi.items():
             are_mappings = isinstance(value, Mapping) and isinstance(settings.get(name), Mapping)
             settings[name] = settings[name] | value if are_mappings else value
         return settings
 
-    def _own_settings(self) -> dict[str, Any]:
+    def _plugin_settings(self) -> dict[str, Any]:
         """Return the options of the plugin that follow from those of the method."""
         raise NotImplementedError
 
@@ -199,7 +199,7 @@ REFUSED: dict[str, str] = {
 }
 
 
-def why_not(name: str) -> str | None:
+def refusal_reason(name: str) -> str | None:
     """Return the reason why a solver of CasADi is not offered.
 
     None for names that do not begin with "casadi:" and for solvers that are offered.
@@ -215,7 +215,7 @@ def why_not(name: str) -> str | None:
     return f"found {name!r}, which CasADi does not have; {hint}expected one of {offered}"
 
 
-def _judged(collocation: Collocation, status: Status, z: Array, multipliers: Array) -> Status:
+def _judge(collocation: Collocation, status: Status, z: Array, multipliers: Array) -> Status:
     """Return the status of a solution, checked by the constraints and optimality of the NLP."""
     if status.converged:
         violation = np.abs(collocation.constraint_values(z)).max(initial=0.0)
@@ -226,7 +226,7 @@ def _judged(collocation: Collocation, status: Status, z: Array, multipliers: Arr
     return status
 
 
-def _curvature(collocation: Collocation, hessian: Hessian) -> HessianValues:
+def _hessian_values(collocation: Collocation, hessian: Hessian) -> HessianValues:
     """Return the function that writes the Hessian's values, for `NlpFunctions`."""
 
     def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:

@@ -134,12 +134,12 @@ class CgResult:
     ending: Ending
 
     @property
-    def converged(self) -> bool:
+    def is_converged(self) -> bool:
         """Whether the gradient is within the tolerance."""
         return self.ending == "converged"
 
 
-def minimise(
+def minimise_cg_descent(
     fun_and_grad: ValueAndGradient,
     x0: Array,
     options: CgDescentOptions | None = None,
@@ -169,36 +169,38 @@ def minimise(
         Last iterate and the reason for the end.
     """
     options = options or CgDescentOptions()
-    counted = _Counted(fun_and_grad, value)
+    counted = _CountedFunction(fun_and_grad, value)
     x = np.array(x0, dtype=float)
     f, g = counted(x)
 
-    def ended(ending: Ending, iterations: int) -> CgResult:
+    def result(ending: Ending, iterations: int) -> CgResult:
         """Return the last iterate as the result."""
         return CgResult(x, f, g, iterations, counted.evaluations, ending)
 
     if not (np.isfinite(f) and np.isfinite(g).all()):
-        return ended("not-finite", 0)
+        return result("not-finite", 0)
     d = -g
     step = 0.0
     change = np.inf
-    average = _Average(options)
+    average = _AverageValue(options)
     if callback is not None and callback(CgState(0, x, f, g, d, 0.0, 0.0)):
-        return ended("stopped", 0)
+        return result("stopped", 0)
     for k in range(options.max_iterations):
         if np.abs(g).max(initial=0.0) <= options.tolerance:
-            return ended("converged", k)
+            return result("converged", k)
         average.add(f)
-        line = _Line(counted, x, f, g, d, average.error, average.approximate, options)
-        trial = line.search(_first_step(x, f, g) if k == 0 else _next_step(line, step, change))
+        line = _LineSearch(counted, x, f, g, d, average.error, average.approximate, options)
+        trial = line.search(
+            _initial_step(x, f, g) if k == 0 else _initial_step_after(line, step, change)
+        )
         if trial is None and line.slope > -float(g @ g) * (1 - 1e-12):  # once down the gradient
             d = -g
-            line = _Line(counted, x, f, g, d, average.error, average.approximate, options)
-            trial = line.search(_first_step(x, f, g))
+            line = _LineSearch(counted, x, f, g, d, average.error, average.approximate, options)
+            trial = line.search(_initial_step(x, f, g))
         if trial is None:
-            return ended("line-search", k)
+            return result("line-search", k)
         change = abs(trial.value - f)
-        average.judge(change)
+        average.note_change(change)
         step = trial.step
         slope = line.slope
         y = trial.gradient - g
@@ -207,26 +209,26 @@ def minimise(
         f = trial.value
         g = trial.gradient
         reached_along = d
-        d = _direction(d, before, g, y, options.truncation)
+        d = _next_direction(d, before, g, y, options.truncation)
         state = CgState(k + 1, x, f, g, reached_along, slope, step)
         if callback is not None and callback(state):
-            return ended("stopped", k + 1)
+            return result("stopped", k + 1)
     if np.abs(g).max(initial=0.0) <= options.tolerance:
-        return ended("converged", options.max_iterations)
-    return ended("iteration-limit", options.max_iterations)
+        return result("converged", options.max_iterations)
+    return result("iteration-limit", options.max_iterations)
 
 
-def _direction(d: Array, before: Array, g: Array, y: Array, truncation: float) -> Array:
+def _next_direction(d: Array, previous: Array, g: Array, y: Array, truncation: float) -> Array:
     """Return the next direction; the steepest descent after a step without positive curvature."""
     curvature = float(d @ y)
     if curvature <= 0:
         return -g
     beta = float((y - 2 * d * (float(y @ y) / curvature)) @ g) / curvature
-    size = float(np.linalg.norm(d)) * min(truncation, float(np.linalg.norm(before)))
+    size = float(np.linalg.norm(d)) * min(truncation, float(np.linalg.norm(previous)))
     return -g + max(beta, -1 / size) * d
 
 
-def _first_step(x: Array, f: float, g: Array) -> float:
+def _initial_step(x: Array, f: float, g: Array) -> float:
     """Return the step size of the first line search, rule I0."""
     steepest = float(np.abs(g).max())
     if x.any():
@@ -234,7 +236,7 @@ def _first_step(x: Array, f: float, g: Array) -> float:
     return FIRST * abs(f) / float(g @ g) if f else 1.0
 
 
-def _next_step(line: _Line, last: float, change: float) -> float:
+def _initial_step_after(line: _LineSearch, last: float, change: float) -> float:
     """Return the initial step size of a later line search: I1 (parabola through a sample of
     the value) or I2.
     """
@@ -247,7 +249,7 @@ def _next_step(line: _Line, last: float, change: float) -> float:
     return GROWTH * last
 
 
-class _Counted:
+class _CountedFunction:
     """Function with a count of the evaluations of its gradient."""
 
     def __init__(
@@ -268,7 +270,7 @@ class _Counted:
 
 
 @dataclass
-class _Average:
+class _AverageValue:
     """Average size C of the values so far, from which the effect of rounding is estimated.
 
     Attributes
@@ -287,7 +289,7 @@ class _Average:
         self.weight = 1 + self.options.memory * self.weight
         self.size += (abs(value) - self.size) / self.weight
 
-    def judge(self, change: float) -> None:
+    def note_change(self, change: float) -> None:
         """Switch to the approximate Wolfe conditions after a small change of the value."""
         if change <= self.options.switch * self.size:
             self.approximate = True
@@ -299,7 +301,7 @@ class _Average:
 
 
 @dataclass(frozen=True, eq=False)
-class _Probe:
+class _LineTrial:
     """Function along the line at one step size: value, derivative (`slope`) and gradient."""
 
     step: float
@@ -308,24 +310,24 @@ class _Probe:
     gradient: Array = field(repr=False)
 
 
-class _Found(Exception):
+class _TrialAccepted(Exception):
     """Exception that ends a line search with a trial that satisfies the Wolfe conditions."""
 
-    def __init__(self, trial: _Probe) -> None:
+    def __init__(self, trial: _LineTrial) -> None:
         super().__init__()
         self.trial = trial
 
 
-class _Exhausted(Exception):
+class _TrialsExhausted(Exception):
     """Exception that ends a line search after the largest number of trials."""
 
 
-class _Line:
+class _LineSearch:
     """Line search along one direction."""
 
     def __init__(
         self,
-        function: _Counted,
+        function: _CountedFunction,
         x: Array,
         value: float,
         gradient: Array,
@@ -339,7 +341,7 @@ class _Line:
         self.value = value
         self.direction = direction
         self.slope = float(gradient @ direction)
-        self.start = _Probe(0.0, value, self.slope, gradient)
+        self.start = _LineTrial(0.0, value, self.slope, gradient)
         self.limit = value + error
         self.approximate = approximate
         self.options = options
@@ -349,7 +351,7 @@ class _Line:
         """Return the value at a step size."""
         return self.function.value(self.x + step * self.direction)
 
-    def search(self, step: float) -> _Probe | None:
+    def search(self, step: float) -> _LineTrial | None:
         """Return a trial that satisfies the Wolfe conditions (L0 … L3), starting at a step
         size; None if none is found.
         """
@@ -364,13 +366,13 @@ class _Line:
                     low, high = self._update(low, high, middle)
                 a = low
                 b = high
-        except _Found as found:
+        except _TrialAccepted as found:
             return found.trial
-        except _Exhausted:
+        except _TrialsExhausted:
             return None
 
-    def _try(self, step: float) -> _Probe:
-        """Evaluate a trial; raise `_Found` if it satisfies the Wolfe conditions.
+    def _try(self, step: float) -> _LineTrial:
+        """Evaluate a trial; raise `_TrialAccepted` if it satisfies the Wolfe conditions.
 
         Raises
         ------
@@ -378,17 +380,17 @@ class _Line:
             After too many trials.
         """
         if self.trials >= self.options.max_trials:
-            raise _Exhausted
+            raise _TrialsExhausted
         self.trials += 1
         value, gradient = self.function(self.x + step * self.direction)
         # Out of the domain the slope is not a number: neither up nor down, and the value is high.
         slope = float(gradient @ self.direction) if np.isfinite(value) else np.nan
-        trial = _Probe(step, value if np.isfinite(slope) else np.inf, slope, gradient)
-        if self._is_enough(trial):
-            raise _Found(trial)
+        trial = _LineTrial(step, value if np.isfinite(slope) else np.inf, slope, gradient)
+        if self._satisfies_wolfe(trial):
+            raise _TrialAccepted(trial)
         return trial
 
-    def _is_enough(self, trial: _Probe) -> bool:
+    def _satisfies_wolfe(self, trial: _LineTrial) -> bool:
         """Return whether a trial satisfies the Wolfe conditions T1 or T2."""
         decrease = self.options.decrease
         curvature = self.options.curvature
@@ -399,7 +401,7 @@ class _Line:
         is_decreased = trial.value - self.value <= decrease * trial.step * self.slope
         return is_decreased and not self.approximate
 
-    def _bracket(self, step: float) -> tuple[_Probe, _Probe]:
+    def _bracket(self, step: float) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval at whose ends the slopes have opposite signs, rules B0 … B3."""
         low = self.start
         while True:
@@ -411,7 +413,7 @@ class _Line:
             low = trial
             step = EXPANSION * step
 
-    def _update(self, a: _Probe, b: _Probe, step: float) -> tuple[_Probe, _Probe]:
+    def _update(self, a: _LineTrial, b: _LineTrial, step: float) -> tuple[_LineTrial, _LineTrial]:
         """Return a smaller interval, if `step` is within it, rules U0 … U3."""
         if not a.step < step < b.step:
             return a, b
@@ -422,7 +424,7 @@ class _Line:
             return trial, b
         return self._cut(a, trial)
 
-    def _cut(self, a: _Probe, b: _Probe) -> tuple[_Probe, _Probe]:
+    def _cut(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
         """Return an interval with an ascending end, from a low descending point and a high
         one, rule U3.
         """
@@ -435,7 +437,7 @@ class _Line:
             else:
                 b = trial
 
-    def _double_secant(self, a: _Probe, b: _Probe) -> tuple[_Probe, _Probe]:
+    def _double_secant(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
         """Return a smaller interval by two secant steps, rules S1 … S4."""
         step = _secant(a, b)
         low, high = self._update(a, b, step)
@@ -446,7 +448,7 @@ class _Line:
         return low, high
 
 
-def _secant(a: _Probe, b: _Probe) -> float:
+def _secant(a: _LineTrial, b: _LineTrial) -> float:
     """Return the zero of the linear interpolation of both slopes; NaN if they are equal."""
     if a.slope == b.slope:
         return np.nan

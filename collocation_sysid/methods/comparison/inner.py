@@ -17,9 +17,9 @@ from scipy.optimize import minimize as scipy_minimise
 
 from ...arrays import Array
 from .cg_descent import CgDescentOptions
-from .cg_descent import minimise as cg_descent
-from .levenberg_marquardt import minimise as levenberg_marquardt
-from .merit import Merit
+from .cg_descent import minimise_cg_descent as cg_descent
+from .levenberg_marquardt import minimise_levenberg_marquardt as levenberg_marquardt
+from .merit import MeritFunction
 
 Report = Callable[[Array, float, Array], None]
 
@@ -33,9 +33,9 @@ FAR = 50.0
 STEEP = 10.0
 
 
-def minimise(
+def minimise_merit(
     inner: Inner,
-    merit: Merit,
+    merit: MeritFunction,
     z: Array,
     tolerance: float,
     max_iterations: int,
@@ -47,7 +47,7 @@ def minimise(
     ----------
     inner : str
         Name of the solver.
-    merit : Merit
+    merit : MeritFunction
         Merit function.
     z : (variables,) array
         Initial variables.
@@ -66,8 +66,8 @@ def minimise(
     """
     if inner == "levenberg-marquardt":
         return levenberg_marquardt(merit, z, tolerance, max_iterations, report)
-    scaled = _Scaled(merit, z, smooth=inner != "l-bfgs-b")
-    follow = _Follower(scaled, tolerance, report)
+    scaled = _ScaledMerit(merit, z, smooth=inner != "l-bfgs-b")
+    follow = _ConvergenceCheck(scaled, tolerance, report)
     follow(scaled.start)
     if follow.converged:
         return True
@@ -82,7 +82,7 @@ def minimise(
         )
         return follow.converged
 
-    def each(intermediate_result: OptimizeResult) -> None:
+    def callback(intermediate_result: OptimizeResult) -> None:
         """Stop SciPy's solver once the tolerance is reached."""
         if follow(intermediate_result.x):
             raise StopIteration
@@ -97,16 +97,16 @@ def minimise(
         jac=True,
         method=method,
         bounds=scaled.bounds if inner == "l-bfgs-b" else None,
-        callback=each,
+        callback=callback,
         options=settings,
     )
     return follow.converged
 
 
-class _Follower:
+class _ConvergenceCheck:
     """Callback that reports iterates of the scaled problem and checks convergence."""
 
-    def __init__(self, scaled: _Scaled, tolerance: float, report: Report) -> None:
+    def __init__(self, scaled: _ScaledMerit, tolerance: float, report: Report) -> None:
         self.scaled = scaled
         self.tolerance = tolerance
         self.report = report
@@ -116,34 +116,34 @@ class _Follower:
         """Report the iterate s (free variables,), and return whether its gradient is within
         the tolerance.
         """
-        z, value, gradient = self.scaled.at(s)
-        self.scaled.ceiling = STEEP * abs(value) + 1e-300
-        projected = self.scaled.projected(s, z, gradient)
+        z, value, gradient = self.scaled.evaluate_at(s)
+        self.scaled.replacement_value = STEEP * abs(value) + 1e-300
+        projected = self.scaled.project_gradient(s, z, gradient)
         self.report(z, value, projected)
         self.converged = bool(np.abs(projected).max(initial=0.0) <= self.tolerance)
         return self.converged
 
 
-class _Scaled:
+class _ScaledMerit:
     """Merit function of the scaled free variables s, without bounds if they are mapped smoothly.
 
     Attributes
     ----------
     start : (free,) array
         Initial s, zeros.
-    bounds : Bounds
+    bounds : HandBounds
         Bounds of s.
-    ceiling : float
+    replacement_value : float
         Value that replaces an infinite merit, for solvers that interpolate values.
     """
 
-    def __init__(self, merit: Merit, z: Array, smooth: bool) -> None:
+    def __init__(self, merit: MeritFunction, z: Array, smooth: bool) -> None:
         self.merit = merit
         self.z = z.copy()
         problem = merit.problem
-        self.free = np.flatnonzero(problem.free)
+        self.free = np.flatnonzero(problem.is_free)
         _, jacobian = problem.constraints_and_jacobian(z)
-        loss = problem.nlp.hessian(z, 1.0, np.zeros(problem.nlp.constraints)).diagonal()
+        loss = problem.nlp.hessian(z, 1.0, np.zeros(problem.nlp.constraint_count)).diagonal()
         diagonal = loss + merit.rho * (jacobian.power(2).sum(axis=0))
         diagonal = diagonal[self.free]
         self.unit = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
@@ -160,10 +160,10 @@ class _Scaled:
         share = np.clip((at - self.middle) / self.half, -0.999, 0.999)
         self.angle = np.arcsin(share)
         self.start = np.zeros(len(self.free))
-        self.ceiling = np.inf
+        self.replacement_value = np.inf
         self._last: tuple[Array, Array, float, Array] | None = None
 
-    def z_of(self, s: Array) -> Array:
+    def to_variables(self, s: Array) -> Array:
         """Return all variables (variables,) from s."""
         z = self.z.copy()
         free_values = z[self.free] + self.unit * s
@@ -181,29 +181,31 @@ class _Scaled:
         slopes[self.mapped] = np.cos(self._angles(s)) / np.cos(self.angle)
         return slopes
 
-    def at(self, s: Array) -> tuple[Array, float, Array]:
+    def evaluate_at(self, s: Array) -> tuple[Array, float, Array]:
         """Return z, m and ∇m at s; the result of the last s is stored."""
         if self._last is None or not np.array_equal(self._last[0], s):
-            z = self.z_of(s)
+            z = self.to_variables(s)
             self._last = (s.copy(), z, *self.merit.value_and_gradient(z))
         return self._last[1:]
 
     def value(self, s: Array) -> float:
         """Return m at s."""
-        return self.merit.value(self.z_of(s))
+        return self.merit.value(self.to_variables(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:
         """Return m and ∂m/∂s (free,) at s."""
-        _, value, gradient = self.at(s)
+        _, value, gradient = self.evaluate_at(s)
         return value, gradient[self.free] * self.unit * self._slopes(s)
 
     def finite_value_and_gradient(self, s: Array) -> tuple[float, Array]:
         """Return m and ∂m/∂s; a large value and zeros where the merit is infinite."""
         value, gradient = self.value_and_gradient(s)
-        return (value, gradient) if np.isfinite(value) else (self.ceiling, np.zeros(len(s)))
+        return (
+            (value, gradient) if np.isfinite(value) else (self.replacement_value, np.zeros(len(s)))
+        )
 
-    def projected(self, s: Array, z: Array, gradient: Array) -> Array:
+    def project_gradient(self, s: Array, z: Array, gradient: Array) -> Array:
         """Return ∂m/∂z (variables,) with zeros at active bounds."""
-        projected = self.merit.problem.projected(z, gradient)
+        projected = self.merit.problem.project_gradient(z, gradient)
         projected[self.free] *= np.minimum(np.abs(self._slopes(s)), 1.0)
         return projected

@@ -23,8 +23,8 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from ...arrays import Array, Index
 from ...errors import InputError
 from ...program.lapack import cholesky_in_place, one_blas_thread
-from ...program.least_squares import LeastSquares
-from .merit import Merit, Unconstrained
+from ...program.least_squares import SquareRootInformation
+from .merit import MeritFunction, PenaltyProblem
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 
@@ -46,8 +46,8 @@ LOCAL = 0.1
 ROUNDING = 1e-12
 
 
-def minimise(
-    merit: Merit,
+def minimise_levenberg_marquardt(
+    merit: MeritFunction,
     z: Array,
     tolerance: float,
     max_iterations: int,
@@ -57,7 +57,7 @@ def minimise(
 
     Parameters
     ----------
-    merit : Merit
+    merit : MeritFunction
         Merit function.
     z : (variables,) array
         Initial variables.
@@ -78,32 +78,32 @@ def minimise(
     growth = 2.0
     is_local = False
     order = []
-    point = _Point.at(merit, z)
+    point = _MeritPoint.evaluate(merit, z)
     for count in range(max_iterations + 1):
         report(point.z, point.value, point.projected)
-        if point.steepness <= tolerance:
+        if point.gradient_norm <= tolerance:
             return True
         if count == max_iterations:
             break
-        system = _system(merit, point, is_local, order)
+        system = _quadratic_model(merit, point, is_local, order)
         while True:
             step = system.step(damping)
             if step is None and system.exact:
-                system = _system(merit, point, False, order)
+                system = _quadratic_model(merit, point, False, order)
                 continue
             if step is not None:
                 predicted = system.predicted_decrease(step)
                 trial = np.clip(point.z + step, merit.problem.lower, merit.problem.upper)
                 if predicted <= ROUNDING * abs(point.value):
                     # Values cannot judge this step any more; gradients can.
-                    after = _Point.at(merit, trial)
-                    if not after.steepness <= point.steepness / 2:
+                    after = _MeritPoint.evaluate(merit, trial)
+                    if not after.gradient_norm <= point.gradient_norm / 2:
                         return False
                     ratio = 1.0
                     break
                 decrease = point.value - merit.value(trial)
                 if decrease >= ACCEPTED * predicted:
-                    after = _Point.at(merit, trial)
+                    after = _MeritPoint.evaluate(merit, trial)
                     ratio = decrease / predicted
                     break
             damping = damping * growth
@@ -111,14 +111,14 @@ def minimise(
             if damping > MOST_DAMPING:
                 return False
         damping = max(damping * max(1 / 5, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
-        is_local = float(np.abs(step[merit.problem.bounded]).max(initial=0.0)) <= LOCAL
+        is_local = float(np.abs(step[merit.problem.parameter_indices]).max(initial=0.0)) <= LOCAL
         growth = 2.0
         point = after
     return False
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
+class _MeritPoint:
     """Merit function with its derivatives at z; the matrix is overwritten by the next point's."""
 
     z: Array
@@ -129,50 +129,52 @@ class _Point:
     projected: Array
 
     @classmethod
-    def at(cls, merit: Merit, z: Array) -> _Point:
+    def evaluate(cls, merit: MeritFunction, z: Array) -> _MeritPoint:
         """Return the merit function and its derivatives at z."""
         rows, jacobian = merit.problem.constraints_and_jacobian(z)
         gradient = merit.gradient(z, rows, jacobian)
-        projected = merit.problem.projected(z, gradient)
-        return cls(z, merit.value_of(z, rows), rows, jacobian, gradient, projected)
+        projected = merit.problem.project_gradient(z, gradient)
+        return cls(z, merit.value_from_constraints(z, rows), rows, jacobian, gradient, projected)
 
     @property
-    def steepness(self) -> float:
+    def gradient_norm(self) -> float:
         """Largest entry of the projected gradient."""
         return float(np.abs(self.projected).max(initial=0.0))
 
 
-def _system(merit: Merit, point: _Point, exact: bool, order: list[Index]) -> _System:
+def _quadratic_model(
+    merit: MeritFunction, point: _MeritPoint, exact: bool, order: list[Index]
+) -> _QuadraticModel:
     """Return the quadratic model at a point.
 
     Parameters
     ----------
-    merit : Merit
+    merit : MeritFunction
         Merit function.
-    point : _Point
+    point : _MeritPoint
         Point with its derivatives.
     exact : bool
         Whether the Hessian is that of the Lagrangian, else that of the loss.
     order : list
         Order of the band's columns, appended when it is first computed.
     """
-    weights = merit.estimate(point.rows) if exact else np.zeros_like(point.rows)
+    weights = merit.multiplier_estimate(point.rows) if exact else np.zeros_like(point.rows)
     with merit.problem.stopwatch.evaluating():
         hessian = merit.problem.nlp.hessian(point.z, 1.0, weights)
-    return _System(
+    return _QuadraticModel(
         merit.problem, point.z, merit.rho, point.jacobian, hessian, point.gradient, exact, order
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
+class _QuadraticModel:
     """Quadratic model of a merit function at z.
 
     `order` is an empty list until the order of the band's columns is computed; it is shared by all
     models.
     """
 
-    problem: Unconstrained
+    problem: PenaltyProblem
     z: Array
     rho: float
     jacobian: sp.csc_array
@@ -199,21 +201,21 @@ class _System:
     def _step(self, damping: float) -> Array | None:
         """Return the damped step, see `step`."""
         positions = self._positions
-        border = self.problem.bounded
+        border = self.problem.parameter_indices
         band = self._band.copy("F")
         band[0] += damping
         if not cholesky_in_place(band):
             return None
-        right = np.column_stack([self._mixed, self.gradient[positions]])
+        right = np.column_stack([self._mixed_block, self.gradient[positions]])
         (order,) = self.order
         solved = np.empty_like(right)
         solved[order] = _pbtrs(band, right[order], lower=1)[0].reshape(right.shape)
         by_p = solved[:, :-1]
         position_step = solved[:, -1]
-        schur = self._corner - self._mixed.T @ by_p + damping * np.eye(len(border))
+        schur = self._parameter_block - self._mixed_block.T @ by_p + damping * np.eye(len(border))
         step = np.zeros(len(self.z))
         if len(border):
-            reduced_gradient = self.gradient[border] - self._mixed.T @ position_step
+            reduced_gradient = self.gradient[border] - self._mixed_block.T @ position_step
             of_p = self._bounded_step((schur + schur.T) / 2, reduced_gradient)
             if of_p is None:
                 return None
@@ -230,7 +232,7 @@ class _System:
             factor = cholesky(schur, lower=True)
         except np.linalg.LinAlgError:
             return None
-        border = self.problem.bounded
+        border = self.problem.parameter_indices
         problem = self.problem
         reach = problem.nlp.reach_p
         places = np.where(border < problem.nlp.nq, border, border - len(self.z) + len(reach))
@@ -239,41 +241,41 @@ class _System:
         low = np.minimum(np.maximum(problem.lower[border] - self.z[border], -reach), 0) - 1e-15
         high = np.maximum(np.minimum(problem.upper[border] - self.z[border], reach), 0) + 1e-15
         right = solve_triangular(factor, slope, lower=True)
-        return LeastSquares(np.column_stack([factor.T, right])).best(low, high)
+        return SquareRootInformation(np.column_stack([factor.T, right])).minimiser(low, high)
 
     # The bordered matrix ----------------------------------------------------------------------
 
     @cached_property
     def _positions(self) -> Index:
         """Indices of the free positions in z."""
-        free = self.problem.free.copy()
-        free[self.problem.bounded] = False
+        free = self.problem.is_free.copy()
+        free[self.problem.parameter_indices] = False
         return np.flatnonzero(free)
 
     @cached_property
-    def _parts(self) -> tuple[sp.csc_array, Array]:
+    def _jacobian_blocks(self) -> tuple[sp.csc_array, Array]:
         """Columns of J for the positions (sparse) and for the parameters (dense)."""
         of_x = sp.csc_array(self.jacobian[:, self._positions])
-        return of_x, self.jacobian[:, self.problem.bounded].toarray()
+        return of_x, self.jacobian[:, self.problem.parameter_indices].toarray()
 
     @cached_property
-    def _mixed(self) -> Array:
+    def _mixed_block(self) -> Array:
         """Block (positions, parameters) of the matrix."""
-        of_x, of_p = self._parts
+        of_x, of_p = self._jacobian_blocks
         rows = sp.csr_array(self.hessian)[self._positions]
-        return self.rho * (of_x.T @ of_p) + rows[:, self.problem.bounded].toarray()
+        return self.rho * (of_x.T @ of_p) + rows[:, self.problem.parameter_indices].toarray()
 
     @cached_property
-    def _corner(self) -> Array:
+    def _parameter_block(self) -> Array:
         """Block (parameters, parameters) of the matrix."""
-        of_p = self._parts[1]
-        border = self.problem.bounded
+        of_p = self._jacobian_blocks[1]
+        border = self.problem.parameter_indices
         return self.rho * of_p.T @ of_p + self.hessian[border][:, border].toarray()
 
     @cached_property
-    def _square(self) -> sp.coo_array:
+    def _position_block(self) -> sp.coo_array:
         """Block (positions, positions) of the matrix, without damping."""
-        of_x = self._parts[0]
+        of_x = self._jacobian_blocks[0]
         positions = self._positions
         curved = sp.csr_array(self.hessian)[positions][:, positions]
         return sp.coo_array(self.rho * (of_x.T @ of_x) + curved)
@@ -288,7 +290,7 @@ class _System:
             If it needs more memory than `MOST_MEMORY`.
         """
         with self.problem.stopwatch.solving():
-            square = self._square
+            square = self._position_block
             if not len(self.order):
                 self.order.append(_narrow_order(square))
             (order,) = self.order

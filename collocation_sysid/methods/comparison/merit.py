@@ -16,25 +16,25 @@ import numpy as np
 import scipy.sparse as sp
 
 from ...arrays import Array, Index
-from ...program.collocation import Collocation, carried_over
+from ...program.collocation import Collocation, convert_variables
 from ...program.stopwatch import Stopwatch
 
 
-class Unconstrained:
+class PenaltyProblem:
     """Collocation in which prescribed displacements are constraints, and its relation to the given
     one.
 
     Attributes
     ----------
-    given : Collocation
+    original : Collocation
         Given problem.
     nlp : Collocation
         Problem with constraints for prescribed displacements, and with lifted variables.
     lower, upper : (variables,) array
         Bounds.
-    free : (variables,) array of bool
+    is_free : (variables,) array of bool
         Variables that are not constant.
-    bounded : (k,) array of int
+    parameter_indices : (k,) array of int
         Indices of the free parameters q and φ, which may have bounds.
     evaluations : int
         Number of evaluations of the constraints so far.
@@ -48,23 +48,23 @@ class Unconstrained:
     """
 
     def __init__(self, collocation: Collocation, stopwatch: Stopwatch | None = None) -> None:
-        self.given = collocation
+        self.original = collocation
         self.stopwatch = stopwatch or Stopwatch()
         with self.stopwatch.building():
-            explicit = collocation.explicit_grasps
-            grasped = collocation if explicit else replace(collocation, explicit_grasps=True)
-            self.nlp = grasped.made_explicit()
+            explicit = collocation.has_grasp_constraints
+            grasped = collocation if explicit else replace(collocation, has_grasp_constraints=True)
+            self.nlp = grasped.with_lifted_variables()
             indptr, indices = self.nlp.jacobian_structure
-            shape = (self.nlp.constraints, self.nlp.variables)
+            shape = (self.nlp.constraint_count, self.nlp.variable_count)
             self._entries = np.zeros(len(indices))
             self._jacobian = sp.csc_array((self._entries, indices, indptr), shape=shape)
         self.evaluations = 0
         self.lower, self.upper = self.nlp.bounds()
-        self.free = self.lower != self.upper
-        of_p = np.zeros(self.nlp.variables, dtype=bool)
+        self.is_free = self.lower != self.upper
+        of_p = np.zeros(self.nlp.variable_count, dtype=bool)
         of_p[: self.nlp.nq] = True
-        of_p[self.nlp.of_phi] = True
-        self.bounded: Index = np.flatnonzero(of_p & self.free)
+        of_p[self.nlp.phi_columns] = True
+        self.parameter_indices: Index = np.flatnonzero(of_p & self.is_free)
 
     def constraints_and_jacobian(self, z: Array) -> tuple[Array, sp.csc_array]:
         """Return g (constraints,) and ∂g/∂z; the matrix is overwritten by the next call."""
@@ -79,63 +79,68 @@ class Unconstrained:
         with self.stopwatch.evaluating():
             return self.nlp.constraint_values(z)
 
-    def is_upright(self, z: Array) -> bool:
+    def has_valid_elements(self, z: Array) -> bool:
         """Return whether z is finite and no element is inverted where the equations of
         motion are evaluated.
         """
         if not np.isfinite(z).all():
             return False
         with self.stopwatch.evaluating():
-            for part in self.nlp.parts(z):
+            for part in self.nlp.iterates(z):
                 states, _ = part.segment.dynamics.evaluation_states(part.x)
                 if not part.segment.body.volume_ratios(states).min() > 0:
                     return False
         return True
 
-    def projected(self, z: Array, slope: Array) -> Array:
+    def project_gradient(self, z: Array, slope: Array) -> Array:
         """Return a gradient (variables,) with zeros for constant variables and at active bounds."""
-        slope = np.where(self.free, slope, 0.0)
+        slope = np.where(self.is_free, slope, 0.0)
         slope[(z <= self.lower) & (slope > 0)] = 0
         slope[(z >= self.upper) & (slope < 0)] = 0
         return slope
 
     # Answering for the collocation given ------------------------------------------------------
 
-    def began(self, z: Array) -> Array:
+    def from_original(self, z: Array) -> Array:
         """Return variables from those of the given problem."""
-        return carried_over(z, self.given, self.nlp)
+        return convert_variables(z, self.original, self.nlp)
 
-    def answer(self, z: Array) -> Array:
+    def to_original(self, z: Array) -> Array:
         """Return variables of the given problem, with grasped nodes at their prescribed positions.
 
         They are not moved to the prescribed positions if that would invert elements.
         """
-        positions = [part.segment.grasped(part.x, part.phi) for part in self.nlp.parts(z)]
-        prescribed = self.nlp.pack(self.nlp.parameters_of(z), positions)
-        prescribed[~self.free] = z[~self.free]
-        return carried_over(prescribed if self.is_upright(prescribed) else z, self.nlp, self.given)
+        positions = [
+            part.segment.with_prescribed_positions(part.x, part.phi)
+            for part in self.nlp.iterates(z)
+        ]
+        prescribed = self.nlp.pack(self.nlp.parameters_from(z), positions)
+        prescribed[~self.is_free] = z[~self.is_free]
+        return convert_variables(
+            prescribed if self.has_valid_elements(prescribed) else z, self.nlp, self.original
+        )
 
-    def multipliers(self, explicit: Array) -> Array:
+    def to_original_multipliers(self, multipliers: Array) -> Array:
         """Return multipliers of the given problem from those of all constraints (constraints,)."""
-        pairs = zip(self.given.segments, self.nlp.segments, strict=True)
-        rows = ((given, s, explicit[s.rows]) for given, s in pairs)
+        pairs = zip(self.original.transcriptions, self.nlp.transcriptions, strict=True)
+        rows = ((given, s, multipliers[s.rows]) for given, s in pairs)
         return np.concatenate(
             [
                 each
-                if given.rows_per_time == s.rows_per_time
-                else each.reshape(-1, s.dofs)[:, given.row_dofs].ravel()
+                if given.constraints_per_time == s.constraints_per_time
+                else each.reshape(-1, s.dof_count)[:, given.constrained_dofs].ravel()
                 for given, s, each in rows
             ]
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Merit:
+class MeritFunction:
     """Merit function m for one ρ and y.
 
     Attributes
     ----------
-    problem : Unconstrained
+    problem : PenaltyProblem
         Problem.
     rho : float
         Penalty parameter ρ.
@@ -143,36 +148,36 @@ class Merit:
         Multipliers y.
     """
 
-    problem: Unconstrained
+    problem: PenaltyProblem
     rho: float
     multipliers: Array
 
     def value(self, z: Array) -> float:
         """Return m(z); infinite if an element is inverted."""
-        if not self.problem.is_upright(z):
+        if not self.problem.has_valid_elements(z):
             return np.inf
-        return self.value_of(z, self.problem.constraint_values(z))
+        return self.value_from_constraints(z, self.problem.constraint_values(z))
 
     def value_and_gradient(self, z: Array) -> tuple[float, Array]:
         """Return m(z) and ∇m (variables,), which is zero for constant variables.
 
         If an element is inverted, m is infinite and ∇m NaN.
         """
-        if not self.problem.is_upright(z):
+        if not self.problem.has_valid_elements(z):
             return np.inf, np.full(len(z), np.nan)
         rows, jacobian = self.problem.constraints_and_jacobian(z)
-        return self.value_of(z, rows), self.gradient(z, rows, jacobian)
+        return self.value_from_constraints(z, rows), self.gradient(z, rows, jacobian)
 
     def gradient(self, z: Array, rows: Array, jacobian: sp.csc_array) -> Array:
         """Return ∇m (variables,) from g and J at z."""
-        slope = self.problem.nlp.gradient(z) + jacobian.T @ self.estimate(rows)
-        return np.where(self.problem.free, slope, 0.0)
+        slope = self.problem.nlp.gradient(z) + jacobian.T @ self.multiplier_estimate(rows)
+        return np.where(self.problem.is_free, slope, 0.0)
 
-    def estimate(self, rows: Array) -> Array:
+    def multiplier_estimate(self, rows: Array) -> Array:
         """Return the multipliers y + ρ g, with which the Lagrangian is stationary where m is."""
         return self.multipliers + self.rho * rows
 
-    def value_of(self, z: Array, rows: Array) -> float:
+    def value_from_constraints(self, z: Array, rows: Array) -> float:
         """Return m from g at z; infinite if it is not finite."""
         penalty = float(self.multipliers @ rows + self.rho / 2 * (rows @ rows))
         value = self.problem.nlp.objective(z) + penalty

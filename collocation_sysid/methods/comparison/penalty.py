@@ -28,10 +28,10 @@ from ...arrays import Array
 from ...checked import AboveOne, AtLeastOne, Count, Options, Positive
 from ...errors import InputError
 from ...program.collocation import Collocation
-from ..recorder import Ended, Recorder
+from ..recorder import Recorder, SearchEnded
 from ..solution import Solution, Status, Watch
-from .inner import FIRST_ORDER, Inner, minimise
-from .merit import Merit, Unconstrained
+from .inner import FIRST_ORDER, Inner, minimise_merit
+from .merit import MeritFunction, PenaltyProblem
 
 # ρ increases if a stage leaves more than this share of the violation.
 FALL = 0.25
@@ -50,7 +50,7 @@ ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
-class Slack:
+class ConstraintViolation:
     """Violation of the equations of motion at a point.
 
     Attributes
@@ -78,27 +78,27 @@ class Stage:
 
     Attributes
     ----------
-    merit : Merit
+    merit : MeritFunction
         Merit function.
-    wanted : float
+    tolerance : float
         Tolerance: largest entry of the merit's projected gradient.
     gradient : float
         The same at the end of the stage; infinite before.
-    reached : bool
+    is_minimum : bool
         Whether the minimum was reached, as far as rounding allows at large ρ.
-    slack : Slack
+    violation : ConstraintViolation
         Violation at the end of the stage.
     """
 
-    merit: Merit
-    wanted: float
+    merit: MeritFunction
+    tolerance: float
     gradient: float = np.inf
-    reached: bool = False
-    slack: Slack = Slack()
+    is_minimum: bool = False
+    violation: ConstraintViolation = ConstraintViolation()
 
 
 @dataclass(frozen=True)
-class Stages(Options):
+class PenaltyOptions(Options):
     """Base class of both methods: the increase of ρ, and limits.
 
     Attributes
@@ -156,8 +156,8 @@ class Stages(Options):
         InputError
             For a start with inverted elements.
         """
-        climb = _PenaltyClimb(self, Recorder(self.name, collocation, watch, self.max_time_s), start)
-        status, why = climb.recorder.search(climb.run)
+        climb = _PenaltySolve(self, Recorder(self.name, collocation, watch, self.max_time_s), start)
+        status, why = climb.recorder.run_search(climb.run)
         return climb.solution(status, why)
 
     @property
@@ -170,14 +170,14 @@ class Stages(Options):
         """Tolerance of the first stage."""
         return self.tolerance
 
-    def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
+    def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage.
 
         Parameters
         ----------
         stage : Stage
             Stage that has ended.
-        before : Slack
+        previous_violation : ConstraintViolation
             Violation at the end of the stage before it.
         z : (variables,) array
             Variables at its end.
@@ -191,7 +191,7 @@ class Stages(Options):
 
 
 @dataclass(frozen=True)
-class Penalty(Stages):
+class Penalty(PenaltyOptions):
     """The equations of motion are not constraints, but violations are penalised, as in the paper.
 
     Attributes
@@ -214,30 +214,30 @@ class Penalty(Stages):
         """Largest ρ of the solve."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
-    def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
+    def following(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage, with a larger ρ if the schedule says so, see
-        `Stages.following`.
+        `PenaltyOptions.next_stage`.
         """
         rho = stage.merit.rho
         is_increase_due = (
-            self.schedule != "progress" or stage.slack.relative > FALL * before.relative
+            self.schedule != "progress" or stage.violation.relative > FALL * before.relative
         )
         if is_increase_due and rho >= self.last_rho:
-            if stage.reached:
+            if stage.is_minimum:
                 message = "The merit is at its minimum but the dynamics do not hold; raise rho_max."
-                raise Ended(Status.STALLED, message)
-            raise Ended(
+                raise SearchEnded(Status.STALLED, message)
+            raise SearchEnded(
                 Status.ITERATION_LIMIT,
                 f"The last stage ended before its minimum, with a gradient of {stage.gradient:.2g};"
                 " raise inner_iterations or choose another inner solver.",
             )
-        if is_increase_due or stage.reached:
+        if is_increase_due or stage.is_minimum:
             rho = min(self.rho_factor * rho, self.last_rho)
         return Stage(replace(stage.merit, rho=rho), self.tolerance)
 
 
 @dataclass(frozen=True)
-class AugmentedLagrangian(Stages):
+class AugmentedLagrangian(PenaltyOptions):
     """A penalty with multipliers, so that ρ need not become large."""
 
     name: ClassVar[str] = "augmented-lagrangian"
@@ -247,20 +247,20 @@ class AugmentedLagrangian(Stages):
         """Tolerance of the first stage."""
         return max(FIRST_GRADIENT, self.tolerance)
 
-    def following(self, stage: Stage, before: Slack, z: Array) -> Stage:
+    def following(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage with updated multipliers, and a larger ρ if much violation remains.
 
-        See `Stages.following`.
+        See `PenaltyOptions.next_stage`.
         """
         rho = stage.merit.rho
-        wanted = stage.wanted
-        slack = stage.slack
+        wanted = stage.tolerance
+        slack = stage.violation
         is_feasible = slack.relative <= self.violation
         is_last = rho >= self.rho_max or is_feasible
         if is_last and wanted <= self.tolerance and slack.scaled > STUCK * before.scaled:
-            if stage.reached:
-                raise Ended(Status.STALLED, "rho_max does not make the dynamics hold.")
-            raise Ended(
+            if stage.is_minimum:
+                raise SearchEnded(Status.STALLED, "rho_max does not make the dynamics hold.")
+            raise SearchEnded(
                 Status.STALLED,
                 f"The last stage ended with a gradient of {stage.gradient:.2g}, short of its "
                 f"tolerance {wanted:.2g}; another inner solver may get farther.",
@@ -268,30 +268,30 @@ class AugmentedLagrangian(Stages):
         if not is_feasible and slack.scaled > FALL * before.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
-        merit = replace(stage.merit, rho=rho, multipliers=stage.merit.estimate(rows))
+        merit = replace(stage.merit, rho=rho, multipliers=stage.merit.multiplier_estimate(rows))
         return Stage(merit, max(0.0 if is_feasible else TIGHTER * wanted, self.tolerance))
 
 
-class _PenaltyClimb:
+class _PenaltySolve:
     """State of a solve in stages: last iterate, which is the best as the merit decreases,
     and counts.
     """
 
-    def __init__(self, options: Stages, recorder: Recorder, start: Array | None) -> None:
+    def __init__(self, options: PenaltyOptions, recorder: Recorder, start: Array | None) -> None:
         self.options = options
         self.recorder = recorder
-        self.problem = Unconstrained(recorder.collocation, recorder.stopwatch)
+        self.problem = PenaltyProblem(recorder.collocation, recorder.stopwatch)
         nlp = self.problem.nlp
-        began = self.problem.began(recorder.start(start))
-        self.z = np.clip(began, self.problem.lower, self.problem.upper)
-        if not self.problem.is_upright(self.z):
+        began = self.problem.from_original(recorder.initial_variables(start))
+        self.variables = np.clip(began, self.problem.lower, self.problem.upper)
+        if not self.problem.has_valid_elements(self.variables):
             raise InputError("elements are inverted at the start; start from another point")
-        no_weights = np.zeros(nlp.constraints)
-        merit = Merit(self.problem, options.rho, no_weights)
+        no_weights = np.zeros(nlp.constraint_count)
+        merit = MeritFunction(self.problem, options.rho, no_weights)
         self.stage = Stage(merit, options.first_gradient)
         self.iterations = 0
         self.gradient = np.inf
-        curvature = nlp.hessian(self.z, 1.0, no_weights).diagonal()
+        curvature = nlp.hessian(self.variables, 1.0, no_weights).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
         self._every = EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
 
@@ -304,25 +304,29 @@ class _PenaltyClimb:
             If no further progress is possible or a limit is reached.
         """
         options = self.options
-        before = Slack()
+        before = ConstraintViolation()
         while True:
             ended_stage = self._minimise()
-            is_feasible = ended_stage.slack.relative <= options.violation
-            if ended_stage.reached and is_feasible and ended_stage.wanted <= options.tolerance:
+            is_feasible = ended_stage.violation.relative <= options.violation
+            if (
+                ended_stage.is_minimum
+                and is_feasible
+                and ended_stage.tolerance <= options.tolerance
+            ):
                 said = "Converged: gradient and slack are within their tolerances."
                 return Status.CONVERGED, said
-            self.stage = options.following(ended_stage, before, self.z)
-            before = ended_stage.slack
+            self.stage = options.next_stage(ended_stage, before, self.variables)
+            before = ended_stage.violation
 
-    def solution(self, status: Status, why: str) -> Solution:
+    def solution(self, status: Status, reason: str) -> Solution:
         """Return the last iterate as a solution of the given problem."""
         merit = self.stage.merit
-        estimate = merit.estimate(self.problem.constraint_values(self.z))
+        estimate = merit.multiplier_estimate(self.problem.constraint_values(self.variables))
         return self.recorder.solution(
             status,
-            f"{why} At ρ = {merit.rho:.3g} {self._slack()} is left.",
-            self.problem.answer(self.z),
-            self.problem.multipliers(estimate),
+            f"{reason} At ρ = {merit.rho:.3g} {self._violation()} is left.",
+            self.problem.to_original(self.variables),
+            self.problem.to_original_multipliers(estimate),
             self.iterations,
             self.problem.evaluations,
         )
@@ -341,43 +345,47 @@ class _PenaltyClimb:
         stage = self.stage
         options = self.options
         recorder = self.recorder
-        tolerance = max(stage.wanted, ROUNDING * (stage.merit.rho + self._curvature))
+        tolerance = max(stage.tolerance, ROUNDING * (stage.merit.rho + self._curvature))
         before = self.iterations
         done = 0
 
         def report(z: Array, value: float, projected: Array) -> None:
             """Store an iterate, add it to the history now and then, and check the limits."""
             nonlocal done
-            self.z = z
+            self.variables = z
             self.gradient = float(np.abs(projected).max(initial=0.0))
             self.iterations = before + done
             if (done % self._every == 0 and done > 0) or not recorder.history:
                 self._record()
-            if recorder.late:
-                raise Ended(Status.TIME_LIMIT)
+            if recorder.is_late:
+                raise SearchEnded(Status.TIME_LIMIT)
             if self.iterations >= options.max_iterations and self.gradient > tolerance:
-                raise Ended(Status.ITERATION_LIMIT)
+                raise SearchEnded(Status.ITERATION_LIMIT)
             done += 1
 
         limit = options.inner_iterations
-        reached = minimise(options.inner, stage.merit, self.z, tolerance, limit, report)
+        reached = minimise_merit(
+            options.inner, stage.merit, self.variables, tolerance, limit, report
+        )
         if recorder.history[-1].number < self.iterations:
             self._record()
-        return replace(stage, gradient=self.gradient, reached=reached, slack=self._slack())
+        return replace(
+            stage, gradient=self.gradient, is_minimum=reached, violation=self._violation()
+        )
 
     def _record(self) -> None:
         """Add the last iterate to the history."""
-        nlp = self.problem.given
-        z = self.problem.answer(self.z)
-        self.recorder.line(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
+        nlp = self.problem.original
+        z = self.problem.to_original(self.variables)
+        self.recorder.add_variables(self.iterations, z, nlp.objective(z) / nlp.loss_scale)
 
-    def _slack(self) -> Slack:
+    def _violation(self) -> ConstraintViolation:
         """Return the violation at the last iterate, with grasped nodes at their prescribed
         positions.
         """
-        nlp = self.problem.given
-        z = self.problem.answer(self.z)
-        newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.violations_n(z))
-        rows = self.problem.constraint_values(self.z)
+        nlp = self.problem.original
+        z = self.problem.to_original(self.variables)
+        newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.residuals_n(z))
+        rows = self.problem.constraint_values(self.variables)
         scaled = float(np.abs(rows).max(initial=0.0))
-        return Slack(newtons, newtons / max(nlp.largest_force_n(z), 1e-300), scaled)
+        return ConstraintViolation(newtons, newtons / max(nlp.largest_force_n(z), 1e-300), scaled)

@@ -6,7 +6,7 @@ This is the usual method in the literature, as a baseline: the only variables ar
 optimum is that of the other methods. The gradient is computed
 
 - "forward": from the sensitivities Z = dx/dp, solved with the trajectory, for Gauss–Newton steps in
-a trust region (SciPy's `least_squares`, "dogbox": steps of at most one in each parameter's
+a trust region (SciPy's `least_squares_of_fit`, "dogbox": steps of at most one in each parameter's
 logarithm at first);
 - "adjoint": from one sweep backward in time for the multipliers y of c_xᵀ y = −∂L/∂x, as dL/dp =
 ∂L/∂p + yᵀ ∂c/∂p for any number of parameters, for SciPy's L-BFGS-B.
@@ -29,9 +29,9 @@ from ...errors import SimulationError
 from ...program.collocation import Collocation
 from ...program.stopwatch import Stopwatch
 from ..horizon import Horizon
-from ..recorder import Ended, Recorder
+from ..recorder import Recorder, SearchEnded
 from ..solution import Solution, Status, Watch, constraint_multipliers
-from ..start import completed, marched
+from ..start import complete_variables, simulate_trajectories
 
 # Relative decrease of the loss, or of one of a standard deviation, that is rounding.
 ROUNDING = 1e-14
@@ -77,23 +77,25 @@ class Shooting(Options):
         the positions are those of a rigid motion with the grasp.
         """
         recorder = Recorder(self.name, collocation, watch, self.max_time_s)
-        search = _Search(self, recorder, start)
-        status, message = recorder.search(search.run)
+        search = _ShootingSearch(self, recorder, start)
+        status, message = recorder.run_search(search.run)
         best = search.best
-        shots = search.shots
+        shots = search.simulations
         if best is None:
-            z = completed(collocation, search.first)
-            multipliers = np.zeros(collocation.constraints)
+            z = complete_variables(collocation, search.first)
+            multipliers = np.zeros(collocation.constraint_count)
         else:
             z = best.z
             multipliers = None
-        if best is not None and search.failed:
-            failed = f"{search.failed} of {shots} simulations failed"
+        if best is not None and search.failures:
+            failed = f"{search.failures} of {shots} simulations failed"
             recorder.notes.append(f"{failed}; the search went back each time")
         return recorder.solution(status, message, z, multipliers, shots, shots)
 
 
-def simulated(collocation: Collocation, p: Array, stopwatch: Stopwatch | None = None) -> Array:
+def simulate_variables(
+    collocation: Collocation, p: Array, stopwatch: Stopwatch | None = None
+) -> Array:
     """Return variables z (variables,) at the parameters p = (q, φ), with simulated positions.
 
     Raises
@@ -101,7 +103,7 @@ def simulated(collocation: Collocation, p: Array, stopwatch: Stopwatch | None = 
     SimulationError
         If a simulation fails; it names the time step.
     """
-    positions, failure = marched(collocation, p, stopwatch=stopwatch)
+    positions, failure = simulate_trajectories(collocation, p, stopwatch=stopwatch)
     if failure is not None:
         raise failure
     return collocation.pack(p, positions)
@@ -127,12 +129,12 @@ def adjoint_gradient(
         If the equations of a time step are singular.
     """
     multipliers = constraint_multipliers(collocation, z, stopwatch)
-    slope = collocation.gradient(z) + collocation.pulled_back(z, multipliers)
-    return collocation.parameters_of(slope)
+    slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
+    return collocation.parameters_from(slope)
 
 
 @dataclass(frozen=True, eq=False)
-class _Shot:
+class _SimulatedPoint:
     """Simulation at parameters p: variables z, objective, and derivatives.
 
     Attributes
@@ -150,14 +152,14 @@ class _Shot:
     slope: Array
 
 
-class _Search:
+class _ShootingSearch:
     """Search by SciPy's optimisers, which counts and records simulations.
 
     Attributes
     ----------
-    shots, failed : int
+    simulations, failures : int
         Numbers of all and of failed simulations.
-    last, best : _Shot or None
+    last, best : _SimulatedPoint or None
         Last and best simulation that succeeded; None before the first.
     horizon : Horizon or None
         Linearised problem; None with adjoint gradients.
@@ -167,15 +169,15 @@ class _Search:
         self.options = options
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
-        self.lower, self.upper = collocation.bounds_p
-        first = collocation.guess_p if start is None else collocation.parameters_of(start)
+        self.lower, self.upper = collocation.parameter_bounds
+        first = collocation.guess_p if start is None else collocation.parameters_from(start)
         self.first = np.clip(first, self.lower, self.upper)
-        self.shots = self.failed = 0
-        self.last: _Shot | None = None
-        self.best: _Shot | None = None
+        self.simulations = self.failures = 0
+        self.last: _SimulatedPoint | None = None
+        self.best: _SimulatedPoint | None = None
         self.horizon = None
         if options.gradient == "forward":
-            rows = [segment.grid_rows for segment in collocation.segments]
+            rows = [segment.grid_times for segment in collocation.transcriptions]
             self.horizon = Horizon(collocation, rows, stopwatch=recorder.stopwatch)
 
     def run(self) -> tuple[Status, str]:
@@ -186,7 +188,7 @@ class _Search:
         SimulationError
             If the first simulation fails.
         """
-        self.last = self._shoot(self.first)
+        self.last = self._simulate(self.first)
         if not len(self.first):
             return Status.CONVERGED, Status.CONVERGED.sentence
         return self._gauss_newton() if self.horizon else self._quasi_newton()
@@ -194,11 +196,11 @@ class _Search:
     # Optimisers -------------------------------------------------------------------------------
 
     def _gauss_newton(self) -> tuple[Status, str]:
-        """Minimise by SciPy's `least_squares`."""
+        """Minimise by SciPy's `least_squares_of_fit`."""
         result = least_squares(
             self._residual,
             np.zeros(len(self.first)),  # then the trust region starts at one
-            self._slope,  # pyright: ignore[reportArgumentType]
+            self._residual_slope,  # pyright: ignore[reportArgumentType]
             (self.lower - self.first, self.upper - self.first),
             method="dogbox",
             x_scale=self.collocation.reach_p,
@@ -217,7 +219,7 @@ class _Search:
         assert self.best is not None
         return np.full(len(self.best.residual), np.inf) if shot is None else shot.residual
 
-    def _slope(self, step: Array) -> Array:
+    def _residual_slope(self, step: Array) -> Array:
         """Return the derivatives of the residuals after a step from the first parameters."""
         shot = self._try(self.first + step)
         assert shot is not None  # SciPy asks where the residuals were finite
@@ -265,7 +267,7 @@ class _Search:
 
     # Simulations ------------------------------------------------------------------------------
 
-    def _try(self, p: Array) -> _Shot | None:
+    def _try(self, p: Array) -> _SimulatedPoint | None:
         """Return the simulation at p, which is not repeated if it is the last; None if it fails.
 
         Raises
@@ -276,19 +278,19 @@ class _Search:
         if self.last is not None and np.array_equal(p, self.last.p):
             return self.last
         try:
-            shot = self._shoot(p)
+            shot = self._simulate(p)
         except SimulationError:
             shot = None
         if shot is None or not np.isfinite(shot.objective):
-            self.failed += 1
+            self.failures += 1
             assert self.best is not None
             if np.abs(p - self.best.p).max() <= self.options.tolerance:
-                raise Ended(Status.STALLED)
+                raise SearchEnded(Status.STALLED)
             return None
         self.last = shot
         return shot
 
-    def _shoot(self, p: Array) -> _Shot:
+    def _simulate(self, p: Array) -> _SimulatedPoint:
         """Simulate at p with derivatives, and record it if it is the best.
 
         Raises
@@ -298,21 +300,23 @@ class _Search:
         SimulationError
             If the simulation fails.
         """
-        if self.shots and self.shots >= self.options.max_iterations:
-            raise Ended(Status.ITERATION_LIMIT)
-        if self.shots and self.recorder.late:
-            raise Ended(Status.TIME_LIMIT)
-        self.shots += 1
+        if self.simulations and self.simulations >= self.options.max_iterations:
+            raise SearchEnded(Status.ITERATION_LIMIT)
+        if self.simulations and self.recorder.is_late:
+            raise SearchEnded(Status.TIME_LIMIT)
+        self.simulations += 1
         collocation = self.collocation
-        z = simulated(collocation, p, self.recorder.stopwatch)
+        z = simulate_variables(collocation, p, self.recorder.stopwatch)
         if self.horizon is not None:
             point = self.horizon.evaluate(p, collocation.unpack(z)[1])
             value = point.loss * collocation.loss_scale
-            shot = _Shot(p.copy(), z, value, point.fit.residual, point.fit.slope)
+            shot = _SimulatedPoint(p.copy(), z, value, point.fit.residual, point.fit.jacobian)
         else:
             slope = adjoint_gradient(collocation, z, self.recorder.stopwatch)
-            shot = _Shot(p.copy(), z, collocation.objective(z), np.zeros(0), slope)
+            shot = _SimulatedPoint(p.copy(), z, collocation.objective(z), np.zeros(0), slope)
         if self.best is None or shot.objective < self.best.objective:
             self.best = shot
-            self.recorder.line(self.shots, z, shot.objective / collocation.loss_scale)
+            self.recorder.add_variables(
+                self.simulations, z, shot.objective / collocation.loss_scale
+            )
         return shot

@@ -1,6 +1,6 @@
 """Search for the motion with the smallest error bars, within limits and over a prior of θ.
 
-Use `design`.
+Use `design_motion`.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from ...problem import Problem
 from ...program.simulation import Trajectory, simulate, with_markers
 from ...recording import Experiment, PoseSequence
 from ...runs.solving import solve
-from ...statistics.linearised import linearised_fit
+from ...statistics.linearised import linearise_fit
 from .information import (
-    Criterion,
-    Errors,
+    DesignCriterion,
     FutureRecording,
     LinearRecording,
+    PredictedErrors,
     SimulatedMotion,
-    both_sides,
-    draws_about,
+    prior_draws,
     shared_information,
+    symmetric_draws,
 )
-from .limits import REACHED, Bounds, Limits
+from .limits import REACHED, HandBounds, Limits
 from .motion import HandMotion
-from .search import Best, Watch, search
+from .search import SearchResult, Watch, minimise
 
 Say = Callable[[str], None]
 
@@ -70,12 +70,12 @@ class DesignOptions(Options):
     seed: Count = 0
 
 
-WORST = Criterion()
+WORST = DesignCriterion()
 USUAL = DesignOptions()
 
 
 @dataclass(frozen=True, eq=False)
-class Bars:
+class ErrorBars:
     """Relative error bars, by name.
 
     Attributes
@@ -94,7 +94,7 @@ class Bars:
     highest: Mapping[str, float]
 
     @classmethod
-    def of(cls, errors: list[Errors]) -> Bars:
+    def from_draws(cls, errors: list[PredictedErrors]) -> ErrorBars:
         """Return the error bars from those at the draws, the middle first."""
         each = [error.relative for error in errors]
         lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
@@ -115,12 +115,12 @@ class Design:
         Experiment to be recorded, with simulated markers instead of measured ones.
     predicted : Trajectory
         Simulation at the middle of the prior.
-    criterion : Criterion
+    criterion : DesignCriterion
         Criterion that was minimised.
-    before : Bars or None
+    before : ErrorBars or None
         Error bars of the existing recordings, if they are used, else of the problem's own motion;
         None if that could not be simulated.
-    after : Bars
+    after : ErrorBars
         Error bars with the new recording, and with the existing ones if they are used.
     added : bool
         Whether the existing recordings are used.
@@ -128,7 +128,7 @@ class Design:
         Limits of the robot.
     shares : mapping of str to float
         Largest value over the limit, by name of the limit.
-    best : Best
+    best : SearchResult
         Result of the search.
     draws : int
         Number of draws of θ.
@@ -138,13 +138,13 @@ class Design:
     motion: HandMotion
     experiment: Experiment
     predicted: Trajectory
-    criterion: Criterion
-    before: Bars | None
-    after: Bars
+    criterion: DesignCriterion
+    before: ErrorBars | None
+    after: ErrorBars
     added: bool
     limits: Limits
     shares: Mapping[str, float]
-    best: Best
+    best: SearchResult
     draws: int
 
     @property
@@ -153,18 +153,18 @@ class Design:
         return self.experiment.grasps[0].poses
 
     @property
-    def reached(self) -> list[str]:
+    def active_limits(self) -> list[str]:
         """Names of the limits that the motion reaches."""
         return [name for name, share in self.shares.items() if share > REACHED]
 
     @property
-    def size(self) -> float:
+    def minimised_error(self) -> float:
         """Relative error bar that was minimised."""
         return float(np.exp(self.best.value))
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class MotionObjective:
     """Objective of the search: size of the error bars of a motion.
 
     Attributes
@@ -173,22 +173,22 @@ class Judge:
         Recording to be designed.
     limits : Limits
         Limits of the robot.
-    criterion : Criterion
+    criterion : DesignCriterion
         Criterion.
     draws : list of (nq,) array
         Draws of q, the middle of the prior first.
-    known : (nq, nq) array
+    known_information : (nq, nq) array
         Information of the existing recordings.
     """
 
     recording: FutureRecording
     limits: Limits
-    criterion: Criterion
+    criterion: DesignCriterion
     draws: list[Array]
-    known: Array
+    known_information: Array
 
     @cached_property
-    def bounds(self) -> Bounds:
+    def bounds(self) -> HandBounds:
         """Limits relative to the initial position."""
         return self.recording.bounds(self.limits)
 
@@ -201,22 +201,24 @@ class Judge:
     def motion(self, coefficients: Array) -> HandMotion:
         """Return the motion of any coefficients, scaled to the limits."""
         recording = self.recording
-        free = HandMotion.of(
+        free = HandMotion.from_coefficients(
             coefficients,
             float(recording.since_start_s[-1]),
             recording.highest_hz(self.limits),
             self.bounds.reach,
         )
-        return self.bounds.within(free)
+        return self.bounds.scale_to_limits(free)
 
-    def errors(self, information: Array | float, q: Array) -> Errors:
+    def errors(self, information: Array | float, q: Array) -> PredictedErrors:
         """Return the error bars at q with the existing recordings and additional
         information (nq, nq).
         """
         parameters = self.recording.problem.parameters
-        return Errors.of(self.known + information, parameters, self.constants, q)
+        return PredictedErrors.from_information(
+            self.known_information + information, parameters, self.constants, q
+        )
 
-    def first_guess(self, options: DesignOptions, say: Say) -> Best:
+    def first_guess(self, options: DesignOptions, say: Say) -> SearchResult:
         """Return the best motion to first order, as a start of the search.
 
         The result has no coefficients if a wrench is measured too, the memory would be too large,
@@ -224,15 +226,15 @@ class Judge:
         """
         sensed = self.recording.template.grasps[0].wrench is not None
         if sensed or LinearRecording.gigabytes(self.recording) > MOST_GIGABYTES:
-            return Best()
+            return SearchResult()
         middle = self.draws[0]
         count = TO_FIRST_ORDER * options.evaluations
         try:
-            linear = LinearRecording.of(self.recording, middle)
+            linear = LinearRecording.from_simulations(self.recording, middle)
         except SimulationError:
-            return Best()
+            return SearchResult()
 
-        def told(number: int, size: float) -> None:
+        def report(number: int, size: float) -> None:
             """Report the progress now and then."""
             if number % NEWS == 0:
                 size = 100 * np.exp(size)
@@ -243,43 +245,43 @@ class Judge:
             information = linear.information(self.motion(coefficients))
             return self.criterion.log_size(self.errors(information, middle))
 
-        size = HandMotion.size(options.waves)
-        return search(value, size, count, options.seed, told)
+        size = HandMotion.coefficient_count(options.waves)
+        return minimise(value, size, count, options.seed, report)
 
-    def value(self, coefficients: Array, bar: float) -> float:
+    def value(self, coefficients: Array, bound: float) -> float:
         """Return the logarithm of the error bar; `FORBIDDEN` or more if a simulation fails or a
         view is left.
 
-        If the value at the middle of the prior exceeds `bar`, the other draws are not simulated.
+        If the value at the middle of the prior exceeds `bound`, the other draws are not simulated.
 
         Parameters
         ----------
         coefficients : (d,) array
             Coefficients of the motion.
-        bar : float
+        bound : float
             Bound beyond which the value need not be exact.
         """
         experiment = self.recording.experiment(self.recording.poses(self.motion(coefficients)))
         sizes = []
         for q in self.draws:
             try:
-                result = self.recording.told(experiment, q)
+                result = self.recording.simulate_motion(experiment, q)
             except SimulationError as failure:
                 simulated_share = (failure.time_s - experiment.t_s[0]) / experiment.duration_s
                 return FORBIDDEN * (3 - min(1.0, simulated_share))
             if (excess := self.limits.out_of_view(result.markers_m)) > 0:
                 return FORBIDDEN * (1 + excess / (1 + excess))
             sizes.append(self.criterion.log_size(self.errors(result.information, q)))
-            if len(sizes) == 1 and sizes[0] > bar:
+            if len(sizes) == 1 and sizes[0] > bound:
                 break
-        return self.criterion.over_draws(sizes)
+        return self.criterion.combine_draws(sizes)
 
 
-def design(
+def design_motion(
     problem: Problem,
     limits: Limits,
     duration_s: float,
-    criterion: Criterion = WORST,
+    criterion: DesignCriterion = WORST,
     options: DesignOptions = USUAL,
     *,
     experiment: str | None = None,
@@ -298,7 +300,7 @@ def design(
         Limits of the robot.
     duration_s : float
         Duration of the motion [s].
-    criterion : Criterion
+    criterion : DesignCriterion
         Criterion to minimise.
     options : DesignOptions
         Options of the search.
@@ -325,41 +327,46 @@ def design(
         raise InputError(
             f"found {duration_s:g}; expected a number of seconds above 0", None, "--duration"
         )
-    recording = FutureRecording(problem, _chosen(problem, experiment), duration_s)
+    recording = FutureRecording(problem, _select_experiment(problem, experiment), duration_s)
     recording.bounds(limits)
     recording.highest_hz(limits)
     if not problem.parameters.free:
         raise InputError("every parameter is fixed; expected one to estimate", problem.path)
     if add:
         say("identifying the parameters from the recordings there are")
-        draws, known = _from_recordings(problem, options)
+        draws, known = _draws_from_recordings(problem, options)
     else:
         _require_guesses(problem)
-        draws = draws_about(problem.parameters, options.spread, options.pairs, options.seed)
+        draws = prior_draws(problem.parameters, options.spread, options.pairs, options.seed)
         known = np.zeros((len(draws[0]),) * 2)
-    judge = Judge(recording, limits, criterion, draws, known)
+    judge = MotionObjective(recording, limits, criterion, draws, known)
     criterion.require_known(judge.errors(0.0, draws[0]))
     first = judge.first_guess(options, say)
     say("seeking a motion")
-    evaluations = 1 if first.interrupted else options.evaluations
-    best = search(
-        judge.value, HandMotion.size(options.waves), evaluations, options.seed, watch, first.at
+    evaluations = 1 if first.is_interrupted else options.evaluations
+    best = minimise(
+        judge.value,
+        HandMotion.coefficient_count(options.waves),
+        evaluations,
+        options.seed,
+        watch,
+        first.coefficients,
     )
-    best.interrupted |= first.interrupted
-    if best.at is None or best.value >= FORBIDDEN:
-        raise InputError(_no_motion(best), problem.path)
+    best.is_interrupted |= first.is_interrupted
+    if best.coefficients is None or best.value >= FORBIDDEN:
+        raise InputError(_no_motion_message(best), problem.path)
     say("simulating the best motion")
-    return _designed(judge, best, add)
+    return _evaluate_design(judge, best, add)
 
 
-def _designed(judge: Judge, best: Best, add: bool) -> Design:
+def _evaluate_design(judge: MotionObjective, best: SearchResult, add: bool) -> Design:
     """Return the design with the best motion and its error bars."""
-    assert best.at is not None
+    assert best.coefficients is not None
     recording = judge.recording
-    motion = judge.motion(best.at)
+    motion = judge.motion(best.coefficients)
     experiment = recording.experiment(recording.poses(motion))
-    results = [recording.told(experiment, q) for q in judge.draws]
-    after = _bars(judge, results)
+    results = [recording.simulate_motion(experiment, q) for q in judge.draws]
+    after = _error_bars(judge, results)
     problem = recording.problem
     values = problem.parameters.values(judge.draws[0])
     predicted = simulate(experiment, values, problem.scheme, substeps=problem.first_substeps)
@@ -379,29 +386,29 @@ def _designed(judge: Judge, best: Best, add: bool) -> Design:
     )
 
 
-def _before(judge: Judge, add: bool) -> Bars | None:
+def _before(judge: MotionObjective, add: bool) -> ErrorBars | None:
     """Error bars of the recordings there are, or of the motion that the problem has."""
     if add:
-        return Bars.of([judge.errors(0.0, q) for q in judge.draws])
+        return ErrorBars.from_draws([judge.errors(0.0, q) for q in judge.draws])
     recording = judge.recording
     template = recording.template
     if len(template.grasps[0].poses.t_s) < 2:
         return None
     shipped = replace(recording, duration_s=template.duration_s)
     try:
-        told = [shipped.told(template, q) for q in judge.draws]
+        told = [shipped.simulate_motion(template, q) for q in judge.draws]
     except SimulationError:
         return None
-    return _bars(judge, told)
+    return _error_bars(judge, told)
 
 
-def _bars(judge: Judge, told: list[SimulatedMotion]) -> Bars:
+def _error_bars(judge: MotionObjective, results: list[SimulatedMotion]) -> ErrorBars:
     """Return the error bars from the motion's information at all draws."""
-    pairs = zip(told, judge.draws, strict=True)
-    return Bars.of([judge.errors(each.information, q) for each, q in pairs])
+    pairs = zip(results, judge.draws, strict=True)
+    return ErrorBars.from_draws([judge.errors(each.information, q) for each, q in pairs])
 
 
-def _from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
+def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
     """Return draws of q around the estimate, and the information (nq, nq) of the recordings."""
     solution = solve(problem)
     solution.unless_interrupted()
@@ -411,20 +418,20 @@ def _from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Arr
             "there is nothing to add to; solve the problem first, or leave out --add",
             problem.path,
         )
-    known = shared_information(linearised_fit(solution.collocation, solution.z))
+    known = shared_information(linearise_fit(solution.collocation, solution.z))
     constants = ThetaMap(problem.parameters, problem.experiments[0].body)
-    errors = Errors.of(known, problem.parameters, constants, solution.q)
+    errors = PredictedErrors.from_information(known, problem.parameters, constants, solution.q)
     # Where they tell next to nothing of a parameter, as far about the answer as about a guess.
     largest_deviation = np.log(options.spread)
     deviations = np.sqrt(np.diag(errors.covariance))
     factors = np.minimum(1.0, largest_deviation / deviations)
     root = factors[:, None] * np.linalg.cholesky(errors.covariance)
-    return both_sides(problem.parameters, solution.q, root, options.pairs, options.seed), known
+    return symmetric_draws(problem.parameters, solution.q, root, options.pairs, options.seed), known
 
 
-def _chosen(problem: Problem, name: str | None) -> Experiment:
+def _select_experiment(problem: Problem, name: str | None) -> Experiment:
     """Return the experiment with a name, or the first that is not static for None."""
-    moving = [each for each in problem.experiments if not each.static]
+    moving = [each for each in problem.experiments if not each.is_static]
     if not moving:
         raise InputError("every experiment is static; expected one that moves", problem.path)
     if name is None:
@@ -436,7 +443,7 @@ def _chosen(problem: Problem, name: str | None) -> Experiment:
 
 def _require_guesses(problem: Problem) -> None:
     """Raise `InputError` if a parameter has no guess."""
-    if names := problem.parameters.unguessed:
+    if names := problem.parameters.names_without_guess:
         key = f"parameters.{names[0]}"
         raise InputError(
             "has no guess, and a motion is designed about a value; expected --set "
@@ -446,7 +453,7 @@ def _require_guesses(problem: Problem) -> None:
         )
 
 
-def _no_motion(best: Best) -> str:
+def _no_motion_message(best: SearchResult) -> str:
     """Return why no motion was found."""
     tried = f"none of the {len(best.history)} motions that were tried"
     if best.value >= 2 * FORBIDDEN:

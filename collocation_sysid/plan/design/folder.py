@@ -15,17 +15,17 @@ import numpy as np
 import tomli_w
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from ...fem.constants import is_mode
+from ...fem.constants import is_field_coefficient
 from ...problem.recording_schema import MovedSection
-from ...problem.schema import ProblemFile, completed
+from ...problem.schema import ProblemFile, with_experiment_defaults
 from ...recording import PoseSequence, write_markers_csv, write_poses_csv, write_wrench_csv
 from ...result.animation import film
 from ...result.pictures.album import save_pictures
 from ...result.replay import Replay
 from ...result.writers import run_folder
 from ...tree import as_json, content
-from .designing import Bars, Design
-from .page import pictures
+from .designing import Design, ErrorBars
+from .page import design_figures
 
 DESIGN_FILE = "design.json"
 POSES_FILE = "poses.csv"
@@ -81,26 +81,26 @@ def write_design(
     """
     target = Path(folder)
     with run_folder(target, mark=DESIGN_FILE, what="design") as place:
-        write_poses_csv(place / POSES_FILE, _of_gripper(design))
+        write_poses_csv(place / POSES_FILE, _gripper_poses(design))
         experiment = design.experiment
         markers = experiment.markers
         write_markers_csv(place / MARKERS_FILE, markers.t_s, markers.names, markers.positions_m)
         for sensor, wrench in zip(experiment.wrenches, design.predicted.wrenches, strict=True):
             write_wrench_csv(place / WRENCH_FILE, sensor.t_s, wrench)
         if design.recording.problem.origin is not None:
-            text = HEAD + tomli_w.dumps(_content(design, target.resolve()))
+            text = HEAD + tomli_w.dumps(_problem_content(design, target.resolve()))
             (place / PROBLEM_FILE).write_text(text, encoding="utf-8")
-        save_pictures(place, pictures(design))
+        save_pictures(place, design_figures(design))
         if with_film:
             say("filming the motion")
             shapes_m = design.predicted.positions_m
             replay = Replay.of(experiment, (shapes_m, markers.positions_m))
             film(replay, place / FILM_FILE, FRAMES_PER_SECOND, names=("predicted", ""))
-        (place / DESIGN_FILE).write_text(as_json(as_dict(design)), encoding="utf-8")
+        (place / DESIGN_FILE).write_text(as_json(design_json(design)), encoding="utf-8")
     return target
 
 
-def as_dict(design: Design) -> dict[str, Any]:
+def design_json(design: Design) -> dict[str, Any]:
     """Return the content of design.json."""
     search = design.best
     limits = design.limits
@@ -114,26 +114,26 @@ def as_dict(design: Design) -> dict[str, Any]:
             "for": list(design.criterion.names),
             "over": design.criterion.over,
             "draws": design.draws,
-            "relative_error": design.size,
+            "relative_error": design.minimised_error,
         },
         "recordings_count": design.added,
-        "before": None if design.before is None else _bars(design.before),
-        "after": _bars(design.after),
+        "before": None if design.before is None else _error_bars_json(design.before),
+        "after": _error_bars_json(design.after),
         "limits": {
             name: {"limit": getattr(limits, name), "share_used": share}
             for name, share in design.shares.items()
         },
-        "limits_reached": design.reached,
+        "limits_reached": design.active_limits,
         "search": {
             "evaluations": len(search.history),
-            "interrupted": search.interrupted,
+            "interrupted": search.is_interrupted,
             "history": [float(np.exp(min(value, 100.0))) for value in search.history],
         },
         "motion": content(design.motion),
     }
 
 
-def _bars(bars: Bars) -> dict[str, Any]:
+def _error_bars_json(bars: ErrorBars) -> dict[str, Any]:
     """Return error bars for JSON."""
     return {
         name: {
@@ -149,7 +149,7 @@ def _bars(bars: Bars) -> dict[str, Any]:
 # The problem --------------------------------------------------------------------------------------
 
 
-def _of_gripper(design: Design) -> PoseSequence:
+def _gripper_poses(design: Design) -> PoseSequence:
     """Return the poses of the gripper if the problem states its transform to the body, else
     of the body.
     """
@@ -159,34 +159,34 @@ def _of_gripper(design: Design) -> PoseSequence:
         return design.poses
     sections = ProblemFile.model_validate(tomllib.loads(origin.text)).experiment
     (section,) = (section for section in sections if section.name == name)
-    if (transform := section.grasps[0].gripper_to_body) is None:
+    if (transform := section.grasp_list[0].gripper_to_body) is None:
         return design.poses
     rotation = Rotation.from_quat(transform.quaternion_xyzw)
     body_in_gripper = RigidTransform.from_components(transform.position_m, rotation)
     return design.poses.after(body_in_gripper.inv().as_matrix())
 
 
-def _content(design: Design, folder: Path) -> dict[str, Any]:
+def _problem_content(design: Design, folder: Path) -> dict[str, Any]:
     """Return the problem file for the designed recording, with the existing ones if they
     are used.
     """
     origin = design.recording.problem.origin
     recording = design.recording
     assert origin is not None
-    problem_table = completed(tomllib.loads(origin.text))
+    problem_table = with_experiment_defaults(tomllib.loads(origin.text))
     problem_table.pop("experiment_defaults", None)
     old_folder = origin.path.resolve().parent
     for key in ("object", "experiment"):
-        problem_table[key] = _seen_from(problem_table[key], old_folder, folder)
+        problem_table[key] = _relative_to(problem_table[key], old_folder, folder)
     tables = problem_table["experiment"]
     names = [each.get("name") for each in tables]
     new = deepcopy(tables[names.index(recording.template.name)])
     used_names = {*names} if design.added else set()
     candidate_names = (f"{NAME}_{k}" if k > 1 else NAME for k in range(1, len(names) + 2))
     new["name"] = next(name for name in candidate_names if name not in used_names)
-    problem_table["experiment"] = [*(tables if design.added else []), _designed(new)]
+    problem_table["experiment"] = [*(tables if design.added else []), _designed_table(new)]
     for item in recording.problem.parameters.free:
-        if is_mode(item.name):
+        if is_field_coefficient(item.name):
             continue
         stated = problem_table["parameters"].get(item.name)
         guess = {"guess": design.after.values[item.name]}
@@ -196,7 +196,7 @@ def _content(design: Design, folder: Path) -> dict[str, Any]:
     return problem_table
 
 
-def _designed(table: dict[str, Any]) -> dict[str, Any]:
+def _designed_table(table: dict[str, Any]) -> dict[str, Any]:
     """Return an experiment's table with the files of the design; the table is modified."""
     for key in OF_TIME:
         table.pop(key, None)
@@ -205,7 +205,7 @@ def _designed(table: dict[str, Any]) -> dict[str, Any]:
         grasp.pop(key, None)
     grasp["poses"] = POSES_FILE
     if "wrench" in grasp:
-        grasp["wrench"] = _of_design(grasp["wrench"])
+        grasp["wrench"] = _designed_wrench(grasp["wrench"])
     if "markers" in table:
         for key in OF_MARKERS:
             table["markers"].pop(key, None)
@@ -213,7 +213,7 @@ def _designed(table: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def _of_design(wrench: dict[str, Any]) -> dict[str, Any]:
+def _designed_wrench(wrench: dict[str, Any]) -> dict[str, Any]:
     """Return a wrench's table with the file of the design, which refers to the mesh and is
     in newtons.
     """
@@ -223,18 +223,18 @@ def _of_design(wrench: dict[str, Any]) -> dict[str, Any]:
     return remaining | sigmas | {"file": WRENCH_FILE}
 
 
-def _seen_from(value: Any, old: Path, new: Path) -> Any:
+def _relative_to(value: Any, old: Path, new: Path) -> Any:
     """Return a table of a problem with file names relative to another folder.
 
     Names of columns are not file names.
     """
     if isinstance(value, list):
-        return [_seen_from(each, old, new) for each in value]
+        return [_relative_to(each, old, new) for each in value]
     if not isinstance(value, dict):
         return value
     return {
         key: Path(os.path.relpath(old / each, new)).as_posix()
         if key in OF_FILES and isinstance(each, str)
-        else (each if key == "columns" else _seen_from(each, old, new))
+        else (each if key == "columns" else _relative_to(each, old, new))
         for key, each in value.items()
     }

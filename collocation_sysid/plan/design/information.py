@@ -31,17 +31,22 @@ from scipy.spatial.transform import Rotation
 
 from ...arrays import Array
 from ...errors import InputError, require_among
-from ...fem.constants import is_mode
+from ...fem.constants import is_field_coefficient
 from ...model.parameters import Parameters, ThetaMap
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.marching import march_on
+from ...program.marching import continue_simulation
 from ...program.newton import NewtonOptions
 from ...recording import Experiment, PoseSequence
 from ...recording.wrench import Wrench
-from ...statistics.estimates import UNDETERMINED, relative_slopes
-from ...statistics.linearised import Derived, LinearisedFit, least_squares, linearised_fit
-from .limits import Bounds, Limits
+from ...statistics.estimates import UNDETERMINED, relative_derivatives
+from ...statistics.linearised import (
+    DerivedModuli,
+    LinearisedFit,
+    least_squares_of_fit,
+    linearise_fit,
+)
+from .limits import HandBounds, Limits
 from .motion import HandMotion
 
 Kind = Literal["worst", "A", "D"]
@@ -49,7 +54,7 @@ Over = Literal["mean", "worst"]
 
 
 @dataclass(frozen=True)
-class Criterion:
+class DesignCriterion:
     """Criterion that a design minimises.
 
     Attributes
@@ -72,7 +77,7 @@ class Criterion:
         require_among(self.kind, get_args(Kind), None, "--criterion")
         require_among(self.over, get_args(Over), None, "--over")
 
-    def log_size(self, errors: Errors) -> float:
+    def log_size(self, errors: PredictedErrors) -> float:
         """Return the logarithm of the error bar that is minimised."""
         slopes = errors.slopes_of(self.names)
         covariance = slopes @ errors.covariance @ slopes.T
@@ -81,11 +86,11 @@ class Criterion:
         variances = np.diag(covariance)
         return 0.5 * float(np.log(variances.max() if self.kind == "worst" else variances.mean()))
 
-    def over_draws(self, sizes: Sequence[float]) -> float:
+    def combine_draws(self, sizes: Sequence[float]) -> float:
         """Return one value from those at several θ."""
         return float(np.max(sizes) if self.over == "worst" else np.mean(sizes))
 
-    def require_known(self, errors: Errors) -> None:
+    def require_known(self, errors: PredictedErrors) -> None:
         """Raise `InputError` for names that are not estimated, and for "D" those that
         depend on each other.
         """
@@ -102,7 +107,7 @@ class Criterion:
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class PredictedErrors:
     """Relative error bars at one θ, to first order.
 
     Attributes
@@ -113,19 +118,19 @@ class Errors:
         Estimated parameters, followed by derived moduli, by name.
     slopes : dict of str to (nq,) array
         Relative change of each with q.
-    estimated : int
+    estimated_count : int
         Number of estimated parameters, the first of the names.
     """
 
     covariance: Array
     values: dict[str, float]
     slopes: dict[str, Array]
-    estimated: int
+    estimated_count: int
 
     @classmethod
-    def of(
+    def from_information(
         cls, information: Array, parameters: Parameters, constants: ThetaMap, q: Array
-    ) -> Errors:
+    ) -> PredictedErrors:
         """Return the errors from the information (nq, nq) of all recordings and the priors of q.
 
         No error bar exceeds `UNDETERMINED` times the parameter, so that motions without information
@@ -142,27 +147,27 @@ class Errors:
         q : (nq,) array
             Parameters in the solver's coordinates.
         """
-        sizes = relative_slopes(parameters, q)
-        prior = parameters.prior(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
+        sizes = relative_derivatives(parameters, q)
+        prior = parameters.prior_residuals(q)[1] ** 2 + (sizes / UNDETERMINED) ** 2
         units = 1 / np.sqrt(np.diag(information) + prior)
         scaled = units[:, None] * (information + np.diag(prior)) * units
         covariance = units[:, None] * np.linalg.inv(scaled) * units
         values = dict[str, float]()
         slopes = dict[str, Array]()
         for item, c, slope in zip(parameters.free, q, np.diag(sizes), strict=True):
-            if not is_mode(item.name):
-                values[item.name] = item.value(float(c))
+            if not is_field_coefficient(item.name):
+                values[item.name] = item.from_coordinate(float(c))
                 slopes[item.name] = slope
         estimated_count = len(values)
-        derived = Derived.of([constants], q)
-        varying = {name: by_q for name, by_q in derived.by_q.items() if by_q.any()}
+        derived = DerivedModuli.from_bodies([constants], q)
+        varying = {name: by_q for name, by_q in derived.derivatives.items() if by_q.any()}
         values |= {name: derived.values[name] for name in varying}
         slopes |= {name: by_q / derived.values[name] for name, by_q in varying.items()}
         return cls(covariance, values, slopes, estimated_count)
 
     def slopes_of(self, names: Sequence[str]) -> Array:
         """Return the slopes (k, nq) of names; of all estimated parameters if names is empty."""
-        chosen = names or list(self.slopes)[: self.estimated]
+        chosen = names or list(self.slopes)[: self.estimated_count]
         return np.array([self.slopes[name] for name in chosen])
 
     @property
@@ -174,7 +179,7 @@ class Errors:
         }
 
 
-def draws_about(parameters: Parameters, spread: float, pairs: int, seed: int) -> list[Array]:
+def prior_draws(parameters: Parameters, spread: float, pairs: int, seed: int) -> list[Array]:
     """Return draws (nq,) of q: the middle, followed by pairs on either side of it.
 
     A parameter with a prior is drawn from it. Others are drawn around their guess: logarithms with
@@ -186,12 +191,12 @@ def draws_about(parameters: Parameters, spread: float, pairs: int, seed: int) ->
     )
     for k, item in enumerate(parameters.free):
         if item.prior is not None:
-            middle[k] = item.q(item.prior[0])
+            middle[k] = item.to_coordinate(item.prior[0])
             deviation[k] = item.prior[1] / (1.0 if item.scale == "log" else item.unit)
-    return both_sides(parameters, middle, np.diag(deviation), pairs, seed)
+    return symmetric_draws(parameters, middle, np.diag(deviation), pairs, seed)
 
 
-def both_sides(
+def symmetric_draws(
     parameters: Parameters, middle: Array, root: Array, pairs: int, seed: int
 ) -> list[Array]:
     """Return the middle of a normal distribution of q and pairs of draws on either side, within
@@ -232,8 +237,8 @@ def shared_information(fit: LinearisedFit) -> Array:
     Nuisance parameters are eliminated with their priors; priors of the shared parameters are not
     included.
     """
-    alone = least_squares(fit).marginal(fit.shared)
-    return alone.information - np.diag(fit.prior_slope[: fit.shared] ** 2)
+    alone = least_squares_of_fit(fit).marginal(fit.shared_count)
+    return alone.information - np.diag(fit.prior_jacobian[: fit.shared_count] ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,14 +278,14 @@ class FutureRecording:
 
     def __post_init__(self) -> None:
         try:
-            self._check()
+            self._validate()
         except InputError as error:
             raise error.located(self.problem.path, f"experiment '{self.template.name}'") from error
 
-    def _check(self) -> None:
+    def _validate(self) -> None:
         """Raise `InputError` if a motion cannot be designed for the experiment."""
         template = self.template
-        if template.static:
+        if template.is_static:
             raise InputError("is static; expected one that moves, to design a motion for")
         if len(template.grasps) != 1:
             raise InputError(
@@ -310,7 +315,7 @@ class FutureRecording:
         return np.asarray(np.arange(self.samples) * self.template.timestep_s, dtype=np.float64)
 
     @cached_property
-    def start(self) -> tuple[Array, Array]:
+    def start_pose(self) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) [m] of the first pose."""
         rotations, translations = self.template.rigid_motion(self.template.t_s[:1])
         return rotations[0], translations[0]
@@ -321,10 +326,10 @@ class FutureRecording:
         (grasp,) = self.template.grasps
         return np.asarray(self.template.body.nodes_m[grasp.nodes].mean(axis=0), dtype=np.float64)
 
-    def bounds(self, limits: Limits) -> Bounds:
+    def bounds(self, limits: Limits) -> HandBounds:
         """Return the limits of the hand relative to its initial position."""
-        rotation, translation = self.start
-        return limits.about(rotation @ self.hand_m + translation)
+        rotation, translation = self.start_pose
+        return limits.bounds_from(rotation @ self.hand_m + translation)
 
     def highest_hz(self, limits: Limits) -> float:
         """Return the highest frequency of a wave.
@@ -352,13 +357,13 @@ class FutureRecording:
 
     def poses(self, motion: HandMotion) -> PoseSequence:
         """Return the poses of a motion."""
-        return self.carried(motion.derivatives(self.pose_times_s)[0])
+        return self.poses_from_coordinates(motion.derivatives(self.pose_times_s)[0])
 
-    def carried(self, coordinates: Array) -> PoseSequence:
+    def poses_from_coordinates(self, coordinates: Array) -> PoseSequence:
         """Return the poses at `pose_times_s` from translation and rotation vector (P, 6) of
         the hand.
         """
-        rotation, translation = self.start
+        rotation, translation = self.start_pose
         turned = Rotation.from_rotvec(coordinates[:, 3:]) * Rotation.from_matrix(rotation)
         hand = rotation @ self.hand_m + translation + coordinates[:, :3]
         placed = hand - turned.apply(self.hand_m)
@@ -373,11 +378,11 @@ class FutureRecording:
         return replace(
             template,
             t_s=t_s,
-            grasps=(replace(grasp, poses=poses, wrench=_anew(grasp.wrench, t_s)),),
+            grasps=(replace(grasp, poses=poses, wrench=_resampled(grasp.wrench, t_s)),),
             markers=replace(template.markers, t_s=t_s, positions_m=nowhere),
         )
 
-    def told(self, experiment: Experiment, q: Array) -> SimulatedMotion:
+    def simulate_motion(self, experiment: Experiment, q: Array) -> SimulatedMotion:
         """Return information and marker positions of an experiment simulated at q.
 
         Raises
@@ -385,9 +390,11 @@ class FutureRecording:
         SimulationError
             If the simulation does not reach the end.
         """
-        fit, x = self.fit(experiment, q)
+        fit, x = self.linearise(experiment, q)
         positions = x[:: self.problem.first_substeps].reshape(len(experiment.t_s), -1, 3)
-        return SimulatedMotion(shared_information(fit), experiment.markers.observe(positions))
+        return SimulatedMotion(
+            shared_information(fit), experiment.markers.predict_positions(positions)
+        )
 
     def program(self, experiment: Experiment) -> Collocation:
         """Return the nonlinear program of one experiment."""
@@ -395,7 +402,7 @@ class FutureRecording:
         fitted = replace(experiment, validation=False) if experiment.validation else experiment
         return Collocation([fitted], problem.parameters, problem.scheme, problem.first_substeps)
 
-    def fit(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
+    def linearise(self, experiment: Experiment, q: Array) -> tuple[LinearisedFit, Array]:
         """Return the linearised fit of an experiment simulated at q, and its positions (N, 3n) [m].
 
         Raises
@@ -404,9 +411,9 @@ class FutureRecording:
             If the simulation does not reach the end.
         """
         alone = self.program(experiment)
-        (segment,) = alone.segments
+        (segment,) = alone.transcriptions
         known = self._starts.get(q.tobytes())  # every motion starts from the same rest
-        x, failure = march_on(
+        x, failure = continue_simulation(
             experiment,
             segment.dynamics.with_theta(segment.constants.theta(q)),
             known,
@@ -415,10 +422,10 @@ class FutureRecording:
         if failure is not None:
             raise failure
         self._starts[q.tobytes()] = x[:1]
-        return linearised_fit(alone, alone.pack(np.append(q, segment.guess_phi), [x])), x
+        return linearise_fit(alone, alone.pack(np.append(q, segment.guess_phi), [x])), x
 
 
-def _anew(wrench: Wrench | None, t_s: Array) -> Wrench | None:
+def _resampled(wrench: Wrench | None, t_s: Array) -> Wrench | None:
     """Return the sensor with its own rate over other times; zeros where it measures. None
     for None.
     """
@@ -427,7 +434,7 @@ def _anew(wrench: Wrench | None, t_s: Array) -> Wrench | None:
     rate_hz = (len(wrench.t_s) - 1) / max(np.ptp(wrench.t_s), 1e-300)
     count = max(3, 1 + int(np.ptp(t_s) * rate_hz + 1e-6))
     times = t_s[0] + np.arange(count) / rate_hz
-    values = np.tile(np.where(wrench.measured, 0.0, np.nan), (count, 1))
+    values = np.tile(np.where(wrench.measured_components, 0.0, np.nan), (count, 1))
     return replace(wrench, t_s=times, values=values)
 
 
@@ -449,7 +456,7 @@ class LinearRecording:
         Recording to be designed.
     rest : LinearisedFit
         Linearised fit without any motion.
-    answers : (6, frequencies, 3M, p) array
+    responses : (6, frequencies, 3M, p) array
         Fourier transforms of the change of the slopes, for a pulse of height one.
     length : int
         Length of the transforms.
@@ -457,18 +464,18 @@ class LinearRecording:
 
     recording: FutureRecording
     rest: LinearisedFit
-    answers: Array
+    responses: Array
     length: int
 
     @staticmethod
     def gigabytes(recording: FutureRecording) -> float:
         """Return the memory of the responses [GB]."""
-        (segment,) = recording.program(recording.template).segments
+        (segment,) = recording.program(recording.template).transcriptions
         markers = 3 * len(recording.template.markers.names)
-        return 6 * 16e-9 * recording.samples * markers * len(segment.places)
+        return 6 * 16e-9 * recording.samples * markers * len(segment.parameter_indices)
 
     @classmethod
-    def of(cls, recording: FutureRecording, q: Array) -> LinearRecording:
+    def from_simulations(cls, recording: FutureRecording, q: Array) -> LinearRecording:
         """Return the response at q (nq,), from seven simulations.
 
         Raises
@@ -476,14 +483,16 @@ class LinearRecording:
         SimulationError
             If a simulation does not reach the end.
         """
-        still = recording.fit(recording.experiment(_pulse(recording, np.zeros(6))), q)[0]
+        still = recording.linearise(recording.experiment(_pulse_poses(recording, np.zeros(6))), q)[
+            0
+        ]
         (at_rest,) = still.blocks
         count = recording.samples
         length = 1 << (2 * count - 1).bit_length()
         answers = []
         for k, height in enumerate(HEIGHTS):
-            pulsed = recording.experiment(_pulse(recording, height * np.eye(6)[k]))
-            (block,) = recording.fit(pulsed, q)[0].blocks
+            pulsed = recording.experiment(_pulse_poses(recording, height * np.eye(6)[k]))
+            (block,) = recording.linearise(pulsed, q)[0].blocks
             change = (block.channels[1] - at_rest.channels[1]) / height
             answers.append(np.fft.rfft(change, length, axis=0))
         return cls(recording, still, np.array(answers), length)
@@ -496,16 +505,16 @@ class LinearRecording:
         course = motion.derivatives(recording.since_start_s)[0]
         # What was simulated is highest at a sample before which a motion from rest is nothing yet.
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
-        transform = np.einsum("fk,kfcp->fcp", of_course, self.answers)
+        transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks
         change = np.fft.irfft(transform, self.length, axis=0)[: recording.samples]
-        slope = rest.slope + change.reshape(rest.slope.shape)
-        return shared_information(replace(self.rest, blocks=(replace(rest, slope=slope),)))
+        slope = rest.jacobian + change.reshape(rest.jacobian.shape)
+        return shared_information(replace(self.rest, blocks=(replace(rest, jacobian=slope),)))
 
 
-def _pulse(recording: FutureRecording, heights: Array) -> PoseSequence:
+def _pulse_poses(recording: FutureRecording, heights: Array) -> PoseSequence:
     """Return poses with a pulse of each coordinate, of given heights (6,) in metres and radians."""
     t_s = recording.pose_times_s
     since = t_s / recording.template.timestep_s - CENTRE
     share = np.nan_to_num(np.asarray(PULSE(since), dtype=np.float64))
-    return recording.carried(np.outer(share, heights))
+    return recording.poses_from_coordinates(np.outer(share, heights))

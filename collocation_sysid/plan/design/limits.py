@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from ...arrays import Array
 from ...checked import AtLeastOne, Positive
 from ...errors import InputError
-from ...problem.explaining import explain
+from ...problem.explaining import explain_validation_error
 from ...problem.reading import parse_toml, read_text
 from ...section import Section, Vector
 from .motion import HandMotion, angular_motion
@@ -35,7 +35,7 @@ class CameraSection(Section):
     )
 
     @model_validator(mode="after")
-    def _looks_somewhere(self) -> CameraSection:
+    def _require_direction(self) -> CameraSection:
         """Raise `ValueError` if the camera has no direction."""
         if self.position_m == self.looks_at_m:
             raise ValueError("looks_at_m is position_m; expected another point")
@@ -74,7 +74,7 @@ class Limits(Section):
     )
 
     @model_validator(mode="after")
-    def _possible(self) -> Limits:
+    def _require_consistent(self) -> Limits:
         """Raise `ValueError` for corners in the wrong order, or too few cameras."""
         for key in ("workspace_m", "markers_box_m"):
             corners = getattr(self, key)
@@ -102,9 +102,9 @@ class Limits(Section):
         try:
             return cls.model_validate(content)
         except ValidationError as error:
-            raise explain(error, content, file, cls) from error
+            raise explain_validation_error(error, content, file, cls) from error
 
-    def about(self, hand_m: Array) -> Bounds:
+    def bounds_from(self, hand_m: Array) -> HandBounds:
         """Return the limits of a hand that starts at a position (3,) in the poses' world [m].
 
         Raises
@@ -124,7 +124,7 @@ class Limits(Section):
                 None,
                 "workspace_m",
             )
-        return Bounds(self, low, high)
+        return HandBounds(self, low, high)
 
     def out_of_view(self, markers_m: Array) -> float:
         """Return how far markers (T, M, 3) [m] leave the views; zero if all are in view.
@@ -155,7 +155,7 @@ def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class HandBounds:
     """Limits of a hand with a known initial position.
 
     Attributes
@@ -188,9 +188,9 @@ class Bounds:
     def shares(self, motion: HandMotion) -> dict[str, float]:
         """Return the largest values of a motion as shares of the limits, by name of the limit."""
         course = motion.derivatives(motion.grid_s)
-        return self._of_shift(*course) | self._of_turn(*course)
+        return self._translation_shares(*course) | self._rotation_shares(*course)
 
-    def _of_shift(self, *course: Array) -> dict[str, float]:
+    def _translation_shares(self, *course: Array) -> dict[str, float]:
         """Return the shares of the translation's limits, from coordinates and derivatives
         (T, 6).
         """
@@ -198,20 +198,20 @@ class Bounds:
         limits = self.limits
         return {
             "workspace_m": float(np.maximum(shift / self.low_m, shift / self.high_m).max()),
-            "speed_m_s": _largest(rate) / limits.speed_m_s,
-            "acceleration_m_s2": _largest(curvature) / limits.acceleration_m_s2,
+            "speed_m_s": _largest_norm(rate) / limits.speed_m_s,
+            "acceleration_m_s2": _largest_norm(curvature) / limits.acceleration_m_s2,
         }
 
-    def _of_turn(self, *course: Array) -> dict[str, float]:
+    def _rotation_shares(self, *course: Array) -> dict[str, float]:
         """Return the shares of the rotation's limits, from coordinates and derivatives (T, 6)."""
         turn = course[0][:, 3:]
         limits = self.limits
-        largest = map(_largest, (turn, *angular_motion(*(each[:, 3:] for each in course))))
+        largest = map(_largest_norm, (turn, *angular_motion(*(each[:, 3:] for each in course))))
         names = "rotation_deg", "angular_speed_deg_s", "angular_acceleration_deg_s2"
         pairs = zip(names, largest, strict=True)
         return {name: np.degrees(peak) / getattr(limits, name) for name, peak in pairs}
 
-    def within(self, motion: HandMotion) -> HandMotion:
+    def scale_to_limits(self, motion: HandMotion) -> HandMotion:
         """Return the motion with translations and rotations reduced so that every limit is
         satisfied.
 
@@ -219,17 +219,19 @@ class Bounds:
         their scale, those of rotations nearly.
         """
         course = motion.derivatives(motion.grid_s)
-        shift = WITHIN / max(WITHIN, *self._of_shift(*course).values())
-        return motion.scaled(shift, self._turn_scale(course))
+        shift = WITHIN / max(WITHIN, *self._translation_shares(*course).values())
+        return motion.scaled(shift, self._rotation_scale(course))
 
-    def _turn_scale(self, course: tuple[Array, Array, Array]) -> float:
+    def _rotation_scale(self, course: tuple[Array, Array, Array]) -> float:
         """Return the factor of the rotations."""
         scale = 1.0
-        while (largest := max(self._of_turn(*(scale * c for c in course)).values())) > WITHIN:
+        while (
+            largest := max(self._rotation_shares(*(scale * c for c in course)).values())
+        ) > WITHIN:
             scale *= TIGHTER * WITHIN / largest
         return scale
 
 
-def _largest(vectors: Array) -> float:
+def _largest_norm(vectors: Array) -> float:
     """Return the largest norm of vectors (T, 3)."""
     return float(np.linalg.norm(vectors, axis=1).max())

@@ -64,7 +64,7 @@ class HandMotion:
     phase_rad: Array
 
     @classmethod
-    def of(
+    def from_coefficients(
         cls,
         coefficients: Array,
         duration_s: float,
@@ -86,12 +86,14 @@ class HandMotion:
             wave alone satisfies them.
         """
         rise, active = (
-            low + (high - low) * _unit(u)
+            low + (high - low) * _to_unit_interval(u)
             for (low, high), u in zip((RISE, ACTIVE), coefficients[:OWN], strict=True)
         )
         share, first, last, phase = coefficients[OWN:].reshape(PER_WAVE, 6, -1)
         low, high = np.log([min(FEWEST_PERIODS / duration_s, highest_hz), highest_hz])
-        first_hz, last_hz = (np.exp(low + (high - low) * _unit(u)) for u in (first, last))
+        first_hz, last_hz = (
+            np.exp(low + (high - low) * _to_unit_interval(u)) for u in (first, last)
+        )
         angular = 2 * np.pi * np.maximum(first_hz, last_hz)
         size, rate, rate_of_rate = (np.repeat(each, 3)[:, None] for each in reach)
         largest_amplitude = np.minimum(size, np.minimum(rate / angular, rate_of_rate / angular**2))
@@ -107,15 +109,15 @@ class HandMotion:
         )
 
     @staticmethod
-    def size(waves: int) -> int:
+    def coefficient_count(waves: int) -> int:
         """Return the number of coefficients of a motion with `waves` waves per coordinate."""
         return OWN + PER_WAVE * 6 * waves
 
-    def scaled(self, shift: float = 1.0, turn: float = 1.0) -> HandMotion:
-        """Return the motion with translations multiplied by `shift` and rotation vectors by
-        `turn`.
+    def scaled(self, translation: float = 1.0, rotation: float = 1.0) -> HandMotion:
+        """Return the motion with translations multiplied by `translation` and rotation vectors by
+        `cayley_rotation`.
         """
-        factors = np.repeat([shift, turn], 3)[:, None]
+        factors = np.repeat([translation, rotation], 3)[:, None]
         return replace(self, amplitude=factors * self.amplitude)
 
     @cached_property
@@ -198,6 +200,6 @@ def _jacobian_factors(angle: Array) -> tuple[Array, Array, Array, Array]:
     return tuple(np.where(small, s, e) for s, e in zip(series, exact, strict=True))  # type: ignore[return-value]
 
 
-def _unit(u: Array | float) -> Array:
+def _to_unit_interval(u: Array | float) -> Array:
     """Return numbers between 0 and 1 from any numbers; nearly uniform for normal ones."""
     return 0.5 * (1 + np.tanh(0.8 * np.asarray(u)))

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...display import Line, Shown, Table
-from ...fem.constants import symbol_of, with_unit
+from ...fem.constants import symbol_of, symbol_with_unit
 from ...result.style import (
     BLUE,
     CYCLE,
@@ -31,15 +31,15 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
     tried = len(design.best.history)
     interrupted = Line(f"interrupted: the best of {tried} motions", "check")
     return [
-        *[interrupted] * design.best.interrupted,
-        _table(design),
-        _meaning(design),
-        f"limits reached: {', '.join(design.reached) or 'none'}",
+        *[interrupted] * design.best.is_interrupted,
+        _error_table(design),
+        _column_note(design),
+        f"limits reached: {', '.join(design.active_limits) or 'none'}",
         f"written to {folder}",
     ]
 
 
-def _table(design: Design) -> Table:
+def _error_table(design: Design) -> Table:
     """Return the table of error bars before and after."""
     heads = ("", "value", "error before", "error after", "over the draws", "times smaller")
     before = design.before
@@ -49,7 +49,7 @@ def _table(design: Design) -> Table:
         earlier = before.relative[name] if before is not None else np.nan
         rows.append(
             (
-                with_unit(name),
+                symbol_with_unit(name),
                 f"{after.values[name]:.4g}",
                 _percent(earlier),
                 _percent(relative),
@@ -67,7 +67,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.3g} %" if share < 10 else "not told"
 
 
-def _meaning(design: Design) -> str:
+def _column_note(design: Design) -> str:
     """Return an explanation of the columns."""
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
@@ -79,7 +79,7 @@ def _meaning(design: Design) -> str:
     return f"before: the problem's own motion of {shipped}; {after} by itself"
 
 
-def pictures(design: Design) -> dict[str, Figure]:
+def design_figures(design: Design) -> dict[str, Figure]:
     """Return the figures of a design by file name."""
     return {"motion": motion_picture(design), "error_bars": error_bars_picture(design)}
 

@@ -2,7 +2,7 @@
 
 Random samples are followed by an evolution strategy that adapts the diagonal of a covariance
 (sep-CMA-ES: Hansen, The CMA evolution strategy: a tutorial, 2016, and Ros and Hansen 2008). It
-converges in a few hundred evaluations and uses only the order of values. Use `search`.
+converges in a few hundred evaluations and uses only the order of values. Use `minimise`.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ Watch = Callable[[int, float], None]
 
 
 @dataclass(eq=False)
-class Best:
+class SearchResult:
     """Best point of a search, updated while the search runs.
 
     Attributes
     ----------
-    at : (d,) array or None
+    coefficients : (d,) array or None
         Best coefficients; None before the first evaluation.
     value : float
         Smallest value; infinite before the first evaluation.
     history : list of float
         Smallest value after each evaluation.
-    interrupted : bool
+    is_interrupted : bool
         Whether Ctrl-C ended the search.
     """
 
-    at: Array | None = None
+    coefficients: Array | None = None
     value: float = np.inf
     history: list[float] = field(default_factory=list)
-    interrupted: bool = False
+    is_interrupted: bool = False
 
 
-def search(
+def minimise(
     value: Value,
     dimension: int,
     evaluations: int,
     seed: int = 0,
     watch: Watch | None = None,
     start: Array | None = None,
-) -> Best:
+) -> SearchResult:
     """Minimise a function of coefficients whose expected magnitude is one.
 
     Ctrl-C ends the search; the result is the best point so far.
@@ -81,14 +81,14 @@ def search(
     KeyboardInterrupt
         If the search is interrupted before the first evaluation.
     """
-    best = Best()
+    best = SearchResult()
     rng = np.random.default_rng(seed)
 
-    def evaluated(at: Array, bar: float) -> float:
+    def evaluate(at: Array, bar: float) -> float:
         """Evaluate coefficients, and update the best point."""
         size = value(at, bar)
-        if best.at is None or size < best.value:
-            best.at = at
+        if best.coefficients is None or size < best.value:
+            best.coefficients = at
             best.value = size
         best.history.append(best.value)
         if watch is not None:
@@ -97,28 +97,28 @@ def search(
 
     try:
         if start is not None:
-            evaluated(start, np.inf)
+            evaluate(start, np.inf)
         else:
             for _ in range(max(1, round(EXPLORED * evaluations))):
-                evaluated(rng.normal(size=dimension), best.value)
-        assert best.at is not None
-        strategy = Strategy(best.at, FIRST_DEVIATION if start is None else NEAR)
+                evaluate(rng.normal(size=dimension), best.value)
+        assert best.coefficients is not None
+        strategy = EvolutionStrategy(best.coefficients, FIRST_DEVIATION if start is None else NEAR)
         bar = np.inf
         while len(best.history) < evaluations:
             count = min(strategy.offspring, evaluations - len(best.history))
             steps = rng.normal(size=(count, dimension))
-            sizes = np.array([evaluated(strategy.point(step), bar) for step in steps])
+            sizes = np.array([evaluate(strategy.point(step), bar) for step in steps])
             if count == strategy.offspring:
-                strategy.learn(steps[np.argsort(sizes, kind="stable")])
+                strategy.update(steps[np.argsort(sizes, kind="stable")])
             bar = float(np.median(sizes))
     except KeyboardInterrupt:
-        if best.at is None:
+        if best.coefficients is None:
             raise
-        best.interrupted = True
+        best.is_interrupted = True
     return best
 
 
-class Strategy:
+class EvolutionStrategy:
     """State of sep-CMA-ES: mean, deviations and paths, with the constants of the tutorial.
 
     Parameters
@@ -153,7 +153,7 @@ class Strategy:
         """Return the coefficients (d,) of a sample (d,) of the unit normal distribution."""
         return self.mean + self.deviation * np.sqrt(self.variances) * step
 
-    def learn(self, steps: Array) -> None:
+    def update(self, steps: Array) -> None:
         """Update mean, deviation and variances from samples (offspring, d), sorted from
         best to worst.
         """

@@ -1,7 +1,8 @@
 """File formats of recordings; they are used through `recording.readers`, `pose_files` and `tables`.
 
 - `text`, `columns`, `units`: CSV tables, columns recognised by name, units.
-- `tracks`: marker tracks as they are in a file; `c3d`, `trc`, `qualisys`, `motive` and `plain` read
+- `tracks_of_table`: marker tracks as they are in a file; `c3d`, `trc`, `qualisys`, `motive` and
+  `plain` read
 the formats.
 - `logs`, `topics`: logs of robots (ROS bags, MCAP, LeRobot), and the tables in their topics.
 - `depth_files`, `depth_messages`, `ply`: depth images and clouds of points, from files and logs.

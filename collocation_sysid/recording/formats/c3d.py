@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ...apart import Failed, ProcessLimits, computed_apart
 from ...errors import InputError
-from .tracks import Choose, RawTracks
-from .units import stated_unit
+from .tracks import LabelChooser, RawTracks
+from .units import length_unit_of_text
 
 # Second byte of every C3D file.
 _KEY = 0x50
@@ -34,12 +34,12 @@ found["points"] = numpy.asarray(file["data"]["points"], dtype=float)[:3]
 """
 
 
-def recognises(content: bytes) -> bool:
+def is_c3d(content: bytes) -> bool:
     """Return whether a file's content is C3D: its second byte is 0x50, and it is no text."""
     return len(content) > 1 and content[1] == _KEY and b"\0" in content[:_BLOCK]
 
 
-def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
+def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
     """Read a C3D file; points with a negative residual are missing (NaN, by ezc3d).
 
     Parameters
@@ -47,7 +47,7 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
     path : str or Path
     content : bytes
         Content of that file.
-    choose : Choose
+    choose : LabelChooser
         Picks the markers.
 
     Raises
@@ -57,7 +57,7 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
     """
     if find_spec("ezc3d") is None:
         raise InputError("reading C3D needs ezc3d: pip install 'collocation-sysid[c3d]'")
-    points_stated, frames_stated = _stated_counts(content)
+    points_stated, frames_stated = _header_counts(content)
     try:
         read = computed_apart(
             _WORKER, str(Path(path).resolve()), limits=ProcessLimits.for_file(path)
@@ -84,14 +84,14 @@ def read(path: str | Path, content: bytes, choose: Choose) -> RawTracks:
     return RawTracks(
         labels=[labels[k] for k in chosen],
         coordinates=points[:, chosen].transpose(2, 1, 0),
-        unit=stated_unit(units, "POINT:UNITS"),
+        unit=length_unit_of_text(units, "POINT:UNITS"),
         unit_key="POINT:UNITS",
         rate_hz=rates[0] if rates and rates[0] > 0 else None,
         rate_key="POINT:RATE",
     )
 
 
-def _stated_counts(content: bytes) -> tuple[int, int | None]:
+def _header_counts(content: bytes) -> tuple[int, int | None]:
     """Return the numbers of points and frames in the header; None frames if the counter overflowed.
 
     Raises

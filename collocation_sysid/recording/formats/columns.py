@@ -16,7 +16,15 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, hint_at
-from .text import Grid, decode, numbers, of_file, read_bytes, read_grid, times_of
+from .text import (
+    Table,
+    decode,
+    names_file_in_errors,
+    numeric_cells,
+    read_bytes,
+    read_table,
+    times_in_column,
+)
 from .units import expected_units, si_factor
 
 
@@ -48,7 +56,7 @@ class Quantity:
 
 
 TIME = Quantity("t", "time", "s", "time zeit prüfzeit temps tiempo tempo")
-SHIFTS = tuple(Quantity(axis, "length", "m") for axis in "xyz")
+DISPLACEMENTS = tuple(Quantity(axis, "length", "m") for axis in "xyz")
 FORCES = tuple(Quantity(f"f{axis}", "force", "n") for axis in "xyz")
 TORQUES = tuple(Quantity(f"t{axis}", "torque", "nm") for axis in "xyz")
 DISPLACEMENT = Quantity(
@@ -63,8 +71,8 @@ STRAIN = Quantity("strain", "ratio", "1", "strain dehnung stauchung déformation
 STRESS = Quantity("stress", "pressure", "pa", "stress spannung contrainte")
 TENSION = Quantity("tension", "force", "n", "tension")
 PRESSURE = Quantity("pressure", "pressure", "pa", "pressure druck pression")
-KNOWN = (
-    *(TIME, *SHIFTS, *FORCES, *TORQUES),
+KNOWN_QUANTITIES = (
+    *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
     *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
 )
 
@@ -78,48 +86,48 @@ _DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class QuantityTable:
     """Quantities of a table in SI units.
 
     Attributes
     ----------
-    grid : Grid
+    grid : Table
         Cells of the table.
     t_s : (T,) array
     values : dict
         (T,) array by the key of each quantity that the table has, NaN where missing.
     """
 
-    grid: Grid
+    grid: Table
     t_s: Array
     values: Mapping[str, Array]
 
 
-@of_file
+@names_file_in_errors
 def read_columns(
     path: str | Path,
-    wanted: Sequence[Quantity],
-    mapped: Mapping[str, str] | None = None,
+    quantities: Sequence[Quantity],
+    column_names: Mapping[str, str] | None = None,
     blank_allowed: bool = False,
-    timed: bool = True,
-    all_of: bool = False,
-) -> Columns:
-    """Read those of the `wanted` quantities that a table has, in any order.
+    requires_times: bool = True,
+    requires_all: bool = False,
+) -> QuantityTable:
+    """Read those of the `quantities` quantities that a table has, in any order.
 
     Parameters
     ----------
     path : str or Path
-    wanted : sequence of Quantity
-    mapped : mapping, optional
+    quantities : sequence of Quantity
+    column_names : mapping, optional
         Column name by a quantity's key; "t" for the time. A unit that the file does not state may
         follow the name, as in "Load (N)". Other columns are not looked for if a quantity besides
         the time is mapped; without mapping, columns are recognised by name.
     blank_allowed : bool
         Whether cells may be blank.
-    timed : bool
+    requires_times : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
-    all_of : bool
-        Whether each of `wanted` is required; otherwise one is enough.
+    requires_all : bool
+        Whether each of `quantities` is required; otherwise one is enough.
 
     Raises
     ------
@@ -127,67 +135,67 @@ def read_columns(
         If a column is missing, repeated, unknown, without unit or with a wrong one, a cell is not a
         number, or time does not increase; the line is named.
     """
-    grid = read_grid(decode(read_bytes(path)))
-    if "t_s" in grid.columns and not mapped:
-        _refuse_unknown(grid, wanted, all_of)
-    places = _places(grid, wanted, mapped or {})
+    grid = read_table(decode(read_bytes(path)))
+    if "t_s" in grid.columns and not column_names:
+        _require_known_columns(grid, quantities, requires_all)
+    places = _find_columns(grid, quantities, column_names or {})
     t = places.pop(TIME.key, None)
-    if len(places) < (len(wanted) if all_of else 1) or (timed and t is None):
-        raise _other_columns(grid, wanted, all_of)
+    if len(places) < (len(quantities) if requires_all else 1) or (requires_times and t is None):
+        raise _columns_error(grid, quantities, requires_all)
     values = {}
     for key, (place, factor) in places.items():
-        values[key] = factor * numbers(grid, [place], blank_allowed)[:, 0]
+        values[key] = factor * numeric_cells(grid, [place], blank_allowed)[:, 0]
         if np.isnan(values[key]).all():
             raise InputError(f"column {grid.columns[place]} is blank throughout; leave it out")
-    t_s = np.arange(float(len(grid.rows))) if t is None else times_of(grid, *t)
-    return Columns(grid, t_s, values)
+    t_s = np.arange(float(len(grid.rows))) if t is None else times_in_column(grid, *t)
+    return QuantityTable(grid, t_s, values)
 
 
 # Which column -------------------------------------------------------------------------------------
 
 
-def _places(
-    grid: Grid, wanted: Sequence[Quantity], mapped: Mapping[str, str]
+def _find_columns(
+    grid: Table, quantities: Sequence[Quantity], mapped: Mapping[str, str]
 ) -> dict[str, tuple[int, float]]:
     """Return column index and factor to SI of each quantity that the table has, by its key."""
-    quantities = {quantity.key: quantity for quantity in (TIME, *wanted)}
+    by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
-        if key not in quantities:
-            expected = f"expected one of {', '.join(quantities)}{hint_at(key, quantities)}"
+        if key not in by_key:
+            expected = f"expected one of {', '.join(by_key)}{hint_at(key, by_key)}"
             raise InputError(f"columns has the key {key!r}; {expected}")
-    chosen = {key: _mapped(grid, quantities[key], name) for key, name in mapped.items()}
-    sought = wanted if not chosen.keys() - {TIME.key} else ()
+    chosen = {key: _column_named_by_user(grid, by_key[key], name) for key, name in mapped.items()}
+    sought = quantities if not chosen.keys() - {TIME.key} else ()
     recognised = {
         quantity.key: column
         for quantity in (TIME, *sought)
-        if quantity.key not in chosen and (column := column_of(grid, quantity)) is not None
+        if quantity.key not in chosen and (column := find_column(grid, quantity)) is not None
     }
     return chosen | recognised
 
 
-def _mapped(grid: Grid, quantity: Quantity, name: str) -> tuple[int, float]:
+def _column_named_by_user(grid: Table, quantity: Quantity, name: str) -> tuple[int, float]:
     """Return index and factor to SI of the column that the user names for a quantity."""
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare
     if grid.columns.count(column) != 1:
         fault = "is there twice" if column in grid.columns else "is not there"
-        raise grid.refusal(
+        raise grid.error_at(
             f"columns.{quantity.key} is {name!r}, which {fault}; the columns are "
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
     unit = name_and_unit(column)[1] or unit_of_user
     if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
-        raise grid.refusal(
+        raise grid.error_at(
             f"column {column} is of the deformed specimen; expected engineering "
             f"{quantity.key}, by the undeformed length or area"
         )
     factor = None if unit is None else si_factor(unit, quantity.dimension)
     if factor is None:
-        raise _other_unit(grid, column, unit, quantity)
+        raise _unit_error(grid, column, unit, quantity)
     return grid.columns.index(column), factor
 
 
-def column_of(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
+def find_column(grid: Table, quantity: Quantity) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
     name fits.
 
@@ -199,22 +207,22 @@ def column_of(grid: Grid, quantity: Quantity) -> tuple[int, float] | None:
     units = {
         k: name_and_unit(column)[1]
         for k, column in enumerate(grid.columns)
-        if _is_called(column, quantity)
+        if _name_fits(column, quantity)
     }
     factors = {k: si_factor(unit, quantity.dimension) for k, unit in units.items() if unit}
     fitting = [(k, factor) for k, factor in factors.items() if factor is not None]
     if len(fitting) > 1:
-        raise grid.refusal(
+        raise grid.error_at(
             f"the columns {', '.join(grid.columns[k] for k, _ in fitting)} may each be "
             f'{quantity.key}; expected one, or columns = {{ {quantity.key} = "…" }} to say which'
         )
     if units and not fitting:
         first = next(iter(units))
-        raise _other_unit(grid, grid.columns[first], units[first], quantity)
+        raise _unit_error(grid, grid.columns[first], units[first], quantity)
     return fitting[0] if fitting else None
 
 
-def _is_called(column: str, quantity: Quantity) -> bool:
+def _name_fits(column: str, quantity: Quantity) -> bool:
     """Return whether the name of a column, without its unit, fits a quantity."""
     name, _ = name_and_unit(column)
     called = _words(name) & set(quantity.words.split())
@@ -239,37 +247,38 @@ def _words(name: str) -> set[str]:
 # Refusals -----------------------------------------------------------------------------------------
 
 
-def _refuse_unknown(grid: Grid, wanted: Sequence[Quantity], all_of: bool) -> None:
+def _require_known_columns(grid: Table, quantities: Sequence[Quantity], all_of: bool) -> None:
     """Raise an `InputError` if a column holds no known quantity."""
-    known = {quantity.key for quantity in KNOWN}
+    known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
-            hint = hint_at(column, [quantity.column for quantity in wanted])
-            raise _other_columns(grid, wanted, all_of, f": {column} is none of them{hint}")
+            hint = hint_at(column, [quantity.column for quantity in quantities])
+            raise _columns_error(grid, quantities, all_of, f": {column} is none of them{hint}")
 
 
-def _other_columns(
-    grid: Grid, wanted: Sequence[Quantity], all_of: bool, why: str = ""
+def _columns_error(
+    grid: Table, quantities: Sequence[Quantity], all_of: bool, why: str = ""
 ) -> InputError:
     """Return the error for a table without the wanted columns; `why` is added to its message."""
-    expected = ", ".join(quantity.column for quantity in wanted)
+    expected = ", ".join(quantity.column for quantity in quantities)
     needed = [
         f"; a {quantity.key} needs {size} of the undeformed specimen"
         for quantity, size in ((STRAIN, "length_m"), (STRESS, "area_m2"))
-        if quantity not in wanted and any(_is_called(column, quantity) for column in grid.columns)
+        if quantity not in quantities
+        and any(_name_fits(column, quantity) for column in grid.columns)
     ]
-    return grid.refusal(
+    return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {TIME.column} and "
         f"{'all' if all_of else 'any'} of {expected}, each once, in these or other units"
         f"{why}{''.join(needed)}"
     )
 
 
-def _other_unit(grid: Grid, column: str, unit: str | None, quantity: Quantity) -> InputError:
+def _unit_error(grid: Table, column: str, unit: str | None, quantity: Quantity) -> InputError:
     """Return the error for a column without a unit, or with a unit of another dimension."""
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"
-    return grid.refusal(
+    return grid.error_at(
         f"column {column} {has}; expected {expected_units(unit or '', quantity.dimension)}: "
         f"{remedy}"
     )

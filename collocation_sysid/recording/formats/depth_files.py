@@ -22,17 +22,17 @@ from ...files import reason, require_regular
 from . import ply
 from .depth_messages import (
     ENCODINGS,
-    columns_of,
-    depth_in,
-    distortion_of,
-    image_of,
-    is_camera,
-    matrix_of,
-    png,
+    camera_matrix,
+    decode_cloud,
+    decode_image,
+    depth_kind,
+    distortion_coefficients,
+    is_camera_model,
+    read_png,
 )
-from .logs import Address, Log, opened, require_topic
-from .text import decode, read_bytes, read_grid, times_of
-from .topics import by_time
+from .logs import Log, TopicAddress, open_log, require_topic
+from .text import decode, read_bytes, read_table, times_in_column
+from .topics import sort_by_time
 
 # Depth of one count of an integer image if none is stated [m], as is usual for depth cameras.
 USUAL_COUNT_M = 1e-3
@@ -48,7 +48,7 @@ NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 
 
 @dataclass(frozen=True, eq=False)
-class DepthFile:
+class DepthFileContent:
     """Depth data of a file or a folder: either images or clouds.
 
     Attributes
@@ -72,7 +72,7 @@ class DepthFile:
 
 
 @dataclass(frozen=True, eq=False)
-class _Messages(Sequence[Array]):
+class _LazyImages(Sequence[Array]):
     """Images of messages, decoded when they are accessed, as all of them may not fit into
     memory.
     """
@@ -86,12 +86,12 @@ class _Messages(Sequence[Array]):
 
     def __getitem__(self, place: Any) -> Any:
         with located(self.path):
-            return _in_metres(image_of(self.messages[place]), self.count_m)
+            return _in_metres(decode_image(self.messages[place]), self.count_m)
 
 
 def read_depth(
-    path: Path, count_m: float | None, length_m: float, known: Container[str] = ()
-) -> DepthFile:
+    path: Path, count_m: float | None, length_m: float, known_camera_fields: Container[str] = ()
+) -> DepthFileContent:
     """Read a file, a topic of a log, or all files of a folder in the order of their names.
 
     Parameters
@@ -101,7 +101,7 @@ def read_depth(
         Depth of one count of an integer image; by default as stated in the file, or a millimetre.
     length_m : float
         Unit of clouds.
-    known : container of str
+    known_camera_fields : container of str
         "matrix" and "distortion" if they are known otherwise; they are then not read from a log.
 
     Raises
@@ -109,62 +109,67 @@ def read_depth(
     InputError
         If it is none of these, is damaged, or a package that reads it is missing.
     """
-    if (address := Address.of(path)) is not None:
+    if (address := TopicAddress.from_path(path)) is not None:
         with located(path):
-            return _topic(path, address, count_m, length_m, known)
+            return _read_topic(path, address, count_m, length_m, known_camera_fields)
     if path.is_dir():
-        return _folder(path, count_m, length_m)
+        return _read_folder(path, count_m, length_m)
     require_regular(path)
     kind = path.suffix.lower()
     if kind not in _READERS:
-        known = ", ".join(_READERS)
-        raise InputError(f"is a {kind or 'file without an ending'}; expected one of {known}", path)
+        known_camera_fields = ", ".join(_READERS)
+        raise InputError(
+            f"is a {kind or 'file without an ending'}; expected one of {known_camera_fields}", path
+        )
     try:
         content = _READERS[kind](path)
     except InputError as error:
         raise error.located(path) from error
     except (Exception, SystemExit) as error:
         raise InputError(f"cannot be read ({reason(error)}); expected {kind}", path) from error
-    if isinstance(content, DepthFile):
+    if isinstance(content, DepthFileContent):
         return content
     if kind in CLOUDS:
-        return DepthFile([], [_cloud(content, path, length_m)])
+        return DepthFileContent([], [_scaled_cloud(content, path, length_m)])
     with located(path):
-        return DepthFile([_in_metres(content, count_m)], [])
+        return DepthFileContent([_in_metres(content, count_m)], [])
 
 
-def _topic(
-    path: Path, address: Address, count_m: float | None, length_m: float, known: Container[str]
-) -> DepthFile:
+def _read_topic(
+    path: Path, address: TopicAddress, count_m: float | None, length_m: float, known: Container[str]
+) -> DepthFileContent:
     """Return the messages of a topic in the order of their times, and the camera model beside
     them.
     """
-    with opened(address.log, address.episode) as log:
+    with open_log(address.log, address.episode) as log:
         require_topic(log, address.topic)
-        t_s, messages = by_time(list(log.messages(address.topic)), log.start_ns)
-        camera = _camera_beside(log, address.topic)
-    if not messages or not (kind := depth_in(messages[0])):
+        t_s, messages = sort_by_time(list(log.messages(address.topic)), log.start_ns)
+        camera = _camera_of_topic(log, address.topic)
+    if not messages or not (kind := depth_kind(messages[0])):
         raise InputError(
             f"the topic {address.topic} has neither depth images ({', '.join(ENCODINGS)}, "
             "compressedDepth) nor clouds of points"
         )
     if "images" not in kind:
-        clouds = [_cloud(_of_columns(columns_of(each)), path, length_m) for each in messages]
-        return DepthFile([], clouds, t_s)
-    images = _Messages(messages, count_m, path)
+        clouds = [
+            _scaled_cloud(_points_from_columns(decode_cloud(each)), path, length_m)
+            for each in messages
+        ]
+        return DepthFileContent([], clouds, t_s)
+    images = _LazyImages(messages, count_m, path)
     matrix = None
     distortion = None
     if camera is not None:
         rectified = RECTIFIED.search(address.topic.lower()) is not None
         with located(f"{address.log}#{camera[0]}"):
             if "matrix" not in known:
-                matrix = matrix_of(camera[1], rectified, images[0].shape)
+                matrix = camera_matrix(camera[1], rectified, images[0].shape)
             if "distortion" not in known:
-                distortion = distortion_of(camera[1], rectified)
-    return DepthFile(images, [], t_s, matrix, distortion=distortion)
+                distortion = distortion_coefficients(camera[1], rectified)
+    return DepthFileContent(images, [], t_s, matrix, distortion=distortion)
 
 
-def _camera_beside(log: Log, topic: str) -> tuple[str, Any] | None:
+def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
     """Return topic and first message of the camera_info in a topic's namespace or above; None
     without it.
     """
@@ -173,10 +178,10 @@ def _camera_beside(log: Log, topic: str) -> tuple[str, Any] | None:
     if (name := next((each for each in names if each in log.topics), None)) is None:
         return None
     message = next((each for _, each in log.messages(name)), None)
-    return (name, message) if is_camera(message) else None
+    return (name, message) if is_camera_model(message) else None
 
 
-def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
+def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFileContent:
     """Read all files of a folder, which must be of one kind; times.csv has their times."""
     files = sorted(each for each in path.iterdir() if each.suffix.lower() in (*IMAGES, *CLOUDS))
     if not files:
@@ -188,11 +193,11 @@ def _folder(path: Path, count_m: float | None, length_m: float) -> DepthFile:
     t_s = None
     if times.is_file():
         with located(times):
-            t_s = times_of(read_grid(decode(read_bytes(times))), 0)
+            t_s = times_in_column(read_table(decode(read_bytes(times))), 0)
         if len(t_s) != len(files):
             raise InputError(f"has {len(t_s)} times for {len(files)} files", times)
     images = [image for part in parts for image in part.images_m]
-    return DepthFile(images, [cloud for part in parts for cloud in part.clouds_m], t_s)
+    return DepthFileContent(images, [cloud for part in parts for cloud in part.clouds_m], t_s)
 
 
 def _in_metres(image: Array, count_m: float | None) -> Array:
@@ -204,7 +209,7 @@ def _in_metres(image: Array, count_m: float | None) -> Array:
     return image.astype(float)
 
 
-def _cloud(points: Array, path: Path, length_m: float) -> Array:
+def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
     """Return points (P, 3) or (P, 6) in metres; an `InputError` for another shape."""
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
@@ -216,7 +221,7 @@ def _cloud(points: Array, path: Path, length_m: float) -> Array:
     return np.hstack([length_m * points[:, :3], points[:, 3:]])
 
 
-def _npz(path: Path) -> DepthFile:
+def _read_npz(path: Path) -> DepthFileContent:
     """Read depth_m, depth_counts or points_m, and the camera model, from a NumPy archive."""
     arrays = load_arrays(path)
     names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
@@ -231,7 +236,7 @@ def _npz(path: Path) -> DepthFile:
     samples = [np.asarray(each, dtype=float) for each in (values if values.ndim == 3 else [values])]
     clouded = names[0] == "points_m"
     camera = (arrays.get(name) for name in ("t_s", "camera_matrix", "camera_pose"))
-    return DepthFile([] if clouded else samples, samples if clouded else [], *camera)
+    return DepthFileContent([] if clouded else samples, samples if clouded else [], *camera)
 
 
 @contextmanager
@@ -251,7 +256,7 @@ def _standard_error_silenced() -> Iterator[None]:
         os.close(kept)
 
 
-def _exr(path: Path) -> Array:
+def _read_exr(path: Path) -> Array:
     """Read the depths [m] of an OpenEXR image."""
     try:
         library = import_module("OpenEXR")
@@ -267,7 +272,7 @@ def _exr(path: Path) -> Array:
     return np.asarray(channels[names[0]].pixels, dtype=float)
 
 
-def _of_columns(columns: Mapping[str, Array]) -> Array:
+def _points_from_columns(columns: Mapping[str, Array]) -> Array:
     """Return points (P, 3), or (P, 6) with normals, from named columns."""
     if not {*"xyz"} <= {*columns}:
         raise InputError(f"has the columns {', '.join(columns)}; expected x, y and z among them")
@@ -282,7 +287,7 @@ def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
     return points
 
 
-def _pcd(path: Path) -> Array:
+def _read_pcd(path: Path) -> Array:
     """Read the points (P, 3) or (P, 6) of a PCD file, ascii or binary."""
     raw = path.read_bytes()
     head = dict[str, list[str]]()
@@ -309,15 +314,15 @@ def _pcd(path: Path) -> Array:
             f"has DATA {' '.join(head['DATA'])}; expected ascii or binary: convert it, for example "
             "by pcl_convert_pcd_ascii_binary"
         )
-    return _of_columns(columns)
+    return _points_from_columns(columns)
 
 
-_READERS: dict[str, Callable[[Path], Array | DepthFile]] = {
-    ".npz": _npz,
-    ".png": png,
-    ".exr": _exr,
-    ".ply": lambda path: _of_columns(ply.read_columns(path)),
-    ".pcd": _pcd,
+_READERS: dict[str, Callable[[Path], Array | DepthFileContent]] = {
+    ".npz": _read_npz,
+    ".png": read_png,
+    ".exr": _read_exr,
+    ".ply": lambda path: _points_from_columns(ply.read_columns(path)),
+    ".pcd": _read_pcd,
     ".npy": load_array,
     ".xyz": lambda path: np.loadtxt(path, ndmin=2),
 }

@@ -25,7 +25,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 _PACKED = np.dtype([("kind", "<i4"), ("scale", "<f4"), ("shift", "<f4")])
 
 
-def depth_in(message: Any) -> str:
+def depth_kind(message: Any) -> str:
     """Return the kind of depth data in a message as text; empty if there is none."""
     if hasattr(message, "point_step") and hasattr(message, "fields"):
         return "clouds of points"
@@ -37,12 +37,14 @@ def depth_in(message: Any) -> str:
     return ""
 
 
-def is_camera(message: Any) -> bool:
+def is_camera_model(message: Any) -> bool:
     """Return whether a message holds a camera model."""
-    return all(_told(message, name) is not None for name in "kpd") and len(_told(message, "k")) == 9
+    return (
+        all(_field(message, name) is not None for name in "kpd") and len(_field(message, "k")) == 9
+    )
 
 
-def matrix_of(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
+def camera_matrix(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
     """Return the matrix (3, 3) of the camera model in a message.
 
     Parameters
@@ -69,13 +71,13 @@ def matrix_of(message: Any, rectified: bool, shape: tuple[int, int]) -> Array:
             f"{offset} on, beside images of {shape[1]} x {shape[0]}; expected one of whole images "
             "of that size: state camera.matrix"
         )
-    projection = np.asarray(_told(message, "p"), dtype=float)
+    projection = np.asarray(_field(message, "p"), dtype=float)
     if rectified and projection.size == 12 and projection.any():
         return projection.reshape(3, 4)[:, :3]
-    return np.asarray(_told(message, "k"), dtype=float).reshape(3, 3)
+    return np.asarray(_field(message, "k"), dtype=float).reshape(3, 3)
 
 
-def distortion_of(message: Any, rectified: bool) -> Array:
+def distortion_coefficients(message: Any, rectified: bool) -> Array:
     """Return the distortion coefficients of the camera model; empty for rectified images.
 
     Raises
@@ -83,7 +85,7 @@ def distortion_of(message: Any, rectified: bool) -> Array:
     InputError
         If the lens model is not that of Brown and Conrady with at most five coefficients.
     """
-    coefficients = np.asarray(_told(message, "d"), dtype=float)
+    coefficients = np.asarray(_field(message, "d"), dtype=float)
     if rectified or not coefficients.any():
         return np.zeros(0)
     kind = getattr(message, "distortion_model", "plumb_bob")
@@ -95,23 +97,23 @@ def distortion_of(message: Any, rectified: bool) -> Array:
     return coefficients
 
 
-def _told(message: Any, name: str) -> Any:
+def _field(message: Any, name: str) -> Any:
     """Return a field of a message, None without it; ROS 1 and Foxglove use capitals for ROS 2's
     names.
     """
     return getattr(message, name, getattr(message, name.upper(), None))
 
 
-def image_of(message: Any) -> Any:
+def decode_image(message: Any) -> Any:
     """Return the pixels (rows, columns) of an image: integer counts, or metres."""
     if not hasattr(message, "encoding"):
-        return _unpacked(str(message.format), _bytes(message))
+        return _decode_compressed(str(message.format), _message_data(message))
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     form = np.dtype(order + ENCODINGS[message.encoding])
-    return _rows(message, message.step, form.itemsize).view(form)
+    return _unpadded_rows(message, message.step, form.itemsize).view(form)
 
 
-def _unpacked(kind: str, data: bytes) -> Any:
+def _decode_compressed(kind: str, data: bytes) -> Any:
     """Return the pixels of a compressed image: counts, or metres for compressed 32FC1.
 
     Parameters
@@ -127,7 +129,7 @@ def _unpacked(kind: str, data: bytes) -> Any:
     """
     packed = "compressedDepth" in kind
     try:
-        counts = png(BytesIO(data[_PACKED.itemsize :] if packed else data))
+        counts = read_png(BytesIO(data[_PACKED.itemsize :] if packed else data))
     except InputError:
         raise
     except Exception as error:  # the library has exceptions of its own
@@ -142,7 +144,7 @@ def _unpacked(kind: str, data: bytes) -> Any:
         return np.where(counts > 0, float(how["scale"]) / (counts - float(how["shift"])), np.nan)
 
 
-def png(source: Path | BytesIO) -> Any:
+def read_png(source: Path | BytesIO) -> Any:
     """Return the counts (rows, columns) of a PNG with 16 bits and one channel; else an
     `InputError`.
     """
@@ -154,7 +156,7 @@ def png(source: Path | BytesIO) -> Any:
     return np.asarray(image).astype(np.int64)
 
 
-def columns_of(message: Any) -> dict[str, Array]:
+def decode_cloud(message: Any) -> dict[str, Array]:
     """Return the columns (P,) of a cloud of points by name, as floats."""
     order = ">" if getattr(message, "is_bigendian", 0) else "<"
     fields = list(message.fields)
@@ -173,12 +175,12 @@ def columns_of(message: Any) -> dict[str, Array]:
             f"has the columns {columns} in points of {message.point_step} bytes; expected each "
             "once, of types 1 to 8, within these"
         ) from error
-    rows = _rows(message, message.row_step, message.point_step)
+    rows = _unpadded_rows(message, message.row_step, message.point_step)
     points = np.frombuffer(rows.tobytes(), form)
     return {name: points[name].astype(float) for name in form.names or ()}
 
 
-def _rows(message: Any, step: int, size: int) -> Any:
+def _unpadded_rows(message: Any, step: int, size: int) -> Any:
     """Return the bytes (rows, columns × size) of a message, without the padding of its rows.
 
     Parameters
@@ -189,7 +191,7 @@ def _rows(message: Any, step: int, size: int) -> Any:
     size : int
         Bytes of a pixel or point.
     """
-    data = np.frombuffer(_bytes(message), "u1")
+    data = np.frombuffer(_message_data(message), "u1")
     height = message.height
     if len(data) != height * step or step < message.width * size:
         raise InputError(
@@ -199,6 +201,6 @@ def _rows(message: Any, step: int, size: int) -> Any:
     return np.ascontiguousarray(data.reshape(height, step)[:, : message.width * size])
 
 
-def _bytes(message: Any) -> bytes:
+def _message_data(message: Any) -> bytes:
     """Return the data of a message; JSON messages have it in base64."""
     return b64decode(message.data) if isinstance(message.data, str) else bytes(message.data)

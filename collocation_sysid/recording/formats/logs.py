@@ -23,14 +23,14 @@ from ...arrays import Array
 from ...errors import InputError, hint_at
 from ...files import reason, require_regular
 
-MARK = "#"
+TOPIC_SEPARATOR = "#"
 # Of the positions of joints.
-UNITS = ("rad", "deg")
+ANGLE_UNITS = ("rad", "deg")
 _NEEDS = "reading logs needs {}: pip install 'collocation-sysid[logs]'"
 
 
 @dataclass(frozen=True)
-class Address:
+class TopicAddress:
     """A topic of a log, and options for reading it.
 
     Attributes
@@ -56,7 +56,7 @@ class Address:
     episode: int | None = None
 
     @classmethod
-    def of(cls, path: str | Path) -> Address | None:
+    def from_path(cls, path: str | Path) -> TopicAddress | None:
         """Return the address that a path states; None for the path of an existing file or without a
         log.
 
@@ -65,10 +65,10 @@ class Address:
         InputError
             If a part behind the topic is not understood.
         """
-        log, mark, rest = str(path).partition(MARK)
+        log, mark, rest = str(path).partition(TOPIC_SEPARATOR)
         if not mark or Path(path).exists() or not Path(log).exists():
             return None
-        topic, *more = rest.split(MARK)
+        topic, *more = rest.split(TOPIC_SEPARATOR)
         options: dict[str, Any] = {}
         for part in more:
             if ">" in part:
@@ -76,7 +76,7 @@ class Address:
                 options["frames"] = parent.strip(), child.strip()
             elif part.lower().endswith((".urdf", ".xml")):
                 options["robot"] = Path(log).parent / part
-            elif part in UNITS:
+            elif part in ANGLE_UNITS:
                 options["unit"] = part
             elif part.isdecimal():
                 options["episode"] = int(part)
@@ -88,7 +88,7 @@ class Address:
 
 def stored_files(path: str | Path) -> list[Path]:
     """Return the files on disk that a path refers to: those of the log if it names a topic."""
-    address = Address.of(path)
+    address = TopicAddress.from_path(path)
     place = Path(path) if address is None else address.log
     if address is not None and place.is_dir():
         return sorted(each for each in place.rglob("*") if each.is_file())
@@ -118,7 +118,7 @@ class Log(Protocol):
 
 
 @contextmanager
-def opened(path: Path, episode: int | None = None) -> Iterator[Log]:
+def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
     """Open a log, whose format is recognised by its content.
 
     Parameters
@@ -275,7 +275,7 @@ class _Dataset:
         for name, feature in info["features"].items():
             if feature["dtype"].startswith(("float", "int")) and "index" not in name:
                 self.topics[name] = feature["dtype"], int(info["total_frames"])
-                self.names[name] = _names(feature, name)
+                self.names[name] = _names_of_numbers(feature, name)
         self.topics.pop("timestamp", None)
         return self
 
@@ -302,7 +302,7 @@ class _Dataset:
             )
 
 
-def _names(feature: Any, name: str) -> list[str]:
+def _names_of_numbers(feature: Any, name: str) -> list[str]:
     """Return the names of the numbers of a feature; older datasets nest them in a dictionary."""
     names = feature.get("names")
     while isinstance(names, dict):

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ...errors import InputError
-from .text import Row, grid, separated_rows
-from .tracks import Choose, Header, RawTracks, tracks
-from .units import stated_unit
+from .text import Row, separated_rows, table_of_rows
+from .tracks import Header, LabelChooser, RawTracks, tracks_of_table
+from .units import length_unit_of_text
 
 BEGINNING = "Format Version"
 _MEASURED = "Marker"
@@ -23,14 +23,14 @@ _RATES = ("Export Frame Rate", "Capture Frame Rate")
 
 
 @dataclass(frozen=True)
-class _Columns:
+class _MarkerColumns:
     """Type of a marker's columns, and the indices of its columns of x, y and z."""
 
     kind: str
-    places: tuple[int, int, int]
+    coordinate_columns: tuple[int, int, int]
 
 
-def read(text: str, choose: Choose) -> RawTracks:
+def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a Motive CSV file; `choose` picks the markers."""
     rows = separated_rows(text, ",")
     first = rows[0]
@@ -42,22 +42,22 @@ def read(text: str, choose: Choose) -> RawTracks:
             "is no Motive CSV with markers: expected rows of Type, Name, ID and Position, then "
             "'Frame,Time (Seconds),X,Y,Z,…'"
         )
-    heads = _heads(rows[1:top], rows[top])
+    heads = _column_headings(rows[1:top], rows[top])
     columns = _marker_columns(heads, rows[top].line)
     labels = list(columns)
     chosen = choose(labels, [name for name in labels if name.startswith("Unlabeled")])
     titles = [f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads]
-    table = grid(titles, rows[top + 1 :])
-    header.compare("Total Exported Frames", len(table.rows), "frames")
+    table = table_of_rows(titles, rows[top + 1 :])
+    header.require_count("Total Exported Frames", len(table.rows), "frames")
     rate_key = next((key for key in _RATES if header.number(key)), _RATES[0])
-    (unit, _) = header.stated.get("Length Units", ("", 0))
-    raw = tracks(
+    (unit, _) = header.entries.get("Length Units", ("", 0))
+    raw = tracks_of_table(
         table,
         labels,
-        [each.places for each in columns.values()],
+        [each.coordinate_columns for each in columns.values()],
         chosen,
         time=1,
-        unit=stated_unit(unit, "line 1, Length Units"),
+        unit=length_unit_of_text(unit, "line 1, Length Units"),
         unit_key="Length Units",
         rate_hz=header.number(rate_key),
         rate_key=rate_key,
@@ -72,7 +72,7 @@ def read(text: str, choose: Choose) -> RawTracks:
     return replace(raw, notes=tuple(notes))
 
 
-def _heads(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
+def _column_headings(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
     """Return type, name, quantity and axis of every column.
 
     Older files do not label the rows of the header; the first two are then types and names.
@@ -85,7 +85,9 @@ def _heads(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
     return list(zip(types, names, padded[-1], axes.cells, strict=True))
 
 
-def _marker_columns(heads: Sequence[tuple[str, str, str, str]], line: int) -> dict[str, _Columns]:
+def _marker_columns(
+    heads: Sequence[tuple[str, str, str, str]], line: int
+) -> dict[str, _MarkerColumns]:
     """Return the columns of every marker by its name; measured columns have priority over fitted
     ones.
 
@@ -103,11 +105,11 @@ def _marker_columns(heads: Sequence[tuple[str, str, str, str]], line: int) -> di
             message = f"two markers are named '{name}'; expected names that differ"
             raise InputError(message, where=f"line {line}")
         axes[axis] = column
-    columns: dict[str, _Columns] = {}
+    columns: dict[str, _MarkerColumns] = {}
     for (name, kind), axes in by_kind.items():
         if sorted(axes) != ["X", "Y", "Z"]:
             message = f"marker '{name}' has the columns {', '.join(axes)}; expected X, Y and Z"
             raise InputError(message, where=f"line {line}")
         if kind == _MEASURED or name not in columns:
-            columns[name] = _Columns(kind, (axes["X"], axes["Y"], axes["Z"]))
-    return dict(sorted(columns.items(), key=lambda item: item[1].places))
+            columns[name] = _MarkerColumns(kind, (axes["X"], axes["Y"], axes["Z"]))
+    return dict(sorted(columns.items(), key=lambda item: item[1].coordinate_columns))

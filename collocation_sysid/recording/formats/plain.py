@@ -12,24 +12,24 @@ from collections import Counter
 import numpy as np
 
 from ...errors import InputError
-from ..clock import first_time_fault
-from .text import Grid, numbers, read_grid
-from .tracks import Choose, RawTracks, tracks
+from ..clock import first_unordered_time
+from .text import Table, numeric_cells, read_table
+from .tracks import LabelChooser, RawTracks, tracks_of_table
 from .units import METRES_PER_UNIT
 
 
-def read(text: str, choose: Choose) -> RawTracks:
+def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a plain CSV file, wide or long; `choose` picks the markers."""
-    table = read_grid(text)
+    table = read_table(text)
     return (_read_long if "marker" in table.columns else _read_wide)(table, choose)
 
 
-def _read_wide(table: Grid, choose: Choose) -> RawTracks:
+def _read_wide(table: Table, choose: LabelChooser) -> RawTracks:
     """Read a table with three columns for each marker."""
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
     places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
-    return tracks(
+    return tracks_of_table(
         table,
         labels,
         places,
@@ -40,7 +40,7 @@ def _read_wide(table: Grid, choose: Choose) -> RawTracks:
     )
 
 
-def _wide_labels(table: Grid) -> list[str]:
+def _wide_labels(table: Table) -> list[str]:
     """Names of the markers in the file, in the order of their first columns.
 
     Raises
@@ -71,28 +71,28 @@ def _wide_labels(table: Grid) -> list[str]:
     )
 
 
-def _read_long(table: Grid, choose: Choose) -> RawTracks:
+def _read_long(table: Table, choose: LabelChooser) -> RawTracks:
     """Read a table with one row for each marker and time."""
-    axes, unit = _long_layout(table)
+    axes, unit = _long_columns(table)
     of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
     if "" in of_row:
-        raise table.refusal("column marker is blank; expected a name", of_row.index(""))
+        raise table.error_at("column marker is blank; expected a name", of_row.index(""))
     labels = list(dict.fromkeys(of_row))
     chosen = [labels[k] for k in choose(labels)]
-    row_t_s = numbers(table, [table.columns.index("t_s")], blank_allowed=False)[:, 0]
+    row_t_s = numeric_cells(table, [table.columns.index("t_s")], blank_allowed=False)[:, 0]
     t_s, frame = np.unique(row_t_s, return_inverse=True)
     coordinates = np.full((len(t_s), len(chosen), 3), np.nan)
     for k, label in enumerate(chosen):
         own = [i for i, other in enumerate(of_row) if other == label]
-        rows = Grid(table.columns, [table.rows[i] for i in own])
-        if fault := first_time_fault(row_t_s[own]):
-            raise rows.refusal(f"marker '{label}': {fault[1]}", fault[0])
+        rows = Table(table.columns, [table.rows[i] for i in own])
+        if fault := first_unordered_time(row_t_s[own]):
+            raise rows.error_at(f"marker '{label}': {fault[1]}", fault[0])
         columns = [table.columns.index(axis) for axis in axes]
-        coordinates[frame[own], k] = numbers(rows, columns, blank_allowed=True)
+        coordinates[frame[own], k] = numeric_cells(rows, columns, blank_allowed=True)
     return RawTracks(chosen, coordinates, unit, "the columns' names", t_s, zeros_are_missing=False)
 
 
-def _long_layout(table: Grid) -> tuple[list[str], str | None]:
+def _long_columns(table: Table) -> tuple[list[str], str | None]:
     """Return the names of the columns of x, y and z, and the unit in these names; None
     without one.
     """

@@ -10,13 +10,13 @@ import re
 
 from ...errors import InputError
 from .text import Row, tab_rows
-from .tracks import Choose, Header, RawTracks, framed
+from .tracks import Header, LabelChooser, RawTracks, tracks_of_frames
 
 BEGINNING = "NO_OF_"
 _KEY = re.compile(r"(?!NAN$)[A-Z][A-Z0-9_]*")
 
 
-def read(text: str, choose: Choose) -> RawTracks:
+def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a Qualisys TSV file; `choose` picks the markers."""
     rows = tab_rows(text)
     count = next((k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])), len(rows))
@@ -26,12 +26,12 @@ def read(text: str, choose: Choose) -> RawTracks:
     labels = [cell for cell in above["MARKER_NAMES"].cells[1:] if cell]
     stated = {key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()}
     header = Header(stated)
-    header.compare("NO_OF_MARKERS", len(labels), "marker names")
+    header.require_count("NO_OF_MARKERS", len(labels), "marker names")
     frames = rows[count:]
     leading = _leading_columns(frames, 3 * len(labels))
-    if frames and _names_columns(frames[0]):
+    if frames and _has_column_names(frames[0]):
         del frames[0]
-    return framed(
+    return tracks_of_frames(
         header,
         "NO_OF_FRAMES",
         "FREQUENCY",
@@ -43,7 +43,7 @@ def read(text: str, choose: Choose) -> RawTracks:
     )
 
 
-def _names_columns(row: Row) -> bool:
+def _has_column_names(row: Row) -> bool:
     """Return whether a row holds column names instead of numbers."""
     return any(re.match(r"[A-Za-z]", cell) and cell.lower() != "nan" for cell in row.cells[:3])
 
@@ -66,7 +66,7 @@ def _leading_columns(frames: list[Row], coordinates: int) -> list[str]:
     if not frames:
         return []
     first = frames[0]
-    if _names_columns(first):
+    if _has_column_names(first):
         return [cell for cell in first.cells[:2] if cell in ("Frame", "Time")]
     extra = len(first.cells) - coordinates
     if extra > 0 and not any(first.cells[coordinates:]):

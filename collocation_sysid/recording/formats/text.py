@@ -1,6 +1,6 @@
 """Text files as tables: rows of cells below column names, and numbers from cells.
 
-Messages name lines; readers of files add the path, see `of_file`.
+Messages name lines; readers of files add the path, see `names_file_in_errors`.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError, excerpt, located
 from ...files import require_regular
-from ..clock import first_time_fault
-from .logs import Address
-from .topics import table
+from ..clock import first_unordered_time
+from .logs import TopicAddress
+from .topics import topic_as_csv
 from .units import UNITS, si_factor
 
 P = ParamSpec("P")
 T = TypeVar("T")
 # Largest accepted number: no measurement is larger, and products of two such numbers are finite.
-LARGEST = 1e100
+LARGEST_NUMBER = 1e100
 _ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
 _CONTROL = re.compile("[\x01-\x08\x0e-\x1f]")
 _SEPARATOR = re.compile("[,;\t]")
@@ -48,7 +48,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class Table:
     """Rows of equal length below column names; `names_line` is the line of the names, counted from
     1.
     """
@@ -57,7 +57,7 @@ class Grid:
     rows: list[Row]
     names_line: int = 1
 
-    def refusal(self, message: str, row: int | None = None) -> InputError:
+    def error_at(self, message: str, row: int | None = None) -> InputError:
         """Return an `InputError` about a row, by its index, or about the column names if `row` is
         None.
         """
@@ -65,7 +65,9 @@ class Grid:
         return InputError(message, where=f"line {line}")
 
 
-def of_file(read: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
+def names_file_in_errors(
+    read: Callable[Concatenate[Any, P], T],
+) -> Callable[Concatenate[Any, P], T]:
     """Decorate a reader whose first argument is a path, so that its `InputError`s name that
     path.
     """
@@ -86,8 +88,8 @@ def read_bytes(path: str | Path) -> bytes:
     InputError
         If it cannot be read.
     """
-    if (address := Address.of(path)) is not None:
-        return table(address)
+    if (address := TopicAddress.from_path(path)) is not None:
+        return topic_as_csv(address)
     require_regular(path)
     try:
         return Path(path).read_bytes()
@@ -170,7 +172,7 @@ def tab_rows(text: str) -> list[Row]:
     return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
 
 
-def grid(columns: list[str], rows: list[Row], names_line: int = 1) -> Grid:
+def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> Table:
     """Return a table of rows that are as wide as their column names.
 
     Blank columns at the end of all rows are cut.
@@ -193,14 +195,14 @@ def grid(columns: list[str], rows: list[Row], names_line: int = 1) -> Grid:
     common = len(rows[0].cells)
     if common > width and all(len(r.cells) == common and not any(r.cells[width:]) for r in rows):
         rows = [Row(row.line, row.cells[:width]) for row in rows]
-    table = Grid(columns, rows, names_line)
+    table = Table(columns, rows, names_line)
     for k, row in enumerate(rows):
         if len(row.cells) != width:
-            raise table.refusal(f"{len(row.cells)} cells, but the header has {width} columns", k)
+            raise table.error_at(f"{len(row.cells)} cells, but the header has {width} columns", k)
     return table
 
 
-def read_grid(text: str) -> Grid:
+def read_table(text: str) -> Table:
     """Return a table from text of separated cells with a row of column names.
 
     Lines above the names are skipped; units in a row of their own are joined to the names, as in
@@ -223,7 +225,7 @@ def read_grid(text: str) -> Grid:
     if names and all(map(_is_unit, header)):
         above = rows[names - 1].cells
         header = [f"{a} ({u.strip('()[]')})" for a, u in zip_longest(above, header, fillvalue="")]
-    return grid(header, rows[names + 1 :], rows[names].line)
+    return table_of_rows(header, rows[names + 1 :], rows[names].line)
 
 
 def _is_unit(cell: str) -> bool:
@@ -236,12 +238,12 @@ def _is_unit(cell: str) -> bool:
 # Cells --------------------------------------------------------------------------------------------
 
 
-def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
+def numeric_cells(grid: Table, columns: Sequence[int], blank_allowed: bool) -> Array:
     """Return the cells of some columns as numbers (rows, columns); NaN where blank.
 
     Parameters
     ----------
-    grid : Grid
+    grid : Table
     columns : sequence of int
         Indices of the columns.
     blank_allowed : bool
@@ -257,24 +259,26 @@ def numbers(grid: Grid, columns: Sequence[int], blank_allowed: bool) -> Array:
         for j, column in enumerate(columns):
             cell = row.cells[column]
             try:
-                value = written_number(cell) if cell else math.nan
+                value = number_from_text(cell) if cell else math.nan
             except ValueError:
                 value = math.inf
-            if abs(value) > LARGEST or (math.isnan(value) and not blank_allowed):
+            if abs(value) > LARGEST_NUMBER or (math.isnan(value) and not blank_allowed):
                 expected = "a number or a blank cell" if blank_allowed else "a number"
                 name = grid.columns[column]
-                raise grid.refusal(f"column {name} holds '{excerpt(cell)}'; expected {expected}", i)
+                raise grid.error_at(
+                    f"column {name} holds '{excerpt(cell)}'; expected {expected}", i
+                )
             values[i, j] = value
     return values
 
 
-def times_of(grid: Grid, place: int, factor: float = 1.0) -> Array:
+def times_in_column(grid: Table, column: int, factor: float = 1.0) -> Array:
     """Return the times (rows,) in a column.
 
     Parameters
     ----------
-    grid : Grid
-    place : int
+    grid : Table
+    column : int
         Index of the column.
     factor : float
         Factor from the column's unit to seconds.
@@ -284,9 +288,9 @@ def times_of(grid: Grid, place: int, factor: float = 1.0) -> Array:
     InputError
         If a cell is not a number, or time does not increase; the line is named.
     """
-    t_s = factor * numbers(grid, [place], blank_allowed=False)[:, 0]
-    if fault := first_time_fault(t_s):
-        raise grid.refusal(fault[1], fault[0])
+    t_s = factor * numeric_cells(grid, [column], blank_allowed=False)[:, 0]
+    if fault := first_unordered_time(t_s):
+        raise grid.error_at(fault[1], fault[0])
     return t_s
 
 
@@ -295,7 +299,7 @@ def is_number(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None
 
 
-def written_number(text: str) -> float:
+def number_from_text(text: str) -> float:
     """Return the number in a text.
 
     Raises

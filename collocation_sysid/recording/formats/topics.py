@@ -19,8 +19,8 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError, hint_at
 from ...files import require_regular
-from .depth_messages import depth_in, is_camera
-from .logs import Address, Log, opened, require_packages, require_topic
+from .depth_messages import depth_kind, is_camera_model
+from .logs import Log, TopicAddress, open_log, require_packages, require_topic
 
 AXES = ("x", "y", "z")
 POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -35,18 +35,23 @@ _POSES = (
 )
 _POINTS = ("pose.pose.position", "pose.position", "position", "translation", "point", "pose")
 _NAMES = ("marker_name", "name", "id", "ns", "child_frame_id")
-_NUMBERS = {"fluid_pressure": "pressure_pa", "range": "range_m", "data": "data", "value": "value"}
+_NUMBER_FIELDS = {
+    "fluid_pressure": "pressure_pa",
+    "range": "range_m",
+    "data": "data",
+    "value": "value",
+}
 _LISTS = ("transforms", "markers", "poses", "points", "objects", "rigidbodies")
 # Largest difference of stamp and recording time on one clock [ns], a day: otherwise the stamp is of
 # another clock, such as a simulation's.
 SAME_CLOCK_NS = 86_400 * 10**9
 # Largest excess of a joint over its limits [rad or m]: noise of its sensor.
-SLACK = 0.01
+JOINT_LIMIT_SLACK = 0.01
 # Number of first messages from which the use of a topic is recognised.
 _FIRST = 20
 
 # Ending of the name of the topic with fixed frames.
-STATIC = "_static"
+STATIC_TOPIC_SUFFIX = "_static"
 
 Row = dict[str, float]
 # Poses by time of each child in its parent.
@@ -64,9 +69,9 @@ class LogTopic:
         Number of messages.
     rate_hz : float or None
         Rate of the first messages; None for fewer than two.
-    serves : str
+    uses : str
         Possible uses in words; empty if the topic cannot be used.
-    write : tuple of str
+    problem_texts : tuple of str
         Text to write in a problem file in place of a file, one for each way to read the topic.
     """
 
@@ -74,11 +79,11 @@ class LogTopic:
     type: str
     messages: int
     rate_hz: float | None
-    serves: str
-    write: tuple[str, ...]
+    uses: str
+    problem_texts: tuple[str, ...]
 
 
-def listed_topics(path: str | Path) -> list[LogTopic]:
+def list_topics(path: str | Path) -> list[LogTopic]:
     """Return the topics of a log.
 
     Raises
@@ -86,11 +91,11 @@ def listed_topics(path: str | Path) -> list[LogTopic]:
     InputError
         If the path is no log, the log is damaged, or a package that reads it is missing.
     """
-    with opened(Path(path), episode=0) as log:
-        return [_told(log, Path(path), name) for name in log.topics]
+    with open_log(Path(path), episode=0) as log:
+        return [_describe_topic(log, Path(path), name) for name in log.topics]
 
 
-def table(address: Address) -> bytes:
+def topic_as_csv(address: TopicAddress) -> bytes:
     """Return the content of a CSV file equivalent to a topic; times count from the log's first
     message.
 
@@ -100,18 +105,20 @@ def table(address: Address) -> bytes:
         If the topic does not exist or holds no known data, or if frames or a robot's description
         are needed and missing.
     """
-    with opened(address.log, address.episode) as log:
+    with open_log(address.log, address.episode) as log:
         require_topic(log, address.topic)
         messages = list(log.messages(address.topic))
         if not messages:
             raise InputError(f"the topic {address.topic} has no messages")
-        if kind := depth_in(messages[0][1]):
+        if kind := depth_kind(messages[0][1]):
             raise InputError(f"the topic {address.topic} holds {kind}; expected one of numbers")
         if _is_transforms(messages[0][1]):
-            return _written(POSE, *_chained(_frames(log, messages, address.topic), address))
-        times, ordered = by_time(messages, log.start_ns)
+            return _csv_content(
+                POSE, *_poses_through_frames(_all_transforms(log, messages, address.topic), address)
+            )
+        times, ordered = sort_by_time(messages, log.start_ns)
         by_namespace = has_namespaces(ordered)
-        rows = [_row(each, by_namespace=by_namespace) for each in ordered]
+        rows = [_message_numbers(each, by_namespace=by_namespace) for each in ordered]
         unit = address.unit or log.unit
     columns = list(dict.fromkeys(name for row in rows for name in row))
     if not columns:
@@ -121,11 +128,11 @@ def table(address: Address) -> bytes:
         )
     values = np.array([[row.get(name, np.nan) for name in columns] for row in rows])
     if address.robot is not None:
-        return _written(POSE, times, _of_joints(columns, values, address, unit))
-    return _written(columns, times, values)
+        return _csv_content(POSE, times, _poses_from_joints(columns, values, address, unit))
+    return _csv_content(columns, times, values)
 
 
-def _told(log: Log, path: Path, name: str) -> LogTopic:
+def _describe_topic(log: Log, path: Path, name: str) -> LogTopic:
     """Return the description of a topic from its first messages.
 
     Parameters
@@ -143,27 +150,31 @@ def _told(log: Log, path: Path, name: str) -> LogTopic:
     serves = ""
     write = [f"{path.name}#{name}"]
     if first and _is_transforms(first[0][1]):
-        chains = moving_chains(_frames(log, log.messages(name), name))
+        chains = moving_chains(_all_transforms(log, log.messages(name), name))
         serves = "poses of one frame in another" if chains else "frames that do not move"
         write = [f"{write[0]}#{parent}>{child}" for parent, child in chains]
-        if name.removesuffix(STATIC) in log.topics and name.endswith(STATIC):
-            serves += f", part of the chains of {name.removesuffix(STATIC)}"
-    elif first and (held := depth_in(first[0][1])):
+        if name.removesuffix(STATIC_TOPIC_SUFFIX) in log.topics and name.endswith(
+            STATIC_TOPIC_SUFFIX
+        ):
+            serves += f", part of the chains of {name.removesuffix(STATIC_TOPIC_SUFFIX)}"
+    elif first and (held := depth_kind(first[0][1])):
         serves = f"{held}: [[experiment.depth]]"
-    elif first and is_camera(first[0][1]):
+    elif first and is_camera_model(first[0][1]):
         serves = "the camera's matrix, for the depth images beside it"
         write = []
     elif first:
         messages = [message for _, message in first]
         by_namespace = has_namespaces(messages)
-        columns = set[str]().union(*(_row(each, by_namespace=by_namespace) for each in messages))
-        serves = _served(columns, messages[0])
+        columns = set[str]().union(
+            *(_message_numbers(each, by_namespace=by_namespace) for each in messages)
+        )
+        serves = _possible_uses(columns, messages[0])
         if serves.startswith("positions"):
             write.append(f"{write[0]}#ROBOT.urdf#BASE>TOOL")
     return LogTopic(name, kind, count, rate, serves, tuple(write if serves else ()))
 
 
-def _served(columns: set[str], message: Any) -> str:
+def _possible_uses(columns: set[str], message: Any) -> str:
     """Return the possible uses of messages with these columns, in words."""
     if not columns:
         return ""
@@ -183,7 +194,7 @@ def _served(columns: set[str], message: Any) -> str:
 # From messages to rows ----------------------------------------------------------------------------
 
 
-def by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Any]]:
+def sort_by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list[Any]]:
     """Return the times (S,) [s] of messages, and the messages in this order; duplicates in time are
     cut.
 
@@ -194,18 +205,22 @@ def by_time(messages: list[tuple[int, Any]], start_ns: int) -> tuple[Array, list
     start_ns : int
         Time of recording of the log's first message.
     """
-    t_s = np.array([time_s(message, at_ns, start_ns) for at_ns, message in messages])
+    t_s = np.array([measurement_time_s(message, at_ns, start_ns) for at_ns, message in messages])
     times, first = np.unique(t_s, return_index=True)
     return times, [messages[k][1] for k in first]
 
 
-def time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
+def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
     """Return the time of measurement of a message, or of its recording if it has no stamp [s].
 
     The time counts from the log's first message, or is absolute if the stamp is of another clock.
     """
-    first = next(iter(_items(message)), None)
-    stamps = (_at(message, "header.stamp"), _at(message, "timestamp"), _at(first, "header.stamp"))
+    first = next(iter(_first_list(message)), None)
+    stamps = (
+        _nested_field(message, "header.stamp"),
+        _nested_field(message, "timestamp"),
+        _nested_field(first, "header.stamp"),
+    )
     stamped_ns = next((_nanoseconds(each) for each in stamps if each is not None), 0)
     if not stamped_ns:
         return (recorded_ns - start_ns) / 1e9
@@ -224,78 +239,90 @@ def _nanoseconds(stamp: Any) -> int:
     )
 
 
-def _row(message: Any, *, by_namespace: bool) -> Row:
+def _message_numbers(message: Any, *, by_namespace: bool) -> Row:
     """Return the numbers of a message by their columns.
 
     With `by_namespace` the names of markers begin with their namespace.
     """
-    wrench = _at(message, "wrench") or message
-    if _is_vector(force := _at(wrench, "force")):
-        values = [*_vector(force), *_vector(_at(wrench, "torque"))]
+    wrench = _nested_field(message, "wrench") or message
+    if _is_vector(force := _nested_field(wrench, "force")):
+        values = [*_vector(force), *_vector(_nested_field(wrench, "torque"))]
         return dict(zip(WRENCH, values, strict=True))
     if hasattr(message, "name") and hasattr(message, "position"):
         pairs = zip(message.name, message.position, strict=True)
         return {str(name): float(value) for name, value in pairs}
-    if (pose := _pose(message)) is not None:
+    if (pose := _pose_of_message(message)) is not None:
         return dict(zip(POSE, pose, strict=True))
-    points = _points(message, by_namespace=by_namespace)
+    points = _points_of_message(message, by_namespace=by_namespace)
     if points:
         return {f"{name}_{axis}": p[k] for name, p in points.items() for k, axis in enumerate(AXES)}
-    for name, column in _NUMBERS.items():
-        if isinstance(value := _at(message, name), (int, float)):
+    for name, column in _NUMBER_FIELDS.items():
+        if isinstance(value := _nested_field(message, name), (int, float)):
             return {column: float(value)}
         if name == "data" and isinstance(value, (list, np.ndarray)) and len(np.shape(value)) == 1:
             return {f"{column}_{k}": float(each) for k, each in enumerate(value)}
     return {}
 
 
-def _pose(message: Any) -> tuple[float, ...] | None:
+def _pose_of_message(message: Any) -> tuple[float, ...] | None:
     """Return position and quaternion (x, y, z, w) of a message; None if it has no pose."""
     for position, rotation in _POSES:
-        if hasattr(turned := _at(message, rotation), "w"):
-            return *_vector(_at(message, position)), *_vector(turned), turned.w
+        if hasattr(turned := _nested_field(message, rotation), "w"):
+            return *_vector(_nested_field(message, position)), *_vector(turned), turned.w
     return None
 
 
-def _points(message: Any, *, by_namespace: bool) -> dict[str, tuple[float, ...]]:
+def _points_of_message(message: Any, *, by_namespace: bool) -> dict[str, tuple[float, ...]]:
     """Return positions by name: of a single point, or of the items of the first list that has
     some.
     """
-    if _is_vector(one := _at(message, "point")):
-        return {_at(message, "header.frame_id") or "point": _vector(one)}
-    items = enumerate(_items(message))
-    places = {_called(item, k, by_namespace=by_namespace): _place(item) for k, item in items}
+    if _is_vector(one := _nested_field(message, "point")):
+        return {_nested_field(message, "header.frame_id") or "point": _vector(one)}
+    items = enumerate(_first_list(message))
+    places = {
+        _item_name(item, k, by_namespace=by_namespace): _position_of_item(item) for k, item in items
+    }
     return {key: place for key, place in places.items() if place is not None}
 
 
-def _items(message: Any) -> Any:
+def _first_list(message: Any) -> Any:
     """Return the first list in a message whose items may have positions; empty if there is none."""
-    lists = (_at(message, name) for name in _LISTS)
+    lists = (_nested_field(message, name) for name in _LISTS)
     return next((each for each in lists if each is not None and len(each)), ())
 
 
-def _place(item: Any) -> tuple[float, ...] | None:
+def _position_of_item(item: Any) -> tuple[float, ...] | None:
     """Return the position of an item of a list; None if it has none."""
     if _is_vector(item):
         return _vector(item)
-    return next((_vector(p) for name in _POINTS if _is_vector(p := _at(item, name))), None)
+    return next(
+        (_vector(p) for name in _POINTS if _is_vector(p := _nested_field(item, name))), None
+    )
 
 
-def _called(item: Any, index: int, *, by_namespace: bool) -> str:
+def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
     """Return the name of an item of a list; its number, counted from 1, if it has none."""
-    names = (_at(item, name) for name in _NAMES)
+    names = (_nested_field(item, name) for name in _NAMES)
     name = str(next((name for name in names if name not in (None, "")), index + 1))
-    return f"{namespace}/{name}" if by_namespace and (namespace := _at(item, "ns")) else name
+    return (
+        f"{namespace}/{name}" if by_namespace and (namespace := _nested_field(item, "ns")) else name
+    )
 
 
 def has_namespaces(messages: Iterable[Any]) -> bool:
     """Return whether the messages hold markers of several namespaces, whose names may be the
     same.
     """
-    return len({_at(item, "ns") for each in messages for item in _items(each)} - {None, ""}) > 1
+    return (
+        len(
+            {_nested_field(item, "ns") for each in messages for item in _first_list(each)}
+            - {None, ""}
+        )
+        > 1
+    )
 
 
-def _at(message: Any, path: str) -> Any:
+def _nested_field(message: Any, path: str) -> Any:
     """Return the nested field at a dotted path; None if it does not exist."""
     for name in path.split("."):
         message = getattr(message, name, None)
@@ -317,38 +344,49 @@ def _vector(value: Any) -> tuple[float, ...]:
 
 def _is_transforms(message: Any) -> bool:
     """Return whether a message places one frame in another."""
-    return _at(message, "transforms") is not None or _child(message) is not None
+    return (
+        _nested_field(message, "transforms") is not None or _transform_frames(message) is not None
+    )
 
 
-def _child(transform: Any) -> tuple[str, str] | None:
+def _transform_frames(transform: Any) -> tuple[str, str] | None:
     """Return the parent and the child frame of a transform; None if the message is no transform."""
-    child = _at(transform, "child_frame_id")
-    parent = _at(transform, "parent_frame_id") or _at(transform, "header.frame_id")
-    is_one = child and parent and _pose(transform) and not hasattr(transform, "twist")
+    child = _nested_field(transform, "child_frame_id")
+    parent = _nested_field(transform, "parent_frame_id") or _nested_field(
+        transform, "header.frame_id"
+    )
+    is_one = child and parent and _pose_of_message(transform) and not hasattr(transform, "twist")
     return (parent.lstrip("/"), child.lstrip("/")) if is_one else None
 
 
-def _edges(messages: Iterable[tuple[int, Any]], start_ns: int) -> Edges:
+def _poses_of_transforms(messages: Iterable[tuple[int, Any]], start_ns: int) -> Edges:
     """Return poses of child frames in their parents, by (parent, child) and time [s].
 
     Of several poses at a time the first is kept.
     """
     edges: Edges = {}
     for at_ns, message in messages:
-        for each in _at(message, "transforms") or [message]:
-            pose = _pose(each)
-            if (edge := _child(each)) is not None and pose is not None:
-                edges.setdefault(edge, {}).setdefault(time_s(each, at_ns, start_ns), pose)
+        for each in _nested_field(message, "transforms") or [message]:
+            pose = _pose_of_message(each)
+            if (edge := _transform_frames(each)) is not None and pose is not None:
+                edges.setdefault(edge, {}).setdefault(
+                    measurement_time_s(each, at_ns, start_ns), pose
+                )
     return edges
 
 
-def _frames(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
+def _all_transforms(log: Log, moving: Iterable[tuple[int, Any]], topic: str) -> Edges:
     """Return the poses of a topic's transforms and of the fixed transforms in its static topic."""
-    still = log.messages(topic + STATIC) if topic + STATIC in log.topics else ()
+    still = (
+        log.messages(topic + STATIC_TOPIC_SUFFIX)
+        if topic + STATIC_TOPIC_SUFFIX in log.topics
+        else ()
+    )
     fixed = {
-        edge: {0.0: next(iter(of.values()))} for edge, of in _edges(still, log.start_ns).items()
+        edge: {0.0: next(iter(of.values()))}
+        for edge, of in _poses_of_transforms(still, log.start_ns).items()
     }
-    return fixed | _edges(moving, log.start_ns)
+    return fixed | _poses_of_transforms(moving, log.start_ns)
 
 
 def moving_chains(edges: Edges) -> list[tuple[str, str]]:
@@ -369,7 +407,7 @@ def moving_chains(edges: Edges) -> list[tuple[str, str]]:
     return sorted(chains, key=lambda chain: chain[1] in carrying)
 
 
-def _chained(edges: Edges, address: Address) -> tuple[Array, Array]:
+def _poses_through_frames(edges: Edges, address: TopicAddress) -> tuple[Array, Array]:
     """Return times (T,) and poses (T, 7) of one frame in another, through all frames between them.
 
     The times are those of the most frequent transform; others are interpolated along screw motions.
@@ -385,8 +423,8 @@ def _chained(edges: Edges, address: Address) -> tuple[Array, Array]:
     from pytransform3d.transform_manager import StaticTransform as Static
     from pytransform3d.transform_manager import TemporalTransformManager as Manager
 
-    parent, child = _between(edges, address)
-    path = _path(edges, parent, child)
+    parent, child = _requested_frames(edges, address)
+    path = _frame_path(edges, parent, child)
     moving = [np.array(sorted(edges[edge])) for edge in path if len(edges[edge]) > 1]
     if not moving:
         raise InputError(f"nothing moves between {parent} and {child}; leave poses out instead")
@@ -408,7 +446,9 @@ def _chained(edges: Edges, address: Address) -> tuple[Array, Array]:
     return times, pqs_from_transforms(matrices)[:, [0, 1, 2, 4, 5, 6, 3]]
 
 
-def _between(edges: Mapping[tuple[str, str], Any], address: Address) -> tuple[str, str]:
+def _requested_frames(
+    edges: Mapping[tuple[str, str], Any], address: TopicAddress
+) -> tuple[str, str]:
     """Return the parent and the child frame that an address asks for; an `InputError` if not
     there.
     """
@@ -428,7 +468,9 @@ def _between(edges: Mapping[tuple[str, str], Any], address: Address) -> tuple[st
     return address.frames
 
 
-def _path(edges: Mapping[tuple[str, str], Any], parent: str, child: str) -> list[tuple[str, str]]:
+def _frame_path(
+    edges: Mapping[tuple[str, str], Any], parent: str, child: str
+) -> list[tuple[str, str]]:
     """Return the edges on the path from one frame through the common ancestor to the other.
 
     Raises
@@ -454,7 +496,9 @@ def _path(edges: Mapping[tuple[str, str], Any], parent: str, child: str) -> list
     return path
 
 
-def _of_joints(columns: list[str], values: Array, address: Address, unit: str | None) -> Array:
+def _poses_from_joints(
+    columns: list[str], values: Array, address: TopicAddress, unit: str | None
+) -> Array:
     """Return poses (T, 7) of a robot's link from joint positions (T, joints), by its URDF file.
 
     Parameters
@@ -463,7 +507,7 @@ def _of_joints(columns: list[str], values: Array, address: Address, unit: str | 
         Names of the joints.
     values : (T, joints) array
         Positions; angles in `unit`, displacements in metres.
-    address : Address
+    address : TopicAddress
     unit : {"rad", "deg"} or None
         None raises an `InputError`.
     """
@@ -499,7 +543,7 @@ def _of_joints(columns: list[str], values: Array, address: Address, unit: str | 
         for name, value in zip(columns, position, strict=True):
             if name in limits:
                 angle = np.radians(value) if unit == "deg" else value
-                _refuse_beyond(name, angle, limits[name], address)
+                _require_joint_limits(name, angle, limits[name], address)
                 robot.set_joint(name, angle)
         poses[row] = pq_from_transform(robot.get_transform(child, parent))[[0, 1, 2, 4, 5, 6, 3]]
     return poses
@@ -514,9 +558,11 @@ def _has_joint(robot: Any, name: str) -> bool:
     return True
 
 
-def _refuse_beyond(name: str, angle: float, limits: tuple[float, float], address: Address) -> None:
+def _require_joint_limits(
+    name: str, angle: float, limits: tuple[float, float], address: TopicAddress
+) -> None:
     """Raise an `InputError` if a joint is beyond its limits: the library would silently clip it."""
-    if not limits[0] - SLACK <= angle <= limits[1] + SLACK:
+    if not limits[0] - JOINT_LIMIT_SLACK <= angle <= limits[1] + JOINT_LIMIT_SLACK:
         hint = "" if address.unit else "; are these degrees? Then #deg belongs behind the topic"
         raise InputError(
             f"the joint {name} is at {angle:.4g}, beyond its limits {limits[0]:.4g} to "
@@ -524,7 +570,7 @@ def _refuse_beyond(name: str, angle: float, limits: tuple[float, float], address
         )
 
 
-def _written(columns: Any, t_s: Array, values: Array) -> bytes:
+def _csv_content(columns: Any, t_s: Array, values: Array) -> bytes:
     """Return a table as CSV text; NaN becomes a blank cell."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")

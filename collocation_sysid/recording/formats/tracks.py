@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from ...arrays import Array
 from ...errors import InputError
-from .text import Grid, Row, grid, numbers, times_of, written_number
+from .text import Row, Table, number_from_text, numeric_cells, table_of_rows, times_in_column
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,31 +54,32 @@ class RawTracks:
     notes: tuple[str, ...] = ()
 
 
-class Choose(Protocol):
+class LabelChooser(Protocol):
     """A function that picks markers by the labels of a file, before any of their cells is read."""
 
-    def __call__(self, labels: Sequence[str], aside: Collection[str] = ()) -> list[int]:
-        """Return the indices of the chosen labels; those in `aside` only if they are requested by
+    def __call__(self, labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
+        """Return the indices of the chosen labels; those in `excluded` only if they are requested
+        by
         name.
         """
         ...
 
 
-def tracks(
-    table: Grid,
+def tracks_of_table(
+    table: Table,
     labels: Sequence[str],
-    places: Sequence[Sequence[int]],
+    coordinate_columns: Sequence[Sequence[int]],
     chosen: Sequence[int],
     time: int | None,
-    **stated: Any,
+    **fields: Any,
 ) -> RawTracks:
     """Return the tracks of a table with a row for each frame.
 
     Parameters
     ----------
-    table : Grid
+    table : Table
     labels : sequence of str
-    places : sequence of (int, int, int)
+    coordinate_columns : sequence of (int, int, int)
         Indices of the columns of x, y and z, by marker.
     chosen : sequence of int
         Indices of the markers to read.
@@ -87,12 +88,14 @@ def tracks(
     **stated
         Further fields of `RawTracks`.
     """
-    cells = numbers(table, [column for k in chosen for column in places[k]], blank_allowed=True)
+    cells = numeric_cells(
+        table, [column for k in chosen for column in coordinate_columns[k]], blank_allowed=True
+    )
     return RawTracks(
         labels=[labels[k] for k in chosen],
         coordinates=cells.reshape(-1, len(chosen), 3),
-        t_s=None if time is None else times_of(table, time),
-        **stated,
+        t_s=None if time is None else times_in_column(table, time),
+        **fields,
     )
 
 
@@ -102,10 +105,10 @@ class Header:
 
     Attributes
     ----------
-    stated : mapping of a key to its text and line
+    entries : mapping of a key to its text and line
     """
 
-    stated: Mapping[str, tuple[str, int]]
+    entries: Mapping[str, tuple[str, int]]
 
     def number(self, key: str) -> float | None:
         """Return the number that a key states; None if it is blank or missing.
@@ -115,11 +118,11 @@ class Header:
         InputError
             If it is no number above 0.
         """
-        text, line = self.stated.get(key, ("", 0))
+        text, line = self.entries.get(key, ("", 0))
         if not text:
             return None
         try:
-            value = written_number(text)
+            value = number_from_text(text)
         except ValueError:
             value = math.nan
         if not 0 < value < math.inf:
@@ -127,7 +130,7 @@ class Header:
             raise InputError(message, where=f"line {line}")
         return value
 
-    def compare(self, key: str, count: int, what: str, line: int | None = None) -> None:
+    def require_count(self, key: str, count: int, what: str, line: int | None = None) -> None:
         """Raise an `InputError` if the number stated by a key differs from `count`.
 
         Parameters
@@ -143,31 +146,31 @@ class Header:
         stated = self.number(key)
         if stated is not None and stated != count:
             message = f"{key} is {stated:g}, but {count} {what} are there; is the file cut short?"
-            raise InputError(message, where=f"line {line or self.stated[key][1]}")
+            raise InputError(message, where=f"line {line or self.entries[key][1]}")
 
 
-def framed(
+def tracks_of_frames(
     header: Header,
-    counted: str,
-    rate: str,
+    count_key: str,
+    rate_key: str,
     leading: Sequence[str],
     labels: Sequence[str],
     frames: list[Row],
-    choose: Choose,
-    **stated: Any,
+    choose: LabelChooser,
+    **fields: Any,
 ) -> RawTracks:
     """Return the tracks of a table of frames: leading columns, then x, y and z of each marker.
 
     Parameters
     ----------
     header : Header
-    counted, rate : str
+    count_key, rate_key : str
         Keys of the number of frames, and of their rate.
     leading : sequence of str
         Names of the columns before those of the markers; "Time" is the time.
     labels : sequence of str
     frames : list of Row
-    choose : Choose
+    choose : LabelChooser
     **stated
         Further fields of `RawTracks`.
 
@@ -177,9 +180,11 @@ def framed(
         If the header's counts or a row disagree with the table.
     """
     chosen = choose(labels)
-    table = grid([*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")], frames)
-    header.compare(counted, len(frames), "frames")
+    table = table_of_rows(
+        [*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")], frames
+    )
+    header.require_count(count_key, len(frames), "frames")
     places = [range(k, k + 3) for k in range(len(leading), len(table.columns), 3)]
     time = leading.index("Time") if "Time" in leading else None
-    stated |= {"rate_hz": header.number(rate), "rate_key": rate}
-    return tracks(table, labels, places, chosen, time, **stated)
+    fields |= {"rate_hz": header.number(rate_key), "rate_key": rate_key}
+    return tracks_of_table(table, labels, places, chosen, time, **fields)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from ...errors import InputError
 from .text import tab_rows
-from .tracks import Choose, Header, RawTracks, framed
-from .units import stated_unit
+from .tracks import Header, LabelChooser, RawTracks, tracks_of_frames
+from .units import length_unit_of_text
 
 BEGINNING = "PathFileType"
 _KEYS = ("DataRate", "NumFrames", "NumMarkers", "Units")
 
 
-def read(text: str, choose: Choose) -> RawTracks:
+def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a TRC file; `choose` picks the markers."""
     rows = [row for row in tab_rows(text) if any(row.cells)]
     if len(rows) < 5:
@@ -23,11 +23,11 @@ def read(text: str, choose: Choose) -> RawTracks:
     _, keys, values, names, axes, *frames = rows
     stated = zip(values.cells, [values.line] * len(keys.cells), strict=False)
     header = Header(dict(zip(keys.cells, stated, strict=False)))
-    if missing := [key for key in _KEYS if key not in header.stated]:
+    if missing := [key for key in _KEYS if key not in header.entries]:
         there = ", ".join(filter(None, keys.cells))
         message = f"the header lacks {', '.join(missing)}; found {there}"
         raise InputError(message, where=f"line {keys.line}")
-    unit = stated_unit(header.stated["Units"][0], f"line {values.line}")
+    unit = length_unit_of_text(header.entries["Units"][0], f"line {values.line}")
     labels = [cell for cell in names.cells[2:] if cell]
     if names.cells[0] != "Frame#" or axes.cells[0]:
         raise InputError(
@@ -35,8 +35,8 @@ def read(text: str, choose: Choose) -> RawTracks:
             "names of the markers, and X1, Y1, Z1 … below them",
             where=f"line {names.line}",
         )
-    header.compare("NumMarkers", len(labels), "marker names", names.line)
-    return framed(
+    header.require_count("NumMarkers", len(labels), "marker names", names.line)
+    return tracks_of_frames(
         header,
         "NumFrames",
         "DataRate",

@@ -31,11 +31,11 @@ _WORDS = {
 _SPELLINGS = {word: unit for unit, words in _WORDS.items() for word in words}
 
 
-def si_factor(unit: str, dimension: str) -> float | None:
+def si_factor(unit_text: str, dimension: str) -> float | None:
     """Return the factor from a unit to SI; None if it is no unit of that dimension, a key of
     `UNITS`.
     """
-    bare = unit.replace("·", "").replace("*", "").replace(" ", "").replace("μ", "µ")
+    bare = unit_text.replace("·", "").replace("*", "").replace(" ", "").replace("μ", "µ")
     known = UNITS[dimension]
     if bare not in known and dimension == "length":
         bare = _SPELLINGS.get(bare.lower(), bare)
@@ -48,7 +48,7 @@ def expected_units(unit: str, dimension: str) -> str:
     return f"{'a unit of force, ' if mass else ''}one of {', '.join(UNITS[dimension])}"
 
 
-def stated_unit(text: str, where: str) -> str | None:
+def length_unit_of_text(text: str, where: str) -> str | None:
     """Return the unit of length ("m", "cm", "mm", "in") that a file's text names; None if it is
     blank.
 
@@ -71,7 +71,7 @@ def stated_unit(text: str, where: str) -> str | None:
     return _SPELLINGS.get(word)
 
 
-def refuse_unknown_unit(length_unit: str | None) -> None:
+def require_length_unit(length_unit: str | None) -> None:
     """Raise an `InputError` if a unit of length is neither None nor a key of `METRES_PER_UNIT`."""
     if length_unit is not None and length_unit not in METRES_PER_UNIT:
         raise InputError(

@@ -34,7 +34,7 @@ _CHAINS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 def export(body: Identified) -> Exported:
     """Return the input deck, with what CalculiX cannot express."""
-    static = body.experiment.static
+    static = body.experiment.is_static
     limits = replace(HOLDS, motion=static, drives=static).lost(body)
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
@@ -68,7 +68,7 @@ def export(body: Identified) -> Exported:
 
 def _times_s(body: Identified) -> Array:
     """Return the time of each step: all samples of a static recording, else the first one."""
-    return body.experiment.t_s[: None if body.experiment.static else 1]
+    return body.experiment.t_s[: None if body.experiment.is_static else 1]
 
 
 def _walls(body: Identified, touched: Sequence[Wall]) -> str:
@@ -97,7 +97,7 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> str:
             f"*SOLID SECTION,ELSET=W{k},MATERIAL=WALL\n*SURFACE,NAME=W{k}\nW{k},S1\n"
             f"*SURFACE,NAME=B{k}\n{sides}"
             f"*SURFACE INTERACTION,NAME=W{k}\n*SURFACE BEHAVIOR,PRESSURE-OVERCLOSURE=LINEAR\n"
-            f"{_fields(wall.stiffness_pa_m)}\n{stick if wall.obstacle.rubs else ''}"
+            f"{_fields(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
             f"*CONTACT PAIR,INTERACTION=W{k},TYPE=SURFACE TO SURFACE\nB{k},W{k}\n"
         )
     material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_fields(body.regions[0].young_pa, 0.3)}\n"
@@ -118,7 +118,7 @@ def _step(body: Identified, touched: Sequence[Wall], t_s: float, linear: bool) -
     linear : bool
         Whether the analysis is geometrically linear.
     """
-    displacements_m = [body.experiment.grasped([t_s])[1][0] - body.nodes_m]
+    displacements_m = [body.experiment.prescribed_displacements([t_s])[1][0] - body.nodes_m]
     displacements_m += [wall.points_m(t_s) - wall.start_m for wall in touched]
     rows = np.concatenate(displacements_m)
     prescribed = np.argwhere(np.isfinite(rows))

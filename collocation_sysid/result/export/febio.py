@@ -177,7 +177,7 @@ def _walls(body: Identified, touched: Sequence[Wall]) -> tuple[str, str]:
         cells = _rows("elem", wall.tetrahedra + 1, wall.cells)
         solids += f'<Nodes name="nodes_wall_{k}">\n{nodes}</Nodes>\n'
         solids += f'<Elements type="tet4" name="cells_wall_{k}">\n{cells}</Elements>\n'
-        touching = body.body.nodes.on_faces(corners[wall.faces]) + 1
+        touching = body.body.nodes.nodes_of_faces(corners[wall.faces]) + 1
         for name, sides in (("body", touching), ("wall", wall.triangles + 1)):
             rows = _rows(f"tri{sides.shape[1]}", sides)
             facets += f'<Surface name="{name}_side_{k}">\n{rows}</Surface>\n'

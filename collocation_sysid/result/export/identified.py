@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from ...arrays import Array, Index
 from ...errors import InputError, listed, located
 from ...fem.body import Body
-from ...fem.moduli import engineering
+from ...fem.moduli import engineering_constants
 from ...problem import Problem
 from ...recording import Experiment, Markers, Obstacle
-from ...recording.solids import name_of
+from ...recording.solids import solid_key
 from ...runs.result import ReportedEstimate, Result
-from ...runs.warm_start import Earlier
+from ...runs.warm_start import WarmStart
 from ..replay import Replay, read_arrays, reading_run
 
 
@@ -58,7 +58,7 @@ class IdentifiedRegion:
         Name of the damping law.
     gamma_r_s, gamma_m_1_s : float
         Stiffness-proportional and mass-proportional damping, see the glossary.
-    branches : tuple of Branch
+    branches : tuple of BranchIndices
     """
 
     name: str
@@ -102,7 +102,7 @@ def alone(experiment: Experiment) -> Experiment:
     some = Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, ["corner"], body.nodes_m[:1])
     unmeasured: dict[str, Any] = {"markers": some, "readings": (), "depths": ()}
     try:
-        return replace(experiment, grasps=experiment.gripping, **started, **unmeasured)
+        return replace(experiment, grasps=experiment.body_grasps, **started, **unmeasured)
     except InputError as error:
         raise InputError(
             "exports leave obstacles out, and the body has no equilibrium without them; expected a "
@@ -167,8 +167,8 @@ class Identified:
         """
         folder = Path(run)
         result = Result.read(folder)
-        answer = Earlier.of_result(result, folder)
-        home = result.home(folder, "which export needs")
+        answer = WarmStart.from_result(result, folder)
+        home = result.problem_folder(folder, "which export needs")
         with reading_run(folder):
             warnings = _warnings(result)
         problem = Problem.read(folder / "problem.toml", allow_code=allow_code, folder=home)
@@ -176,8 +176,8 @@ class Identified:
             {n: each.shapes.length_m for n, each in result.fields.items()}
         )
         if problem.parameters.free:
-            problem = answer.started(problem)  # which may state no guess itself
-        if any(body.scan is not None for body in problem.bodies):
+            problem = answer.apply_to_problem(problem)  # which may state no guess itself
+        if any(body.scan_conditions is not None for body in problem.bodies):
             raise InputError(
                 "the mesh was made under gravity, and targets take meshes as free of stress; "
                 "expected a stress-free mesh: write body.stress_free_mesh(theta) to a file, and "
@@ -186,23 +186,23 @@ class Identified:
                 "object.rest_shape",
             )
         collocation = problem.collocation()
-        names = [segment.experiment.name for segment in collocation.segments]
+        names = [segment.experiment.name for segment in collocation.transcriptions]
         if experiment is not None and experiment not in names:
             raise InputError(
                 f"no experiment {experiment!r} was fitted; expected {', '.join(names)}", folder
             )
-        segment = collocation.segments[names.index(experiment) if experiment else 0]
+        segment = collocation.transcriptions[names.index(experiment) if experiment else 0]
         with reading_run(folder):
             values = {
                 item.name: result.parameters[item.name].value for item in problem.parameters.items
             }
-        phi = answer.nuisance_of(collocation)[0][segment.local.places]
+        phi = answer.apply_to_nuisance(collocation)[0][segment.nuisance_indices.indices]
         with reading_run(folder):
             replay = Replay.from_arrays(segment.experiment.name, read_arrays(folder))
             body = segment.body
             if replay.undeformed_m.shape != body.nodes.points_m.shape:
                 raise ValueError("the mesh is not that of the problem file")
-        corrected = segment.corrected(phi)
+        corrected = segment.corrected_experiment(phi)
         rolled_out_m = replay.rolled_out_positions_m
         obstacles = tuple(
             replace(o, friction=values[o.friction]) if isinstance(o.friction, str) else o
@@ -220,7 +220,7 @@ class Identified:
             warnings,
             {n: each for n, each in result.parameters.items() if n in result.values},
             body,
-            body.theta(values),
+            body.theta_from_values(values),
             corrected,
             rolled_out_m,
             touching,
@@ -244,12 +244,12 @@ class Identified:
     @cached_property
     def held(self) -> NDArray[np.bool_]:
         """Whether a node's coordinate has a prescribed displacement at the first sample (n, 3)."""
-        return self.experiment.held([self.start_s])[0]
+        return self.experiment.is_prescribed([self.start_s])[0]
 
     @cached_property
     def held_m(self) -> Array:
         """Prescribed coordinates (n, 3) at the first sample, NaN where a coordinate is free."""
-        return self.experiment.grasped([self.start_s])[1][0]
+        return self.experiment.prescribed_displacements([self.start_s])[1][0]
 
     @property
     def grasped(self) -> NDArray[np.bool_]:
@@ -273,7 +273,7 @@ class Identified:
     @cached_property
     def tied_kg(self) -> Array:
         """Point masses attached to the nodes (n,) at the first sample."""
-        return self.experiment.tied_mass_kg([self.start_s])[0]
+        return self.experiment.point_mass_at_nodes_kg([self.start_s])[0]
 
     @cached_property
     def node_mass_kg(self) -> Array:
@@ -291,7 +291,7 @@ class Identified:
         of the body.
         """
         weight = self.tied_kg[:, None] * self.experiment.gravity_m_s2
-        return self.experiment.node_forces_n([self.start_s])[0] + weight
+        return self.experiment.stated_node_forces_n([self.start_s])[0] + weight
 
     @cached_property
     def regions(self) -> tuple[IdentifiedRegion, ...]:
@@ -299,11 +299,11 @@ class Identified:
         body = self.body
         regions = []
         lame = body.lame(self.theta)
-        shares = body.split(self.theta)
+        shares = body.split_theta(self.theta)
         densities = body.densities(self.theta)
         for part, share, density in zip(body.parts, shares, densities, strict=True):
             values = {c.name: float(v) for c, v in zip(part.constants, share, strict=True)}
-            young, poisson = engineering(*lame[part.name])
+            young, poisson = engineering_constants(*lame[part.name])
             regions.append(
                 IdentifiedRegion(
                     part.name or "body",
@@ -373,7 +373,7 @@ class Identified:
             "obstacles": [
                 {
                     "name": each.name,
-                    "shape": {name_of(each.shape): each.shape},
+                    "shape": {solid_key(each.shape): each.shape},
                     "friction": each.friction,
                     "pose_t_s": each.poses.t_s,
                     "pose_positions_m": each.poses.positions_m,
@@ -397,7 +397,7 @@ def _warnings(result: Result) -> tuple[str, ...]:
             f"{listed(result.fields)} differs from place to place: the mean is exported"
         )
     for name, each in result.parameters.items():
-        if each.at_bound and not each.fixed:
+        if each.is_at_bound and not each.fixed:
             warnings.append(
                 f"{name} = {each.value:.4g} ended at a bound: the data would have it elsewhere"
             )

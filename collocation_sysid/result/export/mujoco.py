@@ -60,7 +60,7 @@ def export(body: Identified) -> Exported:
         For grasps that hold single axes, or not during the whole recording.
     """
     for k, grasp in enumerate(body.experiment.grasps, start=1):
-        if grasp.axes != "xyz" or not grasp.holds(body.experiment.t_s).all():
+        if grasp.axes != "xyz" or not grasp.is_active(body.experiment.t_s).all():
             raise InputError(
                 f"grasp {k} holds only {grasp.axes}, from {grasp.from_s:g} s until "
                 f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
@@ -242,7 +242,7 @@ def verify(body: Identified, folder: Path) -> list[Comparison]:
     except ValueError as error:
         raise InputError(f"MuJoCo refuses the model: {error}", folder / MODEL) from error
     compared = [_first_frequency(body, mujoco, model)]
-    if not body.experiment.static and body.rolled_out_m is not None:
+    if not body.experiment.is_static and body.rolled_out_m is not None:
         compared.append(_motion(body, mujoco, model))
     return compared
 
@@ -295,7 +295,7 @@ def _first_frequency(body: Identified, mujoco: ModuleType, model: Any) -> Compar
     theirs = float(np.sqrt(oscillating[0])) / (2 * np.pi)
     dofs = np.flatnonzero(np.repeat(free, 3))
     in_vacuum = replace(body.experiment, air_density_kg_m3="none")
-    forces = Forces.of(in_vacuum, body.start_s, body.theta)
+    forces = Forces.from_experiment(in_vacuum, body.start_s, body.theta)
     ours = natural_modes(forces, body.nodes_m, dofs, 1).frequencies_hz
     return Comparison("first natural frequency, undeformed", theirs, float(ours[0]), "Hz")
 

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from ...arrays import Array, Index
 from ...errors import listed
-from ...model.contact import contacts
+from ...model.contact import contact_terms
 from ...recording import Capsule, Cuboid, Cylinder, Obstacle, Plane, Solid, Sphere
-from ...recording.solids import name_of
+from ...recording.solids import solid_key
 from .identified import Identified
 
 # Smallest and largest width of the facets of round surfaces [rad].
@@ -50,14 +50,14 @@ class Primitive:
     @classmethod
     def of(cls, solid: Solid) -> Primitive:
         """Return the primitive of a solid; rounded edges are left out."""
-        kind = name_of(solid).removesuffix("_m")
+        kind = solid_key(solid).removesuffix("_m")
         turn = Rotation.identity()
         if isinstance(solid, Plane):
             return cls(kind, np.zeros(0), solid.point_m, _upright(solid.normal))
         if isinstance(solid, Sphere):
             return cls(kind, np.array([solid.radius_m]), solid.centre_m, turn)
         if isinstance(solid, Cuboid):
-            return cls(kind, np.diff(solid.corners_m, axis=0)[0] / 2, solid.middle_m, turn)
+            return cls(kind, np.diff(solid.corners_m, axis=0)[0] / 2, solid.tilt_centre_m, turn)
         assert isinstance(solid, (Cylinder, Capsule))
         way = np.diff(solid.ends_m, axis=0)[0]
         size = np.array([solid.radius_m, np.linalg.norm(way) / 2])
@@ -127,7 +127,7 @@ class Facets:
             Allowed distance between facets and surface.
         """
         if isinstance(solid, Plane):
-            corners = solid.outline(about_m, size_m)[0][:4]
+            corners = solid.outline_polylines(about_m, size_m)[0][:4]
             behind = corners.mean(axis=0) - size_m / 4 * solid.normal
             return cls(np.vstack([corners, behind]), np.array([(0, 1, 2), (0, 2, 3)]))._outwards()
         places = _extremes(Primitive.of(solid), getattr(solid, "rounding_m", 0.0), depth_m)
@@ -268,9 +268,9 @@ def walls(body: Identified) -> tuple[Wall, ...]:
     made: list[Wall] = []
     nodes = len(body.nodes_m)
     cells = len(body.body.cells)
-    for obstacle, contact in zip(body.obstacles, contacts(body.touching), strict=True):
-        law = contact.contact
-        depth_m, normal = contact.deepest(shape.ravel())
+    for obstacle, contact in zip(body.obstacles, contact_terms(body.touching), strict=True):
+        law = contact.law_of_contact
+        depth_m, normal = contact.deepest_point(shape.ravel())
         rotations, places = obstacle.poses.at(times)
         rigid_m = body.experiment.rigid_positions(times)
         ends = np.stack([rigid_m.min(axis=1), rigid_m.max(axis=1)], axis=2) - places[..., None]
@@ -283,7 +283,7 @@ def walls(body: Identified) -> tuple[Wall, ...]:
         solid = grown(obstacle.shape, width_m / 2)
         facets = Facets.of(solid, box_m.mean(axis=0), size_m, width_m / 2)
         faces = law.surface.faces
-        touching = np.unique(body.body.nodes.on_faces(body.body.mesh.surface[faces]))
+        touching = np.unique(body.body.nodes.nodes_of_faces(body.body.mesh.surface[faces]))
         # Nodes may be deeper than the points at which ours are pushed.
         back_m = -max(depth_m, 0.0) * normal
         nearest = (rigid_m[0, touching] - places[0] - back_m) @ rotations[0]

@@ -16,7 +16,7 @@ from ...arrays import Array, Index
 from ...errors import printable
 from ...fem.refinement import split_in_eight
 from ...model.forces import Forces
-from ...program.rest import rest_state
+from ...program.rest import equilibrium
 from ...program.simulation import simulate
 from .identified import Identified
 from .solids import Primitive
@@ -199,9 +199,12 @@ def _never_held(body: Identified) -> Iterator[str]:
         yield "buoyancy, added mass and drag of the air are not exported"
     if e.body.forces:
         yield f"custom forces are not exported: {', '.join(f.name for f in e.body.forces)}"
-    if np.ptp(e.node_forces_n(times), axis=0).any() or np.ptp(e.tied_mass_kg(times), axis=0).any():
+    if (
+        np.ptp(e.stated_node_forces_n(times), axis=0).any()
+        or np.ptp(e.point_mass_at_nodes_kg(times), axis=0).any()
+    ):
         yield "forces and point masses stay as they are at the first sample"
-    if any(not grasp.holds(times).all() for grasp in e.grasps):
+    if any(not grasp.is_active(times).all() for grasp in e.grasps):
         yield "grasps that begin or end to hold within the recording stay as they begin"
 
 
@@ -232,10 +235,12 @@ def at_rest(body: Identified, samples: int = 1) -> tuple[Array, Array]:
     if samples > 1:
         states = simulate(experiment, body.theta).positions_m[:samples].reshape(samples, -1)
     else:
-        states = rest_state(experiment, body.theta)[None]
+        states = equilibrium(experiment, body.theta)[None]
     # In statics what slides is the way since the sample before.
     ways = np.diff(states, axis=0, prepend=states[:1])
-    forces = Forces.of(experiment, experiment.t_s[:samples], body.theta).total(states, ways)
+    forces = Forces.from_experiment(experiment, experiment.t_s[:samples], body.theta).total(
+        states, ways
+    )
     on_nodes = forces.reshape(samples, -1, 3)
     on_body = [-on_nodes[:, each.nodes].sum(axis=1) for each in body.obstacles]
     moved_m = states.reshape(samples, -1, 3)[:, : len(body.nodes_m)] - body.nodes_m

@@ -138,7 +138,7 @@ def _library() -> Any:
 def _mesh(pxr: Any, stage: Any, body: Identified, placed_m: Array) -> None:
     """Add the tetrahedra, masses, materials and simulated motion of the body to the stage.
 
-    `pxr` are the modules of `_library`; `placed_m` (n, 3) are the initial node positions.
+    `pxr` are the modules of `_emit_library_call`; `placed_m` (n, 3) are the initial node positions.
     """
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
     body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")

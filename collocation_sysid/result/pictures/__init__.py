@@ -3,7 +3,7 @@
 Over time: `over_time` (markers, wrenches, custom sensors) and `spectrum`. In space: `shapes` (body
 and
 markers at several times), `mesh`, `field` (a spatially varying constant), `depth` (images of depth
-cameras) and `instability` (a buckling mode). Statistics and method: `confidence`, `search` and
+cameras) and `instability` (a buckling mode). Statistics and method: `confidence`, `minimise` and
 `jacobian`. `album` collects all pictures of a run and writes them; `camera` and `scene` draw bodies
 in
 space for the others.

@@ -13,8 +13,8 @@ from scipy.stats import chi2, norm
 
 from ...arrays import Array
 from ...runs.result import Result
-from ...statistics.budget import largest_first, worded
-from ...statistics.estimates import correlation_of
+from ...statistics.budget import main_sources, source_label
+from ...statistics.estimates import correlation_from_covariance
 from ..style import (
     BLACK,
     BLUE,
@@ -196,7 +196,7 @@ def correlation_matrix(known: Confidence) -> Figure:
     known : Confidence
         At least two parameters.
     """
-    correlation = correlation_of(known.covariance)
+    correlation = correlation_from_covariance(known.covariance)
     count = len(known.names)
     figure = framed_figure(64, 52, 8, 7, 6, 5)
     axes, bar_axes = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
@@ -238,7 +238,7 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
     shares : mapping of estimate to mapping of source to share
         Shares of the variance, from 0 to 1.
     """
-    drawn = largest_first(shares, LITTLE)[: len(CYCLE)]
+    drawn = main_sources(shares, LITTLE)[: len(CYCLE)]
     rows = list(shares)[::-1]
     sources = [*drawn, OTHERS]
     legend_mm = LEGEND_LINE_MM * -(-len(sources) // LEGEND_COLUMNS) + 3
@@ -252,7 +252,9 @@ def budget_picture(shares: Mapping[str, Mapping[str, float]]) -> Figure:
             else shares[row].get(source, 0.0)
             for row in rows
         ]
-        bars = axes.barh(range(len(rows)), widths, left=starts, color=colour, label=worded(source))
+        bars = axes.barh(
+            range(len(rows)), widths, left=starts, color=colour, label=source_label(source)
+        )
         for bar in bars:  # a white line keeps neighbours apart
             bar.set(edgecolor="white", linewidth=0.4)
         starts = [a + b for a, b in zip(starts, widths, strict=True)]

@@ -43,7 +43,7 @@ def depth_picture(seen: Array) -> Figure:
     Parameters
     ----------
     seen : (k, 8)
-        Rows of `Replay.seen`.
+        Rows of `Replay.fit_summary`.
     """
     times = np.unique(seen[np.isnan(seen[:, 3]), 0])
     points = seen[np.isfinite(seen[:, 3])]
@@ -96,7 +96,7 @@ def _sheet(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_],
     Parameters
     ----------
     points : (P, 8)
-        Points of `Replay.seen`.
+        Points of `Replay.fit_summary`.
     times : (m,)
         Times of the samples, one column each.
     rows : int

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from ...arrays import Array
-from ...fem.constants import with_unit
+from ...fem.constants import symbol_with_unit
 from ...fem.mesh import boundary_of
 from ..replay import Replay
 from ..style import PAGE_MM, SMALL_PT
@@ -92,7 +92,7 @@ def field_picture(seen: Replay, name: str, values: Array) -> Figure:
     bar.ax.minorticks_off()
     bar.ax.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=1.5)
     end = {"ha": "right", "va": "top", "fontsize": SMALL_PT}
-    axes.text(PAGE_MM - 1, total - 1.0, with_unit(name), **end)
+    axes.text(PAGE_MM - 1, total - 1.0, symbol_with_unit(name), **end)
     draw_directions(axes, camera, (6.0, FOOT_MM))
     draw_scale(axes, view.mm_per_m, (CORNER_MM + width + GAP_MM, 3.5))
     return figure

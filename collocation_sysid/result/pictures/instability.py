@@ -36,7 +36,7 @@ def instability_picture(lost: LostStability) -> Figure:
     none = np.zeros(len(shown_m), dtype=bool)
     Drawn(axes, view, lost.faces).show(shown_m, none, np.zeros((0, 3)), colours)
     title = (
-        f"unstable mode: stretches {lost.stretch:.3g} and {lost.across:.3g}, "
+        f"unstable mode: stretches {lost.smaller_stretch:.3g} and {lost.larger_stretch:.3g}, "
         f"wavelength {1e3 * lost.wavelength_m:.3g} mm"
     )
     axes.text(PAGE_MM / 2, HEAD_MM / 2 + height + FOOT_MM, title, ha="center", fontsize=SMALL_PT)

@@ -14,7 +14,7 @@ from matplotlib.image import AxesImage
 
 from ...arrays import Array
 from ...program.collocation import Collocation
-from ...runs.check.derivatives import first_samples
+from ...runs.check.derivatives import shortened_experiment
 from ..style import PAGE_MM, SMALL_PT, dress, framed_figure, mathematical
 
 # Timesteps shown: enough to see the band, few enough to see its blocks.
@@ -43,14 +43,14 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     z : (variables,)
         Variables at which the Jacobian is evaluated.
     """
-    total = collocation.segments[0].grid_rows
+    total = collocation.transcriptions[0].grid_times
     collocation, z = _first_steps(collocation, z)
-    segment = collocation.segments[0]
+    segment = collocation.transcriptions[0]
     nq = collocation.nq
     first = segment.dynamics.first_row
-    steps = min(SHOWN_STEPS, segment.grid_rows)
-    height = segment.rows_per_time
-    width = segment.dofs
+    steps = min(SHOWN_STEPS, segment.grid_times)
+    height = segment.constraints_per_time
+    width = segment.dof_count
     rows = (steps - first) * height
     matrix = abs(collocation.jacobian(z)[:, : nq + steps * width])[:rows]
     band = matrix[:, nq:]
@@ -77,7 +77,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
     _tick_blocks(middle, "y", "c", range(first, steps), height)
     middle.tick_params(labelleft=False, left=False)
     name = rf"$\partial c_{{{steps - 1}}} / \partial x_{{{steps - 1}}}$"
-    free = "" if segment.grasps_have_rows else ", free ones only"
+    free = "" if segment.has_constraints_of_grasps else ", free ones only"
     dress(right, f"{name}: the mesh graph", "column, 3 node + axis", f"row{free}")
     for axes in (left, middle, right):
         axes.grid(False)
@@ -95,11 +95,13 @@ def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array
     The complete Jacobian may need gigabytes.
     """
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
-    few = [first_samples(segment.experiment, count) for segment in collocation.segments]
-    short = replace(collocation, experiments=few, charts={})
-    p = np.concatenate([z[: collocation.nq], *(s.guess_phi for s in short.segments)])
-    pairs = zip(collocation.parts(z), short.segments, strict=True)
-    return short, short.pack(p, [part.x[: segment.grid_rows] for part, segment in pairs])
+    few = [
+        shortened_experiment(segment.experiment, count) for segment in collocation.transcriptions
+    ]
+    short = replace(collocation, experiments=few, associations={})
+    p = np.concatenate([z[: collocation.nq], *(s.guess_phi for s in short.transcriptions)])
+    pairs = zip(collocation.iterates(z), short.transcriptions, strict=True)
+    return short, short.pack(p, [part.x[: segment.grid_times] for part, segment in pairs])
 
 
 def _draw(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:

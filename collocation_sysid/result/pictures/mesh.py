@@ -122,7 +122,7 @@ def _draw_given(axes: Axes, view: View, places_m: Array, given_m: Array) -> set[
     Parameters
     ----------
     axes : Axes
-    view : View
+    view : DepthCameraModel
     places_m, given_m : (M, 3)
         Estimated and stated places; stated ones are NaN where there is none.
 

@@ -123,7 +123,7 @@ class Drawn:
     ----------
     axes : Axes
         Axes of a `sheet`.
-    view : View
+    view : DepthCameraModel
     surface : (F, 3)
         Nodes of the boundary triangles.
     parts : (F,), optional

@@ -215,7 +215,7 @@ def portrait(
 
 def _on_surface(seen: Replay, body: Body, constants: Mapping[str, float], field: str) -> Coloured:
     """Return a field of the elements, see `FIELDS`, as values on the boundary triangles."""
-    elements = ElementFields.of(body, body.theta(constants))
+    elements = ElementFields.of(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 
     def at(samples: Index) -> Array:

@@ -70,7 +70,7 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     Linear trends are removed and a Hann window is applied; the densities of x, y and z are added,
     those of
     markers averaged. Gaps are interpolated linearly, and markers present in less than the share
-    `SEEN` of
+    `TRIAL_SAMPLES` of
     the samples are left out.
 
     Parameters

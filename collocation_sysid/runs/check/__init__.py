@@ -1,6 +1,7 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
-`check_problem` does everything, `glance` what takes no simulation. The modules contribute `body`
+`check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
+`body`
 (meshes and grasps), `measurements`, `motion` (natural modes and the time grid), `cost` and
 `derivatives`. Every warning is one sentence that ends with the remedy.
 """
@@ -14,77 +15,77 @@ from typing import Any, ClassVar
 
 from ...arrays import Array
 from ...methods.reduced_space import ReducedSpace
-from ...methods.scan import SOFT_PA, started, usual_constants, usual_parameters
+from ...methods.scan import SOFT_PA, start_problem, typical_constants, typical_parameters
 from ...methods.start import initial_variables
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.stability import Instability, instabilities
-from ...program.touches import touched
-from ...statistics.cameras import camera_mistakes
+from ...program.stability import Instability, find_instabilities
+from ...program.touches import contact_summaries_of_parts
+from ...statistics.cameras import camera_hypotheses
 from ...statistics.concern import Concern
-from ...statistics.hypothesis import Hypothesis, ranked
-from ...statistics.modal import doubts
+from ...statistics.hypothesis import Hypothesis, rank
+from ...statistics.modal import find_misspecifications_by_modes
 from ...statistics.numerical import MOST_SUBSTEPS
 from ...statistics.placement_causes import placement_mistakes
-from ...statistics.plausible import oddities
-from ...statistics.scale import scale_concerns, stillness_concerns
-from ...statistics.trust import contact_concerns, stability_concerns, turn_concerns
+from ...statistics.plausible import size_and_density_hypotheses
+from ...statistics.scale import scale_concerns, static_concerns
+from ...statistics.trust import contact_concerns, rotation_step_concerns, stability_concerns
 from ...statistics.wrench_causes import CHECKED_SAMPLES, wrench_mistakes
 from ...tree import content
-from .body import BodyFinding, ElementShape, Hold, body_finding, hold_concerns, holds_of
-from .cost import Cost, cost_concerns, cost_notes, costs, nonzeros
-from .derivatives import derivative_errors, shortened
-from .measurements import MarkerFinding, Recording, recording_concerns, recording_of
-from .motion import ModeFinding, Motion, motion_concerns, motion_notes, motion_of
+from .body import BodyCheck, ElementShape, GraspCheck, check_body, check_grasps, grasp_concerns
+from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
+from .derivatives import derivative_errors, shortened_problem
+from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
+from .motion import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
 
 __all__ = [
-    "BodyFinding",
-    "Cost",
+    "BodyCheck",
+    "CheckResult",
     "ElementShape",
-    "Findings",
-    "Glance",
-    "Hold",
-    "MarkerFinding",
-    "ModeFinding",
-    "Motion",
-    "Recording",
+    "GraspCheck",
+    "MarkerCheck",
+    "MethodCost",
+    "ModeCheck",
+    "ModesCheck",
+    "QuickCheck",
+    "RecordingCheck",
     "check_problem",
-    "glance",
+    "quick_check",
 ]
 
 
 # Longest computation, a simulation of the whole recordings for one, that needs no request [s].
-PATIENCE_S = 10.0
+LONGEST_SIMULATION_S = 10.0
 # Time of a fit of the first samples to the markers, in simulations of these samples.
 FIT_SIMULATIONS = 15.0
 # Largest relative deviation from fourth-order central differences that rounding explains.
-AGREEMENT = 1e-6
-GUESSED = ", at the guess"
-CHOSEN = (
+DERIVATIVE_TOLERANCE = 1e-6
+AT_THE_GUESS = ", at the guess"
+SUBSTEPS_NOTE = (
     "one step a sample is counted here. Where transcription.substeps is not given, solve "
     f"takes as many as the error bars need, up to {MOST_SUBSTEPS}"
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Glance:
+class QuickCheck:
     """Findings of `check` without a simulation.
 
     Attributes
     ----------
-    bodies : tuple of BodyFinding
-    recordings : tuple of Recording, one for each experiment
-    holds : tuple of Hold, one for each grasp
+    bodies : tuple of BodyCheck
+    recordings : tuple of RecordingCheck, one for each experiment
+    holds : tuple of GraspCheck, one for each grasp
     """
 
-    bodies: tuple[BodyFinding, ...]
-    recordings: tuple[Recording, ...]
-    holds: tuple[Hold, ...]
+    bodies: tuple[BodyCheck, ...]
+    recordings: tuple[RecordingCheck, ...]
+    holds: tuple[GraspCheck, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Findings(Glance):
+class CheckResult(QuickCheck):
     """All findings of `check`.
 
     Attributes
@@ -98,7 +99,7 @@ class Findings(Glance):
     rms_at_guess_m : float or None
         RMS distance of the markers in the simulation at the guess; None if only the first samples
         were simulated.
-    motions : tuple of Motion, one for each fitted experiment that moves
+    motions : tuple of ModesCheck, one for each fitted experiment that moves
     variables, constraints : int
         Size of the program without lifted variables.
     overstresses, wrenches : int
@@ -109,8 +110,8 @@ class Findings(Glance):
     method : str
         The chosen method.
     memory_mb : float or None
-        Its memory; None if it is not among the `costs`.
-    costs : tuple of Cost, one for each method with a known cost
+        Its memory; None if it is not among the `method_costs`.
+    costs : tuple of MethodCost, one for each method with a known cost
     jacobian_error, hessian_error : float
         Largest relative deviation from central differences along random directions.
     causes : tuple of Hypothesis
@@ -120,7 +121,7 @@ class Findings(Glance):
         Expected problems, with the remedy; `warnings` are their sentences.
     """
 
-    TOLD: ClassVar = ("warnings",)
+    SERIALISED_PROPERTIES: ClassVar = ("warnings",)
 
     experiments: int
     timesteps: int
@@ -128,7 +129,7 @@ class Findings(Glance):
     missing: int
     largest_marker_distance_m: float
     rms_at_guess_m: float | None
-    motions: tuple[Motion, ...]
+    motions: tuple[ModesCheck, ...]
     variables: int
     constraints: int
     overstresses: int
@@ -137,7 +138,7 @@ class Findings(Glance):
     hessian_nonzeros: int
     method: str
     memory_mb: float | None
-    costs: tuple[Cost, ...]
+    costs: tuple[MethodCost, ...]
     jacobian_error: float
     hessian_error: float
     causes: tuple[Hypothesis, ...]
@@ -145,36 +146,36 @@ class Findings(Glance):
     concerns: tuple[Concern, ...] = ()
 
     @property
-    def chosen_cost(self) -> Cost | None:
+    def chosen_cost(self) -> MethodCost | None:
         """Cost of the chosen method; None if it is not known."""
         return next((cost for cost in self.costs if cost.method == self.method), None)
 
     @property
     def derivatives_agree(self) -> bool:
         """Whether both derivative checks pass."""
-        return max(self.jacobian_error, self.hessian_error) < AGREEMENT
+        return max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences of the concerns; each ends with the remedy."""
-        return tuple(concern.sentence for concern in self.concerns)
+        return tuple(concern.message for concern in self.concerns)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the findings as plain values for JSON and tables."""
         return content(replace(self, causes=())) | {"causes": [c.as_dict() for c in self.causes]}
 
 
-def glance(problem: Problem) -> Glance:
+def quick_check(problem: Problem) -> QuickCheck:
     """Return what needs no simulation: bodies, recordings and grasps.
 
     Parameters without a guess get usual values.
     """
-    usual = usual_parameters(problem.parameters, SOFT_PA)
-    return Glance(**_seen(replace(problem, parameters=usual), {}))
+    usual = typical_parameters(problem.parameters, SOFT_PA)
+    return QuickCheck(**_quick_fields(replace(problem, parameters=usual), {}))
 
 
-def _seen(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
-    """Return the fields of `Glance`.
+def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
+    """Return the fields of `QuickCheck`.
 
     Parameters
     ----------
@@ -187,14 +188,14 @@ def _seen(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
     experiments = problem.experiments
     return {
         "bodies": bodies,
-        "recordings": tuple(recording_of(e, positions_m.get(e.name)) for e in experiments),
-        "holds": tuple(hold for e in experiments for hold in holds_of(e, edges_m[e.name])),
+        "recordings": tuple(check_recording(e, positions_m.get(e.name)) for e in experiments),
+        "holds": tuple(hold for e in experiments for hold in check_grasps(e, edges_m[e.name])),
     }
 
 
 def check_problem(
-    problem: Problem, say: Callable[[str], None] | None = None, full: bool = False
-) -> Findings:
+    problem: Problem, report_progress: Callable[[str], None] | None = None, full: bool = False
+) -> CheckResult:
     """Check a problem: simulate it at the guess, compare derivatives, and look for likely mistakes.
 
     Where parameters have no guess, a scan finds where a solve would start.
@@ -202,7 +203,7 @@ def check_problem(
     Parameters
     ----------
     problem : Problem
-    say : callable, optional
+    report_progress : callable, optional
         Called with progress messages.
     full : bool
         Whether the whole recordings are simulated at the guess however long that takes; by default
@@ -213,79 +214,82 @@ def check_problem(
     InputError
         Where no start is found.
     """
-    say = say or (lambda _: None)
+    report_progress = report_progress or (lambda _: None)
     collocation = problem.collocation()
     notes = []
-    if problem.parameters.unguessed:
-        say("looking for a start, as there is no guess")
-        collocation, scan = started(collocation)
+    if problem.parameters.names_without_guess:
+        report_progress("looking for a start, as there is no guess")
+        collocation, scan = start_problem(collocation)
         problem = replace(problem, parameters=collocation.parameters)
         notes = [scan.sentence] if scan else []
-    say("simulating the first samples at the guess")
+    report_progress("simulating the first samples at the guess")
     started_s = time.perf_counter()
-    first = shortened(problem).collocation()
+    first = shortened_problem(problem).collocation()
     first_z, start_notes = initial_variables(first)
-    whole_s = (time.perf_counter() - started_s) * _rows(collocation) / _rows(first)
-    say("comparing derivatives with differences")
+    whole_s = (time.perf_counter() - started_s) * _grid_rows(collocation) / _grid_rows(first)
+    report_progress("comparing derivatives with differences")
     jacobian_error, hessian_error = derivative_errors(first, first_z)
-    say("estimating what methods take")
-    program = _program(problem, collocation, first, first_z)
+    report_progress("estimating what methods take")
+    program = _program_fields(problem, collocation, first, first_z)
     simulated = first
     z = first_z
-    if full or whole_s <= PATIENCE_S:
-        say(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
+    if full or whole_s <= LONGEST_SIMULATION_S:
+        report_progress(f"simulating the recordings at the guess, about {max(1, round(whole_s))} s")
         simulated = collocation
         (z, start_notes) = initial_variables(collocation)
-    say("looking at modes and at the description")
-    causes = description_causes(problem)
-    fit_s = FIT_SIMULATIONS * whole_s * min(1.0, CHECKED_SAMPLES / _rows(collocation))
-    sensed = any(e.wrenches and e.markers.samples for e in problem.experiments)
-    if sensed and not causes and (full or fit_s <= PATIENCE_S):
-        say("comparing the wrenches with what the markers predict")
-        causes = ranked(wrench_mistakes(collocation))
+    report_progress("looking at modes and at the description")
+    causes = misspecification_hypotheses(problem)
+    fit_s = FIT_SIMULATIONS * whole_s * min(1.0, CHECKED_SAMPLES / _grid_rows(collocation))
+    sensed = any(e.wrenches and e.markers.sample_count for e in problem.experiments)
+    if sensed and not causes and (full or fit_s <= LONGEST_SIMULATION_S):
+        report_progress("comparing the wrenches with what the markers predict")
+        causes = rank(wrench_mistakes(collocation))
     elif sensed and not causes:
         notes.append(
             "the wrenches were not compared with what the markers predict: it would take about "
             f"{fit_s:.2g} s; check --full does it"
         )
-    findings = Findings(
-        **_measured(problem, simulated, z),
-        timesteps=_rows(collocation),
-        rms_at_guess_m=None if simulated is first else collocation.rms_m(z),
-        motions=_motions(problem, collocation),
+    findings = CheckResult(
+        **_simulated_fields(problem, simulated, z),
+        timesteps=_grid_rows(collocation),
+        rms_at_guess_m=None if simulated is first else collocation.rms_marker_distance_m(z),
+        motions=_natural_modes(problem, collocation),
         **program,
         jacobian_error=jacobian_error,
         hessian_error=hessian_error,
         causes=causes,
     )
     # Nothing is said of contact by a body that was only carried.
-    touching = () if start_notes else _contacts(simulated, z, whole=simulated is not first)
-    concerns = (*_concerns(problem, findings, instabilities(simulated, z)), *touching)
-    notes += [*start_notes, *(each for m in findings.motions for each in motion_notes(m))]
+    touching = (
+        () if start_notes else _contact_concerns(simulated, z, is_whole=simulated is not first)
+    )
+    concerns = (*_concerns(problem, findings, find_instabilities(simulated, z)), *touching)
+    notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
     notes += cost_notes(findings.chosen_cost, findings.costs) if findings.chosen_cost else []
     if simulated is first:
         notes.append(
             f"the recordings were not simulated at the guess but for their first samples: it would "
             f"take about {whole_s:.2g} s; check --full does it"
         )
-    notes += [CHOSEN] * (problem.substeps == "auto" and bool(findings.motions))
+    notes += [SUBSTEPS_NOTE] * (problem.substeps == "auto" and bool(findings.motions))
     findings = replace(findings, concerns=concerns)
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *notes))
 
 
-def _measured(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
-    """Return the fields of `Glance` and the totals of `Findings` for simulations at the guess.
+def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
+    """Return the fields of `QuickCheck` and the totals of `CheckResult` for simulations at the
+    guess.
 
     The collocation may be that of the first samples.
     """
     positions_m = {}
-    for part in collocation.parts(z):
-        at_samples = part.x[part.segment.markers.grid_rows]
+    for part in collocation.iterates(z):
+        at_samples = part.x[part.segment.markers.sample_rows]
         positions_m[part.segment.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
-    shared_fields = _seen(problem, positions_m)
+    shared_fields = _quick_fields(problem, positions_m)
     recordings = shared_fields["recordings"]
-    distances_m = [r.farthest.distance_m for r in recordings if r.markers]
+    distances_m = [r.farthest_marker.distance_m for r in recordings if r.markers]
     return shared_fields | {
         "experiments": len(recordings),
         "samples": sum(recording.samples for recording in recordings),
@@ -294,15 +298,15 @@ def _measured(problem: Problem, collocation: Collocation, z: Array) -> dict[str,
     }
 
 
-def _rows(collocation: Collocation) -> int:
+def _grid_rows(collocation: Collocation) -> int:
     """Return the number of time steps of all segments."""
-    return sum(segment.grid_rows for segment in collocation.segments)
+    return sum(segment.grid_times for segment in collocation.transcriptions)
 
 
-def _program(
+def _program_fields(
     problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
 ) -> dict[str, Any]:
-    """Return size of the program and cost of the methods, as fields of `Findings`.
+    """Return size of the program and cost of the methods, as fields of `CheckResult`.
 
     Parameters
     ----------
@@ -314,19 +318,19 @@ def _program(
     first_z : (variables,) array
         Variables of `first` at the guess.
     """
-    lifted = collocation.made_explicit()
+    lifted = collocation.with_lifted_variables()
     jacobian, hessian = nonzeros(problem, lifted)
     # Reduced space as the file has it, whichever method is chosen.
     named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
     reduced = next(each for each in named if isinstance(each, ReducedSpace))
     method = problem.method
     name = method if isinstance(method, str) else getattr(method, "name", repr(method))
-    counted = costs(collocation, first, first_z, jacobian + hessian, reduced.factorisation)
+    counted = method_costs(collocation, first, first_z, jacobian + hessian, reduced.factorisation)
     return {
-        "variables": collocation.variables,
-        "constraints": collocation.constraints,
-        "overstresses": lifted.added("memory"),
-        "wrenches": lifted.added("wrench"),
+        "variables": collocation.variable_count,
+        "constraints": collocation.constraint_count,
+        "overstresses": lifted.lifted_count("memory"),
+        "wrenches": lifted.lifted_count("wrench"),
         "jacobian_nonzeros": jacobian,
         "hessian_nonzeros": hessian,
         "method": name,
@@ -335,19 +339,19 @@ def _program(
     }
 
 
-def _motions(problem: Problem, collocation: Collocation) -> tuple[Motion, ...]:
+def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
     """Return the natural modes at the guess of all fitted experiments that move."""
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
     return tuple(
-        motion_of(s.experiment, scheme, s.dynamics.step_s, s.body.theta(guesses))
-        for s in collocation.segments
-        if not s.experiment.static
+        check_modes(s.experiment, scheme, s.dynamics.step_s, s.body.theta_from_values(guesses))
+        for s in collocation.transcriptions
+        if not s.experiment.is_static
     )
 
 
 def _concerns(
-    problem: Problem, findings: Findings, unstable: Sequence[Instability]
+    problem: Problem, findings: CheckResult, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
     """Return the expected problems, the likeliest mistakes first."""
     experiments = problem.experiments
@@ -357,37 +361,37 @@ def _concerns(
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
         *(cause.concern() for cause in findings.causes),
-        *stillness_concerns(experiments, parameters),
+        *static_concerns(experiments, parameters),
         *scale_concerns(experiments, parameters),
-        *(each for body in bodies for each in _of_body(body, len(bodies) == 1)),
-        *(each for hold in findings.holds for each in hold_concerns(hold)),
-        *(each for motion in findings.motions for each in motion_concerns(motion)),
+        *(each for body in bodies for each in _body_concerns(body, len(bodies) == 1)),
+        *(each for hold in findings.holds for each in grasp_concerns(hold)),
+        *(each for motion in findings.motions for each in mode_concerns(motion)),
         *stability_concerns(unstable),
-        *(each for e in experiments for each in turn_concerns(e, problem.first_substeps)),
+        *(each for e in experiments for each in rotation_step_concerns(e, problem.first_substeps)),
         *(c for r in findings.recordings for c in recording_concerns(r, body_of[r.experiment])),
         *(cost_concerns(chosen, findings.costs) if chosen else ()),
     )
 
 
-def _contacts(simulated: Collocation, z: Array, whole: bool) -> list[Concern]:
+def _contact_concerns(simulated: Collocation, z: Array, is_whole: bool) -> list[Concern]:
     """Return concerns about contact at the guess.
 
-    `whole` is false if only the first samples were simulated: then only about penetration at the
+    `is_whole` is false if only the first samples were simulated: then only about penetration at the
     start.
     """
-    concerns = contact_concerns(touched(simulated.parts(z)), GUESSED)
-    return [each for each in concerns if whole or each.code == "contact/pressed"]
+    concerns = contact_concerns(contact_summaries_of_parts(simulated.iterates(z)), AT_THE_GUESS)
+    return [each for each in concerns if is_whole or each.code == "contact/pressed"]
 
 
-def _bodies(problem: Problem) -> tuple[BodyFinding, ...]:
+def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
     """Return the finding of each body, with the names of its experiments."""
     guesses = problem.parameters.guesses
     names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
     pairs = zip(problem.bodies, names, strict=True)
-    return tuple(body_finding(body, body.theta(guesses), own) for body, own in pairs)
+    return tuple(check_body(body, body.theta_from_values(guesses), own) for body, own in pairs)
 
 
-def _of_body(body: BodyFinding, alone: bool) -> tuple[Concern, ...]:
+def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
     """Return the concerns of a body, with the names of its experiments unless it is the only
     body.
     """
@@ -396,7 +400,7 @@ def _of_body(body: BodyFinding, alone: bool) -> tuple[Concern, ...]:
     return body.concerns if alone else tuple(named)
 
 
-def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:
+def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     """Return likely errors in the description of a problem; mostly none.
 
     Odd sizes and densities come first, as others may follow from them; then the likeliest.
@@ -406,9 +410,13 @@ def description_causes(problem: Problem) -> tuple[Hypothesis, ...]:
     InputError
         For a size or a density that no body can have.
     """
-    constants = usual_constants(problem.parameters)
-    odd = (oddity for body in problem.bodies for oddity in oddities(body))
-    doubtful = (cause for e in problem.experiments for cause in doubts(e, constants, problem.huber))
-    blind = (cause for e in problem.experiments for cause in camera_mistakes(e))
+    constants = typical_constants(problem.parameters)
+    odd = (oddity for body in problem.bodies for oddity in size_and_density_hypotheses(body))
+    doubtful = (
+        cause
+        for e in problem.experiments
+        for cause in find_misspecifications_by_modes(e, constants, problem.huber)
+    )
+    blind = (cause for e in problem.experiments for cause in camera_hypotheses(e))
     placed = (cause for e in problem.experiments for cause in placement_mistakes(e))
-    return (*odd, *ranked((*placed, *blind, *doubtful)))
+    return (*odd, *rank((*placed, *blind, *doubtful)))

@@ -10,24 +10,24 @@ import numpy as np
 
 from ...arrays import Array
 from ...fem.body import Body
-from ...fem.constants import is_mode
-from ...fem.field import FieldShapes
+from ...fem.constants import is_field_coefficient
+from ...fem.field import FieldResolution
 from ...fem.mesh import TetMesh
 from ...fem.mesh_checks import edge_lengths, mean_ratios
-from ...fem.moduli import engineering
+from ...fem.moduli import engineering_constants
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
-from ...statistics.concern import Concern, concerned
+from ...statistics.concern import Concern, concern_if
 
 # Mean-ratio quality below which an element's shape functions are poor.
-FLAT = 0.1
+POOR_QUALITY = 0.1
 # Too stiff from this Poisson's ratio on: linear tetrahedra cannot keep their volume and bend;
 # with quadratic ones a beam's stiffness is found 6 % too low at 0.45, and 12 % at 0.49.
 LOCKING_POISSON = {"tet4": 0.4, "tet10": 0.45}
 # Rounding of Poisson's ratio, which is converted to λ and μ and back, and of the elements across.
 ROUNDING = 1e-6
 # Ratio of length to thickness above which a body bends like a beam.
-SLENDER = 2.5
+LEAST_SLENDERNESS = 2.5
 # Elements needed across the thickness of a bending body: with averaged dilatation one element
 # sags by half too much, two by 4 to 8 %.
 CELLS_ACROSS = {"tet4": 4.0, "tet10-p0": 2.0}
@@ -118,20 +118,20 @@ def element_concerns(
     """
     name = body.element.name
     needed = CELLS_ACROSS.get(body.element.name, 0.0)
-    poisson = max(engineering(*lame)[1] for lame in body.lame(theta).values())
+    poisson = max(engineering_constants(*lame)[1] for lame in body.lame(theta).values())
     limit = LOCKING_POISSON.get(name, np.inf)
-    slender = shape.length_m > SLENDER * shape.thickness_m
+    slender = shape.length_m > LEAST_SLENDERNESS * shape.thickness_m
     off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
     return [
-        *concerned(
-            worst.quality < FLAT,
+        *concern_if(
+            worst.quality < POOR_QUALITY,
             False,
             "mesh/flat",
             number=worst.element,
             quality=worst.quality,
             aspect_ratio=worst.aspect_ratio,
         ),
-        *concerned(
+        *concern_if(
             poisson >= limit - ROUNDING,
             False,
             "mesh/locks",
@@ -140,7 +140,7 @@ def element_concerns(
             limit=limit,
             remedy=FOR_VOLUME,
         ),
-        *concerned(
+        *concern_if(
             slender and shape.cells_across < needed - ROUNDING,
             False,
             "mesh/few",
@@ -173,11 +173,11 @@ def _areas(triangles: Array) -> Array:
 
 
 # Shapes that hold less of a field's variance leave most of it to the interval.
-FEW_SHAPES = 0.5
+LEAST_FIELD_VARIANCE = 0.5
 
 
 @dataclass(frozen=True)
-class BodyFinding:
+class BodyCheck:
     """Size, mesh and guess of a body.
 
     Attributes
@@ -194,7 +194,7 @@ class BodyFinding:
         Values of the constants, and of E and ν at small strain, at the guess.
     concerns : tuple of Concern
         Concerns about the elements; `warnings` are their sentences.
-    fields : mapping of the name of a constant to FieldShapes
+    fields : mapping of the name of a constant to FieldResolution
         Constants that vary in space.
     rest_shape : str or None
         "stress_free" or "under_gravity" where that is stated or follows from how the mesh was made.
@@ -203,7 +203,7 @@ class BodyFinding:
         such shape.
     """
 
-    TOLD: ClassVar = ("warnings",)
+    SERIALISED_PROPERTIES: ClassVar = ("warnings",)
 
     experiments: tuple[str, ...]
     nodes: int
@@ -219,7 +219,7 @@ class BodyFinding:
     cells_across: float
     guess: dict[str, float]
     concerns: tuple[Concern, ...]
-    fields: dict[str, FieldShapes]
+    fields: dict[str, FieldResolution]
     rest_shape: str | None = None
     rest_shape_change_m: float = 0.0
 
@@ -231,10 +231,10 @@ class BodyFinding:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences of the concerns about this body."""
-        return tuple(concern.sentence for concern in self.concerns)
+        return tuple(concern.message for concern in self.concerns)
 
 
-def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyFinding:
+def check_body(body: Body, theta: Array, experiments: tuple[str, ...]) -> BodyCheck:
     """Return size, mesh and guess of a body.
 
     Parameters
@@ -246,12 +246,12 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
         Names of its experiments.
     """
     mesh = body.mesh
-    fields = {part.field_name: part.field.told for part in body.parts if part.field}
+    fields = {part.field_name: part.field.resolution for part in body.parts if part.field}
     quality = mesh.quality()
     worst = worst_elements(mesh)
     shape = slenderness(mesh)
     x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
-    return BodyFinding(
+    return BodyCheck(
         experiments,
         nodes=len(body.nodes.points_m),
         elements=len(body.cells),
@@ -264,7 +264,7 @@ def body_finding(body: Body, theta: Array, experiments: tuple[str, ...]) -> Body
         median_element_quality=quality.quality_median,
         worst_elements=worst,
         cells_across=shape.cells_across,
-        guess=_guess(body, theta),
+        guess=_constants_at_guess(body, theta),
         concerns=(*element_concerns(body, theta, shape, worst[0]), *_field_concerns(fields)),
         fields=fields,
         rest_shape=_rest_shape(body),
@@ -276,47 +276,47 @@ def _rest_shape(body: Body) -> str | None:
     """Return the kind of the stated rest shape; None if none is stated."""
     if body.rest_shape is None:
         return None
-    return "stress_free" if body.scan is None else "under_gravity"
+    return "stress_free" if body.scan_conditions is None else "under_gravity"
 
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
     """Return the largest distance of the mesh from the stress-free shape [m], NaN without one."""
-    if body.inverse is None:
+    if body.inverse_equilibrium is None:
         return 0.0
-    if body.unreachable(theta) is not None:
+    if body.rest_shape_failure(theta) is not None:
         return float("nan")
-    change_m = body.inverse.shape(theta).positions_m - body.nodes.points_m
+    change_m = body.inverse_equilibrium.solve(theta).positions_m - body.nodes.points_m
     return float(np.linalg.norm(change_m, axis=1).max())
 
 
-def _field_concerns(fields: Mapping[str, FieldShapes]) -> Iterator[Concern]:
+def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
     """Yield a concern for each field with too few shapes for its correlation length."""
     for name, field in fields.items():
-        if field.share < FEW_SHAPES:
+        if field.share < LEAST_FIELD_VARIANCE:
             yield Concern("field/shapes", data={"name": name, **vars(field)})
 
 
-def _guess(body: Body, theta: Array) -> dict[str, float]:
+def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
     """Return constants, and E and ν at small strain, by name."""
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
-        young, poisson = engineering(*lame)
+        young, poisson = engineering_constants(*lame)
         moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
     constants = zip(body.constants, theta.tolist(), strict=True)
-    return moduli | {name: value for name, value in constants if not is_mode(name)}
+    return moduli | {name: value for name, value in constants if not is_field_coefficient(name)}
 
 
 # Distance from the box of the held nodes, in mean edges, below which it is by chance whether a node
 # is held.
-NEAR = 0.1
+NEAR_EDGES = 0.1
 # Distance from that box, in mean edges, that is rounding.
-ROUND_OFF = 1e-6
+ROUND_OFF_EDGES = 1e-6
 # Largest distance from that box, in mean edges, of the neighbours of the held nodes.
-NEIGHBOURING = 1.5
+NEIGHBOUR_EDGES = 1.5
 
 
 @dataclass(frozen=True)
-class Hold:
+class GraspCheck:
     """The nodes of one grasp.
 
     Attributes
@@ -346,13 +346,15 @@ class Hold:
     axes: str = "xyz"
 
 
-def holds_of(experiment: Experiment, mean_edge_m: float) -> tuple[Hold, ...]:
+def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck, ...]:
     """Return the held nodes of each grasp; `mean_edge_m` is the mean edge length of the mesh."""
     points_m = experiment.body.nodes.points_m
-    return tuple(_hold(experiment.name, points_m, g, mean_edge_m) for g in experiment.gripping)
+    return tuple(
+        _check_grasp(experiment.name, points_m, g, mean_edge_m) for g in experiment.body_grasps
+    )
 
 
-def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:
+def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> GraspCheck:
     """Return the held nodes of one grasp."""
     nodes = grasp.nodes
     held_m = points_m[nodes]
@@ -360,15 +362,15 @@ def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:
     low = held_m.min(axis=0)
     high = held_m.max(axis=0)
     outside_m = np.concatenate([low - free_m, free_m - high], axis=1)
-    is_neighbour = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOURING * mean_edge_m
+    is_neighbour = outside_m.max(axis=1, initial=-np.inf) < NEIGHBOUR_EDGES * mean_edge_m
     # Behind faces of the box that the body goes on beyond, as far as the nearest held node.
     inner = (outside_m > 0).any(axis=0)
     depth_m = np.concatenate([held_m - low, high - held_m], axis=1)[:, inner]
-    least_m = ROUND_OFF * mean_edge_m
-    reach_m = NEAR * mean_edge_m
+    least_m = ROUND_OFF_EDGES * mean_edge_m
+    reach_m = NEAR_EDGES * mean_edge_m
     slightly_outside = (outside_m > least_m) & (outside_m < reach_m) & is_neighbour[:, None]
     slightly_inside = (depth_m > least_m) & (depth_m < reach_m)
-    return Hold(
+    return GraspCheck(
         name,
         len(nodes),
         tuple(low.tolist()),
@@ -380,16 +382,26 @@ def _hold(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> Hold:
     )
 
 
-def hold_sentence(hold: Hold) -> str:
+def grasp_sentence(grasp_check: GraspCheck) -> str:
     """Return a description of the held nodes of a grasp."""
-    size = " × ".join(f"{1e3 * (b - a):.4g}" for a, b in zip(hold.low_m, hold.high_m, strict=True))
-    low = ", ".join(f"{1e3 * x:.4g}" for x in hold.low_m)
-    axes = "" if hold.axes == "xyz" else f", held along {' and '.join(hold.axes)} only"
-    return f"{hold.nodes} nodes, {hold.share:.0%} of all, in a box of {size} mm at ({low}) mm{axes}"
+    size = " × ".join(
+        f"{1e3 * (b - a):.4g}" for a, b in zip(grasp_check.low_m, grasp_check.high_m, strict=True)
+    )
+    low = ", ".join(f"{1e3 * x:.4g}" for x in grasp_check.low_m)
+    axes = (
+        "" if grasp_check.axes == "xyz" else f", held along {' and '.join(grasp_check.axes)} only"
+    )
+    return f"{grasp_check.nodes} nodes, {grasp_check.share:.0%} of all, in a box of {size} mm at ({low}) mm{axes}"
 
 
-def hold_concerns(hold: Hold) -> list[Concern]:
+def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
     """Return a concern if rounding decides which nodes are held."""
-    by_chance = bool(hold.nearly_held or hold.nearly_free)
-    counts = {"nodes": hold.nodes, "nearly_held": hold.nearly_held, "nearly_free": hold.nearly_free}
-    return concerned(by_chance, False, "description/grasp", experiment=hold.experiment, **counts)
+    by_chance = bool(grasp_check.nearly_held or grasp_check.nearly_free)
+    counts = {
+        "nodes": grasp_check.nodes,
+        "nearly_held": grasp_check.nearly_held,
+        "nearly_free": grasp_check.nearly_free,
+    }
+    return concern_if(
+        by_chance, False, "description/grasp", experiment=grasp_check.experiment, **counts
+    )

@@ -19,12 +19,12 @@ from ...program.collocation import Collocation
 from ...program.factorisation import Choice
 from ...program.sweep import Sweep
 from ...statistics.concern import Concern
-from .derivatives import few, first_samples, shortened
+from .derivatives import first_sample_count, shortened_experiment, shortened_problem
 
 # Memory per nonzero [bytes]: IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
-BYTES = 280.0
+BYTES_PER_NONZERO = 280.0
 # Number of variables below which programs fit into any memory.
-SMALL = 50_000
+SMALL_PROGRAM_VARIABLES = 50_000
 
 
 def require_memory(problem: Problem, collocation: Collocation, method: object) -> None:
@@ -39,10 +39,10 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
         With both numbers and a remedy.
     """
     there_mb = machine_memory_mb()
-    if there_mb is None or collocation.variables < SMALL:
+    if there_mb is None or collocation.variable_count < SMALL_PROGRAM_VARIABLES:
         return
     if isinstance(method, InteriorPoint):
-        needed_mb = interior_point_mb(sum(nonzeros(problem, collocation.made_explicit())))
+        needed_mb = interior_point_mb(sum(nonzeros(problem, collocation.with_lifted_variables())))
         fits = memory_mb(collocation) < there_mb
         remedy = 'method = "reduced-space"' if fits else "a coarser mesh or a shorter window_s"
     elif isinstance(method, ReducedSpace):
@@ -53,7 +53,7 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
     if needed_mb > there_mb:
         raise InputError(
             f"{method.name} would take about {needed_mb / 1e3:.2g} GB for "
-            f"{collocation.variables:,} variables, and {there_mb / 1e3:.2g} GB are there; "
+            f"{collocation.variable_count:,} variables, and {there_mb / 1e3:.2g} GB are there; "
             f"take {remedy}",
             problem.path,
         )
@@ -61,31 +61,31 @@ def require_memory(problem: Problem, collocation: Collocation, method: object) -
 
 def interior_point_mb(entries: int) -> float:
     """Return the memory of IPOPT [MB] for so many nonzeros of Jacobian and Hessian."""
-    return BYTES * entries / 1e6
+    return BYTES_PER_NONZERO * entries / 1e6
 
 
-def nonzeros(problem: Problem, whole: Collocation) -> tuple[int, int]:
+def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
     """Return the numbers of nonzeros of Jacobian and Hessian, extrapolated from a few samples.
 
     Parameters
     ----------
     problem : Problem
-    whole : Collocation
+    lifted : Collocation
         Program of the problem with lifted variables, as interior point needs it.
     """
-    further = whole.carried_nonzeros
-    short = shortened(problem)
-    total = least = _counted(short)
+    further = lifted.lifted_nonzeros
+    short = shortened_problem(problem)
+    total = least = _count_nonzeros(short)
     for k, experiment in enumerate(problem.experiments):
         if not experiment.validation:
             parts = list(short.experiments)
-            parts[k] = first_samples(experiment, few(experiment) + 1)
-            more = _counted(replace(problem, experiments=parts)) - least
-            total = total + max(0, len(experiment.t_s) - few(experiment)) * more
+            parts[k] = shortened_experiment(experiment, first_sample_count(experiment) + 1)
+            more = _count_nonzeros(replace(problem, experiments=parts)) - least
+            total = total + max(0, len(experiment.t_s) - first_sample_count(experiment)) * more
     return int(total[0]) + further[0], int(total[1]) + further[1]
 
 
-def _counted(problem: Problem) -> NDArray[np.int64]:
+def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
     """Return the nonzeros of Jacobian and Hessian as (2,) int array, by laying them out."""
     collocation = problem.collocation()
     structures = (collocation.jacobian_structure, collocation.hessian_structure)
@@ -93,23 +93,23 @@ def _counted(problem: Problem) -> NDArray[np.int64]:
 
 
 # Time steps of the sweep that is timed: enough for a steady time per step.
-ROWS = 12
+TIMED_ROWS = 12
 # Sweeps that the reduced space mostly takes.
-SWEEPS = 10
+TYPICAL_SWEEPS = 10
 # Iterations that interior point mostly takes.
-ITERATIONS = 10
+TYPICAL_ITERATIONS = 10
 # Time of an iteration [s] per nonzero and per unknown of a time step to the power POWER: IPOPT with
 # MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps on one core.
-SECONDS = 4.5e-10
-POWER = 1.4
+SECONDS_PER_NONZERO = 4.5e-10
+TIMESTEP_POWER = 1.4
 # Time of a method [s] above which a quicker one is recommended.
-LONG_S = 60.0
+LONG_SOLVE_S = 60.0
 # Largest time of the recommended method, as a share of the chosen one's.
-MUCH_QUICKER = 0.1
+LARGEST_TIME_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Cost:
+class MethodCost:
     """Approximate memory and time of a method.
 
     Attributes
@@ -125,9 +125,9 @@ class Cost:
     time_s: float | None
 
 
-def costs(
+def method_costs(
     collocation: Collocation, short: Collocation, z: Array, nonzeros: int, factorisation: Choice
-) -> tuple[Cost, ...]:
+) -> tuple[MethodCost, ...]:
     """Return the costs of reduced space and of interior point.
 
     Parameters
@@ -136,7 +136,7 @@ def costs(
     short : Collocation
         First samples of the same experiments.
     z : (variables,) array
-        Start of `short`.
+        Start of `shortened`.
     nonzeros : int
         Of the Jacobian and the Hessian of interior point, together.
     factorisation : {"auto", "band", "sparse", "supernodal"}
@@ -144,13 +144,15 @@ def costs(
     """
     width = max(unknowns_of_a_timestep(collocation))
     return (
-        Cost(
-            "reduced-space", memory_mb(collocation), _sweeps_s(collocation, short, z, factorisation)
+        MethodCost(
+            "reduced-space",
+            memory_mb(collocation),
+            _estimated_sweeps_s(collocation, short, z, factorisation),
         ),
-        Cost(
+        MethodCost(
             "interior-point",
             interior_point_mb(nonzeros),
-            ITERATIONS * SECONDS * nonzeros * width**POWER,
+            TYPICAL_ITERATIONS * SECONDS_PER_NONZERO * nonzeros * width**TIMESTEP_POWER,
         ),
     )
 
@@ -158,17 +160,18 @@ def costs(
 def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
     """Return the unknowns per time step of each experiment in interior point, with overstresses."""
     return [
-        len(segment.free_dofs) + sum(b.own.stop - b.own.start for b in segment.body.memory.branches)
-        for segment in collocation.segments
+        len(segment.free_dofs)
+        + sum(b.columns.stop - b.columns.start for b in segment.body.memory.branches)
+        for segment in collocation.transcriptions
     ]
 
 
-def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
+def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
     """Return a note if another method is far quicker."""
     quickest = min(others, key=lambda cost: cost.time_s or np.inf)
     if chosen.time_s is None or quickest.time_s is None:
         return []
-    if chosen.time_s < LONG_S or quickest.time_s > MUCH_QUICKER * chosen.time_s:
+    if chosen.time_s < LONG_SOLVE_S or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s:
         return []
     return [
         f'solver.method = "{quickest.method}" finds the same optimum much sooner than '
@@ -176,7 +179,7 @@ def cost_notes(chosen: Cost, others: Sequence[Cost]) -> list[str]:
     ]
 
 
-def cost_concerns(chosen: Cost, others: Sequence[Cost]) -> list[Concern]:
+def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Concern]:
     """Return a concern if the chosen method needs more memory than there is."""
     available = machine_memory_mb()
     if available is None or chosen.memory_mb < available:
@@ -187,7 +190,7 @@ def cost_concerns(chosen: Cost, others: Sequence[Cost]) -> list[Concern]:
     return [Concern("memory/short", data={"method": chosen.method, **sizes, "remedy": remedy})]
 
 
-def _sweeps_s(
+def _estimated_sweeps_s(
     collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
 ) -> float | None:
     """Return the time of all sweeps [s], from one over the first rows of each experiment.
@@ -195,14 +198,14 @@ def _sweeps_s(
     None if the equations cannot be solved.
     """
     total = 0.0
-    for segment, part in zip(collocation.segments, short.parts(z), strict=True):
-        rows = min(ROWS, len(part.x))
-        setting = part.setting
+    for segment, part in zip(collocation.transcriptions, short.iterates(z), strict=True):
+        rows = min(TIMED_ROWS, len(part.x))
+        setting = part.equations
         solver = Sweep(part.segment, rows, factorisation=factorisation)
         began = time.perf_counter()
         try:
             solver.forward(part.x[:rows], setting)
         except SimulationError:
             return None
-        total += segment.grid_rows / rows * (time.perf_counter() - began)
-    return SWEEPS * total
+        total += segment.grid_times / rows * (time.perf_counter() - began)
+    return TYPICAL_SWEEPS * total

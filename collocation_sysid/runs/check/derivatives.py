@@ -10,12 +10,12 @@ from functools import partial
 import numpy as np
 
 from ...arrays import Array
-from ...model.contact import contacts
+from ...model.contact import contact_terms
 from ...problem import Problem
-from ...program.collocation import Collocation, carried_over
-from ...recording.depth import begun
+from ...program.collocation import Collocation, convert_variables
+from ...recording.depth import until_all_cameras_see
 from ...recording.experiment import Experiment
-from ...recording.tables import FEWEST
+from ...recording.tables import FEWEST_SHARED_SAMPLES
 from ...recording.wrench import Wrench
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
@@ -25,25 +25,25 @@ STATIC_SAMPLES = 3
 # Step of the differences, which balances truncation and rounding of fourth-order differences.
 STEP = 1e-5
 # Largest step in contact, relative to the gap over which the pressure rises: it must stay within.
-OF_WIDTH = 1e-3
+STEP_PER_CONTACT_WIDTH = 1e-3
 # Huber threshold of the check [σ]: differences must not cross the kink of the second derivative.
-WITHOUT_KINK = 1e9
+LARGE_HUBER = 1e9
 # Most nonzeros of lifted variables for which the whole program is laid out and checked.
-LAID_OUT = 5e6
+MOST_LIFTED_NONZEROS = 5e6
 
 
-def few(experiment: Experiment) -> int:
+def first_sample_count(experiment: Experiment) -> int:
     """Return the number of first samples that contain all kinds of equations."""
-    return STATIC_SAMPLES if experiment.static else SAMPLES
+    return STATIC_SAMPLES if experiment.is_static else SAMPLES
 
 
-def shortened(problem: Problem) -> Problem:
+def shortened_problem(problem: Problem) -> Problem:
     """Return the problem with a few first samples of every experiment."""
-    short = tuple(first_samples(e, few(e)) for e in problem.experiments)
+    short = tuple(shortened_experiment(e, first_sample_count(e)) for e in problem.experiments)
     return replace(problem, experiments=short)
 
 
-def first_samples(experiment: Experiment, samples: int) -> Experiment:
+def shortened_experiment(experiment: Experiment, samples: int) -> Experiment:
     """Return the experiment with its first samples, and more if cameras begin to see later.
 
     Parameters
@@ -52,8 +52,8 @@ def first_samples(experiment: Experiment, samples: int) -> Experiment:
     samples : int
         Least number of samples.
     """
-    fewest = 1 if experiment.static else FEWEST
-    samples, depths = begun(experiment.depths, experiment.t_s, samples, fewest)
+    fewest = 1 if experiment.is_static else FEWEST_SHARED_SAMPLES
+    samples, depths = until_all_cameras_see(experiment.depths, experiment.t_s, samples, fewest)
     markers = experiment.markers
     here = slice(samples)
     tracks = markers.positions_m[here]
@@ -61,16 +61,18 @@ def first_samples(experiment: Experiment, samples: int) -> Experiment:
         tracks = np.nan_to_num(tracks)  # at least one sample has to be there
     markers = replace(markers, t_s=markers.t_s[here], positions_m=tracks)
     t_s = experiment.t_s[here]
-    grasps = [replace(g, wrench=_begun(g.wrench, t_s, fewest)) for g in experiment.grasps]
+    grasps = [
+        replace(g, wrench=_shortened_wrench(g.wrench, t_s, fewest)) for g in experiment.grasps
+    ]
     return replace(experiment, t_s=t_s, markers=markers, grasps=grasps, depths=depths)
 
 
-def _begun(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
+def _shortened_wrench(wrench: Wrench | None, t_s: Array, fewest: int) -> Wrench | None:
     """Return a wrench within the times (T,); None if it has fewer than `fewest` samples there."""
     if wrench is None:
         return None
     here = (wrench.t_s >= t_s[0]) & (wrench.t_s <= t_s[-1])
-    if here.sum() < fewest or not wrench.present[here].any():
+    if here.sum() < fewest or not wrench.is_measured[here].any():
         return None
     return replace(wrench, t_s=wrench.t_s[here], values=wrench.values[here])
 
@@ -94,28 +96,28 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     second : float
         Error of the Hessian; 0 if the program with lifted variables is too large to be laid out.
     """
-    if any(segment.depths for segment in collocation.segments):
-        collocation = replace(collocation, huber=WITHOUT_KINK)
+    if any(segment.depths for segment in collocation.transcriptions):
+        collocation = replace(collocation, huber=LARGE_HUBER)
     rng = np.random.default_rng(0)
     of_slopes = 0.0
-    step = _step(collocation)
-    program = collocation.made_explicit()
+    step = _difference_step(collocation)
+    program = collocation.with_lifted_variables()
     plain = collocation
-    if program.explicit:  # methods use these without memory and wrenches as variables
+    if program.has_lifted_variables:  # methods use these without memory and wrenches as variables
         of_slopes = _slope_error(plain.objective, plain.gradient, z, rng, step)
-        if plain.remembers:
-            forces = rng.normal(size=plain.constraints)
-            through = partial(plain.pulled_back, multipliers=forces)
+        if plain.has_eliminated_histories:
+            forces = rng.normal(size=plain.constraint_count)
+            through = partial(plain.jacobian_vjp, multipliers=forces)
             pushed = lambda at: forces @ plain.constraint_values(at)  # noqa: E731
             slope = _slope_error(pushed, through, z, rng, step)
             of_slopes = max(of_slopes, slope)
-        if sum(program.carried_nonzeros) > LAID_OUT:
+        if sum(program.lifted_nonzeros) > MOST_LIFTED_NONZEROS:
             return of_slopes, 0.0
         collocation = program
-        z = carried_over(z, plain, program)
+        z = convert_variables(z, plain, program)
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
-    multipliers = rng.normal(size=collocation.constraints)
+    multipliers = rng.normal(size=collocation.constraint_count)
 
     def lagrangian_gradient(at: Array) -> Array:
         return collocation.gradient(at) + collocation.jacobian(at).T @ multipliers
@@ -127,12 +129,14 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     return max(first, of_slopes), second
 
 
-def _step(collocation: Collocation) -> float:
+def _difference_step(collocation: Collocation) -> float:
     """Return the step of the differences, which is small against the gap in which contact
     begins.
     """
-    touching = (t for s in collocation.segments for t in contacts(s.experiment))
-    return min((STEP, *(OF_WIDTH * term.contact.width_m for term in touching)))
+    touching = (t for s in collocation.transcriptions for t in contact_terms(s.experiment))
+    return min(
+        (STEP, *(STEP_PER_CONTACT_WIDTH * term.law_of_contact.largest_width_m for term in touching))
+    )
 
 
 def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:

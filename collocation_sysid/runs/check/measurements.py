@@ -9,20 +9,20 @@ import numpy as np
 
 from ...arrays import Array
 from ...recording.experiment import Experiment
-from ...statistics.concern import Concern, concerned
-from .body import BodyFinding
+from ...statistics.concern import Concern, concern_if
+from .body import BodyCheck
 
 # Distance of a marker from the body, in mean edges, above which its place is mostly extrapolated.
-FAR = 0.5
+LARGEST_DISTANCE_EDGES = 0.5
 # Distance of a marker's first sample from the simulation at the guess, in diagonals of the body,
 # above which its frame, unit or place is likely wrong.
-ASTRAY = 0.5
+LARGEST_START_MISS_DIAGONALS = 0.5
 # Share of missing samples of a marker above which there is a warning.
-MOSTLY_MISSING = 0.5
+LARGEST_MISSING_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class MarkerFinding:
+class MarkerCheck:
     """One marker of a recording.
 
     Attributes
@@ -45,7 +45,7 @@ class MarkerFinding:
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordingCheck:
     """Measurements of one experiment.
 
     Attributes
@@ -57,7 +57,7 @@ class Recording:
         Number of sample times.
     samples, missing : int
         Numbers of marker samples that are present, and that are missing.
-    markers : tuple of MarkerFinding
+    markers : tuple of MarkerCheck
     instruments : tuple of str
         Other instruments, in words.
     air_density_kg_m3 : float
@@ -72,22 +72,22 @@ class Recording:
     frames: int
     samples: int
     missing: int
-    markers: tuple[MarkerFinding, ...]
+    markers: tuple[MarkerCheck, ...]
     instruments: tuple[str, ...]
     air_density_kg_m3: float = 0.0
 
     @property
-    def farthest(self) -> MarkerFinding:
+    def farthest_marker(self) -> MarkerCheck:
         """The marker farthest from the body."""
         return max(self.markers, key=lambda marker: marker.distance_m)
 
     @property
-    def least_seen(self) -> MarkerFinding:
+    def most_missing_marker(self) -> MarkerCheck:
         """The marker with most samples missing."""
         return max(self.markers, key=lambda marker: marker.missing)
 
 
-def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording:
+def check_recording(experiment: Experiment, positions_m: Array | None) -> RecordingCheck:
     """Return a summary of the measurements of an experiment.
 
     Parameters
@@ -100,13 +100,13 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     miss = np.zeros((0, len(markers.names)))
     if positions_m is not None:
         measured_m = markers.positions_m[: len(positions_m)]
-        miss = np.linalg.norm(markers.observe(positions_m) - measured_m, axis=2)
+        miss = np.linalg.norm(markers.predict_positions(positions_m) - measured_m, axis=2)
     findings = []
-    missing = markers.missing
+    missing = markers.missing_counts
     for k, name in enumerate(markers.names):
-        present = np.flatnonzero(markers.present[:, k])
+        present = np.flatnonzero(markers.is_present[:, k])
         findings.append(
-            MarkerFinding(
+            MarkerCheck(
                 name,
                 float(markers.placement.distance_m[k]),
                 len(present),
@@ -114,14 +114,14 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
                 float(miss[present[0], k]) if len(present) and present[0] < len(miss) else None,
             )
         )
-    return Recording(
+    return RecordingCheck(
         experiment.name,
         experiment.validation,
-        experiment.static,
+        experiment.is_static,
         experiment.duration_s,
         1 / experiment.timestep_s,
         len(experiment.t_s),
-        markers.samples,
+        markers.sample_count,
         int(missing.sum()),
         tuple(findings),
         (
@@ -133,27 +133,27 @@ def recording_of(experiment: Experiment, positions_m: Array | None) -> Recording
     )
 
 
-def recording_concerns(recording: Recording, body: BodyFinding) -> list[Concern]:
+def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Concern]:
     """Return concerns about the markers of a recording; each names the worst marker only."""
     if not recording.markers:
         return []
 
-    def of(marker: MarkerFinding, distance_m: float | None = 0.0) -> dict[str, Any]:
+    def of(marker: MarkerCheck, distance_m: float | None = 0.0) -> dict[str, Any]:
         by_mm = 1e3 * (distance_m or 0.0)
         frames = recording.frames
         named = {"marker": marker.name, "experiment": recording.experiment}
         return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
 
-    farthest = recording.farthest
-    least_seen = recording.least_seen
+    farthest = recording.farthest_marker
+    least_seen = recording.most_missing_marker
     worst = max(recording.markers, key=lambda marker: marker.start_miss_m or 0.0)
     unseen = least_seen.samples == 0
-    missing = not unseen and least_seen.missing > MOSTLY_MISSING * recording.frames
-    astray = (worst.start_miss_m or 0.0) > ASTRAY * body.diagonal_m
-    off = farthest.distance_m > FAR * body.edges_m[1]
+    missing = not unseen and least_seen.missing > LARGEST_MISSING_SHARE * recording.frames
+    astray = (worst.start_miss_m or 0.0) > LARGEST_START_MISS_DIAGONALS * body.diagonal_m
+    off = farthest.distance_m > LARGEST_DISTANCE_EDGES * body.edges_m[1]
     return [
-        *concerned(off, False, "markers/off", **of(farthest, farthest.distance_m)),
-        *concerned(unseen, False, "markers/unseen", **of(least_seen)),
-        *concerned(missing, False, "markers/missing", **of(least_seen)),
-        *concerned(astray, False, "markers/astray", **of(worst, worst.start_miss_m)),
+        *concern_if(off, False, "markers/off", **of(farthest, farthest.distance_m)),
+        *concern_if(unseen, False, "markers/unseen", **of(least_seen)),
+        *concern_if(missing, False, "markers/missing", **of(least_seen)),
+        *concern_if(astray, False, "markers/astray", **of(worst, worst.start_miss_m)),
     ]

@@ -16,17 +16,17 @@ from ...model.forces import Forces
 from ...model.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
 from ...model.schemes import Scheme
 from ...program.modes import Modes, natural_modes
-from ...program.newton import Solver
-from ...program.rest import rest_state
+from ...program.newton import NewtonSolver
+from ...program.rest import equilibrium
 from ...recording.experiment import Experiment
-from ...statistics.concern import Concern, concerned
+from ...statistics.concern import Concern, concern_if
 
 # Number of modes.
-COUNT = 6
+MODE_COUNT = 6
 # Largest numerical damping ratio, as a share of the material's.
 DAMPING_SHARE = 0.1
 # Largest numerical damping ratio of a mode with little damping.
-LITTLE_DAMPING = 0.005
+LEAST_DAMPING_LIMIT = 0.005
 # Fewest grid steps per period with which the motion of a mode is computed well.
 FEW_STEPS = 8
 # Fewest samples per period with which the motion of a mode is measured well.
@@ -38,7 +38,7 @@ ROUNDING = 12
 
 
 @dataclass(frozen=True)
-class ModeFinding:
+class ModeCheck:
     """One natural mode.
 
     Attributes
@@ -63,7 +63,7 @@ class ModeFinding:
 
 
 @dataclass(frozen=True)
-class Motion:
+class ModesCheck:
     """Natural modes of the body in one experiment, and errors of the time scheme.
 
     Attributes
@@ -71,7 +71,7 @@ class Motion:
     experiment : str
     about : str
         State about which the body oscillates: "rest state" or "undeformed shape".
-    modes : tuple of ModeFinding, by frequency
+    modes : tuple of ModeCheck, by frequency
     scheme : str
     timestep_s : float
         Step of the time grid.
@@ -84,7 +84,7 @@ class Motion:
 
     experiment: str
     about: str
-    modes: tuple[ModeFinding, ...]
+    modes: tuple[ModeCheck, ...]
     scheme: str
     timestep_s: float
     duration_s: float
@@ -92,12 +92,12 @@ class Motion:
     not_oscillating: int
 
     @property
-    def first(self) -> ModeFinding | None:
+    def first_mode(self) -> ModeCheck | None:
         """Mode of the lowest frequency; None if there is none."""
         return self.modes[0] if self.modes else None
 
 
-def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> Motion:
+def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> ModesCheck:
     """Return the natural modes of an experiment when fewest dofs are held, and errors of the
     scheme.
 
@@ -112,21 +112,21 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
     theta : array
         Constants θ of the body.
     """
-    is_held = experiment.held(experiment.t_s)
+    is_held = experiment.is_prescribed(experiment.t_s)
     count = is_held.sum(axis=(1, 2))
     least = int(np.flatnonzero(count == count.min())[-1])
     time_s = float(experiment.t_s[least])
-    x, about = _state(experiment, is_held[least], time_s, theta)
+    x, about = _reference_state(experiment, is_held[least], time_s, theta)
     free = np.flatnonzero(~is_held[least])
-    modes = natural_modes(Forces.of(experiment, time_s, theta), x, free, COUNT)
+    modes = natural_modes(Forces.from_experiment(experiment, time_s, theta), x, free, MODE_COUNT)
     findings = _mode_findings(modes, experiment, scheme, step_s)
     needed = None
     if findings:
         omega = float(modes.angular_frequencies_rad_s[0])
         limit = _damping_limit(findings[0])
-        ratio = _oscillating(findings[0].damping_ratio)
+        ratio = _oscillating_damping_ratio(findings[0].damping_ratio)
         needed = substeps_needed(scheme, omega, experiment.timestep_s, limit, damping_ratio=ratio)
-    return Motion(
+    return ModesCheck(
         experiment.name,
         about,
         findings,
@@ -134,11 +134,11 @@ def motion_of(experiment: Experiment, scheme: Scheme, step_s: float, theta: Arra
         step_s,
         experiment.duration_s,
         needed,
-        modes.not_oscillating,
+        modes.omitted_count,
     )
 
 
-def _state(
+def _reference_state(
     experiment: Experiment, held: NDArray[np.bool_], time_s: float, theta: Array
 ) -> tuple[Array, str]:
     """Return node positions (n, 3) [m] about which the body oscillates, and the name of this state.
@@ -147,8 +147,8 @@ def _state(
     """
     if held.any():
         try:
-            solver = Solver(experiment, held=held)
-            return rest_state(experiment, theta, time_s, solver=solver), "rest state"
+            solver = NewtonSolver(experiment, prescribed=held)
+            return equilibrium(experiment, theta, time_s, solver=solver), "rest state"
         except SimulationError:
             pass
     return experiment.rigid_positions([time_s])[0], "undeformed shape"
@@ -156,15 +156,15 @@ def _state(
 
 def _mode_findings(
     modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float
-) -> tuple[ModeFinding, ...]:
+) -> tuple[ModeCheck, ...]:
     """Return the findings of each mode."""
     findings = []
     for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
         omega = 2 * np.pi * frequency
         undamped = numerical_mode(scheme, omega, step_s)
-        damped = numerical_mode(scheme, omega, step_s, _oscillating(float(ratio)))
+        damped = numerical_mode(scheme, omega, step_s, _oscillating_damping_ratio(float(ratio)))
         findings.append(
-            ModeFinding(
+            ModeCheck(
                 float(frequency),
                 float(1 / frequency / experiment.timestep_s),
                 float(1 / frequency / step_s),
@@ -176,7 +176,7 @@ def _mode_findings(
     return tuple(findings)
 
 
-def _oscillating(damping_ratio: float) -> float:
+def _oscillating_damping_ratio(damping_ratio: float) -> float:
     """Return the damping ratio of an oscillating mode; 0 for an overdamped one.
 
     The scheme's change of the damping of an overdamped mode does not matter.
@@ -184,56 +184,60 @@ def _oscillating(damping_ratio: float) -> float:
     return damping_ratio if damping_ratio < 1 else 0.0
 
 
-def _damping_limit(mode: ModeFinding) -> float:
+def _damping_limit(mode: ModeCheck) -> float:
     """Return the largest numerical damping ratio that is accepted for a mode."""
-    return max(DAMPING_SHARE * mode.damping_ratio, LITTLE_DAMPING)
+    return max(DAMPING_SHARE * mode.damping_ratio, LEAST_DAMPING_LIMIT)
 
 
-def motion_concerns(motion: Motion) -> list[Concern]:
+def mode_concerns(motion: ModesCheck) -> list[Concern]:
     """Return concerns about too few steps, too few samples or a recording shorter than a period."""
-    mode = motion.first
+    mode = motion.first_mode
     if mode is None:
         return []
-    first = _first_mode(motion, mode)
+    first = _first_mode_data(motion, mode)
     samples = mode.samples_per_period
     rate_data = {"samples": samples, "needed_hz": FEW_STEPS * mode.frequency_hz}
     is_short = motion.duration_s * mode.frequency_hz < 1
     duration_data = {"duration_s": motion.duration_s}
     return [
         *_grid_concerns(motion, mode),
-        *concerned(samples < FEW_SAMPLES, False, "information/rate", **first, **rate_data),
-        *concerned(is_short, False, "information/short", **first, **duration_data),
+        *concern_if(samples < FEW_SAMPLES, False, "information/rate", **first, **rate_data),
+        *concern_if(is_short, False, "information/short", **first, **duration_data),
     ]
 
 
-def _grid_concerns(motion: Motion, mode: ModeFinding) -> list[Concern]:
+def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
     """Return a concern if the scheme changes the damping too much, or has too few steps per
     period.
     """
-    first = _first_mode(motion, mode)
+    first = _first_mode_data(motion, mode)
     added = mode.numerical_damping_ratio
     if abs(added) > _damping_limit(mode):
-        remedy = _finer(motion)
+        remedy = _step_remedy(motion)
         if motion.scheme != UNDAMPED:
-            or_finer = "" if motion.substeps_needed is None else f", or {_bare(motion)}"
+            or_finer = "" if motion.substeps_needed is None else f", or {_substeps_setting(motion)}"
             remedy = f'set transcription.scheme = "{UNDAMPED}"{or_finer}'
         grid = {"scheme": motion.scheme, "step_ms": 1e3 * motion.timestep_s, "ratio": abs(added)}
         code = "scheme/adds" if added > 0 else "scheme/takes"
         return [Concern(code, data=first | grid | {"remedy": remedy})]
-    steps = {"steps": mode.steps_per_period, "error": mode.period_error, "remedy": _finer(motion)}
+    steps = {
+        "steps": mode.steps_per_period,
+        "error": mode.period_error,
+        "remedy": _step_remedy(motion),
+    }
     few = mode.steps_per_period < FEW_STEPS
-    return concerned(few, False, "scheme/coarse", **first, **steps)
+    return concern_if(few, False, "scheme/coarse", **first, **steps)
 
 
-def _first_mode(motion: Motion, mode: ModeFinding) -> dict[str, Any]:
+def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
     """Return experiment and frequency of the first mode, as data of a concern."""
     return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
 
 
-def motion_notes(motion: Motion) -> list[str]:
+def mode_notes(motion: ModesCheck) -> list[str]:
     """Return notes on rigid modes, overdamped modes and the lengthening of the first period."""
     notes = []
-    mode = motion.first
+    mode = motion.first_mode
     name = motion.experiment
     if motion.not_oscillating:
         notes.append(
@@ -251,18 +255,18 @@ def motion_notes(motion: Motion) -> list[str]:
         notes.append(
             f"{motion.scheme} lengthens the first period of '{name}' by {mode.period_error:.1%}, "
             f"and the stiffness found will be about {2 * mode.period_error:.1%} too high: "
-            f"{_finer(motion)}"
+            f"{_step_remedy(motion)}"
         )
     return notes
 
 
-def _finer(motion: Motion) -> str:
+def _step_remedy(motion: ModesCheck) -> str:
     """Return the remedy for too few steps: a setting, or a higher rate."""
     if motion.substeps_needed is None:
         return "record at a higher rate"
-    return f"set transcription.{_bare(motion)}"
+    return f"set transcription.{_substeps_setting(motion)}"
 
 
-def _bare(motion: Motion) -> str:
+def _substeps_setting(motion: ModesCheck) -> str:
     """Return the setting of the substeps without its table."""
     return f"substeps = {motion.substeps_needed}"

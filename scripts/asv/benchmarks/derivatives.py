@@ -50,14 +50,14 @@ class Sensitivities:
     def setup(self) -> None:
         """Start at the guess."""
         collocation = Problem.read(PROBLEM).collocation()
-        shapes = [s.experiment.rigid_positions(s.dynamics.t_s) for s in collocation.segments]
+        shapes = [s.experiment.rigid_positions(s.dynamics.t_s) for s in collocation.transcriptions]
         z = collocation.pack(collocation.parameters.guess_q, shapes)
-        self.part = next(iter(collocation.parts(z)))
+        self.part = next(iter(collocation.iterates(z)))
 
     def time_sweep(self) -> None:
         """Forward, all columns."""
-        Sweep(self.part.segment).forward(self.part.x, self.part.setting)
+        Sweep(self.part.segment).forward(self.part.x, self.part.equations)
 
     def peakmem_sweep(self) -> None:
         """The same."""
-        Sweep(self.part.segment).forward(self.part.x, self.part.setting)
+        Sweep(self.part.segment).forward(self.part.x, self.part.equations)
