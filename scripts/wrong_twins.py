@@ -382,7 +382,7 @@ def obstacles(change: Callable[[Obstacle], Obstacle]) -> Change:
 def reversed_normal(obstacle: Obstacle) -> Obstacle:
     """A plane on the other side of which the body is."""
     assert isinstance(obstacle.shape, Plane)
-    return replace(obstacle, shape=replace(obstacle.shape, offset_direction=-obstacle.shape.normal))
+    return replace(obstacle, shape=replace(obstacle.shape, normal=-obstacle.shape.normal))
 
 
 OBSTACLE_FAULTS = {

@@ -48,7 +48,7 @@ def unit_drag() -> NodeForce:
         speed = ca.sqrt(ca.sumsqr(v) + SMOOTH_BELOW_M_S**2)
         return -0.5 * DRAG_COEFFICIENT * FACING_SHARE * at.area_m2 * speed * v
 
-    return replace(NodeForce.from_law(air_drag, name="air drag"), compiled=True)
+    return replace(NodeForce.from_law(air_drag, name="air drag"), is_compiled=True)
 
 
 def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:

@@ -353,12 +353,12 @@ class InverseEquilibrium:
     """
 
     def __init__(self, body: Any) -> None:
-        assert body.scan is not None
+        assert body.scan_conditions is not None
         self.body = body
         self.points_m: Array = body.nodes.points_m
-        self.gravity_m_s2 = np.asarray(body.scan.gravity_m_s2, dtype=float)
+        self.gravity_m_s2 = np.asarray(body.scan_conditions.gravity_m_s2, dtype=float)
         size = self.points_m.size
-        held_nodes = body.scan.held_nodes(body.nodes)
+        held_nodes = body.scan_conditions.held_nodes(body.nodes)
         self.free: Index = np.setdiff1d(
             np.arange(size), (3 * held_nodes[:, None] + np.arange(3)).ravel()
         )

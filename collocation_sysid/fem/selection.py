@@ -148,9 +148,9 @@ class Face(_PositionSelection):
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the selected nodes as sorted int64 indices into `nodes.points_m`."""
         points_m = nodes.points_m
-        mask = self._holds(points_m)
+        mask = self._contains(points_m)
         if self.name.startswith("side"):
-            mask &= ~(Face("top")._holds(points_m) | Face("bottom")._holds(points_m))
+            mask &= ~(Face("top")._contains(points_m) | Face("bottom")._contains(points_m))
         return _indices_or_error(mask, nodes.mesh, str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
@@ -159,7 +159,7 @@ class Face(_PositionSelection):
             f"{self} selects nodes, and no cells; expected box_m, ball_m, indices or name"
         )
 
-    def _holds(self, points_m: np.ndarray) -> np.ndarray:
+    def _contains(self, points_m: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the points in the plane through the outermost point."""
         axis, sign = {"top": (2, -1), "bottom": (2, 1), "side_x": (0, 1), "side_y": (1, 1)}[
             self.name

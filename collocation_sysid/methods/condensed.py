@@ -234,7 +234,7 @@ class CondensedCollocation(Collocation):
     complete: Collocation
 
     @cached_property
-    def segments(self) -> tuple[Transcription, ...]:
+    def transcriptions(self) -> tuple[Transcription, ...]:
         """Transcriptions of the fitted experiments."""
         return self.complete.transcriptions
 
@@ -268,12 +268,12 @@ class CondensedCollocation(Collocation):
         return numbers
 
     @property
-    def variables(self) -> int:
+    def variable_count(self) -> int:
         """Length of z."""
         return len(self._kept[0])
 
     @property
-    def constraints(self) -> int:
+    def constraint_count(self) -> int:
         """Length of g."""
         return len(self._kept[1])
 

@@ -123,7 +123,7 @@ class RecordingReader:
             Names the file and line, or the key within the experiment's table.
         """
         section = self.section
-        t_s, poses, table = self._align([*map(self._poses, range(len(section.moved)))])
+        t_s, poses, table = self._align([*map(self._poses, range(len(section.moved_sections)))])
         grasps = [self._grasp(k, sequence, t_s) for k, sequence in enumerate(poses)]
         if len(prescribed_dofs(grasps)) == 3 * (n := len(self.body.nodes_m)):
             message = (
@@ -191,14 +191,14 @@ class RecordingReader:
 
     def _grasp_key(self, k: int, key: str = "") -> str:
         """Return the key of grasp or obstacle number k, from 0, in messages."""
-        grasps = len(self.section.grasps)
+        grasps = len(self.section.grasp_list)
         one = f"grasp.{k}" if grasps > 1 else "grasp"
         one = one if k < grasps else f"obstacle.{k - grasps}"
         return f"{one}.{key}" if key else one
 
     def _poses(self, k: int) -> PoseSequence:
         """Return the poses of grasp or obstacle number k, from 0; constant if none are stated."""
-        grasp = self.section.moved[k]
+        grasp = self.section.moved_sections[k]
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
         if grasp.displacement is not None:
@@ -232,7 +232,7 @@ class RecordingReader:
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
         """Return grasp or obstacle number k, from 0, on the body."""
-        section = self.section.moved[k]
+        section = self.section.moved_sections[k]
         zero = ""
         if (table := section.displacement) is not None:
             file = self._table_file(table, self._grasp_key(k, "displacement"))
@@ -240,7 +240,7 @@ class RecordingReader:
             zero = displaced_axes(file, table.columns, table.axis, rest_m)
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
-        number = k + 1 - len(self.section.grasps)
+        number = k + 1 - len(self.section.grasp_list)
         defaults = {"name": f"obstacle {number}"} if is_obstacle else {}
         arguments: dict[str, Any] = defaults | stated_in(section, kind, self._grasp_key(k))
         wrench = section.wrench and self._wrench(section.wrench, self._grasp_key(k, word), t_s)
@@ -289,7 +289,7 @@ class RecordingReader:
         _, arguments["expression"] = self.code.function(
             section.code, section.function, f"{key}.code"
         )
-        if section.grasp and section.grasp > (count := len(self.section.grasps)):
+        if section.grasp and section.grasp > (count := len(self.section.grasp_list)):
             message = f"found {section.grasp}; expected the number of a grasp, 1 to {count}"
             raise InputError(message, where=f"{key}.grasp")
         with located(where=key):
@@ -423,7 +423,7 @@ class RecordingReader:
         """
         section = self.section
         wrench_sections = [
-            (k, grasp.wrench) for k, grasp in enumerate(section.moved) if grasp.wrench
+            (k, grasp.wrench) for k, grasp in enumerate(section.moved_sections) if grasp.wrench
         ]
         if not (wrench_sections or section.has_markers or section.reading or section.depth):
             message = "nothing is measured: expected markers, a wrench, a reading, or depth"
@@ -484,12 +484,16 @@ class RecordingReader:
         section = self.section
         table = self._fitted_tracks(poses)
         static = self._is_static
-        intervals = [each.model_dump(include={"from_s", "until_s"}) for each in section.moved]
+        intervals = [
+            each.model_dump(include={"from_s", "until_s"}) for each in section.moved_sections
+        ]
         held_s = [
             (-np.inf if first is None else first, np.inf if last is None else last)
             for first, last in (each.values() for each in intervals)
         ]
-        pose_files = [grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved]
+        pose_files = [
+            grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved_sections
+        ]
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]

@@ -802,7 +802,7 @@ class Collocation:
                         float(residual[t, place]),
                     )
                 )
-        return sorted(violations, key=lambda violation: -abs(violation.newtons))[:count]
+        return sorted(violations, key=lambda violation: -abs(violation.residual_n))[:count]
 
     def rms_marker_distance_m(self, z: Array) -> float:
         """Return the root mean square distance of the markers from their measurements [m];

@@ -56,7 +56,7 @@ def lift_variables(
                 LiftedForceHistory(
                     **lift,
                     offsets=offsets,
-                    history_index=history,
+                    motion_history=history,
                     force_index=force,
                     reactions=reactions,
                 )
@@ -68,7 +68,7 @@ def lift_variables(
                 LiftedContactPressure(
                     **lift,
                     offsets=offsets,
-                    history_index=history,
+                    motion_history=history,
                     force_index=force,
                     reactions=reactions,
                 )

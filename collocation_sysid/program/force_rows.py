@@ -37,7 +37,7 @@ class LiftedForceHistory(LiftedVariables):
 
     Attributes
     ----------
-    history_index : int
+    motion_history : int
         Index of the history among those of the motion, `ExperimentIterate.histories_along`.
     force_index : int
         Index of the force, see `ForceHistory`.
@@ -46,7 +46,7 @@ class LiftedForceHistory(LiftedVariables):
         none.
     """
 
-    history_index: int
+    motion_history: int
     force_index: int
     reactions: LiftedReactions | None = None
     kind = "force"
@@ -62,9 +62,9 @@ class LiftedForceHistory(LiftedVariables):
         return self.segment.length_m
 
     @property
-    def history(self) -> int:
+    def history_index(self) -> int:
         """Index of the history among those of the motion."""
-        return self.history_index
+        return self.motion_history
 
     @property
     def _points(self) -> ForcePoints:

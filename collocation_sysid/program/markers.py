@@ -112,7 +112,7 @@ class MarkerResidual(MeasurementResidual):
         return self.observable.coordinate_parameters
 
     @property
-    def is_compared(self) -> NDArray[np.bool_]:
+    def is_present(self) -> NDArray[np.bool_]:
         """Mask (T, M) of the samples that are compared."""
         return self.is_compared[..., 0]
 
@@ -209,5 +209,5 @@ class MarkerResidual(MeasurementResidual):
         """
         predicted = self.predict_positions(x, phi)
         tracks = self.markers.positions_m[: len(predicted)]
-        present = self.is_compared[: len(predicted)]
+        present = self.is_present[: len(predicted)]
         return np.sum((predicted - tracks) ** 2, axis=2)[present]

@@ -96,6 +96,6 @@ class OutlineResidual(DepthResidual):
         """
         return self.signed_distances_m(values, phi)
 
-    def roughly(self, x: Array, phi: Array) -> Array:
+    def rough_residuals(self, x: Array, phi: Array) -> Array:
         """Return no residual: before anything is fitted, distances to the points suffice."""
         return np.zeros(0)

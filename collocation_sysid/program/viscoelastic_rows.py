@@ -127,7 +127,7 @@ class LiftedMemory(LiftedVariables):
         return (_body_history(iterate).recursion_residuals / self.unit_pa).ravel()
 
     @property
-    def history(self) -> int:
+    def history_index(self) -> int:
         """Index of the history: that of the body is the first."""
         return 0
 

@@ -163,7 +163,7 @@ class WrenchResidual(MeasurementResidual):
         """Return the model with reaction forces at the times of another grid."""
         return WrenchResidual.from_sensor(replace(self.observable, reaction_grid=grid), self.wrench)
 
-    def with_samples(self, wrench: Wrench) -> WrenchResidual:
+    def with_wrench(self, wrench: Wrench) -> WrenchResidual:
         """Return the model of other samples, in their own frame."""
         observable = replace(self.observable, frame=wrench.frame, point_m=wrench.point_m)
         return WrenchResidual.from_sensor(observable, wrench)

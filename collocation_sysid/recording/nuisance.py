@@ -215,7 +215,7 @@ def _camera_sharing_key(experiment: Any) -> dict[str, Any]:
 
 def _is_motion(experiment: Any) -> bool:
     """Return whether the experiment is a motion."""
-    return not experiment.static
+    return not experiment.is_static
 
 
 def _has_observable_hand_eye(experiment: Any) -> bool:
@@ -305,7 +305,7 @@ OBSTACLE_OFFSET = NuisanceRow("obstacle_offset_m", "m", 1e-4, key="obstacle", of
          "displacement: where contact begins")
 OBSTACLE_TILT = NuisanceRow("obstacle_tilt_rad", "rad", None, key="obstacle", of="obstacle",
     axes="first second", changes=("grasps",), by="length", considered=0.2 * DEGREE,
-    applies=lambda experiment: any(each.shape.flat for each in experiment.obstacles),
+    applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     label="tilt of {which}, {axis}", told="an obstacle is tilted by {size}",
     said="a constant tilt of each plane or box that may be touched, about its point or middle")
 OBSTACLE_TIME = NuisanceRow("obstacle_time_s", "s", None, key="obstacle", of="obstacle",

@@ -91,6 +91,11 @@ class Plane(Solid):
     )
 
     @property
+    def offset_direction(self) -> Array:
+        """Normal (3,) of the plane."""
+        return self.normal
+
+    @property
     def has_tilt(self) -> bool:
         """Always true: a tilt of a plane may be estimated."""
         return True

@@ -154,7 +154,10 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
         recordings=_recordings_agreement(answer),
         profiles={
             profile.parameter: alike(
-                ProfileResult, profile, rises=profile.losses - profile.losses.min()
+                ProfileResult,
+                profile,
+                rises=profile.losses - profile.losses.min(),
+                sentence=profile.message,
             )
             for profile in answer.profiles
         },
@@ -280,6 +283,7 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
         reading_rms=simulated.reading_rms or None,
         reading_unit=_sensor_units(experiment),
         depth=simulated.depth or None,
+        blind=simulated.blind_error,
         copied=simulated.copy_error if isinstance(simulated.copy_error, CopyError) else None,
         not_copied=simulated.copy_error if isinstance(simulated.copy_error, str) else None,
     )

@@ -263,7 +263,7 @@ class _OneSensor:
         at = (wrench.t_s.tobytes(), wrench.frame, wrench.point_m.tobytes())
         if at not in self._known:
             phi = np.zeros(self.part.segment.nuisance.size)
-            self._known[at] = self.sensor.with_samples(wrench).predict_reactions(self.forced, phi)
+            self._known[at] = self.sensor.with_wrench(wrench).predict_reactions(self.forced, phi)
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:

@@ -134,7 +134,7 @@ class SqpMethod(CasadiSolver):
 
     hessian: Hessian = "gauss-newton"
 
-    def _own_settings(self) -> dict[str, Any]:
+    def _plugin_settings(self) -> dict[str, Any]:
         return {
             "qpsol": "piqp",
             "qpsol_options": {"error_on_fail": False},
@@ -169,7 +169,7 @@ class Sleqp(CasadiSolver):
         "manual abort": Status.INTERRUPTED,
     }
 
-    def _own_settings(self) -> dict[str, Any]:
+    def _plugin_settings(self) -> dict[str, Any]:
         return {
             "max_iter": self.max_iterations,
             "max_wall_time": self.max_time_s,

@@ -214,7 +214,7 @@ class Penalty(PenaltyOptions):
         """Largest ρ of the solve."""
         return self.rho if self.schedule == "constant" else self.rho_max
 
-    def following(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
+    def next_stage(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage, with a larger ρ if the schedule says so, see
         `PenaltyOptions.next_stage`.
         """
@@ -247,7 +247,7 @@ class AugmentedLagrangian(PenaltyOptions):
         """Tolerance of the first stage."""
         return max(FIRST_GRADIENT, self.tolerance)
 
-    def following(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
+    def next_stage(self, stage: Stage, before: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage with updated multipliers, and a larger ρ if much violation remains.
 
         See `PenaltyOptions.next_stage`.
