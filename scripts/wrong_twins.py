@@ -343,7 +343,7 @@ def wrench_times(force: float, torque: float) -> Change:
 
 def tared(wrench: Wrench) -> Wrench:
     """Zeroed with the body in hand."""
-    return replace(wrench, values=wrench.values - wrench.values[:5].mean(axis=0))
+    return replace(wrench, values=wrench.values - np.nanmean(wrench.values[:5], axis=0))
 
 
 def in_other_frame(wrench: Wrench) -> Wrench:
