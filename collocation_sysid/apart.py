@@ -133,7 +133,7 @@ def computed_apart(
 
 
 def killed_by(code: int) -> str:
-    """How a process was killed that ended with this code; nothing where it ended by itself."""
+    """Return the signal that killed a process, from its exit code; "" if it ended by itself."""
     if code < 0:
         with contextlib.suppress(ValueError):
             return f"its process was killed by {signal.Signals(-code).name}"

@@ -335,7 +335,7 @@ def _fine_enough(
     steps = "one step" if before == 1 else f"{before} steps"
     worst, many = coarse.refinement.largest_correction(coarse.optimum)
     why = f"with {steps} a sample, the step moves {worst} by {many:.2g} standard errors"
-    if fit.is_at_bound[: fit.shared_count].all():
+    if fit.at_bound[: fit.shared_count].all():
         substeps = MOST_SUBSTEPS
         why = f"with {steps} a sample, every parameter ends at a bound"
     if substeps <= before:
@@ -343,7 +343,7 @@ def _fine_enough(
     say(f"solving again with {substeps} steps a sample")
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
-    p = np.where(fit.is_at_bound, again.guess_p, p)
+    p = np.where(fit.at_bound, again.guess_p, p)
     try:
         require_memory(problem, again, solver)
         positions, failure = simulate_trajectories(again, p)

@@ -89,14 +89,14 @@ def key(
 def stated(kind: type[T]) -> type[T]:
     """Return the class as a frozen dataclass that converts its fields before ``__post_init__``.
 
-    Messages begin with the `place` of an instance if it has one; otherwise they contain its
-    `called`,
+    Messages begin with the `description` of an instance if it has one; otherwise they contain its
+    `description_name`,
     or the name of the class.
     """
     check = getattr(kind, "__post_init__", lambda self: None)
 
     def convert(self: T) -> None:
-        with located(where=getattr(self, "place", None)):
+        with located(where=getattr(self, "description", None)):
             for name, converted in conversions.items():
                 if (value := getattr(self, name)) is not None:
                     object.__setattr__(self, name, converted(self, value))
@@ -126,13 +126,13 @@ def _converted(field: Field[Any], owner: Any, value: Any) -> Any:
         fault = error.errors(include_url=False)[0]
         called = re.sub("(?<!^)(?=[A-Z])", " ", type(owner).__name__).lower()
         what = field.name
-        word = getattr(owner, "called", called)
+        word = getattr(owner, "description_name", called)
         for part in fault["loc"]:
             if isinstance(value, Mapping) and part in value:
                 what = f"{what}.{part}"
                 value = value[part]
         whose = f"the {word} {owner.name!r}" if hasattr(owner, "name") else f"a {word}"
-        of = what if hasattr(owner, "place") else f"{what} of {whose}"
+        of = what if hasattr(owner, "description") else f"{what} of {whose}"
         shown = f"{value:g}" if isinstance(value, float) else repr(value)
         choices = fault["type"] == "literal_error" and get_args(field.metadata["form"])
         wanted = f"one of {', '.join(choices)}" if choices else expected(fault)

@@ -63,7 +63,7 @@ class Problem:
             shared_count=4,
             prior_residual=self.prior_slope * (wrong + truth),
             prior_jacobian=self.prior_slope,
-            is_at_bound=np.zeros(width, dtype=bool),
+            at_bound=np.zeros(width, dtype=bool),
         )
         return fit, wrong
 

@@ -52,7 +52,9 @@ def test_derivatives_are_those_of_the_value(scalar, states):
 
     matrices = [scalar.couplings.matrix(values) for values in scalar.hessian(x)]
     turned = np.stack([m @ each for m, each in zip(matrices, w, strict=True)])
-    np.testing.assert_allclose((scalar.gradient(x) * w).sum(axis=1), slope(scalar.value), rtol=1e-7)
+    np.testing.assert_allclose(
+        (scalar.gradient(x) * w).sum(axis=1), slope(scalar.evaluate), rtol=1e-7
+    )
     np.testing.assert_allclose(turned, slope(scalar.gradient), atol=1e-7)
     np.testing.assert_allclose(scalar.hessian_derivative(x, w), slope(scalar.hessian), atol=1e-7)
 
@@ -217,4 +219,4 @@ def test_what_no_actuator_can_be_is_refused(make, message):
 )
 def test_what_does_not_fit_the_body_is_refused(make, message):
     with pytest.raises(InputError, match=message):
-        make().on(Body(box_with_cavity(), density_kg_m3=1e3))
+        make().on_body(Body(box_with_cavity(), density_kg_m3=1e3))

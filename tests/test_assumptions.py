@@ -30,7 +30,7 @@ from collocation_sysid.fem.materials import DAMPINGS, DampingLaw
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.assumptions import (
     ASSUMPTIONS,
-    FittedExperiment,
+    ExperimentAtAnswer,
 )
 from collocation_sysid.statistics.considered import changed_residuals
 
@@ -166,7 +166,7 @@ def test_in_a_vacuum_nothing_is_assumed_of_the_air(name):
     collocation = Collocation([swung()], parameters(), "midpoint")
     x = np.tile(collocation.experiments[0].body.nodes_m.ravel(), (25, 1))
     (part,) = collocation.iterates(collocation.pack(collocation.guess_p, [x]))
-    assert BY_NAME[name].effect(FittedExperiment(part, collocation.parameters), 0) is None
+    assert BY_NAME[name].effect(ExperimentAtAnswer(part, collocation.parameters), 0) is None
 
 
 def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
@@ -174,7 +174,7 @@ def test_the_drag_of_air_is_that_of_a_quarter_of_the_surface():
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = experiment.body.nodes_m.ravel()
     z = collocation.pack(collocation.guess_p, [np.tile(x, (len(experiment.t_s), 1))])
-    at = FittedExperiment(collocation.iterates(z)[0], collocation.parameters)
+    at = ExperimentAtAnswer(collocation.iterates(z)[0], collocation.parameters)
     count = len(experiment.t_s)
     sideways = np.tile([0.0, 2.0, 0.0], len(x) // 3)
     vars(at)["states"] = (np.tile(x, (count, 1)), np.tile(sideways, (count, 1)))
@@ -188,8 +188,8 @@ def test_a_ratio_tied_to_one_that_is_estimated_is_not_stated():
     collocation = Collocation([experiment], parameters(), "midpoint")
     x = np.tile(experiment.body.nodes_m.ravel(), (len(experiment.t_s), 1))
     (part,) = collocation.iterates(collocation.pack(collocation.guess_p, [x]))
-    assert BY_NAME["poisson"].effect(FittedExperiment(part, estimated), 0) is None
-    assert BY_NAME["poisson"].effect(FittedExperiment(part, parameters()), 0) is not None
+    assert BY_NAME["poisson"].effect(ExperimentAtAnswer(part, estimated), 0) is None
+    assert BY_NAME["poisson"].effect(ExperimentAtAnswer(part, parameters()), 0) is not None
 
 
 @pytest.mark.parametrize("law", ["material", "kelvin-voigt"])
@@ -214,7 +214,7 @@ def test_without_damping_its_law_is_no_matter(changes):
     rows = len(experiment.t_s)
     rest = np.tile(experiment.body.nodes_m.ravel(), (rows, 1))
     z = collocation.pack(collocation.guess_p, [rest])
-    at = FittedExperiment(next(iter(collocation.iterates(z))), collocation.parameters)
+    at = ExperimentAtAnswer(next(iter(collocation.iterates(z))), collocation.parameters)
     for name in ("damping_law", "rayleigh_damping"):
         row = BY_NAME[name]
         assert all(row.effect(at, axis) is None for axis in range(len(row.components)))

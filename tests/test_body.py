@@ -276,7 +276,7 @@ def second_derivative(
 def test_curvature_gives_the_slopes_of_the_weighted_slopes(body, of, by, rng):
     theta = theta_for(body)
     x, v, w = deformed(body, rng), velocities(body, rng), velocities(body, rng)
-    at = body.curvature(x, v, w, theta)
+    at = body.second_derivatives(x, v, w, theta)
     slope = weighted_slopes(body, w)[of]
     point = {"position": x, "velocity": v, "theta": theta}
 
@@ -301,7 +301,7 @@ def test_curvature_gives_the_slope_by_the_parameters(body, rng):
     theta = theta_for(body)
     x, v, w = deformed(body, rng), velocities(body, rng), velocities(body, rng)
     expected = weighted_slopes(body, w)["theta"](x, v, theta)
-    np.testing.assert_allclose(body.curvature(x, v, w, theta).theta, expected, rtol=1e-10)
+    np.testing.assert_allclose(body.second_derivatives(x, v, w, theta).theta, expected, rtol=1e-10)
 
 
 def test_force_is_linear_in_the_velocity(body, rng):
@@ -373,14 +373,14 @@ def test_volume_ratio_of_a_mirrored_body_is_negative(make_body):
 
 def test_pattern_finds_entries_of_either_triangle_and_nothing_outside(make_body):
     pattern = make_body().pattern
-    found = pattern.position(pattern.rows, pattern.columns)
-    np.testing.assert_array_equal(found, np.arange(pattern.entries))
-    np.testing.assert_array_equal(pattern.position(pattern.columns, pattern.rows), found)
-    full = pattern.matrix(np.ones(pattern.entries)).toarray()
+    found = pattern.positions_of(pattern.rows, pattern.columns)
+    np.testing.assert_array_equal(found, np.arange(pattern.entry_count))
+    np.testing.assert_array_equal(pattern.positions_of(pattern.columns, pattern.rows), found)
+    full = pattern.matrix(np.ones(pattern.entry_count)).toarray()
     absent = np.argwhere(full == 0)
     for row, column in (absent[0], absent[-1]):
         with pytest.raises(IndexError, match="outside the mesh graph"):
-            pattern.position(np.array([row]), np.array([column]))
+            pattern.positions_of(np.array([row]), np.array([column]))
 
 
 # Evaluators, threads, padding -----------------------------------------------------------------

@@ -46,7 +46,7 @@ def test_a_damping_at_its_bound_does_not_make_the_other_falsely_certain(seed):
         run(Problem([experiment], Parameters((*free, last)), rollout=made)).estimates
         for last in (known, bounded)
     )
-    assert found["gamma_m_1_s"].is_at_bound
+    assert found["gamma_m_1_s"].at_bound
     truth = TRUTH["gamma_r_s"]
     low, high = wrong["gamma_r_s"].statistical95 or (0, 0)
     assert high < 1.2 * low

@@ -15,7 +15,7 @@ from collocation_sysid.model.recursion import Recursion, RecursionTrajectory
 from collocation_sysid.program.carried import LiftedOffsets, LiftedVariables
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.part import ExperimentIterate
-from collocation_sysid.program.pattern_rows import AssemblyIndices, ExpressionPattern
+from collocation_sysid.program.pattern_rows import ExpressionPattern, PatternIndices
 
 CORNERS = np.array([[0, 3], [1, 5], [2, 4]])
 MODULUS_PA = 1e3
@@ -39,7 +39,7 @@ STRETCH = Recursion(slow_stretch, 1, 6, 1, 1)
 class Stretches(LiftedVariables):
     """That of three pairs of nodes, at all grid times."""
 
-    called = "stretch"
+    kind = "stretch"
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -58,7 +58,7 @@ class Stretches(LiftedVariables):
         at = x.reshape(len(x), -1, 3, *x.shape[2:])[:, CORNERS]
         return np.moveaxis(at.reshape(len(x), 3, 6, *x.shape[2:]), 2, 0)
 
-    def following(self, part: ExperimentIterate) -> np.ndarray:
+    def consistent_values(self, part: ExperimentIterate) -> np.ndarray:
         return self.evolution(part).states.ravel()
 
     @cached_property
@@ -70,12 +70,12 @@ class Stretches(LiftedVariables):
             lambda before, now, last, q, data: slow_stretch(before, now, last, ca.exp(q), data),
             *(1, 6, 1, 1),
         )
-        looked = AssemblyIndices(at, np.full((1, 1, 1), self.segment.length_m))
+        looked = PatternIndices(at, np.full((1, 1, 1), self.segment.length_m))
         states, of_q = (
-            AssemblyIndices(self.offsets.variable + rows),
-            AssemblyIndices(np.zeros((1, 1, 1), int)),
+            PatternIndices(self.offsets.variable + rows),
+            PatternIndices(np.zeros((1, 1, 1), int)),
         )
-        numbers = self.began, states, looked, of_q, AssemblyIndices(rows)
+        numbers = self.began, states, looked, of_q, PatternIndices(rows)
         return (ExpressionPattern.from_recursion(recursion, *numbers),)
 
 
@@ -83,7 +83,7 @@ class Stretches(LiftedVariables):
 def program() -> Collocation:
     made = Collocation([hung_cube(5)], GUESS)
     last = LiftedOffsets(made.variable_count, made.constraint_count)
-    vars(made)["carried"] = (Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),)
+    vars(made)["lifted"] = (Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),)
     return made
 
 
@@ -95,20 +95,20 @@ def some_positions(program: Collocation, rng: np.random.Generator) -> np.ndarray
 
 def test_rows_vanish_where_it_follows_from_the_motion(program, rng):
     z = program.pack(program.guess_p, [some_positions(program, rng)])
-    (carried,) = program.carried
-    assert (z[carried.variables] > 0.01).all()
+    (carried,) = program.lifted
+    assert (z[carried.columns] > 0.01).all()
     np.testing.assert_allclose(program.constraint_values(z)[carried.rows], 0.0, atol=1e-14)
 
 
 def test_a_programs_matrices_have_it(program, rng):
     z = program.pack(program.guess_p, [some_positions(program, rng)])
-    (carried,), y = program.carried, rng.normal(size=program.constraints)
-    z[carried.variables] += 0.01 * rng.normal(size=carried.count)
+    (carried,), y = program.lifted, rng.normal(size=program.constraint_count)
+    z[carried.columns] += 0.01 * rng.normal(size=carried.count)
     jacobian, hessian = program.jacobian(z), program.hessian(z, 1.3, y)
     own = jacobian[carried.rows]
     values = program.constraint_values
     assert_derivative(lambda at: values(at)[carried.rows], lambda d: own @ d, z, rng, 1e-7, 0.1, 1)
-    for here in (slice(program.nq), program.segments[0].columns, carried.variables):
+    for here in (slice(program.nq), program.transcriptions[0].columns, carried.columns):
         scale = np.zeros(len(z))
         scale[here] = 0.1
         assert_derivative(
@@ -116,7 +116,7 @@ def test_a_programs_matrices_have_it(program, rng):
             lambda d: hessian @ d,
             *(z, rng, 1e-7, scale, 1),
         )
-    assert np.abs(hessian[carried.variables][:, : program.nq]).max() > 0
+    assert np.abs(hessian[carried.columns][:, : program.nq]).max() > 0
 
 
 def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
@@ -124,8 +124,8 @@ def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
     x = some_positions(program, rng)
     z, (segment,), (carried,) = (
         program.pack(program.guess_p, [x]),
-        program.segments,
-        program.carried,
+        program.transcriptions,
+        program.lifted,
     )
     rows = program.jacobian(z)[carried.rows].toarray()
     (part,) = program.iterates_at(program.guess_p, [x])
@@ -134,13 +134,15 @@ def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
         rng.normal(size=(*x.shape, 2)),
         rng.normal(size=2),
     )
-    change = evolution.forward(carried.looked(moved), np.exp(part.q[:1]) * by_q[None])
+    change = evolution.jacobian_vector_product(
+        carried.looked(moved), np.exp(part.q[:1]) * by_q[None]
+    )
     columns = np.vstack([by_q, moved.reshape(-1, 2) / segment.length_m])
     sides = rows[:, [0, *range(*segment.columns.indices(len(z)))]] @ columns
-    expected = -np.linalg.solve(rows[:, carried.variables], sides)
+    expected = -np.linalg.solve(rows[:, carried.columns], sides)
     assert relative_error(change.reshape(-1, 2), expected) < 1e-12
     weights = rng.normal(size=evolution.states.shape)
-    by_looked, by_modulus = evolution.backward(weights)
+    by_looked, by_modulus = evolution.vector_jacobian_product(weights)
     along = np.einsum("ikp,ikpc->c", by_looked, carried.looked(moved))
     along += by_modulus[0] * np.exp(part.q[0]) * by_q
     expected = weights.ravel() @ change.reshape(-1, 2)

@@ -31,9 +31,9 @@ def maxwell(x, v, before, at, spring_n_m, creep_s):
     ds/dt = (x − s) / τ by the trapezoidal rule; what is carried is where s and x were.
     """
     joint, last = before[:3], before[3:]
-    half = at.since_s / (2 * creep_s)
+    half = at.interval_s / (2 * creep_s)
     moved = ((1 - half) * joint + half * (last + x)) / (1 + half)
-    joint = at.began * x + (1 - at.began) * moved
+    joint = at.is_start * x + (1 - at.is_start) * moved
     return -spring_n_m * (x - joint), ca.vertcat(joint, x)
 
 
@@ -124,7 +124,7 @@ carries = 6
 MADE = """
 from collocation_sysid import NodeForce
 
-made = NodeForce.of(lambda x, v, b, at, pull_n: (-pull_n * x, b), carries=3)
+made = NodeForce.from_law(lambda x, v, b, at, pull_n: (-pull_n * x, b), carries=3)
 """
 CONSTANTS = "spring_n_m = { guess = 2.0 }\ncreep_s = { guess = 0.04 }\ngamma_m_1_s = {"
 

@@ -336,7 +336,7 @@ def no_simulation(*_):
 
 
 def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
-    for name in ("initial_variables", "started"):
+    for name in ("initial_variables", "start_problem"):
         monkeypatch.setattr(f"collocation_sysid.runs.check.{name}", no_simulation)
     unguessed = ["parameters.mu_pa={}", "parameters.lambda_pa={}"]
     seen = quick_check(Problem.read(tiny / "problem.toml", unguessed))
@@ -366,7 +366,7 @@ def test_every_grasp_of_an_experiment_is_shown():
 
 
 def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.runs.check.PATIENCE_S", 0.0)
+    monkeypatch.setattr("collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0)
     monkeypatch.setattr("collocation_sysid.runs.check.derivatives.SAMPLES", 4)
     problem, told = Problem.read(tiny / "problem.toml"), []
     short = check_problem(problem, told.append)

@@ -353,7 +353,7 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     assert "no error bars" in result["missing"]
 
 
-@pytest.mark.parametrize("late", ["likely_causes", "_profiles"])
+@pytest.mark.parametrize("late", ["find_misspecifications", "_profiles"])
 def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
     def interrupt(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
@@ -566,7 +566,7 @@ def test_check_reports_sizes_and_derivatives(tiny):
 
 
 def test_check_fails_where_derivatives_do_not_agree(tiny, monkeypatch):
-    monkeypatch.setattr("collocation_sysid.runs.check.AGREEMENT", 0.0)
+    monkeypatch.setattr("collocation_sysid.runs.check.DERIVATIVE_TOLERANCE", 0.0)
     outcome = run_command("check", "problem.toml")
     assert outcome.code == 1
     assert "do not agree" in outcome.out

@@ -185,7 +185,7 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 def compared():
-    print(faults(), workers._done(lambda: faults() and faults()))
+    print(faults(), workers._run_alone(lambda: faults() and faults()))
 
 thread = threading.Thread(target=compared)
 thread.start()

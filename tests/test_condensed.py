@@ -85,11 +85,11 @@ def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
         s.is_grasp_constraint.sum() for s in whole.transcriptions if s.nuisance.affects_grasps
     )
     assert (
-        whole.variable_count - program.variables
-        == whole.constraint_count - program.constraints
+        whole.variable_count - program.variable_count
+        == whole.constraint_count - program.constraint_count
         == rows
     )
-    z, y = some_point(collocation, program, rng), rng.normal(size=program.constraints)
+    z, y = some_point(collocation, program, rng), rng.normal(size=program.constraint_count)
 
     def slope(at: np.ndarray) -> np.ndarray:
         return 1.3 * program.gradient(at) + program.jacobian(at).T @ y
@@ -100,7 +100,7 @@ def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
         program.hessian(z, 1.3, y),
     )
     of_phi = np.zeros(len(z))
-    of_phi[program.phi_slice] = 0.1
+    of_phi[program.phi_columns] = 0.1
     for scale in (0.1, of_phi):
         options = {"scale": scale, "directions": 1}
         assert_derivative(program.objective, lambda d: gradient @ d, z, rng, **options)
@@ -111,7 +111,7 @@ def test_derivatives_go_through_the_dofs_that_are_held(name: str, rng):
 @pytest.mark.parametrize("name", CASES)
 def test_held_dofs_are_where_the_grasps_are_and_multipliers_balance_them(name: str, rng):
     collocation, whole, program = made(name, ON_TIME)
-    z, y = some_point(collocation, program, rng), rng.normal(size=program.constraints)
+    z, y = some_point(collocation, program, rng), rng.normal(size=program.constraint_count)
     at, of_rows = program.complete_variables(z), program.complete_multipliers(z, 1.0, y)
     rows = np.concatenate([each.rows for each in program.eliminated])
     held = np.concatenate([each.variables for each in program.eliminated])

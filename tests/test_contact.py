@@ -71,7 +71,7 @@ def moved(t_s, way_m, **changes) -> PoseSequence:
 def gaps(solid, points_m) -> tuple[np.ndarray, np.ndarray]:
     """Gaps (i,) of points (i, 3), and their slopes (3, i)."""
     point = ca.SX.sym("point", 3)
-    gap = solid.gap(point)
+    gap = solid.signed_distance(point)
     both = ca.Function("both", [point], [gap, ca.gradient(gap, point)]).map(len(points_m))
     value, slope = both(points_m.T)
     return np.array(value)[0], np.array(slope)
@@ -119,7 +119,7 @@ def pushed(friction: float = 0.0) -> tuple[Experiment, States]:
 
 def energy_j(term, x) -> float:
     """Ψ, by its formula and the solid's gap alone."""
-    law, body = term.contact, term.contact.body
+    law, body = term.law_of_contact, term.law_of_contact.body
     from_origin = term.points.vectors(x[None])[:3, 0].T
     origin, *ends = x.reshape(-1, 3)[law.obstacle.nodes]
     axes = (np.array(ends) - origin) / (body.frame_nodes_m[1, 0] - body.frame_nodes_m[0, 0])

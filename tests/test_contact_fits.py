@@ -209,7 +209,7 @@ def test_check_says_what_contact_will_spoil_at_the_guess(changes: dict, codes: s
 
 
 def test_check_says_nothing_of_contact_that_it_has_not_simulated(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.runs.check.PATIENCE_S", 0.0)
+    monkeypatch.setattr("collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0)
     for changes in ({"higher_m": 0.05, "place_sigma_m": None}, {"shape": SMALL}):
         concerns = check_problem(measured_once(poked(**changes))).concerns
         assert not any(each.topic == "contact" for each in concerns)

@@ -205,23 +205,23 @@ def found():
 
 
 def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(found):
-    (part,) = found.collocation.parts(found.z)
+    (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = part.depth_residuals
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = compared_rows(surface, part.segment.experiment.up)
+    rows = compared_rows(surface, part.segment.experiment.upward_direction)
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     used = np.isfinite(points[:, 4])
-    assert used.sum() == reading.sighting.used.sum()
+    assert used.sum() == reading.correspondences.is_compared.sum()
     assert np.sqrt(np.mean(points[used, 4] ** 2)) < 2e-4
     # What is seen lies within what is drawn of the surface, but for a pixel.
     low, high = np.nanmin(lines[:, 1:3], axis=0), np.nanmax(lines[:, 1:3], axis=0)
     assert (points[used, 1:3] > low - 1).all()
     assert (points[used, 1:3] < high + 1).all()
     # Where points are in the world they are on the surface, to what they are apart.
-    skin, x = reading.sighting.skin, reading.shapes(part.x, part.phi)[0]
-    _, places = skin.nearest(x, points[used, 5:], np.arange(len(skin.flat)))
-    faces, _ = skin.nearest(x, points[used, 5:], np.arange(len(skin.flat)))
-    _, feet, _ = skin.points(x, faces, places)
+    skin, x = reading.correspondences.surface, reading.surface_shapes(part.x, part.phi)[0]
+    _, places = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.flat_triangles)))
+    faces, _ = skin.nearest_points(x, points[used, 5:], np.arange(len(skin.flat_triangles)))
+    _, feet, _ = skin.evaluate(x, faces, places)
     away = np.linalg.norm(points[used, 5:] - feet, axis=1)
     assert np.median(np.abs(away - np.abs(points[used, 4]))) < 1e-6
     titles = [axes.get_title() for axes in depth_picture(rows).axes]
@@ -229,10 +229,10 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(f
 
 
 def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found):
-    (part,) = found.collocation.parts(found.z)
+    (part,) = found.collocation.iterates(found.z)
     ((reading, looked),) = part.depth_residuals
     surface = SurfaceComparison.from_fit(reading, part.x, looked, part.phi)
-    rows = compared_rows(surface, part.segment.experiment.up)
+    rows = compared_rows(surface, part.segment.experiment.upward_direction)
     experiment = part.segment.experiment
     x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)
     replay = Replay.of(experiment, (x[:1], np.zeros((1, 0, 3))))
@@ -247,7 +247,7 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found)
         markers_m=np.zeros((3, 0, 3)),
         seen={"front": np.vstack([rows, later])},
     )
-    count = reading.sighting.used.sum()
+    count = reading.correspondences.is_compared.sum()
     assert [len(replay.seen_m(t)) for t in range(3)] == [count, 0, count]
     sparse = replace(replay, seen={"front": rows})
     assert [len(sparse.seen_m(t)) > 0 for t in range(3)] == [True, False, False]
@@ -255,7 +255,7 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found)
     ((_, _, _, drawn, _),) = film.panels
     film.show(0)
     u, _ = drawn.seen.get_data()
-    assert 0 < len(u) <= reading.sighting.used.sum()
+    assert 0 < len(u) <= reading.correspondences.is_compared.sum()
     shown = drawn.view.places(sparse.seen_m(0))
     assert np.isin(np.round(u, 6), np.round(shown[:, 0], 6)).all()
     film.show(2)

@@ -48,7 +48,7 @@ def stiffness(body: Body, x: np.ndarray) -> np.ndarray:
 
 def test_residual_is_the_printed_equation_of_motion(backward_euler):
     collocation, x = backward_euler
-    dynamics = collocation.segments[0].dynamics.with_theta(THETA)
+    dynamics = collocation.transcriptions[0].dynamics.with_theta(THETA)
     body, step = dynamics.body, dynamics.step_s
     residual = dynamics.residual(x)
     for t in range(2, len(x)):
@@ -64,7 +64,7 @@ def test_residual_is_the_printed_equation_of_motion(backward_euler):
 
 def test_first_step_takes_its_inertia_from_the_start_velocity(backward_euler):
     collocation, x = backward_euler
-    dynamics = collocation.segments[0].dynamics.with_theta(THETA)
+    dynamics = collocation.transcriptions[0].dynamics.with_theta(THETA)
     body, step = dynamics.body, dynamics.step_s
     force = body.force(x[1], (x[1] - x[0]) / step, THETA)[0] + dynamics.forces.weight.external_n[1]
     expected = force - body.dof_mass * (x[1] - x[0]) / step**2
@@ -74,7 +74,7 @@ def test_first_step_takes_its_inertia_from_the_start_velocity(backward_euler):
 @pytest.mark.parametrize("lag", [0, 1, 2])
 def test_jacobian_blocks_are_the_printed_ones(backward_euler, lag: int):
     collocation, x = backward_euler
-    segment = collocation.segments[0]
+    segment = collocation.transcriptions[0]
     body, step, free = segment.body, segment.dynamics.step_s, segment.free_dofs
     z = collocation.pack(np.log(THETA), [x])
     jacobian = collocation.jacobian(z).toarray() * segment.force_n / segment.length_m
@@ -88,16 +88,18 @@ def test_jacobian_blocks_are_the_printed_ones(backward_euler, lag: int):
         (gamma_r * k + gamma_m * mass) / step + 2 * inertia,
         -inertia,
     ][lag]
-    rows = (t - segment.dynamics.first_row) * segment.rows_per_time
-    columns = collocation.nq + (t - lag) * segment.dofs
-    block = jacobian[rows : rows + segment.rows_per_time, columns : columns + segment.dofs]
+    rows = (t - segment.dynamics.first_row) * segment.constraints_per_time
+    columns = collocation.nq + (t - lag) * segment.dof_count
+    block = jacobian[
+        rows : rows + segment.constraints_per_time, columns : columns + segment.dof_count
+    ]
     np.testing.assert_allclose(block, expected[free], atol=1e-9 * np.abs(expected).max())
     np.testing.assert_allclose(block[:, free], block[:, free].T, atol=1e-12 * np.abs(block).max())
 
 
 def test_residual_depends_on_nothing_older_than_two_steps_or_newer(backward_euler):
     collocation, x = backward_euler
-    dynamics = collocation.segments[0].dynamics.with_theta(THETA)
+    dynamics = collocation.transcriptions[0].dynamics.with_theta(THETA)
     before = dynamics.residual(x)
     moved = x.copy()
     moved[2] += 1e-3

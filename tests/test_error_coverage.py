@@ -11,7 +11,7 @@ from fits_small import PARAMETERS, Problem, autoregressive, problem
 from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
-from collocation_sysid.statistics.autocorrelation import error_processes, test_dependence
+from collocation_sysid.statistics.autocorrelation import analyse_dependence, error_processes
 from collocation_sysid.statistics.linearised import LinearisedFit, factorise_information
 from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
@@ -93,7 +93,7 @@ def test_intervals_rarely_change_for_white_errors():
 def test_the_test_for_persistence_knows_what_the_fit_took_out(name):
     scores = []
     for fit, _ in draws(PROBLEMS[name], 0.0):
-        found = test_dependence(fit, factorise_information(fit))
+        found = analyse_dependence(fit, factorise_information(fit))
         scores.append(found.lag1 / found.lag1_deviation)
     assert kstest(scores, "norm").pvalue > 1e-3
 
@@ -104,13 +104,13 @@ def test_a_sample_that_is_alone_among_its_times_follows_on_none():
     (block,) = fit.blocks
     alone = np.arange(len(block.t_s))[:, None] == 3
     kept = {
-        "present": block.is_present & alone,
+        "is_present": block.is_present & alone,
         "residual": np.where(alone[..., None], block.residual, 0.0),
-        "slope": np.where(alone[..., None, None], block.jacobian, 0.0),
+        "jacobian": np.where(alone[..., None, None], block.jacobian, 0.0),
     }
     single = replace(fit, blocks=[replace(block, **kept)])
     with np.errstate(all="raise"):
-        found = test_dependence(single, factorise_information(single))
+        found = analyse_dependence(single, factorise_information(single))
     assert (found.lag1, found.lag1_deviation) == (0.0, np.inf)
 
 
@@ -118,7 +118,7 @@ def test_autocorrelation_is_that_of_the_errors_not_of_the_residuals():
     of = PROBLEMS["one marker, 40 samples"]
     corrected, raw = [], []
     for fit, _ in draws(of, 0.85):
-        corrected.append(test_dependence(fit, factorise_information(fit)).lag1)
+        corrected.append(analyse_dependence(fit, factorise_information(fit)).lag1)
         residual = fit.blocks[0].channels[0]
         raw.append(np.sum(residual[1:] * residual[:-1]) / np.sum(residual**2))
     assert np.median(raw) < 0.75
@@ -189,7 +189,7 @@ def test_local_parameters_have_standard_deviations():
 @pytest.mark.parametrize("bounded", [1, 4])
 def test_what_is_at_its_bound_has_no_error_bar_and_others_are_as_if_it_were_free(bounded):
     fit, wrong = sample()
-    at_bound = replace(fit, is_at_bound=np.arange(len(fit.names)) == bounded)
+    at_bound = replace(fit, at_bound=np.arange(len(fit.names)) == bounded)
     found, free = (
         uncertainty_from_fit(each, PARAMETERS, wrong[:4], ErrorModel(errors="independent"))
         for each in (at_bound, fit)
@@ -252,10 +252,14 @@ def test_error_bars_follow_the_units_of_the_residuals():
     )
     for errors in ("independent", "autocorrelated"):
         before, after = (
-            uncertainty_from_fit(f, PARAMETERS, wrong[:4], ErrorModel("estimated", errors)).covariance
-            for f in (replace(fit, prior_jacobian=0 * fit.prior_jacobian),
-                      replace(scaled, prior_jacobian=0 * fit.prior_jacobian))
-        )  # fmt: skip
+            uncertainty_from_fit(
+                f, PARAMETERS, wrong[:4], ErrorModel("estimated", errors)
+            ).covariance
+            for f in (
+                replace(fit, prior_jacobian=0 * fit.prior_jacobian),
+                replace(scaled, prior_jacobian=0 * fit.prior_jacobian),
+            )
+        )
         np.testing.assert_allclose(after, before, rtol=1e-6)
 
 

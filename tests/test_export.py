@@ -741,7 +741,7 @@ def pressed_block(
 def test_facets_lie_on_the_surface_of_their_solid_and_look_out_of_it(name):
     solid, about_m = SOLIDS[name], np.array([0.02, 0.02, 0.02])
     facets = Facets.of(solid, about_m, 0.1, depth_m=2e-5)
-    gap = ca.Function("gap", [place := ca.SX.sym("p", 3)], [solid.gap(place)])
+    gap = ca.Function("gap", [place := ca.SX.sym("p", 3)], [solid.signed_distance(place)])
     corners = facets.points_m[facets.triangles]
     middles = corners.mean(axis=1)
     gaps = np.array(gap(np.vstack([corners.reshape(-1, 3), middles]).T))

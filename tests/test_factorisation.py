@@ -167,7 +167,7 @@ def test_factors_that_live_together_do_not_share_their_memory():
 
 
 def test_what_is_asked_for_and_not_installed_is_told(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.program.supernodal.library", lambda: None)
+    monkeypatch.setattr("collocation_sysid.program.supernodal.load_mkl", lambda: None)
     with pytest.raises(InputError, match=r"collocation-sysid\[large\]"):
         Factoriser(SMALL, np.arange(7), "supernodal")
 

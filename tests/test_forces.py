@@ -253,17 +253,17 @@ def test_second_derivatives_of_forces_are_those_of_the_slopes(segment, rng):
 
 def test_inputs_follow_from_parameters_with_their_derivatives(segment, rng):
     inputs = segment.inputs
-    p = np.concatenate([segment.parameters.guess_q, np.zeros(len(segment.nuisance.moving))])
-    weights = rng.normal(size=inputs.at(p)[0].shape)
+    p = np.concatenate([segment.parameters.guess_q, np.zeros(len(segment.nuisance.motion_indices))])
+    weights = rng.normal(size=inputs.evaluate_at(p)[0].shape)
 
     def slopes(p: np.ndarray) -> np.ndarray:
-        return inputs.at(p)[1]
+        return inputs.evaluate_at(p)[1]
 
-    by_p, twice = slopes(p), inputs.curvature(p, weights)
+    by_p, twice = slopes(p), inputs.weighted_hessian(p, weights)
     for one in np.eye(len(p)):
         if by_p.any(axis=(0, 1)) @ one:
             found = lambda d: by_p @ d  # noqa: E731
-            assert_derivative(lambda p: inputs.at(p)[0], found, p, rng, 1e-6, 0.1 * one)
+            assert_derivative(lambda p: inputs.evaluate_at(p)[0], found, p, rng, 1e-6, 0.1 * one)
         weighed = np.einsum("tu,tum->m", weights, slopes(p + 1e-5 * one) - slopes(p - 1e-5 * one))
         np.testing.assert_allclose(weighed / 2e-5, twice @ one, rtol=1e-5, atol=1e-4)
 

@@ -107,7 +107,7 @@ def test_an_accelerometer_at_rest_reads_gravity_and_follows_a_carried_body():
 @pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)
 def test_the_truth_is_found_from_an_accelerometer_and_a_foil_alone(method):
     solution = method(Collocation([swung()], GUESS))
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     found = part.phi * part.segment.nuisance.scales
     np.testing.assert_allclose(found, [0.3, 0.04], atol=0.02)
     full = part.segment.nuisance.names[0]
@@ -238,7 +238,7 @@ def test_a_load_cell_in_the_clamp_reads_what_a_sensor_there_does():
 @pytest.mark.parametrize("method", [ReducedSpace(), InteriorPoint()], ids=lambda m: m.name)
 def test_the_truth_is_found_from_a_load_cell_and_a_foil_alone(method):
     solution = method(Collocation([clamped()], GUESS))
-    (part,) = solution.collocation.parts(solution.z)
+    (part,) = solution.collocation.iterates(solution.z)
     found = part.phi * part.segment.nuisance.scales
     np.testing.assert_allclose(found, [0.05, 0.04], atol=2e-3)
     for name in ("lambda_pa", "mu_pa"):

@@ -55,7 +55,7 @@ def waving(t_s):
 
 
 def carried(poses, t_s):
-    return poses.carry(POINTS, t_s)
+    return poses.carried_positions(POINTS, t_s)
 
 
 def truly_carried(t_s):

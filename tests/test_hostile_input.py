@@ -253,7 +253,7 @@ def test_a_study_without_end_is_refused_with_a_number(tiny: Path, words: tuple, 
 
 
 def test_a_solve_that_memory_cannot_hold_is_refused(tiny: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "SMALL_PROGRAM_VARIABLES", 0)
     monkeypatch.setattr(memory, "machine_memory_mb", lambda: 0.2)
     said = refused("solve", "problem.toml", "--method", "interior-point")
     assert "interior-point would take about" in said
@@ -333,7 +333,7 @@ def test_ten_thousand_markers_are_read_in_time(tiny: Path):
 
 
 def test_where_the_memory_is_not_known_nothing_is_refused(tiny: Path, monkeypatch):
-    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "SMALL_PROGRAM_VARIABLES", 0)
     monkeypatch.setattr(memory, "machine_memory_mb", lambda: None)
     problem = Problem.read("problem.toml")
     memory.require_memory(problem, problem.collocation(), problem.method)
@@ -387,7 +387,7 @@ def end():
 def deaf(**_):
     threading.Thread(target=end).start()
     time.sleep(600)
-nlpsol._nlpsol = lambda *_: deaf
+nlpsol._create_solver = lambda *_: deaf
 nlpsol.GRACE_S = 0.2 if {times} == 1 else 600
 cli.main()
 """

@@ -185,12 +185,12 @@ def test_topics_offer_the_chains_of_frames_that_can_be_read(tmp_path: Path) -> N
     moving = [of.tree(t, of.transform(t, "base", "flange", (0, t, 0), STILL)) for t in T_S]
     log = bag(tmp_path / "trial", [of.tree(0.0, *fixed, topic="/tf_static"), *moving])
     topics = {each.name: each for each in list_topics(log)}
-    addresses = topics["/tf"].problem_texts
+    addresses = topics["/tf"].write
     assert addresses == ("trial#/tf#world>tool0", "trial#/tf#world>flange")
     for address in addresses:  # each can be read as it is written
         np.testing.assert_allclose(read_poses(tmp_path / address).positions_m[:, 1], T_S, atol=1e-6)
-    assert topics["/tf_static"].problem_texts == ()
-    assert topics["/tf_static"].uses == "frames that do not move, part of the chains of /tf"
+    assert topics["/tf_static"].write == ()
+    assert topics["/tf_static"].serves == "frames that do not move, part of the chains of /tf"
 
 
 def test_addresses_of_topics_are_lines_that_can_be_copied(tmp_path: Path, monkeypatch) -> None:
@@ -226,7 +226,7 @@ def test_markers_of_several_namespaces_have_these_in_their_names(tmp_path: Path)
     several = [array(t, ("body", "robot")) for t in (0.0, 1.0, 2.0)]
     one = [array(t, ("body",)) for t in (0.0, 1.0, 2.0)]
     log = json_mcap(tmp_path / "run.mcap", {"/several": (name, several), "/one": (name, one)})
-    topics = {each.name: each.uses for each in list_topics(log)}
+    topics = {each.name: each.serves for each in list_topics(log)}
     assert topics == {
         "/several": "marker tracks: body/0, body/1; robot/0, robot/1",
         "/one": "marker tracks: 0, 1",
@@ -277,9 +277,9 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
     np.testing.assert_allclose(packed.images_m[0], counts * 2e-3)
     np.testing.assert_array_equal(packed.matrix, RAYS["matrix"])
     topics = {each.name: each for each in list_topics(log)}
-    assert topics[raw].uses == "depth images, 7 x 5: [[experiment.depth]]"
-    assert topics[raw].problem_texts == (f"{log.name}#{raw}",)
-    assert topics["/camera/camera_info"].uses == (
+    assert topics[raw].serves == "depth images, 7 x 5: [[experiment.depth]]"
+    assert topics[raw].write == (f"{log.name}#{raw}",)
+    assert topics["/camera/camera_info"].serves == (
         "the camera's matrix, for the depth images beside it"
     )
 
@@ -418,7 +418,7 @@ def test_a_camera_that_does_not_tell_its_lens_is_not_taken(tmp_path: Path) -> No
     read = read_depth(Path(f"{log}#/depth"), None, 1.0)
     np.testing.assert_allclose(read.images_m[0], [[0.4, 0.4]])
     assert read.matrix is None
-    told = {each.name: each.uses for each in list_topics(log)}
+    told = {each.name: each.serves for each in list_topics(log)}
     assert "camera" not in told["/camera_info"]
 
 

@@ -110,7 +110,11 @@ def test_evaluators_agree(material, rng):
     assert simd.energy(x[0], **elastic(simd)) == pytest.approx(
         casadi.energy(x[0], **elastic(casadi)), rel=1e-12
     )
-    for method, fields in (("force", (x, v)), ("linearise", (x, v)), ("curvature", (x, v, w))):
+    for method, fields in (
+        ("force", (x, v)),
+        ("linearise", (x, v)),
+        ("second_derivatives", (x, v, w)),
+    ):
         found, expected = (
             getattr(each, method)(*fields, theta_for(each)) for each in (simd, casadi)
         )

@@ -62,7 +62,7 @@ def test_a_branch_slower_than_the_recordings_is_told():
     (note,) = memory_notes(slow, 2.0)
     assert "slower than the longest recording of 2 s" in note
     assert not memory_notes(slow, 8.0)
-    (note,) = memory_notes(slow | {"prony_1.share": Estimate(0.0, is_at_bound=True)}, 8.0)
+    (note,) = memory_notes(slow | {"prony_1.share": Estimate(0.0, at_bound=True)}, 8.0)
     assert note.startswith("no memory found: the share of prony_1 ended at 0")
 
 
@@ -126,7 +126,7 @@ def test_check_tells_what_interior_point_gets_of_a_memory(tiny, monkeypatch):
     assert findings.derivatives_agree
     assert findings.hessian_error > 0
     assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
-    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.LAID_OUT", 0)
+    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.MOST_LIFTED_NONZEROS", 0)
     checked = run_command("check", tiny / "problem.toml", *settings(GUESSED))
     assert f"{findings.overstresses:,} more variables and constraints" in checked.out
     assert "τ prony_1" in checked.out

@@ -191,9 +191,13 @@ def test_the_stress_gives_the_elastic_force(body: Body):
 def test_stresses_change_along_positions_and_constants(body: Body, rng):
     theta, x, stresses = constants_of(body), strained(body), body.stresses
     assert_derivative(
-        lambda at: stresses.stress(at, theta), lambda v: stresses.stress_jvp(x, v, theta), x, rng, 1e-7,
+        lambda at: stresses.stress(at, theta),
+        lambda v: stresses.stress_jvp(x, v, theta),
+        x,
+        rng,
+        1e-7,
         scale=1e-2,
-    )  # fmt: skip
+    )
     assert_derivative(
         lambda at: stresses.stress(x, at),
         lambda v: stresses.stress_theta_derivatives(x, theta, v[:, None])[:, 0],

@@ -143,7 +143,7 @@ for size in [mmap.PAGESIZE << k for k in range(14, 0, -1)]:
         pass
 for block in blocks:
     library.munmap(block, mmap.PAGESIZE)
-code = NativeCode("run", "scaled", (ctypes.c_void_p,), scaled_often, quickly=True)
+code = NativeCode("run", "scaled", (ctypes.c_void_p,), scaled_often, is_unoptimised=True)
 value = np.ones(1)
 for each in [CompiledFunction(code) for _ in range(4)]:
     each(address(value))

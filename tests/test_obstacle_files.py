@@ -163,8 +163,8 @@ SOLIDS = {
 @pytest.mark.parametrize("name", SOLIDS)
 def test_an_outline_is_on_the_surface(name: str):
     solid, point = SOLIDS[name], ca.SX.sym("point", 3)
-    gap = ca.Function("gap", [point], [solid.gap(point)])
-    points_m = np.concatenate(solid.outline(np.array([0.05, 0.05, 0.05]), 0.1))
+    gap = ca.Function("gap", [point], [solid.signed_distance(point)])
+    points_m = np.concatenate(solid.outline_polylines(np.array([0.05, 0.05, 0.05]), 0.1))
     assert len(points_m) > 3
     assert max(abs(float(gap(each))) for each in points_m) < 1e-9
 

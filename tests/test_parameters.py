@@ -429,8 +429,8 @@ def test_with_fixed_fixes_what_it_names():
         ({"lower": 1000.0, "guess": 1000.0}, "expected 0 < lower < upper"),
         ({"prior": (300.0, 0.0)}, "mu_pa: prior = .*, expected positive mean and deviation"),
         ({"prior": (-300.0, 0.1)}, "mu_pa: prior = .*, expected positive mean and deviation"),
-        ({"fixed": True, "guess": -1.0}, "mu_pa: fixed = -1, expected a number >= 0"),
-        ({"fixed": True, "guess": np.inf}, "mu_pa: fixed = inf"),
+        ({"is_fixed": True, "guess": -1.0}, "mu_pa: fixed = -1, expected a number >= 0"),
+        ({"is_fixed": True, "guess": np.inf}, "mu_pa: fixed = inf"),
         ({"scale": "linear", "lower": 1000.0}, "lower = 1000, upper = 1000, expected lower < u"),
     ],
 )
@@ -451,7 +451,7 @@ def test_a_guess_beyond_assumed_bounds_is_refused_with_a_word_on_them():
     [
         ({"lower": 0.01, "upper": 0.5}, "poisson: upper = 0.5, expected less than 0.5"),
         ({"lower": 0.01}, "poisson: upper = inf, expected less than 0.5"),
-        ({"guess": 0.5, "fixed": True}, "poisson: fixed = 0.5, expected less than 0.5"),
+        ({"guess": 0.5, "is_fixed": True}, "poisson: fixed = 0.5, expected less than 0.5"),
     ],
 )
 def test_incompressible_bodies_are_refused(name: str, fields: dict, message: str):

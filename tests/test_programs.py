@@ -123,8 +123,8 @@ def breathing(x, v, at, breath_pa):
 def creeping(x, v, before, at, creep_n_m):
     """It bends by all that it takes, as friction does; what creeps slows down as it goes."""
     moved, rate = x - at.rest_m + 0.02 * v, creep_n_m * at.volume_m3 * 1e4
-    share = 20 * at.since_s / (1 + 20 * at.since_s + ca.sumsqr(before) / 1e-3)
-    after = before + (1 - at.began) * share * (1 + ca.sin(rate)) * (moved - before)
+    share = 20 * at.interval_s / (1 + 20 * at.interval_s + ca.sumsqr(before) / 1e-3)
+    after = before + (1 - at.is_start) * share * (1 + ca.sin(rate)) * (moved - before)
     return -rate * (moved - after) * (1 + ca.sumsqr(before) / 1e-3), after
 
 
@@ -320,7 +320,7 @@ PROGRAMS: dict[str, Make] = {
             swung(layout[0]),
             parameters=WITH_PRIOR,
             scheme=layout[1],
-            explicit_grasps=layout[2],
+            has_grasp_constraints=layout[2],
             substeps=layout[3],
         )
         for scheme, start, rows, steps in LAYOUTS
@@ -330,12 +330,14 @@ PROGRAMS: dict[str, Make] = {
     "some fixed": lambda: program(swung(), parameters=POISSON_FIXED),
     "all fixed": lambda: program(swung(), parameters=ALL_FIXED),
     "several": lambda: program(*several_kinds(), scheme="bdf2"),
-    "nobody holds": lambda: program(replace(swung("given"), grasps=()), explicit_grasps=True),
+    "nobody holds": lambda: program(replace(swung("given"), grasps=()), has_grasp_constraints=True),
     "paper's start": lambda: program(
         swung("undeformed", start_rule="paper"), scheme="backward-euler"
     ),
     "shorter than its reach": lambda: program(swung(steps=2), scheme="bdf2"),
-    "static": lambda: program(measured(block("z", gravity_m_s2=HANGING)), explicit_grasps=True),
+    "static": lambda: program(
+        measured(block("z", gravity_m_s2=HANGING)), has_grasp_constraints=True
+    ),
     "static, a displacement's zero": lambda: program(
         measured(block("xyz", nuisance=Nuisance.none(displacement_zero_m=1e-3)))
     ),
@@ -349,7 +351,7 @@ PROGRAMS: dict[str, Make] = {
         f"let go, {scheme}": lambda scheme=scheme: program(measured(bar_let_go(6)), scheme=scheme)
         for scheme in SCHEMES
     },
-    "let go, rows": lambda: program(measured(bar_let_go(6)), explicit_grasps=True),
+    "let go, rows": lambda: program(measured(bar_let_go(6)), has_grasp_constraints=True),
     **{
         f"loads, {scheme}": lambda scheme=scheme: program(
             bar_loaded(6),
@@ -508,7 +510,7 @@ PROGRAMS: dict[str, Make] = {
     "wrench, huber": lambda: program(wristed_cube(6, ALL_UNKNOWN), huber=1.5),
     "wrench, bdf2": lambda: program(wristed_cube(6, ALL_UNKNOWN), scheme="bdf2"),
     "wrench, substeps": lambda: program(wristed_cube(3), scheme="backward-euler", substeps=2),
-    "wrench, rows": lambda: program(wristed_cube(5), explicit_grasps=True),
+    "wrench, rows": lambda: program(wristed_cube(5), has_grasp_constraints=True),
     "wrench, density": lambda: program(
         weighed(wristed_cube(5, ALL_UNKNOWN)), parameters=free_density()
     ),

@@ -93,7 +93,7 @@ def test_experiments_of_different_lengths_and_grasps_are_fitted_together():
     assert solution.kkt_residual < KKT
 
 
-@pytest.mark.parametrize("options", [{"substeps": 3}, {"explicit_grasps": True}])
+@pytest.mark.parametrize("options", [{"substeps": 3}, {"has_grasp_constraints": True}])
 def test_every_layout_is_fitted(options: dict):
     made = measured(hung_cube(8), substeps=options.get("substeps", 1))
     solution = ReducedSpace()(Collocation([made], GUESS, **options))

@@ -128,7 +128,7 @@ def test_halving_the_step_leads_to_the_truth(refined):
 
 def test_finer_answers_start_from_the_coarser(refined):
     assert refined.refinement is not None
-    halved = [(level.refined, level.times) for level in refined.refinement.levels]
+    halved = [(level.refined, level.halvings) for level in refined.refinement.levels]
     assert halved == [("step", 1), ("step", 2), ("mesh", 1), ("mesh", 2)]
     assert max(level.iterations for level in refined.refinement.levels) <= 6
     assert set(refined.refinement.errors) == {*FREE, "young_pa", "poisson"}
@@ -164,7 +164,7 @@ def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
     assert numerical_concerns(optimum, combined, None) == []
     (found,) = concerns(97.77)
     assert (found.code, found.grade) == ("scheme/step", "check")
-    assert "corrected by -3 %, 3 standard uncertainties" in found.sentence
+    assert "corrected by -3 %, 3 standard uncertainties" in found.message
 
 
 def test_other_numbers_of_levels_are_refused(answer):
@@ -196,7 +196,7 @@ def test_the_command_writes_into_the_run_folder(tmp_path):
             assert sum(after["budget"][name].values()) == pytest.approx(1.0)
             assert found["numerical_error"]["mesh"] is not None
             assert before["parameters"][name]["numerical_error"]["mesh"] is None
-    rows = {level["halved"]: level["timesteps"] for level in kept["levels"]}
+    rows = {level["refined"]: level["timesteps"] for level in kept["levels"]}
     assert rows == {"step": 4 * 8 + 1, "mesh": 2 * 8 + 1}
     assert run_command("report", folder).code == 0
     assert "half the edges" in Path(folder / "report.html").read_text()
@@ -221,7 +221,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeyp
     assert "kept" in stopped.err
     assert "collocation-sysid refine" in stopped.err
     kept = json.loads((folder / "refinement.json").read_text())
-    assert [level["halved"] for level in kept["levels"]] == ["step"]
+    assert [level["refined"] for level in kept["levels"]] == ["step"]
     part = json.loads((folder / "result.json").read_text())["parameters"]["mu_pa"]
     assert part["numerical_error"]["step"] is not None
     assert part["numerical_error"]["mesh"] is None
@@ -229,7 +229,7 @@ def test_what_is_interrupted_keeps_the_levels_that_it_finished(tmp_path, monkeyp
     assert len(solved) == 3
     both = json.loads((folder / "refinement.json").read_text())
     assert both["levels"][0] == kept["levels"][0]
-    assert [level["halved"] for level in both["levels"]] == ["step", "mesh"]
+    assert [level["refined"] for level in both["levels"]] == ["step", "mesh"]
     told = json.loads((folder / "result.json").read_text())["parameters"]["mu_pa"]
     assert told["numerical_error"]["mesh"] is not None
 

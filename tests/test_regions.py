@@ -107,9 +107,9 @@ def test_what_no_region_claims_is_the_first_part_and_may_be_nothing(small_mesh):
 
 def test_a_name_without_a_region_is_for_all_regions_that_have_none_of_their_own(make_two):
     body = make_two()
-    shared = body.theta(SOFT)
+    shared = body.theta_from_values(SOFT)
     np.testing.assert_array_equal(shared, [*SOFT.values()] * 2)
-    own = body.theta({**SOFT, "core.gamma_m_1_s": 7.0})
+    own = body.theta_from_values({**SOFT, "core.gamma_m_1_s": 7.0})
     np.testing.assert_array_equal(own, [*SOFT.values(), *[*SOFT.values()][:3], 7.0])
 
 
@@ -162,7 +162,7 @@ def test_evaluators_agree(make_two, material, rng):
     simd, casadi = (make_two(material, evaluator) for evaluator in EVALUATORS)
     x, v, w = states(simd, rng)
     theta = theta_of_two(simd)
-    for method, fields in (("linearise", (x, v)), ("curvature", (x, v, w))):
+    for method, fields in (("linearise", (x, v)), ("second_derivatives", (x, v, w))):
         found, expected = (getattr(body, method)(*fields, theta) for body in (simd, casadi))
         for name, values in vars(expected).items():
             assert relative_error(getattr(found, name), values) < 1e-12, name
@@ -202,7 +202,7 @@ def test_curvature_gives_the_slopes_of_the_weighted_slopes(make_two, material, e
     body = make_two(material, evaluator)
     x, v, w = states(body, rng)
     theta = theta_of_two(body)
-    at = body.curvature(x, v, w, theta)
+    at = body.second_derivatives(x, v, w, theta)
 
     def by_theta(x, v, theta):
         return np.einsum("tik,ti->tk", body.linearise(x, v, theta).by_theta, w)
@@ -280,7 +280,7 @@ def test_regions_without_a_density_share_what_is_left(small_mesh):
 
 def test_regions_damp_their_own_mass(make_two):
     body = make_two()
-    theta = body.theta({**SOFT, **of_region("core", HARD)})
+    theta = body.theta_from_values({**SOFT, **of_region("core", HARD)})
     v = np.tile([1.0, 2.0, 3.0], len(body.nodes_m))
     force = body.force(body.nodes_m, v, theta)[0]
     shares = [np.zeros(len(body.nodes_m)) for _ in body.parts]

@@ -233,7 +233,7 @@ def test_interior_point_and_reduced_space_find_the_same_optimum(static):
 def test_forgetting_how_the_shape_depends_on_the_stiffness_leads_elsewhere(described):
     """The stress-free shape of the guess, kept, gives another E: its derivative matters."""
     body = described.body
-    frozen = body.stress_free_mesh(body.theta(TRUTH | {"young_pa": 4e5}))
+    frozen = body.stress_free_mesh(body.theta_from_values(TRUTH | {"young_pa": 4e5}))
     kept = cs.Body(frozen, mass_kg=body.mass_kg, rest_shape="stress_free")
     other = measured_on(kept)
     problem = problem_of(other, **ONE_STEP)

@@ -151,10 +151,10 @@ class Known:
     def __init__(self, misfit) -> None:
         self.misfit = misfit
 
-    def key(self, young_pa: float) -> tuple[float, ...]:
+    def parameter_key(self, young_pa: float) -> tuple[float, ...]:
         return (young_pa,)
 
-    def at(self, young_pa: float, warm):
+    def evaluate_at(self, young_pa: float, initial_trajectories):
         return self.misfit(young_pa), None
 
 
@@ -292,7 +292,7 @@ def test_a_guess_that_cannot_be_simulated_is_rescued_with_a_note():
 
 
 def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.methods.scan._Trial.rigid_misfit", 1e-3)
+    monkeypatch.setattr("collocation_sysid.methods.scan._TrialSimulation.rigid_misfit", 1e-3)
     collocation, found = start_problem(cube(guessed(mu_pa=1e4)).collocation())
     assert found is not None
     assert found.sentence.startswith("at the guess the measurements are missed by more than")
@@ -302,7 +302,7 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
 
 
 def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.methods.scan._Trial.rigid_misfit", 0.0)
+    monkeypatch.setattr("collocation_sysid.methods.scan._TrialSimulation.rigid_misfit", 0.0)
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
     assert start_problem(collocation)[0] is collocation
 
@@ -328,7 +328,8 @@ def test_with_a_guess_it_is_left_to_the_method():
 def test_a_method_that_simulates_everything_gets_a_start_that_can_be(monkeypatch):
     best = scanned().young_pa[scanned().best]
     monkeypatch.setattr(
-        "collocation_sysid.methods.scan._Trial.runs", lambda _, young: young > 1.5 * best
+        "collocation_sysid.methods.scan._TrialSimulation.is_simulable",
+        lambda _, young: young > 1.5 * best,
     )
     found = scan_stiffness(cube().collocation(), is_complete=True)
     assert found.young_pa[found.best] == pytest.approx(scanned().young_pa[scanned().best + 1])

@@ -118,8 +118,8 @@ def test_a_method_tells_its_options(method: str):
 
 def test_an_option_is_told_with_its_default_and_what_it_can_be():
     told = " ".join(run_command("methods", "reduced-space").out.split())
-    assert "ladder [0.25, 0.5, 1] list, each a number above 0 Shares of the recording" in told
-    assert "hessian gauss-newton gauss-newton, exact Once a step moves no parameter" in told
+    assert "ladder [0.25, 0.5, 1] list, each a number above 0; Shares of the recording" in told
+    assert "hessian gauss-newton gauss-newton, exact; Once a step moves no parameter" in told
     assert "by more than 10 %" in told
     reference = " ".join(run_command("methods", "interior-point").out.split())
     assert "all of them once parameters move by less than `warm_up`" in reference

@@ -68,7 +68,7 @@ def test_a_damping_of_which_nothing_is_known_did_not_end_at_its_bound(guess):
     )
     found = run(Problem([hanging()], Parameters(items)))
     estimate = found.estimates["gamma_r_s"]
-    assert not estimate.is_at_bound
+    assert not estimate.at_bound
     assert estimate.statistical95 is None
     assert estimate.reason == "the data do not determine it"
     assert any(

@@ -30,7 +30,7 @@ from collocation_sysid.program.sweep import Sweep, Tangent
 EXPERIMENTS = SMALL_EXPERIMENTS | {"bar-loaded": bar_loaded}
 LAYOUTS = {
     "bounds": {},
-    "explicit-grasps": {"explicit_grasps": True},
+    "explicit-grasps": {"has_grasp_constraints": True},
     "substeps": {"substeps": 2},
 }
 

@@ -191,7 +191,7 @@ def test_evaluators_agree(material, rng):
     theta, constants = theta_for(simd), elastic(simd)
     energy = casadi.energy(x[0], **constants)
     assert simd.energy(x[0], **constants) == pytest.approx(energy, rel=1e-12)
-    for method, fields in (("linearise", (x, v)), ("curvature", (x, v, w))):
+    for method, fields in (("linearise", (x, v)), ("second_derivatives", (x, v, w))):
         found, expected = (getattr(body, method)(*fields, theta) for body in (simd, casadi))
         for name, values in vars(expected).items():
             difference = abs(getattr(found, name) - values).max(initial=0)

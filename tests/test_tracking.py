@@ -118,7 +118,7 @@ def test_frames_without_three_of_the_grippers_markers_are_counted(tracked):
     change_tracks(tracked, hide)
     driven_by_markers(tracked)
     notes = " ".join(load(tracked).notes)
-    assert "base1: 1 of 9 samples missing (1 blank)" in notes
+    assert "base1 and base2: each 1 of 9 samples missing (1 blank)" in notes
     assert "1 of 9 frames lack three of base1, base2, base3, base4" in notes
 
 

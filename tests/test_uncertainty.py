@@ -84,7 +84,7 @@ def test_sensitivities_keep_the_linearised_constraints(name, scheme):
     assert_constraints_are_kept(collocation, z)
 
 
-@pytest.mark.parametrize("options", [{"explicit_grasps": True}, {"substeps": 3}])
+@pytest.mark.parametrize("options", [{"has_grasp_constraints": True}, {"substeps": 3}])
 def test_sensitivities_fit_every_layout_and_several_experiments(options):
     collocation, z = simulated([hung_cube(4), released_cube(5)], **options)
     assert_constraints_are_kept(collocation, z)
@@ -92,9 +92,13 @@ def test_sensitivities_fit_every_layout_and_several_experiments(options):
 
 def assert_constraints_are_kept(collocation, z):
     found = sensitivities(collocation, z)
-    moving = [segment.places[segment.moving] for segment in collocation.segments]
+    moving = [
+        segment.parameter_indices[segment.dynamic_parameters]
+        for segment in collocation.transcriptions
+    ]
     assert [b.shape for b in found] == [
-        (s.grid_rows, s.dofs, len(m)) for s, m in zip(collocation.segments, moving, strict=True)
+        (s.grid_times, s.dof_count, len(m))
+        for s, m in zip(collocation.transcriptions, moving, strict=True)
     ]
     jacobian = collocation.jacobian(z)
     for k in sorted(set(np.concatenate(moving))):
@@ -288,15 +292,15 @@ def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs(
     uncertainty = uncertainty_at(*simulated([experiment], bound))
     expected = uncertainty_at(*simulated([experiment]))
     at_bound = uncertainty.estimates["lambda_pa"]
-    assert at_bound.is_at_bound
+    assert at_bound.at_bound
     assert at_bound.statistical_std_error is None
     assert at_bound.statistical95 is None
     np.testing.assert_allclose(uncertainty.covariance[1:, 1:], expected.covariance[1:, 1:])
     assert np.isnan(uncertainty.covariance[0]).all()
     assert np.isnan(uncertainty.correlation[0]).all()
-    assert not uncertainty.estimates["mu_pa"].is_at_bound
+    assert not uncertainty.estimates["mu_pa"].at_bound
     assert uncertainty.degrees_of_freedom == expected.degrees_of_freedom
-    assert uncertainty.derived["poisson"].is_at_bound
+    assert uncertainty.derived["poisson"].at_bound
     assert uncertainty.derived["poisson"].statistical_std_error is None
     assert uncertainty.derived["poisson"].reason
     assert any("lambda_pa ended at its upper bound 200" in note for note in uncertainty.notes)
@@ -304,12 +308,12 @@ def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs(
 
 def test_fixed_parameters_have_no_error_bar():
     experiment = measured(hung_cube())
-    fixed = changed(AT_TRUTH, gamma_m_1_s={"fixed": True})
+    fixed = changed(AT_TRUTH, gamma_m_1_s={"is_fixed": True})
     uncertainty = uncertainty_at(*simulated([experiment], fixed))
     assert uncertainty.names == NAMES[:3]
     assert uncertainty.estimates["gamma_m_1_s"].value == 1.0
     assert uncertainty.estimates["gamma_m_1_s"].statistical_std_error is None
-    everything = changed(AT_TRUTH, **{name: {"fixed": True} for name in NAMES})
+    everything = changed(AT_TRUTH, **{name: {"is_fixed": True} for name in NAMES})
     known = uncertainty_at(*simulated([experiment], everything))
     assert known.derived["young_pa"].statistical_std_error is None
     assert known.derived["young_pa"].value == pytest.approx(720.0)

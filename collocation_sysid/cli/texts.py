@@ -143,12 +143,12 @@ def topics(options: Topics) -> None:
             each.type,
             f"{each.messages}",
             f"{each.rate_hz:.3g}" if each.rate_hz else "",
-            each.uses,
+            each.serves,
         )
         for each in listed
     )
     heads = ("topic", "type", "messages", "Hz", "serves as")
-    addresses = [f"  {address}" for each in listed for address in each.problem_texts]
+    addresses = [f"  {address}" for each in listed for address in each.write]
     what = ["", "In place of a file write:", *addresses] if addresses else []
     show([Table("", heads, rows, names=2, texts=1), *what])
 

@@ -2,7 +2,7 @@
 
 A `Material` is a function ``energy(F, **constants) -> ψ`` [J/m³] of the 3 × 3 deformation gradient
 with ψ(I) = 0 and no stress at F = I. Its constants are the arguments of the function. To use a
-custom energy, call `Material.of(function)` or pass the function to `Body`.
+custom energy, call `Material.from_energy(function)` or pass the function to `Body`.
 
 Energies in (λ, μ) have the small-strain stiffness of linear elasticity with these constants.
 Energies in the isochoric invariants Ī₁ = J^(−2/3) I₁, Ī₂ = J^(−4/3) I₂ have the volumetric term ½ κ

@@ -292,7 +292,8 @@ def straightening_notes(points_m: np.ndarray, cells: np.ndarray) -> tuple[str, .
         raise InputError(
             f"quadratic element {e}: mid node {mid} lies {offset[e, k]:.3g} m off the middle of "
             f"the edge from node {a} to node {b}, which is {length[e, k]:.3g} m long; expected at "
-            f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), since sides are taken "
+            f"most {LARGEST_SIDE_CURVATURE:.0%} of that ({len(bad)} such in all), since sides "
+            "are taken "
             "as straight: refine the mesh, or save it with linear tetrahedra"
         )
     curved = offset > ROUND_OFF * length

@@ -100,9 +100,15 @@ class BodyPart:
     def constants(self) -> tuple[Constant, ...]:
         """Constants of material, damping law, memory, mass and field, in the order of θ."""
         memory = [constant for branch in self.prony for constant in branch.constants]
-        law = (*self.material.constants, *self.damping.constants, *memory, GAMMA_M)
-        law = (*law, DENSITY) if self.has_free_density else law
-        return (*law, *self.field_constants)
+        density = (DENSITY,) if self.has_free_density else ()
+        return (
+            *self.material.constants,
+            *self.damping.constants,
+            *memory,
+            GAMMA_M,
+            *density,
+            *self.field_constants,
+        )
 
     @property
     def field_constants(self) -> tuple[Constant, ...]:

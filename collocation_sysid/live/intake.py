@@ -21,7 +21,7 @@ from ..arrays import Array
 from ..program.reading import lagrange_weights
 from ..recording.clock import TIME_TOLERANCE_S
 from .frames import InstrumentSample
-from .model import RowStencil
+from .model import StreamStencil
 from .sweep import LARGEST_SAMPLE_DELAY, LoggedRow, Sample
 
 # Largest difference, in samples, of two times that count as equal.
@@ -47,7 +47,7 @@ class FrameBuffer:
         Number of samples before and after one that its evaluation needs.
     largest_jump_m : float
         Largest distance that a grasp can move between two samples.
-    instruments : sequence of RowStencil
+    instruments : sequence of StreamStencil
         Rows that a sample of each instrument needs.
     counts : Counter
         Numbers of irregularities of frames, by kind.
@@ -57,7 +57,7 @@ class FrameBuffer:
     substeps: int
     neighbouring_samples: int
     largest_jump_m: float = np.inf
-    instruments: Sequence[RowStencil] = ()
+    instruments: Sequence[StreamStencil] = ()
     counts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:

@@ -56,7 +56,7 @@ MIDDLE_PA = 1e4
 ROW_TOLERANCE = 1e-3
 
 
-class RowStencil(NamedTuple):
+class StreamStencil(NamedTuple):
     """Rows that samples of an instrument need, in a recording that continues.
 
     Attributes
@@ -92,14 +92,14 @@ class LiveInstrument(NamedTuple):
     ----------
     reading : MeasurementResidual
         Sensor model.
-    stencil : RowStencil
+    stencil : StreamStencil
         Rows that its samples need.
     observable : slice or int
         Slice of its points among all observed points, or the index of the grasp sensor.
     """
 
     reading: MeasurementResidual
-    stencil: RowStencil
+    stencil: StreamStencil
     observable: slice | int
 
 
@@ -281,13 +281,15 @@ class LiveModel:
         for reading in (*self.segment.custom_sensors, *self.segment.sensors):
             channel = reading.observable
             is_custom = reading in self.segment.custom_sensors
-            stencil = RowStencil(GAUGE_NEIGHBOURS)
+            stencil = StreamStencil(GAUGE_NEIGHBOURS)
             if isinstance(channel, GraspWrench):
                 observable = [other for other, _ in self.wrench_sensors].index(channel)
-                stencil = stencil._replace(first=int(channel.known_rows[0]), late=DELAY_STEPS)
+                stencil = stencil._replace(first=int(channel.known_rows[0]), delay=DELAY_STEPS)
                 if not is_custom:
                     clock_error = channel.clock_limit_s / step_s
-                    stencil = stencil._replace(neighbours=WRENCH_NEIGHBOURS, off=clock_error)
+                    stencil = stencil._replace(
+                        neighbours=WRENCH_NEIGHBOURS, clock_error=clock_error
+                    )
             else:
                 points_of_sensor = next(points)
                 reading = replace(reading, observable=points_of_sensor)

@@ -129,7 +129,7 @@ def estimate_concerns(estimates: Mapping[str, Estimate], distance: float) -> lis
     """
     concerns = concern_if(distance > LARGEST_SETTLED_DISTANCE, False, "solve/moves")
     for name, estimate in estimates.items():
-        if estimate.is_at_bound:
+        if estimate.at_bound:
             concerns += concern_if(True, False, "information/at-bound", name=name)
         elif estimate.reason is not None:
             reason = estimate.reason

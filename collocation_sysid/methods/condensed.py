@@ -42,7 +42,7 @@ def condense(complete: Collocation) -> Collocation:
         return complete
     program = object.__new__(CondensedCollocation)  # has been checked
     vars(program).update(
-        {f.name: getattr(complete, f.name) for f in fields(complete)}, whole=complete
+        {f.name: getattr(complete, f.name) for f in fields(complete)}, complete=complete
     )
     return program
 
@@ -243,7 +243,7 @@ class CondensedCollocation(Collocation):
         """Eliminated dofs of each experiment whose pose in its grasps is estimated."""
         return tuple(
             EliminatedDofs.from_segment(s, self.complete)
-            for s in self.segments
+            for s in self.transcriptions
             if s.nuisance.affects_grasps
         )
 
@@ -283,13 +283,13 @@ class CondensedCollocation(Collocation):
         return self._kept[1]
 
     @property
-    def phi_slice(self) -> slice:
+    def phi_columns(self) -> slice:
         """Slice of the nuisance parameters in z."""
         first = int(self._condensed_indices[0][self.complete.phi_columns.start])
         return slice(first, first + self.nphi)
 
     @property
-    def has_memory(self) -> bool:
+    def has_eliminated_histories(self) -> bool:
         """Whether ∂g/∂z has more entries than `jacobian` contains, because of internal
         variables.
         """
@@ -387,7 +387,9 @@ class CondensedCollocation(Collocation):
                 )
             )
             pairs.append((through[-1].rows[:, None], of_variable[each.phi]))
-        return CondensedPattern.from_pairs((self.constraints, self.variables), kept, pairs, through)
+        return CondensedPattern.from_pairs(
+            (self.constraint_count, self.variable_count), kept, pairs, through
+        )
 
     @property
     def jacobian_structure(self) -> tuple[Index, Index]:
@@ -434,7 +436,7 @@ class CondensedCollocation(Collocation):
             i = number[through[-1].rows[:, None]]
             j = number[each.phi]
             pairs.append((np.minimum(i, j)[i[:, 0] >= 0], np.maximum(i, j)[i[:, 0] >= 0]))
-        size = self.variables
+        size = self.variable_count
         return CondensedPattern.from_pairs((size, size), kept, pairs, through)
 
     def _is_loss_coupling(self, rows: Index, columns: Index) -> NDArray[np.bool_]:
@@ -442,7 +444,7 @@ class CondensedCollocation(Collocation):
         equation of motion.
         """
         mask = np.zeros(len(rows), dtype=bool)
-        for segment in self.segments:
+        for segment in self.transcriptions:
             time = np.full(self.complete.variable_count, -1)
             time[segment.columns] = np.arange(segment.variable_count) // segment.dof_count
             first = time[rows]
@@ -512,7 +514,7 @@ class CondensedCollocation(Collocation):
         """
         nearest = z.copy()
         p = self.complete.parameters_from(z)
-        for segment in self.segments:
+        for segment in self.transcriptions:
             nuisance = segment.nuisance
             places = segment.nuisance_indices.indices
             clock_places = nuisance.indices_of_rows(TIME)

@@ -197,7 +197,8 @@ class _ContinuationState:
         self.recorder.stopwatch.add(spent.build, spent.evaluations, spent.linear_algebra)
         values = ", ".join(f"{name} = {value:.4g}" for name, value in solution.parameters.items())
         self.recorder.notes.append(
-            f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} after "
+            f"{100 * share:.3g} % of the samples by {solution.method}: {solution.status.value} "
+            "after "
             f"{solution.iterations} iterations, {values}"
         )
 

@@ -273,7 +273,7 @@ class Solution:
 
     @cached_property
     def parts(self) -> list[ExperimentIterate]:
-        """Fitted experiments at the solution, in the order of `collocation.segments`."""
+        """Fitted experiments at the solution, in the order of `collocation.transcriptions`."""
         return self.collocation.iterates(self.z)
 
     def nuisance(self, name: str) -> float:

@@ -440,7 +440,7 @@ class Contact(Pointwise):
     law_of_contact : ContactLaw
     factor : float
         Factor of the force.
-    given_pressure : PreviousState, optional
+    previous_state : PreviousState, optional
         Given b of a program that has b as variables; b follows from the gap by default.
     variable_weights : (1, T, points), optional
         Weights of the complementarity residuals in second derivatives.
@@ -450,7 +450,7 @@ class Contact(Pointwise):
 
     law_of_contact: ContactLaw
     factor: float = 1.0
-    given_pressure: PreviousState | None = None
+    previous_state: PreviousState | None = None
     variable_weights: Array | None = None
     step_s: float = 0.0
     size = 0
@@ -466,7 +466,7 @@ class Contact(Pointwise):
         """Force law: of the gap, or of given b with the complementarity residual."""
         return (
             self.law_of_contact.force_function
-            if self.given_pressure is None
+            if self.previous_state is None
             else self.law_of_contact.complementarity_function
         )
 
@@ -478,7 +478,7 @@ class Contact(Pointwise):
     @property
     def internal_variable_count(self) -> int:  # type: ignore[override]
         """Number of values that are given at each point: 1 where b is given, else 0."""
-        return int(self.given_pressure is not None)
+        return int(self.previous_state is not None)
 
     def scaled_pressures(self, xi: Array) -> Array:
         """Return the pressures divided by κ, b (1, T, i) [m], at positions ξ (T, 3n)."""

@@ -181,7 +181,9 @@ class Dynamics:
         return replace(self, forces=forces, mass=_row_masses(self.tables, forces.mass))
 
     def rows_to_evaluations(self, row_values: Array) -> Array:
-        """Apply the transpose of `row_values`: distribute row quantities (N, …) to the evaluations."""
+        """Apply the transpose of `row_values`: distribute row quantities (N, …) to the
+        evaluations.
+        """
         total = self.tables.w.sum(axis=1).reshape((-1,) + (1,) * (row_values.ndim - 1))
         shares = row_values / np.where(total == 0, 1.0, total)
         return np.where(total == 0, row_values, 0.0) + self.combine_transposed(

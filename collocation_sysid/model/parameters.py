@@ -487,7 +487,8 @@ class Parameters:
                 parameter, _, key = name.rpartition(".")
                 if parameter in known:  # a misspelt key of a parameter's table reads like a region
                     raise InputError(
-                        f"unknown key; expected one of {', '.join(PARAMETER_KEYS)}{hint_at(key, PARAMETER_KEYS)}",
+                        "unknown key; expected one of "
+                        f"{', '.join(PARAMETER_KEYS)}{hint_at(key, PARAMETER_KEYS)}",
                         None,
                         name,
                     )

@@ -263,7 +263,8 @@ def _comparison(chosen: Row, rival: Row) -> str:
     support = rival["delta_aic"] - chosen["delta_aic"]
     better, worse = (chosen, rival) if support > 0 else (rival, chosen)
     return (
-        f"{prediction}{size}, {rival['model']} to {_prediction_text(rival)}, {exp(ratio):.3g} times as far "
+        f"{prediction}{size}, {rival['model']} to {_prediction_text(rival)}, {exp(ratio):.3g} "
+        "times as far "
         f"off (±{100 * error:.2g} %). AIC puts {better['model']} {abs(support):.3g} ahead of "
         f"{worse['model']}"
     )

@@ -232,7 +232,8 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
     for problem, measured in zip(problems[1:], others, strict=True):
         if measured != first:
             raise InputError(
-                f"it fits {_measured_text(measured)}, but {problems[0].path} {_measured_text(first)}; expected "
+                f"it fits {_measured_text(measured)}, but {problems[0].path} "
+                f"{_measured_text(first)}; expected "
                 "the same recordings and samples",
                 problem.path,
             )

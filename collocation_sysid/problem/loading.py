@@ -64,12 +64,19 @@ def problem_arguments(
     with _locate_in_table(path, "object"):
         with _lengths_checked(file.object):
             generated = _generated_counts(file.object)
-            if counts := generated:
-                size = _smallest_size(file, *counts, simulation=simulation)
+            if generated:
+                corners, elements = generated
+                size = _smallest_size(
+                    file, corners=corners, elements=elements, simulation=simulation
+                )
                 require_feasible(replace(size, substeps=1), say)
             mesh = _load_mesh(file.object, folder)
-        counts = len(mesh.points_m), len(mesh.tetrahedra)
-        size = _smallest_size(file, *counts, simulation=simulation)
+        size = _smallest_size(
+            file,
+            corners=len(mesh.points_m),
+            elements=len(mesh.tetrahedra),
+            simulation=simulation,
+        )
         require_feasible(replace(size, substeps=1), None if generated else say)
         body = _load_body(with_guessed_densities(file.object, unknowns), mesh, code)
         body = body.with_free_densities(body.parts_with_free_density(unknowns))

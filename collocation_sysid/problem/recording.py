@@ -376,7 +376,7 @@ class RecordingReader:
                 file = existing_file(self.folder, file_name, f"{where}.{key.name}")
                 arguments[name], arguments[key.constant] = key.read(file)
         with located(where=f"{where}.nodes" if "nodes" in arguments else where):
-            return kind(**arguments).on(self.body)
+            return kind(**arguments).on_body(self.body)
 
     # Markers --------------------------------------------------------------------------------------
 
@@ -604,7 +604,8 @@ def _implausible_markers(experiment: Experiment) -> str | None:
         name = markers.names[np.flatnonzero(is_measured)[worst]]
         return (
             f"at t = {experiment.t_s[k]:.6g} s marker {name!r} is measured at "
-            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp carries its "
+            f"{point_text(measured[worst])} m, {miss_m[worst]:.3g} m from where the grasp "
+            "carries its "
             f"place on the body, {point_text(rigid_positions[worst])} m; check length_unit, the "
             "marker's reference_m, that poses and markers share frame and clock, and that "
             "the poses map undeformed to current positions"

@@ -66,9 +66,9 @@ class DepthResidual(MeasurementResidual):
     correspondences: SurfaceCorrespondences
     observable_s: Array
 
-    group = 1
+    group_size = 1
     has_offsets = True
-    stated = "sigma_m of depth"
+    sigma_key = "sigma_m of depth"
 
     @classmethod
     def from_correspondences(

@@ -89,7 +89,9 @@ class LiftedForceHistory(LiftedVariables):
         """Return the part with b taken from z."""
         later = z[self.columns].reshape(self.shape) * self.segment.length_m
         before = np.concatenate([np.zeros_like(later[:, :1]), later], axis=1)
-        return replace(iterate, lifted_histories={**iterate.lifted_histories, self.history: before})
+        return replace(
+            iterate, lifted_histories={**iterate.lifted_histories, self.history_index: before}
+        )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations (count,)."""
@@ -109,7 +111,7 @@ class LiftedForceHistory(LiftedVariables):
 
     def _history_of(self, iterate: ExperimentIterate) -> ForceHistory:
         """Return the force history of a part."""
-        history = iterate.histories[self.history]
+        history = iterate.histories[self.history_index]
         assert isinstance(history, ForceHistory)
         return history
 
@@ -261,7 +263,9 @@ class LiftedForceHistory(LiftedVariables):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`; arguments as in `LiftedVariables.hessian_values`."""
+        """Return the values of `hessian_entries`; arguments as in
+        `LiftedVariables.hessian_values`.
+        """
         history, mu = self.weighted_history(iterate, multipliers)
         assert isinstance(history, ForceHistory)
         length_m = self.segment.length_m

@@ -59,7 +59,7 @@ class CustomSensorResidual(MeasurementResidual):
     observable_s: Array
     is_static: bool
 
-    stated = "sigma"
+    sigma_key = "sigma"
     has_offsets = True
 
     @classmethod

@@ -28,8 +28,8 @@ class OutlineResidual(DepthResidual):
     camera's images [pixels].
     """
 
-    stated = "outline_sigma_px of depth"
-    noise_at_least_stated = True
+    sigma_key = "outline_sigma_px of depth"
+    has_noise_floor = True
 
     @classmethod
     def from_depth(cls, depth: DepthResidual) -> OutlineResidual:

@@ -23,7 +23,7 @@ T = TypeVar("T", bound=np.generic)
 ONE = np.ones(1)
 
 
-class AssemblyIndices(NamedTuple):
+class PatternIndices(NamedTuple):
     """Variables or constraints of instances.
 
     Attributes
@@ -49,24 +49,24 @@ class ExpressionPattern:
         Function y(u, data) with derivatives.
     data : (d, I) array
         Data of the instances.
-    inputs : AssemblyIndices, (k, I)
+    inputs : PatternIndices, (k, I)
         Variables that are the inputs u.
-    rows : AssemblyIndices, (m, I)
+    rows : PatternIndices, (m, I)
         Constraints that the values y are added to.
     """
 
     expression: GeneratedFunction
     data: Array
-    inputs: AssemblyIndices
-    rows: AssemblyIndices
+    inputs: PatternIndices
+    rows: PatternIndices
 
     @classmethod
     def from_arrays(
         cls,
         expression: GeneratedFunction,
         data: Array,
-        inputs: Sequence[AssemblyIndices],
-        rows: AssemblyIndices,
+        inputs: Sequence[PatternIndices],
+        rows: PatternIndices,
     ) -> ExpressionPattern:
         """Build a pattern of instances of any shape.
 
@@ -76,9 +76,9 @@ class ExpressionPattern:
             Function y(u, data).
         data : (d, …) array
             Data; broadcast to the shape of the instances.
-        inputs : sequence of AssemblyIndices, each (k, …)
+        inputs : sequence of PatternIndices, each (k, …)
             Inputs, concatenated along the first axis after broadcasting.
-        rows : AssemblyIndices, (m, …)
+        rows : PatternIndices, (m, …)
             Constraints.
         """
         shapes = (data.shape, rows.indices.shape, *(each.indices.shape for each in inputs))
@@ -88,10 +88,10 @@ class ExpressionPattern:
             broadcast = np.broadcast_to(values, (length, *shape))
             return broadcast.reshape(length, int(np.prod(shape)))
 
-        def joined(parts: Sequence[AssemblyIndices]) -> AssemblyIndices:
+        def joined(parts: Sequence[PatternIndices]) -> PatternIndices:
             places = [flat(part.indices, len(part.indices)) for part in parts]
             units = [flat(np.asarray(part.unit), len(part.indices)) for part in parts]
-            return AssemblyIndices(np.concatenate(places), np.concatenate(units))
+            return PatternIndices(np.concatenate(places), np.concatenate(units))
 
         return cls(expression, flat(data, len(data)), joined(inputs), joined([rows]))
 
@@ -100,10 +100,10 @@ class ExpressionPattern:
         cls,
         recursion: Recursion,
         data: Array,
-        states: AssemblyIndices,
-        input_indices: AssemblyIndices,
-        constants: AssemblyIndices,
-        rows: AssemblyIndices,
+        states: PatternIndices,
+        input_indices: PatternIndices,
+        constants: PatternIndices,
+        rows: PatternIndices,
     ) -> ExpressionPattern:
         """Build the pattern h_k − R(h_{k−1}, s_k, s_{k−1}; c) of a recursion R.
 
@@ -116,13 +116,13 @@ class ExpressionPattern:
             The recursion R.
         data : array
             Data of the recursion.
-        states : AssemblyIndices, (n, N, I)
+        states : PatternIndices, (n, N, I)
             States h.
-        input_indices : AssemblyIndices, (i, N, I)
+        input_indices : PatternIndices, (i, N, I)
             Inputs s.
-        constants : AssemblyIndices
+        constants : PatternIndices
             Constants c.
-        rows : AssemblyIndices
+        rows : PatternIndices
             Constraints.
         """
 
@@ -193,6 +193,6 @@ class ExpressionPattern:
         return (curvature[i, j] * unit[i] * unit[j])[above]
 
 
-def _at_evaluations(indices: AssemblyIndices, evaluations: Index) -> AssemblyIndices:
+def _at_evaluations(indices: PatternIndices, evaluations: Index) -> PatternIndices:
     """Return the indices of other evaluations; units must be the same at all evaluations."""
-    return AssemblyIndices(indices.indices[:, evaluations], indices.unit)
+    return PatternIndices(indices.indices[:, evaluations], indices.unit)

@@ -28,8 +28,8 @@ from .segment import Weighed
 class LiftedContactPressure(LiftedForceHistory):
     """Lifted pressure variables b of one obstacle of one experiment."""
 
-    called = "pressure"
-    least = 0.0  # type: ignore[override]
+    kind = "pressure"
+    lower_bound = 0.0  # type: ignore[override]
 
     @property
     def first_evaluation(self) -> int:

@@ -26,7 +26,7 @@ from .segment import Transcription
 class LiftedReactions(LiftedVariables):
     """Lifted reaction forces R of one experiment."""
 
-    called = "wrench"
+    kind = "wrench"
 
     @property
     def sensed_dofs(self) -> Index:

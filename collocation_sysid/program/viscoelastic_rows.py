@@ -84,7 +84,7 @@ class LiftedMemory(LiftedVariables):
     """
 
     reactions: LiftedReactions | None = None
-    called = "memory"
+    kind = "memory"
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -120,7 +120,9 @@ class LiftedMemory(LiftedVariables):
         """Return the part with the history variables (N, width) taken from z."""
         later = z[self.columns].reshape(self.shape) * self.unit_pa
         memory = np.concatenate([np.zeros((1, self.shape[1])), later])
-        return replace(iterate, lifted_histories={**iterate.lifted_histories, self.history: memory})
+        return replace(
+            iterate, lifted_histories={**iterate.lifted_histories, self.history_index: memory}
+        )
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
         """Return the scaled equations r (count,) at the history variables of the part."""
@@ -349,7 +351,9 @@ class LiftedMemory(LiftedVariables):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`; arguments as in `LiftedVariables.hessian_values`."""
+        """Return the values of `hessian_entries`; arguments as in
+        `LiftedVariables.hessian_values`.
+        """
         segment = self.segment
         history = _body_history(iterate)
         theta_q = iterate.equations.theta_q

@@ -44,9 +44,9 @@ class WrenchResidual(MeasurementResidual):
     observable: GraspWrench
     wrench: Wrench
 
-    stated = "sigma_n"
+    sigma_key = "sigma_n"
     has_offsets = True
-    has_fixed_windows = False
+    has_fixed_stencils = False
 
     @classmethod
     def from_sensor(

@@ -22,7 +22,7 @@ from ..arrays import Array, Index
 from ..model.generated import GeneratedFunction
 from .carried import LiftedVariables
 from .part import ExperimentIterate
-from .pattern_rows import AssemblyIndices, ExpressionPattern
+from .pattern_rows import ExpressionPattern, PatternIndices
 from .reaction_rows import LiftedReactions
 from .reading import MeasurementResidual
 from .segment import RowWeights
@@ -48,7 +48,7 @@ class LiftedWrench(LiftedVariables):
     residual_index: int
     residual: MeasurementResidual
     reactions: LiftedReactions
-    called = "wrench"
+    kind = "wrench"
 
     @property
     def observable(self) -> GraspWrench:
@@ -118,10 +118,10 @@ class LiftedWrench(LiftedVariables):
         of_wrench = numbers[0].T
         unit = self._unit[:, None]
         minus = -self._row_unit[:, None]
-        own = AssemblyIndices(of_wrench, -minus)
+        own = PatternIndices(of_wrench, -minus)
         terms = [
             ExpressionPattern.from_arrays(
-                ITSELF, np.zeros((0, 1)), [AssemblyIndices(wrench, unit)], own
+                ITSELF, np.zeros((0, 1)), [PatternIndices(wrench, unit)], own
             )
         ]
         reaction_columns = self.reactions.columns_of(
@@ -129,31 +129,31 @@ class LiftedWrench(LiftedVariables):
         )
         units = np.array([[self.segment.length_m], [self.segment.force_n]])
         looked = [
-            AssemblyIndices(np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit)
+            PatternIndices(np.moveaxis(each.reshape(channel.count, -1, 3), 2, 0), unit)
             for each, unit in zip((self._position_columns, reaction_columns), units, strict=True)
         ]
-        taken = AssemblyIndices(of_wrench[..., None], minus[..., None])
+        taken = PatternIndices(of_wrench[..., None], minus[..., None])
         terms.append(ExpressionPattern.from_arrays(MOMENT, channel.moment_data, looked, taken))
         if len(tool := channel.tool_parameters):
             data = channel.tool_inputs(np.zeros(len(self.phi_columns)), channel.count)[1]
-            by_phi = AssemblyIndices(self.phi_columns[tool][:, None])
+            by_phi = PatternIndices(self.phi_columns[tool][:, None])
             terms.append(
                 ExpressionPattern.from_arrays(
-                    channel.tool, data, [by_phi], AssemblyIndices(of_wrench, minus)
+                    channel.tool, data, [by_phi], PatternIndices(of_wrench, minus)
                 )
             )
         if len(lag := channel.low_pass_parameters):
             places = self.offsets.variable + numbers
             by_phi = self.phi_columns[lag][:, None, None]
-            unfiltered, filtered = (AssemblyIndices(places[k : k + 1], self._unit) for k in (0, 1))
+            unfiltered, filtered = (PatternIndices(places[k : k + 1], self._unit) for k in (0, 1))
             terms.append(
                 ExpressionPattern.from_recursion(
                     LOW_PASS,
                     channel.low_pass_data[..., None],
                     states=filtered,
                     input_indices=unfiltered,
-                    constants=AssemblyIndices(by_phi),
-                    rows=AssemblyIndices(numbers[1:], self._row_unit),
+                    constants=PatternIndices(by_phi),
+                    rows=PatternIndices(numbers[1:], self._row_unit),
                 )
             )
         return tuple(terms)
@@ -209,7 +209,9 @@ class LiftedWrench(LiftedVariables):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`; arguments as in `LiftedVariables.hessian_values`."""
+        """Return the values of `hessian_entries`; arguments as in
+        `LiftedVariables.hessian_values`.
+        """
         of_equations = super().hessian_values(iterate, z, loss_weight, multipliers, weights)
         rows, columns = self._loss_entries
         size = self._wrench_size + len(iterate.phi)

@@ -146,7 +146,8 @@ def _cut_to_poses(
     spans = " and ".join(_span_text(sequence.t_s) for sequence, _ in moving)
     if is_kept.sum() < fewest:
         raise InputError(
-            f"poses run {spans}, markers {_span_text(t_s)}: they share {is_kept.sum()} marker samples; "
+            f"poses run {spans}, markers {_span_text(t_s)}: they share {is_kept.sum()} marker "
+            "samples; "
             f"expected at least {fewest}: check that both are of one recording and one "
             "clock, and window_s"
         )
@@ -158,7 +159,8 @@ def _cut_to_poses(
     ]
     note = (
         f"the markers were cut to the time of the poses by {' and '.join(ends)}, "
-        f"{(~is_kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran {_span_text(t_s)}"
+        f"{(~is_kept).sum()} of {len(t_s)} samples: poses run {spans}, markers ran "
+        f"{_span_text(t_s)}"
     )
     if cut[0] > t_s[0]:
         note += f"; start tells the state at {cut[0]:.9g} s now"

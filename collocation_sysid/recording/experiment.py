@@ -145,7 +145,10 @@ class Experiment:
                 *(obstacle.with_frame_nodes(frame, self.t_s) for obstacle, frame in framed),
             ),
             markers=Markers.none(self.t_s) if self.markers is None else self.markers,
-            **{name: tuple(load.on(self.body) for load in getattr(self, name)) for name in loads},
+            **{
+                name: tuple(load.on_body(self.body) for load in getattr(self, name))
+                for name in loads
+            },
         )
         self._check_kind()
         self._check_time()
@@ -489,7 +492,8 @@ class Experiment:
             distance_s = np.abs(depth.sample_times_s[:, None] - self.t_s).min(axis=1)
             if self.is_static and distance_s.max() > TIME_TOLERANCE_S:
                 raise InputError(
-                    f"{what} sees at {depth.sample_times_s[distance_s.argmax()]:g} s, where the static "
+                    f"{what} sees at {depth.sample_times_s[distance_s.argmax()]:g} s, where the "
+                    "static "
                     "experiment has no sample; expected times among its own"
                 )
 

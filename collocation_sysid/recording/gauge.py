@@ -149,7 +149,9 @@ class Gauge:
         return values
 
     def __repr__(self) -> str:
-        return f"Gauge({self.name!r}: {len(self.sample_times_s)} samples of {self.measured_values.shape[1]})"
+        samples = len(self.sample_times_s)
+        count = self.measured_values.shape[1]
+        return f"Gauge({self.name!r}: {samples} samples of {count})"
 
     @property
     def sample_times_s(self) -> Array:

@@ -116,7 +116,8 @@ class Load:
     def __post_init__(self) -> None:
         if not self.from_s < self.until_s:
             raise InputError(
-                f"a {self.description_name} is there from {self.from_s:g} s until {self.until_s:g} s; "
+                f"a {self.description_name} is there from {self.from_s:g} s until "
+                f"{self.until_s:g} s; "
                 "expected from_s < until_s"
             )
         if isinstance(self.nodes, Selection):

@@ -242,149 +242,438 @@ def _hand_eye_sharing_key(experiment: Any) -> dict[str, Any]:
     return {"body": id(experiment.body), "nodes in its grasps": nodes}
 
 
-# fmt: off
-PLACE = NuisanceRow("marker_offset_m", "m", 1e-3, key="marker_offsets", of="place", axes="x y z",
-    changes=(), reach=UNLIMITED_REACH, step=_largest_place_step_m,
+PLACE = NuisanceRow(
+    "marker_offset_m",
+    "m",
+    1e-3,
+    key="marker_offsets",
+    of="place",
+    axes="x y z",
+    changes=(),
+    reach=UNLIMITED_REACH,
+    step=_largest_place_step_m,
     label="place of {which}, {axis}",
     said="errors of the places in reference_m without a reference_sigma_m; they turn with the body",
-    same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface})
-OFFSET = NuisanceRow("camera_offset_m", "m", None, key="camera_offsets", of="marker", axes="x y z",
-    reach=UNLIMITED_REACH, by="length",
-    label="camera offset of {which}, {axis}", told="camera offsets up to {size}",
-    said="a constant offset of each marker in the cameras' frame", reading=_shift_position)
-CALIBRATION_SCALE = NuisanceRow("calibration_scale", "1", None, key="calibration_scale",
+    same=lambda e: {"body": id(e.body), "kind of places": e.markers.on_surface},
+)
+OFFSET = NuisanceRow(
+    "camera_offset_m",
+    "m",
+    None,
+    key="camera_offsets",
+    of="marker",
+    axes="x y z",
+    reach=UNLIMITED_REACH,
+    by="length",
+    label="camera offset of {which}, {axis}",
+    told="camera offsets up to {size}",
+    said="a constant offset of each marker in the cameras' frame",
+    reading=_shift_position,
+)
+CALIBRATION_SCALE = NuisanceRow(
+    "calibration_scale",
+    "1",
+    None,
+    key="calibration_scale",
     considered=2e-3,
-    label="scale of the cameras", told="cameras see lengths {signed}",
+    label="scale of the cameras",
+    told="cameras see lengths {signed}",
     said="a factor on all lengths that the cameras see, how far from one",
-    applies=_has_markers, reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)))
-CALIBRATION_DISTORTION = NuisanceRow("calibration_distortion_1_m2", "1/m²", None,
-    key="calibration_distortion", considered=0.02, applies=_has_markers,
-    label="distortion of the cameras", told="cameras' distortion {signed}",
+    applies=_has_markers,
+    reading=lambda y, values, t_s, data: y + values * (y - ca.DM(data.pivot_m)),
+)
+CALIBRATION_DISTORTION = NuisanceRow(
+    "calibration_distortion_1_m2",
+    "1/m²",
+    None,
+    key="calibration_distortion",
+    considered=0.02,
+    applies=_has_markers,
+    label="distortion of the cameras",
+    told="cameras' distortion {signed}",
     said="radial distortion of first order about the body's middle: a factor 1 + k r²",
-    reading=_distort_position)
-TIME = NuisanceRow("time_shift_s", "s", 5e-3, key="time_shift", changes=("clock",), applies=_is_motion,
-    label="time shift", told="markers seen {size} {way} than their times say{limit}",
+    reading=_distort_position,
+)
+TIME = NuisanceRow(
+    "time_shift_s",
+    "s",
+    5e-3,
+    key="time_shift",
+    changes=("clock",),
+    applies=_is_motion,
+    label="time shift",
+    told="markers seen {size} {way} than their times say{limit}",
     said="how much later than their times say markers were seen, on the grasps' clock",
     same=lambda e: {"time between samples": round(e.timestep_s, 12)},
-    clock=lambda values, t_s, data: values)
-CLOCK_RATE = NuisanceRow("clock_rate", "1", None, key="clock_rate", considered=1e-4,
-    changes=("clock",), applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
-    label="rate of the markers' clock", told="the markers' clock {signed} slow",
+    clock=lambda values, t_s, data: values,
+)
+CLOCK_RATE = NuisanceRow(
+    "clock_rate",
+    "1",
+    None,
+    key="clock_rate",
+    considered=1e-4,
+    changes=("clock",),
+    applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
+    label="rate of the markers' clock",
+    told="the markers' clock {signed} slow",
     said="how much slower than the grasps' clock that of the markers goes",
-    clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]))
-POSE_TURN = NuisanceRow("pose_turn_rad", "rad", None, key="pose", axes="x y z",
-    changes=("reading", "gravity"), by="length",
-    label="turn of the pose, {axis}", told="poses turned by {size}",
-    said="a constant turn of grasps and body in the cameras' frame, which turns gravity in the "
-         "body's", reading=_rotate_position)
-POSE_SHIFT = NuisanceRow("pose_shift_m", "m", None, key="pose", axes="x y z", reach=UNLIMITED_REACH, by="length",
-    label="shift of the pose, {axis}", told="poses shifted by {size}",
-    said="a constant shift of both", reading=_shift_position)
-TILT = NuisanceRow("gravity_rad", "rad", DEGREE, key="gravity", axes="first second",
-    changes=("gravity",), applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
+    clock=lambda values, t_s, data: values * (t_s - data.recorded_s[0]),
+)
+POSE_TURN = NuisanceRow(
+    "pose_turn_rad",
+    "rad",
+    None,
+    key="pose",
+    axes="x y z",
+    changes=("reading", "gravity"),
     by="length",
-    label="tilt of gravity, {axis}", told="gravity tilted by {size}",
-    said="a tilt of the direction of gravity", same=lambda e: {"gravity": tuple(e.gravity_m_s2)})
-GRASP_TURN = NuisanceRow("hand_eye_rad", "rad", 0.5 * DEGREE, key="hand_eye", axes="x y z",
-    changes=("grasps",), applies=_has_observable_hand_eye, by="length",
-    label="turn in the grasp, {axis}", told="body turned in its grasp by {size}",
-    said="a constant turn of the body in its grasps", same=_hand_eye_sharing_key)
-GRASP_SHIFT = NuisanceRow("hand_eye_m", "m", 1e-3, key="hand_eye", axes="x y z",
-    changes=("grasps",), applies=_has_observable_hand_eye, by="length",
-    label="shift in the grasp, {axis}", told="body shifted in its grasp by {size}",
+    label="turn of the pose, {axis}",
+    told="poses turned by {size}",
+    said="a constant turn of grasps and body in the cameras' frame, which turns gravity in the "
+    "body's",
+    reading=_rotate_position,
+)
+POSE_SHIFT = NuisanceRow(
+    "pose_shift_m",
+    "m",
+    None,
+    key="pose",
+    axes="x y z",
+    reach=UNLIMITED_REACH,
+    by="length",
+    label="shift of the pose, {axis}",
+    told="poses shifted by {size}",
+    said="a constant shift of both",
+    reading=_shift_position,
+)
+TILT = NuisanceRow(
+    "gravity_rad",
+    "rad",
+    DEGREE,
+    key="gravity",
+    axes="first second",
+    changes=("gravity",),
+    applies=lambda experiment: bool(np.any(experiment.gravity_m_s2)),
+    by="length",
+    label="tilt of gravity, {axis}",
+    told="gravity tilted by {size}",
+    said="a tilt of the direction of gravity",
+    same=lambda e: {"gravity": tuple(e.gravity_m_s2)},
+)
+GRASP_TURN = NuisanceRow(
+    "hand_eye_rad",
+    "rad",
+    0.5 * DEGREE,
+    key="hand_eye",
+    axes="x y z",
+    changes=("grasps",),
+    applies=_has_observable_hand_eye,
+    by="length",
+    label="turn in the grasp, {axis}",
+    told="body turned in its grasp by {size}",
+    said="a constant turn of the body in its grasps",
+    same=_hand_eye_sharing_key,
+)
+GRASP_SHIFT = NuisanceRow(
+    "hand_eye_m",
+    "m",
+    1e-3,
+    key="hand_eye",
+    axes="x y z",
+    changes=("grasps",),
+    applies=_has_observable_hand_eye,
+    by="length",
+    label="shift in the grasp, {axis}",
+    told="body shifted in its grasp by {size}",
     said="a constant shift of it there; both where the start is an equilibrium and markers see it",
-    same=_hand_eye_sharing_key)
-ZERO = NuisanceRow("displacement_zero_m", "m", 1e-4, key="displacement_zero", of="grasp",
-    axes="x y z", changes=("grasps",), by="worst",
-    label="zero of grasp {which}, {axis}", told="zero of a displacement off by {size}",
-    said="a constant offset of each displacement along each of its axes")
-OBSTACLE_OFFSET = NuisanceRow("obstacle_offset_m", "m", 1e-4, key="obstacle", of="obstacle",
-    changes=("grasps",), by="worst", applies=lambda experiment: bool(experiment.obstacles),
-    label="place of {which}", told="an obstacle is off by {size}",
-    said="a constant offset of each obstacle along its normal, or along the axis of its "
-         "displacement: where contact begins")
-OBSTACLE_TILT = NuisanceRow("obstacle_tilt_rad", "rad", None, key="obstacle", of="obstacle",
-    axes="first second", changes=("grasps",), by="length", considered=0.2 * DEGREE,
-    applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
-    label="tilt of {which}, {axis}", told="an obstacle is tilted by {size}",
-    said="a constant tilt of each plane or box that may be touched, about its point or middle")
-OBSTACLE_TIME = NuisanceRow("obstacle_time_s", "s", None, key="obstacle", of="obstacle",
-    changes=("grasps",), by="worst", considered=1e-3,
-    applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
-    label="delay of {which}", told="an obstacle is late by {size}",
-    said="how much later than stated each obstacle moves, to first order")
-TENSION_FACTOR = NuisanceRow("tension_factor", "1", None, key="tension_factor", of="tendon",
-    changes=("drives",),
-    label="{which}, more than stated", told="{which} by {signed}",
-    said="a factor on the tension of each tendon, how far from one")
-TENSION_OFFSET = NuisanceRow("tension_lost_n", "N", None, key="tension_lost", of="tendon",
-    changes=("drives",),
-    label="{which}, lost", told="{which} {signed}",
-    said="tension of each tendon that friction takes")
-PRESSURE_FACTOR = NuisanceRow("pressure_factor", "1", None, key="pressure_factor", of="pressure",
-    changes=("drives",),
-    label="{which}, more than stated", told="{which} by {signed}",
-    said="a factor on each pressure, how far from one")
-PRESSURE_OFFSET = NuisanceRow("pressure_lost_pa", "Pa", None, key="pressure_lost", of="pressure",
-    changes=("drives",),
-    label="{which}, lost", told="{which} {signed}", said="an offset that each pressure lacks")
-JOINING = NuisanceRow("joining_s", "s", 1e-2, key="joining", of="load", changes=("loads",),
-    step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
-    label="{which}", told="{which} {number}{error}{unit} {way} than {stated}",
-    said="how much later than stated each point mass or force joins or leaves, where it does so "
-         "within the recording")
-TARE = NuisanceRow("tare", "σ", 10.0, key="tare", of="sensor", changes=("sensor",), reach=UNLIMITED_REACH,
+    same=_hand_eye_sharing_key,
+)
+ZERO = NuisanceRow(
+    "displacement_zero_m",
+    "m",
+    1e-4,
+    key="displacement_zero",
+    of="grasp",
+    axes="x y z",
+    changes=("grasps",),
     by="worst",
-    label="tare{which} of {axis}", told="tare up to {size}",
-    said="a constant offset of each component of a wrench, in its sigmas")
-SENSOR_TIME = NuisanceRow("sensor_time_s", "s", 5e-3, key="sensor_time", of="sensor",
-    changes=("sensor",), applies=_is_motion, low=-3.0, high=3.0, by="worst",
-    label="time shift of the sensor{which}", told="sensor late by {size}",
-    said="how much later than their times say wrenches were measured; three deviations at most")
-SENSOR_LAG = NuisanceRow("sensor_lag_s", "s", None, key="sensor_lag", of="sensor",
-    changes=("sensor",), applies=_is_motion, low=0.0, high=3.0, by="worst",
-    label="lag of the sensor{which}", told="lag of the sensor {size}",
-    said="time constant of a first-order low-pass in the sensor; from zero to three deviations")
-TOOL_MASS = NuisanceRow("tool_kg", "kg", None, key="tool", of="sensor", changes=("sensor",),
-    low=0.0, by="worst",
-    label="mass of the tool{which}", told="tool of {size}",
-    said="a mass between a sensor and the body")
-TOOL_CENTRE = NuisanceRow("tool_m", "m", None, key="tool", of="sensor", axes="x y z",
-    changes=("sensor",), applies=lambda experiment: bool(experiment.nuisance.tool_kg), by="worst",
+    label="zero of grasp {which}, {axis}",
+    told="zero of a displacement off by {size}",
+    said="a constant offset of each displacement along each of its axes",
+)
+OBSTACLE_OFFSET = NuisanceRow(
+    "obstacle_offset_m",
+    "m",
+    1e-4,
+    key="obstacle",
+    of="obstacle",
+    changes=("grasps",),
+    by="worst",
+    applies=lambda experiment: bool(experiment.obstacles),
+    label="place of {which}",
+    told="an obstacle is off by {size}",
+    said="a constant offset of each obstacle along its normal, or along the axis of its "
+    "displacement: where contact begins",
+)
+OBSTACLE_TILT = NuisanceRow(
+    "obstacle_tilt_rad",
+    "rad",
+    None,
+    key="obstacle",
+    of="obstacle",
+    axes="first second",
+    changes=("grasps",),
+    by="length",
+    considered=0.2 * DEGREE,
+    applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
+    label="tilt of {which}, {axis}",
+    told="an obstacle is tilted by {size}",
+    said="a constant tilt of each plane or box that may be touched, about its point or middle",
+)
+OBSTACLE_TIME = NuisanceRow(
+    "obstacle_time_s",
+    "s",
+    None,
+    key="obstacle",
+    of="obstacle",
+    changes=("grasps",),
+    by="worst",
+    considered=1e-3,
+    applies=lambda experiment: any(len(each.poses.t_s) > 1 for each in experiment.obstacles),
+    label="delay of {which}",
+    told="an obstacle is late by {size}",
+    said="how much later than stated each obstacle moves, to first order",
+)
+TENSION_FACTOR = NuisanceRow(
+    "tension_factor",
+    "1",
+    None,
+    key="tension_factor",
+    of="tendon",
+    changes=("drives",),
+    label="{which}, more than stated",
+    told="{which} by {signed}",
+    said="a factor on the tension of each tendon, how far from one",
+)
+TENSION_OFFSET = NuisanceRow(
+    "tension_lost_n",
+    "N",
+    None,
+    key="tension_lost",
+    of="tendon",
+    changes=("drives",),
+    label="{which}, lost",
+    told="{which} {signed}",
+    said="tension of each tendon that friction takes",
+)
+PRESSURE_FACTOR = NuisanceRow(
+    "pressure_factor",
+    "1",
+    None,
+    key="pressure_factor",
+    of="pressure",
+    changes=("drives",),
+    label="{which}, more than stated",
+    told="{which} by {signed}",
+    said="a factor on each pressure, how far from one",
+)
+PRESSURE_OFFSET = NuisanceRow(
+    "pressure_lost_pa",
+    "Pa",
+    None,
+    key="pressure_lost",
+    of="pressure",
+    changes=("drives",),
+    label="{which}, lost",
+    told="{which} {signed}",
+    said="an offset that each pressure lacks",
+)
+JOINING = NuisanceRow(
+    "joining_s",
+    "s",
+    1e-2,
+    key="joining",
+    of="load",
+    changes=("loads",),
+    step=lambda experiment: SAMPLES_A_STEP * experiment.timestep_s,
+    label="{which}",
+    told="{which} {number}{error}{unit} {way} than {stated}",
+    said="how much later than stated each point mass or force joins or leaves, where it does so "
+    "within the recording",
+)
+TARE = NuisanceRow(
+    "tare",
+    "σ",
+    10.0,
+    key="tare",
+    of="sensor",
+    changes=("sensor",),
+    reach=UNLIMITED_REACH,
+    by="worst",
+    label="tare{which} of {axis}",
+    told="tare up to {size}",
+    said="a constant offset of each component of a wrench, in its sigmas",
+)
+SENSOR_TIME = NuisanceRow(
+    "sensor_time_s",
+    "s",
+    5e-3,
+    key="sensor_time",
+    of="sensor",
+    changes=("sensor",),
+    applies=_is_motion,
+    low=-3.0,
+    high=3.0,
+    by="worst",
+    label="time shift of the sensor{which}",
+    told="sensor late by {size}",
+    said="how much later than their times say wrenches were measured; three deviations at most",
+)
+SENSOR_LAG = NuisanceRow(
+    "sensor_lag_s",
+    "s",
+    None,
+    key="sensor_lag",
+    of="sensor",
+    changes=("sensor",),
+    applies=_is_motion,
+    low=0.0,
+    high=3.0,
+    by="worst",
+    label="lag of the sensor{which}",
+    told="lag of the sensor {size}",
+    said="time constant of a first-order low-pass in the sensor; from zero to three deviations",
+)
+TOOL_MASS = NuisanceRow(
+    "tool_kg",
+    "kg",
+    None,
+    key="tool",
+    of="sensor",
+    changes=("sensor",),
+    low=0.0,
+    by="worst",
+    label="mass of the tool{which}",
+    told="tool of {size}",
+    said="a mass between a sensor and the body",
+)
+TOOL_CENTRE = NuisanceRow(
+    "tool_m",
+    "m",
+    None,
+    key="tool",
+    of="sensor",
+    axes="x y z",
+    changes=("sensor",),
+    applies=lambda experiment: bool(experiment.nuisance.tool_kg),
+    by="worst",
     beside=0.05,
-    label="centre of the tool{which}, {axis}", told="its centre off by {size}",
-    said="its centre about the sensor's point; in the world's frame that of the grasped nodes")
-DEPTH_TURN = NuisanceRow("depth_turn_rad", "rad", 5 * DEGREE, key="depth_pose", of="depth",
-    axes="x y z", changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, by="length",
-    label="turn of {which}, {axis}", told="a depth camera is turned by {size}",
+    label="centre of the tool{which}, {axis}",
+    told="its centre off by {size}",
+    said="its centre about the sensor's point; in the world's frame that of the grasped nodes",
+)
+DEPTH_TURN = NuisanceRow(
+    "depth_turn_rad",
+    "rad",
+    5 * DEGREE,
+    key="depth_pose",
+    of="depth",
+    axes="x y z",
+    changes=("depth",),
+    applies=_has_depth_cameras,
+    low=-4.0,
+    high=4.0,
+    by="length",
+    label="turn of {which}, {axis}",
+    told="a depth camera is turned by {size}",
     said="a turn of each depth camera about the middle of the body, along its own axes",
-    same=_camera_sharing_key)
-DEPTH_SHIFT = NuisanceRow("depth_shift_m", "m", 0.02, key="depth_pose", of="depth",
-    axes="x y z", changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, reach=UNLIMITED_REACH,
-    step=lambda experiment: CAMERA_SHIFT_A_STEP_M, by="length",
-    label="shift of {which}, {axis}", told="a depth camera is shifted by {size}",
+    same=_camera_sharing_key,
+)
+DEPTH_SHIFT = NuisanceRow(
+    "depth_shift_m",
+    "m",
+    0.02,
+    key="depth_pose",
+    of="depth",
+    axes="x y z",
+    changes=("depth",),
+    applies=_has_depth_cameras,
+    low=-4.0,
+    high=4.0,
+    reach=UNLIMITED_REACH,
+    step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
+    by="length",
+    label="shift of {which}, {axis}",
+    told="a depth camera is shifted by {size}",
     said="a shift of it; where neither is given, the first image is aligned to the body first",
-    same=_camera_sharing_key)
-DEPTH_BIAS = NuisanceRow("depth_bias_m", "m", 5e-3, key="depth_bias", of="depth",
-    changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, reach=UNLIMITED_REACH,
-    step=lambda experiment: CAMERA_SHIFT_A_STEP_M, by="worst",
-    label="bias of {which}", told="depth is off by {size}",
-    said="what is to be added to each depth of an image")
-DEPTH_SCALE = NuisanceRow("depth_scale", "1", 5e-3, key="depth_scale", of="depth",
-    changes=("depth",), applies=_has_depth_cameras, low=-4.0, high=4.0, reach=4.0, by="worst",
-    label="scale of {which}", told="depth is off by {size} of itself",
-    said="a factor on each depth of an image, how far from one")
-DEPTH_TIME = NuisanceRow("depth_time_s", "s", 5e-3, key="depth_time", of="depth",
-    changes=("depth",), applies=lambda experiment: _is_motion(experiment) and _has_depth_cameras(experiment),
-    low=-3.0, high=3.0, by="worst",
-    label="time shift of {which}", told="a depth camera is late by {size}",
-    said="how much later than its times say a depth camera saw; three deviations at most")
-DEPTH_EDGE = NuisanceRow("depth_edge_px", "px", 2.0, key="depth_edge", of="depth",
-    changes=("depth",), applies=_has_depth_outlines, low=-4.0, high=4.0, reach=UNLIMITED_REACH, by="worst",
-    label="edge of {which}", told="silhouettes end {size} inside the body",
+    same=_camera_sharing_key,
+)
+DEPTH_BIAS = NuisanceRow(
+    "depth_bias_m",
+    "m",
+    5e-3,
+    key="depth_bias",
+    of="depth",
+    changes=("depth",),
+    applies=_has_depth_cameras,
+    low=-4.0,
+    high=4.0,
+    reach=UNLIMITED_REACH,
+    step=lambda experiment: CAMERA_SHIFT_A_STEP_M,
+    by="worst",
+    label="bias of {which}",
+    told="depth is off by {size}",
+    said="what is to be added to each depth of an image",
+)
+DEPTH_SCALE = NuisanceRow(
+    "depth_scale",
+    "1",
+    5e-3,
+    key="depth_scale",
+    of="depth",
+    changes=("depth",),
+    applies=_has_depth_cameras,
+    low=-4.0,
+    high=4.0,
+    reach=4.0,
+    by="worst",
+    label="scale of {which}",
+    told="depth is off by {size} of itself",
+    said="a factor on each depth of an image, how far from one",
+)
+DEPTH_TIME = NuisanceRow(
+    "depth_time_s",
+    "s",
+    5e-3,
+    key="depth_time",
+    of="depth",
+    changes=("depth",),
+    applies=lambda experiment: _is_motion(experiment) and _has_depth_cameras(experiment),
+    low=-3.0,
+    high=3.0,
+    by="worst",
+    label="time shift of {which}",
+    told="a depth camera is late by {size}",
+    said="how much later than its times say a depth camera saw; three deviations at most",
+)
+DEPTH_EDGE = NuisanceRow(
+    "depth_edge_px",
+    "px",
+    2.0,
+    key="depth_edge",
+    of="depth",
+    changes=("depth",),
+    applies=_has_depth_outlines,
+    low=-4.0,
+    high=4.0,
+    reach=UNLIMITED_REACH,
+    by="worst",
+    label="edge of {which}",
+    told="silhouettes end {size} inside the body",
     said="how many pixels inside the outline of the body its silhouette ends in the images of each "
-         "depth camera, all around")
-# fmt: on
+    "depth camera, all around",
+)
 
 # In the order of φ; neighbours of one component stand together.
 KINDS = tuple(row for row in [*vars().values()] if isinstance(row, NuisanceRow))
@@ -442,7 +731,7 @@ def _check_custom_kind(row: NuisanceRow) -> None:
         raise InputError(f"{row.name} has to have a reading or a clock, one of both")
 
 
-_DOCSTRING = """Standard deviations of an experiment's nuisance parameters; None where not estimated.
+_DOCSTRING = """Standard deviations of an experiment's nuisance parameters; None: not estimated.
 
 Every one has a normal prior around zero with its deviation. The defaults are those of a careful
 laboratory; `none` is for ideal data.

@@ -15,7 +15,7 @@ from ..files import DAMAGE
 from .formats.columns import TIME, find_column, name_and_unit
 from .formats.text import (
     Row,
-    Table,
+    TextTable,
     decode,
     is_number,
     names_file_in_errors,
@@ -103,24 +103,24 @@ def _checked_sequence(
 # Columns ------------------------------------------------------------------------------------------
 
 
-def _numbers_in_columns(grid: Table, places: Iterable[int]) -> Array:
+def _numbers_in_columns(grid: TextTable, places: Iterable[int]) -> Array:
     """Return the cells of these columns as numbers (rows, columns); blank cells raise an
     `InputError`.
     """
     return numeric_cells(grid, list(places), blank_allowed=False)
 
 
-def _with_column_names(table: Table) -> Table:
+def _with_column_names(table: TextTable) -> TextTable:
     """Name the columns of a table with eight columns whose first row is numbers; others are
     unchanged.
     """
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
     names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
-    return Table(names, [Row(1, table.columns), *table.rows])
+    return TextTable(names, [Row(1, table.columns), *table.rows])
 
 
-def _column_error(grid: Table) -> InputError:
+def _column_error(grid: TextTable) -> InputError:
     """Return the error for a table whose columns are not those of poses."""
     return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {', '.join(POSE_COLUMNS)}, each once "
@@ -128,7 +128,7 @@ def _column_error(grid: Table) -> InputError:
     )
 
 
-def _position_columns(grid: Table, length_unit: str | None) -> tuple[list[int], float]:
+def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[int], float]:
     """Return the indices of the columns of x, y, z, and the factor from their unit to metres.
 
     Raises
@@ -159,12 +159,12 @@ def _position_columns(grid: Table, length_unit: str | None) -> tuple[list[int], 
     return axes, float(metres[0] or 1.0)
 
 
-def _quaternion_columns(grid: Table, order: str | None, columns: list[int]) -> list[int]:
+def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) -> list[int]:
     """Return the indices of the columns of the quaternion in the order x, y, z, w.
 
     Parameters
     ----------
-    grid : Table
+    grid : TextTable
     order : {"xyzw", "wxyz"} or None
         Stated order of the columns; needed if the columns are numbered.
     columns : list of int

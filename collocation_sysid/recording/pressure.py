@@ -88,7 +88,7 @@ class Pressure(Actuator[EnclosedVolume]):
 
     def __post_init__(self) -> None:
         pressure = TimeSeries(self.pressure_pa, self.t_s, f"pressure_pa of {self.name}")
-        vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, course=pressure)
+        vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, stated_values=pressure)
 
     def _measure_on(self, body: Body) -> EnclosedVolume:
         """Return the volume behind the faces of a body.

@@ -93,7 +93,7 @@ class Tendon(Actuator[PolylineLength]):
                 f"{name}: tension_n is {tension.values[row]:g} N in row {row + 1}; expected 0 or "
                 "more: a tendon only pulls"
             )
-        vars(self).update(tension_n=tension.values, t_s=tension.t_s, course=tension)
+        vars(self).update(tension_n=tension.values, t_s=tension.t_s, stated_values=tension)
 
     def _measure_on(self, body: Body) -> PolylineLength:
         """Return the length of the polyline in a body; an `InputError` if a point is too far

@@ -152,7 +152,8 @@ def _said(result: Result) -> Iterator[str]:
         size = short(first.size or 0.0)
         error = short(first.size_error or 0.0)
         yield (
-            f"the data determine {source_label(first.name)}: {size} ± {error}, with which χ² falls by "
+            f"the data determine {source_label(first.name)}: {size} ± {error}, with which χ² "
+            "falls by "
             f"{first.chi_squared:.3g} and the estimates change by {listed(moved)}: measure it, or "
             "estimate it"
         )
@@ -187,7 +188,8 @@ def _matters(result: Result) -> Iterator[str]:
         if source is not None:
             share = result.budget[name][source]
             yield (
-                f"of the assumptions not determined by the data, {source_label(source)} matters most: "
+                f"of the assumptions not determined by the data, {source_label(source)} matters "
+                "most: "
                 f"{share:.0%} of {symbol_of(name)}'s variance"
             )
             return

@@ -302,7 +302,7 @@ def _cells(result: Result, name: str) -> tuple[str, ...]:
     each = result.values[name]
     interval = _interval(each.combined95)
     remark = each.reason or ""
-    if each.is_at_bound:
+    if each.at_bound:
         interval = "at its bound"
     elif each.reason:
         interval = "not determined" if each.statistical95 is None else "not identifiable"

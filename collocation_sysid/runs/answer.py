@@ -133,7 +133,7 @@ class SolvedProblem:
         tied = item is not None and item.tied is not None
         return ReportedEstimate(
             **vars(combined),
-            is_at_bound=optimum.is_at_bound,
+            at_bound=optimum.at_bound,
             reason=optimum.reason,
             optimum=optimum.value,
             systematic=systematic,

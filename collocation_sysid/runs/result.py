@@ -88,7 +88,7 @@ class ReportedEstimate(Estimate):
         spread = self.statistical_std_error
         if spread is not None:
             spread *= at.derivative(self.value) / at.derivative(self.optimum)
-        return Estimate(self.optimum, spread, (low, high), self.is_at_bound, self.reason)
+        return Estimate(self.optimum, spread, (low, high), self.at_bound, self.reason)
 
     @property
     def _statistical(self) -> Estimate:
@@ -97,7 +97,7 @@ class ReportedEstimate(Estimate):
             self.value,
             self.statistical_std_error,
             self.statistical95,
-            self.is_at_bound,
+            self.at_bound,
             self.reason,
         )
 

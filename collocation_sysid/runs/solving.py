@@ -202,14 +202,16 @@ def _depth_notes(solution: Solution) -> Iterator[str]:
                     f"them by less than {1e3 * np.nanmedian(np.abs(distance_m)):.3g})"
                 )
             yield (
-                f"experiment '{part.segment.experiment.name}': {sighting.is_compared.sum()} points of "
+                f"experiment '{part.segment.experiment.name}': {sighting.is_compared.sum()} "
+                "points of "
                 f"'{sighting.camera.depth.name}' {distances}; left out: {left_out or 'none'}"
             )
         for outline, apart_px in part.outline_distances_px:
             if len(apart_px):
                 yield (
                     f"experiment '{part.segment.experiment.name}': {len(apart_px)} points of the "
-                    f"body's outline are off the edges in '{outline.correspondences.camera.depth.name}' by "
+                    "body's outline are off the edges in "
+                    f"'{outline.correspondences.camera.depth.name}' by "
                     f"{np.sqrt(np.mean(apart_px**2)):.2g} pixels (RMS)"
                 )
 
@@ -262,7 +264,8 @@ def _best_of_second_start(solver: Method, first: Solution, watch: Watch | None) 
     if not second.status.converged or gain <= LEAST_GAIN:
         return first
     note = (
-        f"Poisson's ratio ended near one half; a second start, from the usual {USUAL_POISSON}, found an "
+        f"Poisson's ratio ended near one half; a second start, from the usual {USUAL_POISSON}, "
+        "found an "
         f"answer that fits better (χ² lower by {gain:.3g})"
     )
     return replace(second, notes=(note, *second.notes))

@@ -87,7 +87,7 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
-class FittedExperiment:
+class ExperimentAtAnswer:
     """One experiment at the answer, as the effects of assumptions need it.
 
     Attributes
@@ -357,7 +357,7 @@ class Assumption:
     unit: str
     sigma: float | None
     description: str
-    effect: Callable[[FittedExperiment, int], Effect | None]
+    effect: Callable[[ExperimentAtAnswer, int], Effect | None]
     component_names: str = ""
 
     @property
@@ -369,7 +369,7 @@ class Assumption:
 # What each changes ------------------------------------------------------------------------------
 
 
-def _size(at: FittedExperiment, _: int) -> Effect:
+def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     """Return the effect of a body that is larger by a share: f = s² f(x/s, v/s).
 
     From Ψ(x; s) = s³ Ψ(x/s): what is strained is the ratio of lengths. Goals of grasped nodes scale
@@ -405,7 +405,7 @@ def _size(at: FittedExperiment, _: int) -> Effect:
     )
 
 
-def _mass(at: FittedExperiment, _: int) -> Effect | None:
+def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of a body that is heavier by a share; None if a density is estimated."""
     if any(part.has_free_density for part in at.body.parts):
         return None
@@ -414,7 +414,7 @@ def _mass(at: FittedExperiment, _: int) -> Effect | None:
     )
 
 
-def _density_gradient(at: FittedExperiment, axis: int) -> Effect:
+def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Effect of a density that is higher at one end of the body and lower at the other, by
     a share.
     """
@@ -424,7 +424,7 @@ def _density_gradient(at: FittedExperiment, axis: int) -> Effect:
     return Effect(at.weight_and_drag(mass), mass)
 
 
-def _anisotropy(at: FittedExperiment, axis: int) -> Effect:
+def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Effect of a stiffness that is higher along one axis by a share of E: the energy ½ E e² of the
     strain e along it.
 
@@ -450,14 +450,14 @@ def _anisotropy(at: FittedExperiment, axis: int) -> Effect:
     return Effect(force)
 
 
-def _drift(at: FittedExperiment, _: int) -> Effect:
+def _drift(at: ExperimentAtAnswer, _: int) -> Effect:
     """Effect of a stiffness that is higher at the end than at the beginning, by a share."""
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
 
 
-def _time_scale(at: FittedExperiment, _: int) -> Effect | None:
+def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of clocks that are fast by a share, so that less time passes than they show;
     None for a static experiment.
     """
@@ -470,7 +470,7 @@ def _time_scale(at: FittedExperiment, _: int) -> Effect | None:
     return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
 
 
-def _poisson(at: FittedExperiment, _: int) -> Effect | None:
+def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of a larger Poisson's ratio where it is stated; None where it is estimated."""
     items = {item.name: item for item in at.parameters.items}
     stated = {
@@ -491,7 +491,7 @@ def _poisson(at: FittedExperiment, _: int) -> Effect | None:
     return Effect((larger - smaller) / (2 * SMALL))
 
 
-def _grip(at: FittedExperiment, _: int) -> Effect | None:
+def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of a compliant layer of the body's own material in the grips; None without a grip.
 
     A grasp that prescribes some axes only is a platen or a plane of symmetry, not a grip.
@@ -510,13 +510,13 @@ def _grip(at: FittedExperiment, _: int) -> Effect | None:
     return Effect(displacement_m=displacement_m)
 
 
-def _is_driven(at: FittedExperiment) -> NDArray[np.bool_]:
+def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
     """Return the mask (g,) of grasped dofs whose prescribed position changes."""
     goals = at.iterate.equations.prescribed.positions_m
     return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
 
 
-def _machine(at: FittedExperiment, _: int) -> Effect | None:
+def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of the compliance of a test bench: displacements are measured behind its
     frame. None for dynamic experiments.
     """
@@ -535,7 +535,7 @@ def _machine(at: FittedExperiment, _: int) -> Effect | None:
     return Effect(displacement_m=displacement_m)
 
 
-def _platen_friction(at: FittedExperiment, _: int) -> Effect | None:
+def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of friction on nodes that slide along platens, perpendicular to the loading axis; None
     without platens.
 
@@ -562,7 +562,7 @@ def _platen_friction(at: FittedExperiment, _: int) -> Effect | None:
     return Effect(force) if platens else None
 
 
-def _contact_stiffness(at: FittedExperiment, _: int) -> Effect | None:
+def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of rigid contact in place of the pressure law, to first order."""
     if not at.contacts:
         return None
@@ -575,24 +575,24 @@ def _contact_stiffness(at: FittedExperiment, _: int) -> Effect | None:
     return Effect(at.pad_rows(change_n))
 
 
-def _buoyancy(at: FittedExperiment, _: int) -> Effect | None:
+def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
     return Effect(at.buoyancy_n) if at.added_mass_kg.any() else None
 
 
-def _added_mass(at: FittedExperiment, _: int) -> Effect | None:
+def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more added mass, as a share of that in the model; None in a vacuum."""
     if at.iterate.segment.experiment.is_static or not at.added_mass_kg.any():
         return None
     return Effect(mass_kg=at.added_mass_kg)
 
 
-def _air_drag(at: FittedExperiment, _: int) -> Effect | None:
+def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
     return Effect(at.air_drag_n) if at.iterate.segment.experiment.has_air_drag else None
 
 
-def _other_damping(at: FittedExperiment, law: str) -> Effect | None:
+def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
     """Effect of replacing the stated damping law by another with the same γ_r.
 
     Parts with a custom law keep it, and so do parts of linear material, for which all laws agree.
@@ -622,17 +622,17 @@ def _other_damping(at: FittedExperiment, law: str) -> Effect | None:
     return Effect(at.pad_rows(next(forces_n) - next(forces_n)))
 
 
-def _objective_damping(at: FittedExperiment, index: int) -> Effect | None:
+def _objective_damping(at: ExperimentAtAnswer, index: int) -> Effect | None:
     """Effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`."""
     return _other_damping(at, OBJECTIVE_DAMPINGS[index])
 
 
-def _rayleigh_damping(at: FittedExperiment, _: int) -> Effect | None:
+def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Effect of Rayleigh damping, which is not objective, instead of the stated law."""
     return _other_damping(at, "rayleigh")
 
 
-def _rest_shape(at: FittedExperiment, axis: int) -> Effect | None:
+def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     """Effect of a mesh that was made under the body's own weight along one of its axes.
 
     None if the problem states the stress-free shape.
@@ -644,7 +644,7 @@ def _rest_shape(at: FittedExperiment, axis: int) -> Effect | None:
     )
 
 
-def _surface(at: FittedExperiment, mode: int) -> Effect:
+def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
     """Effect of an error of the surface along its normal, by one mode of a smooth random field."""
     moved_m = at.surface_modes_m[mode]
     grasping = at.iterate.segment.prescribed_motion

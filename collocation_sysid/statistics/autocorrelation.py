@@ -319,7 +319,7 @@ class ErrorProcess:
     degrees_of_freedom: float
 
 
-def test_dependence(fit: LinearisedFit, information: Information) -> Dependence:
+def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependence:
     """Test the residuals for correlation in time, among channels and in space."""
     if fit.chi_squared <= ROUNDING**2 * fit.measurement_count:
         return Dependence(0.0, np.inf, 1.0)

@@ -154,7 +154,7 @@ class VarianceSources:
         means : mapping of str to float, optional
             Known effects over their standard deviations; None if there are none.
         """
-        free = np.flatnonzero(~fit.is_at_bound)
+        free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared_count]
         all_free, known = (np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2))
         information = least_squares_of_fit(fit).information

@@ -86,7 +86,7 @@ def combine(
     -------
     CombinedEstimate
     """
-    if estimate.is_at_bound:
+    if estimate.at_bound:
         return CombinedEstimate(estimate.value, None, None)
     is_corrected = error is not None or known_effect != 0.0
     known = [estimate.value, *(estimate.statistical95 or ())]

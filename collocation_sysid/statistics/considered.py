@@ -24,7 +24,7 @@ from ..program.reading import MeasurementResidual
 from ..program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, SweepColumns
 from ..recording.experiment import Experiment
 from ..recording.nuisance import KINDS
-from .assumptions import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, FittedExperiment
+from .assumptions import ASSUMPTIONS, CORRELATION_KEY, Assumption, Effect, ExperimentAtAnswer
 from .linearised import linearise_fit
 from .shape_error import CORRELATION
 
@@ -161,7 +161,7 @@ def changed_residuals(
     names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
     for part in collocation.iterates(z):
-        at = FittedExperiment(part, collocation.parameters, surface_correlation)
+        at = ExperimentAtAnswer(part, collocation.parameters, surface_correlation)
         effects = [
             (row.effect(at, axis), sigma)
             for row, sigma in assumptions
@@ -172,7 +172,7 @@ def changed_residuals(
 
 
 def _changes_by_effects(
-    fitted: FittedExperiment, effects: Sequence[tuple[Effect | None, float]]
+    fitted: ExperimentAtAnswer, effects: Sequence[tuple[Effect | None, float]]
 ) -> Iterator[Array]:
     """Yield the changes (T, M, 3, a) of the residuals of each measurement by effects, each
     with its standard deviation; None has no effect.

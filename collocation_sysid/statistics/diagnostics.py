@@ -229,7 +229,8 @@ def _message(
     if diagnosis.constant_share > DOMINANT:
         offset = 1e3 * np.linalg.norm(diagnosis.offset_m)
         cause = (
-            f"{100 * diagnosis.constant_share:.0f} % of its power is constant: its place on the body "
+            f"{100 * diagnosis.constant_share:.0f} % of its power is constant: its place on the "
+            "body "
             f"is off by {offset:.2g} mm; {'widen the prior of' if estimated[0] else 'estimate'} "
             "marker_offsets"
         )

@@ -57,7 +57,7 @@ class Estimate:
     statistical95 : (lower, upper) or None
         95 % interval due to noise and nuisance parameters, within what is physically possible. It
         may exist, and be wide, where there is no `statistical_std_error`.
-    is_at_bound : bool
+    at_bound : bool
         Whether the value, or one it follows from, ended at a bound.
     reason : str or None
         Why an estimated value has no `statistical_std_error`.
@@ -66,7 +66,7 @@ class Estimate:
     value: float
     statistical_std_error: float | None = None
     statistical95: tuple[float, float] | None = None
-    is_at_bound: bool = False
+    at_bound: bool = False
     reason: str | None = None
 
 
@@ -123,7 +123,7 @@ def correlation_from_covariance(covariance: Array) -> Array:
 
 
 def user_estimates(
-    parameters: Parameters, q: Array, covariance_q: Array, is_at_bound: Mask, quantiles: Array
+    parameters: Parameters, q: Array, covariance_q: Array, at_bound: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
     """Return the estimates of the user's parameters by name, except the mode coefficients of
     fields.
@@ -136,7 +136,7 @@ def user_estimates(
         Estimates in the solver's coordinates.
     covariance_q : (nq, nq) array
         Covariance of q.
-    is_at_bound : (nq,) array of bool
+    at_bound : (nq,) array of bool
         Whether each is at a bound.
     quantiles : (nq,) array
         Half widths of the 95 % intervals in standard deviations.
@@ -150,7 +150,7 @@ def user_estimates(
         if item.name not in estimates:
             continue
         value = item.from_coordinate(float(q[k]))
-        if is_at_bound[k]:
+        if at_bound[k]:
             estimates[item.name] = _estimate_at_bound(value)
             continue
         deviation = float(np.sqrt(covariance_q[k, k]))
@@ -188,14 +188,14 @@ def relative_derivatives(parameters: Parameters, q: Array) -> Array:
 
 
 def derived_estimates(
-    derived: DerivedModuli, covariance_q: Array, is_at_bound: Mask, quantiles: Array
+    derived: DerivedModuli, covariance_q: Array, at_bound: Mask, quantiles: Array
 ) -> dict[str, Estimate]:
     """Return the estimates of the moduli that follow from the parameters, by the delta method."""
     estimates = {}
     for name, value in derived.values.items():
         gradient = derived.derivatives[name]
         used = np.flatnonzero(gradient)
-        if is_at_bound[used].any():
+        if at_bound[used].any():
             estimates[name] = _estimate_at_bound(value)
         elif not len(used) or not value > 0:
             estimates[name] = Estimate(value)
@@ -236,7 +236,7 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
         if estimate.statistical_std_error is None
         else abs(ratio) * estimate.statistical_std_error,
         None if not ends else (ends[0], ends[1]),
-        estimate.is_at_bound,
+        estimate.at_bound,
         estimate.reason,
     )
 
@@ -244,7 +244,7 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
 def _estimate_at_bound(value: float) -> Estimate:
     """Return the estimate of a value at a bound, without error bars."""
     return Estimate(
-        value, is_at_bound=True, reason="it ended at a bound, or follows from one that did"
+        value, at_bound=True, reason="it ended at a bound, or follows from one that did"
     )
 
 
@@ -276,7 +276,7 @@ def parameter_notes(parameters: Parameters, estimates: Mapping[str, Estimate]) -
     for item in (each for each in parameters.free if each.name in estimates):
         name = item.name
         estimate = estimates[item.name]
-        if estimate.is_at_bound:
+        if estimate.at_bound:
             nearer = min(
                 ("lower", "upper"), key=lambda side: abs(getattr(item, side) - estimate.value)
             )
@@ -331,7 +331,7 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
             continue
         branch = name.removesuffix(f".{SHARE.name}")
         tau = estimates.get(f"{branch}.{TAU.name}")
-        if share.is_at_bound and share.value < 1e-6:
+        if share.at_bound and share.value < 1e-6:
             notes.append(
                 f"no memory found: the share of {branch} ended at 0, and its relaxation time "
                 "means nothing; leave that branch out"
@@ -341,7 +341,7 @@ def memory_notes(estimates: Mapping[str, Estimate], longest_s: float) -> list[st
                 f"no memory is told from none: the share of {branch} may be 0, and is at most "
                 f"{share.statistical95[1]:.2g} (95 %)"
             )
-        elif (share.is_at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
+        elif (share.at_bound or share.statistical95) and tau and tau.value > LONG * longest_s:
             notes.append(
                 f"{branch} relaxes within {tau.value:.2g} s, slower than the longest recording of "
                 f"{longest_s:.2g} s: its share and long-term moduli follow from its beginning "
@@ -418,8 +418,10 @@ def disagreement_notes(fit: LinearisedFit, scatter: RecordingComparison | None) 
     if scatter is None:
         return []
     return [
-        f"the recordings disagree on {display_name(fit.names[k])} (χ² {scatter.chi_squared[k]:.3g} for "
-        f"{scatter.degrees_of_freedom[k]} degrees of freedom): model error decides, and its interval holds "
+        f"the recordings disagree on {display_name(fit.names[k])} (χ² "
+        f"{scatter.chi_squared[k]:.3g} for "
+        f"{scatter.degrees_of_freedom[k]} degrees of freedom): model error decides, and its "
+        "interval holds "
         "what they disagree by"
         for k in np.flatnonzero(scatter.is_disagreeing).tolist()
     ]

@@ -97,7 +97,8 @@ def _combination_sentence(
         return f"{listed(names)} are confounded{how}: these data fix one combination of them"
     return (
         f"{listed(names)} are confounded{how}: only their combination "
-        f"{_product_text(names, weights / weights[largest])} is fixed, to {_precision_text(float(fixed))} (95 %)"
+        f"{_product_text(names, weights / weights[largest])} is fixed, to "
+        f"{_precision_text(float(fixed))} (95 %)"
     )
 
 

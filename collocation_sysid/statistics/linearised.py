@@ -234,7 +234,7 @@ class LinearisedFit:
         Number of shared parameters.
     prior_residual, prior_jacobian : (p,) arrays
         Residuals of the priors and their derivatives, in standard deviations; zero without a prior.
-    is_at_bound : (p,) array of bool
+    at_bound : (p,) array of bool
         Parameters that ended at a bound.
     derived : DerivedModuli
         Moduli that follow from the shared parameters.
@@ -248,7 +248,7 @@ class LinearisedFit:
     shared_count: int
     prior_residual: Array
     prior_jacobian: Array
-    is_at_bound: Mask
+    at_bound: Mask
     derived: DerivedModuli = field(default_factory=lambda: DerivedModuli({}, {}))
     phase_covariance: Array | None = None
 
@@ -331,7 +331,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         shared_count=collocation.nq,
         prior_residual=prior_residual,
         prior_jacobian=prior_slope,
-        is_at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
+        at_bound=(p - lower < AT_BOUND) | (upper - p < AT_BOUND),
         derived=DerivedModuli.from_bodies(
             (s.constants for s in collocation.transcriptions), p[: collocation.nq]
         ),
@@ -411,5 +411,5 @@ def gauss_newton_step(fit: LinearisedFit) -> Array:
     """Return the step (p,) to the least squares of the linearised fit; parameters at a
     bound do not change.
     """
-    free = np.where(fit.is_at_bound, NO_STEP, np.inf)
+    free = np.where(fit.at_bound, NO_STEP, np.inf)
     return least_squares_of_fit(fit).minimiser(-free, free)

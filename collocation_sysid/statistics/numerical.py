@@ -329,7 +329,7 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
     changes : sequence of (T, M, 3, a) arrays
         Changes of the residuals of each block, in units of σ.
     """
-    free = np.flatnonzero(~fit.is_at_bound)
+    free = np.flatnonzero(~fit.at_bound)
     count = changes[0].shape[-1] if changes else 0
     if not free.size:
         return np.zeros((len(fit.names), count))

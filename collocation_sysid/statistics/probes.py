@@ -100,7 +100,7 @@ def _third(block: ResidualBlock, k: int) -> slice:
 
 def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
     """Return the block with some samples only."""
-    own = ("t_s", "present", "residual", "slope", "misfit", "components")
+    own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
     there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
     shaken = block.disturbances
     return replace(block, **there, disturbances=None if shaken is None else shaken[:, cut])

@@ -19,7 +19,7 @@ import numpy as np
 from ..arrays import Array
 from ..fem.constants import is_field_coefficient, is_modulus
 from ..program.collocation import Collocation, ExperimentIterate
-from .assumptions import FittedExperiment
+from .assumptions import ExperimentAtAnswer
 from .budget import BudgetLine
 from .considered import ResidualChanges, changes_of_assumptions
 from .estimates import Estimate
@@ -218,7 +218,9 @@ def has_monotonic_load(iterate: ExperimentIterate, collocation: Collocation) -> 
     """Whether the internal forces of a static recording only grow, or only shrink, in time;
     true for very few samples.
     """
-    load_n = np.linalg.norm(FittedExperiment(iterate, collocation.parameters).internal_n(), axis=1)
+    load_n = np.linalg.norm(
+        ExperimentAtAnswer(iterate, collocation.parameters).internal_n(), axis=1
+    )
     if len(load_n) < FEWEST_SAMPLES:
         return True
     steps = np.diff(load_n)
@@ -255,7 +257,7 @@ def with_relaxed_assumption(
         names=(*fit.names, *(f"{name} {k}" for k in range(count))),
         prior_residual=np.append(fit.prior_residual, np.zeros(count)),
         prior_jacobian=np.append(fit.prior_jacobian, np.full(count, 1 / widening)),
-        is_at_bound=np.append(fit.is_at_bound, np.zeros(count, dtype=bool)),
+        at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
     )
 
 

@@ -151,7 +151,7 @@ def fit_part(
         names=tuple(fit.names[k] for k in columns),
         prior_residual=prior_residual,
         prior_jacobian=prior_slope,
-        is_at_bound=np.zeros(len(columns), dtype=bool),
+        at_bound=np.zeros(len(columns), dtype=bool),
     )
     step = gauss_newton_step(alone)
     return alone.after_step(step), step
@@ -191,7 +191,7 @@ def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], exce
     together = least_squares_of_fit(fit)
     information = together.information
     score = together.score
-    free = np.flatnonzero(~fit.is_at_bound)
+    free = np.flatnonzero(~fit.at_bound)
     inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
     shared = free[free < fit.shared_count]
     excess_scatter = np.zeros(len(shared))

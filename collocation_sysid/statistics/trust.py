@@ -110,7 +110,7 @@ class Assessment:
     """
 
     concerns: tuple[Concern, ...] = ()
-    TOLD: ClassVar = ("verdict", "reasons")
+    SERIALISED_PROPERTIES: ClassVar = ("verdict", "reasons")
 
     @classmethod
     def from_concerns(cls, concerns: Iterable[Concern]) -> Assessment:
@@ -214,11 +214,11 @@ def parameter_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """
     known = uncertainty.estimates
     estimates = {name: known[name] for name in uncertainty.names if name in known}
-    bounded = [name for name, estimate in estimates.items() if estimate.is_at_bound]
+    bounded = [name for name, estimate in estimates.items() if estimate.at_bound]
     undetermined = [
         name
         for name, estimate in estimates.items()
-        if not estimate.is_at_bound and estimate.statistical_std_error is None
+        if not estimate.at_bound and estimate.statistical_std_error is None
     ]
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
@@ -452,10 +452,10 @@ def forward_simulation_concerns(
 def prediction_concerns(
     name: str,
     what: str,
-    stated: str,
+    sigma_key: str,
     sigmas: float,
-    tame_sigmas: float,
-    numbers: int,
+    robust_sigmas: float,
+    count: int,
     size: str = "",
 ) -> list[Concern]:
     """Return a concern if a prediction, for which nothing was fitted, differs from the
@@ -467,25 +467,25 @@ def prediction_concerns(
         Name of the experiment.
     what : str
         Name of the measured quantity.
-    stated : str
+    sigma_key : str
         Key of its σ in the problem.
     sigmas : float
         Root mean square difference over σ.
-    tame_sigmas : float
+    robust_sigmas : float
         Root mean square difference over σ with outliers shortened, which decides.
-    numbers : int
+    count : int
         Number of measured values.
     size : str
         Root mean square difference with its unit, for the message.
     """
-    is_chance = float(chi2_sf(numbers * tame_sigmas**2, numbers)) > RARE
+    is_chance = float(chi2_sf(count * robust_sigmas**2, count)) > RARE
     return concern_if(
-        tame_sigmas > MISFIT and not is_chance,
-        tame_sigmas > GROSS_MISFIT,
+        robust_sigmas > MISFIT and not is_chance,
+        robust_sigmas > GROSS_MISFIT,
         "prediction/misses",
         experiment=name,
         what=what,
-        stated=stated,
+        stated=sigma_key,
         sigmas=sigmas,
         size=f"{size}, " if size else "",
     )
@@ -549,7 +549,9 @@ def rotation_step_concerns(
     limit_rad: float = WARNING_ANGLE_RAD,
     code: str = "scheme/turns",
 ) -> list[Concern]:
-    """Return a concern if a grasp rotates by more than `limit_rad` [rad] within a step of the grid."""
+    """Return a concern if a grasp rotates by more than `limit_rad` [rad] within a step of the
+    grid.
+    """
     turn = fastest_rotation(experiment, substeps)
     numbers = {"step_ms": 1e3 * turn.step_s, "rate_rad_s": turn.rate_rad_s}
     return concern_if(turn.angle_rad > limit_rad, False, code, **vars(turn), **numbers)

@@ -34,7 +34,7 @@ from ..fem.constants import constant_named, is_damping
 from ..model.parameters import Parameters
 from ..program.collocation import Collocation, ExperimentIterate
 from ..program.lapack import one_blas_thread
-from .autocorrelation import Dependence, error_processes, score_covariance, test_dependence
+from .autocorrelation import Dependence, analyse_dependence, error_processes, score_covariance
 from .diagnostics import Outlier, remove_outliers
 from .distributions import student_ppf
 from .estimates import (
@@ -106,7 +106,7 @@ class ErrorBasis:
     dependence : Dependence
         Tests of the residuals for correlation.
     outliers : tuple of Outlier
-        Single samples that dominate the residuals of their marker; `test_dependence` leaves them
+        Single samples that dominate the residuals of their marker; `analyse_dependence` leaves them
         out.
     """
 
@@ -314,13 +314,13 @@ def _reported_covariance(
     reported = covariance.copy()
     shared = fit.shared_count
     uninformed = _has_no_information(parameters, q, np.diag(covariance)[:shared])
-    at_bound = fit.is_at_bound.copy()
+    at_bound = fit.at_bound.copy()
     at_bound[:shared] &= ~uninformed
     reported[at_bound] = reported[:, at_bound] = np.nan
     of_q = reported[:shared, :shared]
     bounded = at_bound[:shared]
     undetermined = np.flatnonzero(
-        (np.diag(of_q) > UNDETERMINED**2) | (uninformed & fit.is_at_bound[:shared])
+        (np.diag(of_q) > UNDETERMINED**2) | (uninformed & fit.at_bound[:shared])
     )
     of_q[undetermined] = of_q[:, undetermined] = np.nan
     of_q[undetermined, undetermined] = np.inf
@@ -381,7 +381,7 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     """
     factored = factorise_information(fit)
     level = estimate_noise_level(fit, factored)
-    tested = test_dependence(fit, factored)
+    tested = analyse_dependence(fit, factored)
     tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.unevenness)
     return tested, tested.is_correlated and not _is_explained(fit, factored, level, tested)
 
@@ -403,7 +403,7 @@ def _is_explained(
     ]
     _, residuals = project_errors(factored, errors)
     replicas = [
-        test_dependence(
+        analyse_dependence(
             replace(
                 fit,
                 blocks=tuple(
@@ -458,7 +458,7 @@ class MarkerPlace:
     std_error_m: Array | None
     prior_m: float
     given_m: Array | None
-    TOLD: ClassVar = ("given",)
+    SERIALISED_PROPERTIES: ClassVar = ("given",)
 
     @property
     def given(self) -> bool:

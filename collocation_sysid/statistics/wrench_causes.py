@@ -78,7 +78,7 @@ ONE_OF_MANY = 1.05
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
+class DescribedWrench:
     """Description of a wrench to be tested.
 
     Attributes
@@ -204,26 +204,23 @@ class _OneSensor:
         blind = without_grasp_sensors(segment.experiment)
         self.scale_known = not segment.body.mass_derivatives or blind.has_known_force
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
-        self.given = _Trial(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
+        self.given = DescribedWrench(sensor.wrench, segment.experiment.nuisance.tare or 0.0)
 
     def causes(self) -> Iterator[Hypothesis]:
-        """Iterate over the hypotheses without which the wrench fits far better; if it fits,
-        over those about a large tare.
-        """
+        """Yield the hypotheses that improve the fit; if there is none, that of a large tare."""
+        accepted: list[Hypothesis] = []
         misfit = self.misfit(self.given)
         if misfit > MISFIT:
-            yield from HypothesisTest(misfit, self.misfit, BETTER, smallest_misfit=1.0).accepted(
-                self._mistakes()
-            )
-        else:
-            yield from self._large_tare()
+            test = HypothesisTest(misfit, self.misfit, BETTER, smallest_misfit=1.0)
+            accepted = list(test.accepted(self._mistakes()))
+        yield from accepted or self._large_tare()
 
     def _large_tare(self) -> Iterator[Hypothesis]:
         """Yield the hypothesis that the tare of the fit is far beyond its prior."""
         tare = self.given.tare
         if not tare:
             return
-        measured, predicted = self._scaled_by_sigma(_Trial(self.given.wrench, 0.0))
+        measured, predicted = self._scaled_by_sigma(DescribedWrench(self.given.wrench, 0.0))
         factor = 1.0 if self.scale_known else _slope(measured, predicted)
         differences = measured - factor * predicted
         is_measured = np.isfinite(differences).any(axis=0)
@@ -236,7 +233,7 @@ class _OneSensor:
             of = f"the wrench of '{self.part.segment.experiment.name}'"
             yield Hypothesis("wrench-tare", of, strength=float(largest / FAR_TARE))
 
-    def misfit(self, trial: _Trial) -> float:
+    def misfit(self, trial: DescribedWrench) -> float:
         """Return the root mean square of the residuals of a description in standard
         deviations; infinite without samples.
         """
@@ -246,7 +243,7 @@ class _OneSensor:
         factor = 1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
         return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
 
-    def _scaled_by_sigma(self, trial: _Trial) -> tuple[Array, Array]:
+    def _scaled_by_sigma(self, trial: DescribedWrench) -> tuple[Array, Array]:
         """Return samples and prediction (S, 6) over the noise, without tares; NaN in the
         same places.
         """
@@ -305,7 +302,8 @@ class _OneSensor:
         solution = np.linalg.lstsq(
             factor * slopes[is_measured], differences[is_measured], rcond=1e-6
         )
-        return np.asarray(solution[0])
+        shift_m: Array = np.asarray(solution[0], dtype=np.float64)
+        return shift_m
 
     def _mistakes(self) -> Iterator[Hypothesis]:
         """Yield each common mistake with the description that corrects it."""

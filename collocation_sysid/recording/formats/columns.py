@@ -17,7 +17,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError, hint_at
 from .text import (
-    Table,
+    TextTable,
     decode,
     names_file_in_errors,
     numeric_cells,
@@ -91,14 +91,14 @@ class QuantityTable:
 
     Attributes
     ----------
-    grid : Table
+    grid : TextTable
         Cells of the table.
     t_s : (T,) array
     values : dict
         (T,) array by the key of each quantity that the table has, NaN where missing.
     """
 
-    grid: Table
+    grid: TextTable
     t_s: Array
     values: Mapping[str, Array]
 
@@ -155,7 +155,7 @@ def read_columns(
 
 
 def _find_columns(
-    grid: Table, quantities: Sequence[Quantity], mapped: Mapping[str, str]
+    grid: TextTable, quantities: Sequence[Quantity], mapped: Mapping[str, str]
 ) -> dict[str, tuple[int, float]]:
     """Return column index and factor to SI of each quantity that the table has, by its key."""
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
@@ -173,7 +173,7 @@ def _find_columns(
     return chosen | recognised
 
 
-def _column_named_by_user(grid: Table, quantity: Quantity, name: str) -> tuple[int, float]:
+def _column_named_by_user(grid: TextTable, quantity: Quantity, name: str) -> tuple[int, float]:
     """Return index and factor to SI of the column that the user names for a quantity."""
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare
@@ -195,7 +195,7 @@ def _column_named_by_user(grid: Table, quantity: Quantity, name: str) -> tuple[i
     return grid.columns.index(column), factor
 
 
-def find_column(grid: Table, quantity: Quantity) -> tuple[int, float] | None:
+def find_column(grid: TextTable, quantity: Quantity) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
     name fits.
 
@@ -247,7 +247,7 @@ def _words(name: str) -> set[str]:
 # Refusals -----------------------------------------------------------------------------------------
 
 
-def _require_known_columns(grid: Table, quantities: Sequence[Quantity], all_of: bool) -> None:
+def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_of: bool) -> None:
     """Raise an `InputError` if a column holds no known quantity."""
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
@@ -257,7 +257,7 @@ def _require_known_columns(grid: Table, quantities: Sequence[Quantity], all_of: 
 
 
 def _columns_error(
-    grid: Table, quantities: Sequence[Quantity], all_of: bool, why: str = ""
+    grid: TextTable, quantities: Sequence[Quantity], all_of: bool, why: str = ""
 ) -> InputError:
     """Return the error for a table without the wanted columns; `why` is added to its message."""
     expected = ", ".join(quantity.column for quantity in quantities)
@@ -274,7 +274,7 @@ def _columns_error(
     )
 
 
-def _unit_error(grid: Table, column: str, unit: str | None, quantity: Quantity) -> InputError:
+def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
     """Return the error for a column without a unit, or with a unit of another dimension."""
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = f"call it {quantity.column}, or {column.split('_')[0]} ({quantity.unit})"

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ..clock import first_unordered_time
-from .text import Table, numeric_cells, read_table
+from .text import TextTable, numeric_cells, read_table
 from .tracks import LabelChooser, RawTracks, tracks_of_table
 from .units import METRES_PER_UNIT
 
@@ -24,7 +24,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     return (_read_long if "marker" in table.columns else _read_wide)(table, choose)
 
 
-def _read_wide(table: Table, choose: LabelChooser) -> RawTracks:
+def _read_wide(table: TextTable, choose: LabelChooser) -> RawTracks:
     """Read a table with three columns for each marker."""
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
@@ -40,7 +40,7 @@ def _read_wide(table: Table, choose: LabelChooser) -> RawTracks:
     )
 
 
-def _wide_labels(table: Table) -> list[str]:
+def _wide_labels(table: TextTable) -> list[str]:
     """Names of the markers in the file, in the order of their first columns.
 
     Raises
@@ -71,7 +71,7 @@ def _wide_labels(table: Table) -> list[str]:
     )
 
 
-def _read_long(table: Table, choose: LabelChooser) -> RawTracks:
+def _read_long(table: TextTable, choose: LabelChooser) -> RawTracks:
     """Read a table with one row for each marker and time."""
     axes, unit = _long_columns(table)
     of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
@@ -84,7 +84,7 @@ def _read_long(table: Table, choose: LabelChooser) -> RawTracks:
     coordinates = np.full((len(t_s), len(chosen), 3), np.nan)
     for k, label in enumerate(chosen):
         own = [i for i, other in enumerate(of_row) if other == label]
-        rows = Table(table.columns, [table.rows[i] for i in own])
+        rows = TextTable(table.columns, [table.rows[i] for i in own])
         if fault := first_unordered_time(row_t_s[own]):
             raise rows.error_at(f"marker '{label}': {fault[1]}", fault[0])
         columns = [table.columns.index(axis) for axis in axes]
@@ -92,7 +92,7 @@ def _read_long(table: Table, choose: LabelChooser) -> RawTracks:
     return RawTracks(chosen, coordinates, unit, "the columns' names", t_s, zeros_are_missing=False)
 
 
-def _long_columns(table: Table) -> tuple[list[str], str | None]:
+def _long_columns(table: TextTable) -> tuple[list[str], str | None]:
     """Return the names of the columns of x, y and z, and the unit in these names; None
     without one.
     """

@@ -48,7 +48,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class TextTable:
     """Rows of equal length below column names; `names_line` is the line of the names, counted from
     1.
     """
@@ -172,7 +172,7 @@ def tab_rows(text: str) -> list[Row]:
     return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
 
 
-def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> Table:
+def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> TextTable:
     """Return a table of rows that are as wide as their column names.
 
     Blank columns at the end of all rows are cut.
@@ -195,14 +195,14 @@ def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> T
     common = len(rows[0].cells)
     if common > width and all(len(r.cells) == common and not any(r.cells[width:]) for r in rows):
         rows = [Row(row.line, row.cells[:width]) for row in rows]
-    table = Table(columns, rows, names_line)
+    table = TextTable(columns, rows, names_line)
     for k, row in enumerate(rows):
         if len(row.cells) != width:
             raise table.error_at(f"{len(row.cells)} cells, but the header has {width} columns", k)
     return table
 
 
-def read_table(text: str) -> Table:
+def read_table(text: str) -> TextTable:
     """Return a table from text of separated cells with a row of column names.
 
     Lines above the names are skipped; units in a row of their own are joined to the names, as in
@@ -238,12 +238,12 @@ def _is_unit(cell: str) -> bool:
 # Cells --------------------------------------------------------------------------------------------
 
 
-def numeric_cells(grid: Table, columns: Sequence[int], blank_allowed: bool) -> Array:
+def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) -> Array:
     """Return the cells of some columns as numbers (rows, columns); NaN where blank.
 
     Parameters
     ----------
-    grid : Table
+    grid : TextTable
     columns : sequence of int
         Indices of the columns.
     blank_allowed : bool
@@ -272,12 +272,12 @@ def numeric_cells(grid: Table, columns: Sequence[int], blank_allowed: bool) -> A
     return values
 
 
-def times_in_column(grid: Table, column: int, factor: float = 1.0) -> Array:
+def times_in_column(grid: TextTable, column: int, factor: float = 1.0) -> Array:
     """Return the times (rows,) in a column.
 
     Parameters
     ----------
-    grid : Table
+    grid : TextTable
     column : int
         Index of the column.
     factor : float

@@ -69,9 +69,9 @@ class LogTopic:
         Number of messages.
     rate_hz : float or None
         Rate of the first messages; None for fewer than two.
-    uses : str
+    serves : str
         Possible uses in words; empty if the topic cannot be used.
-    problem_texts : tuple of str
+    write : tuple of str
         Text to write in a problem file in place of a file, one for each way to read the topic.
     """
 
@@ -79,8 +79,8 @@ class LogTopic:
     type: str
     messages: int
     rate_hz: float | None
-    uses: str
-    problem_texts: tuple[str, ...]
+    serves: str
+    write: tuple[str, ...]
 
 
 def list_topics(path: str | Path) -> list[LogTopic]:

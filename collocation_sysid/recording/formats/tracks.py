@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from ...arrays import Array
 from ...errors import InputError
-from .text import Row, Table, number_from_text, numeric_cells, table_of_rows, times_in_column
+from .text import Row, TextTable, number_from_text, numeric_cells, table_of_rows, times_in_column
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class LabelChooser(Protocol):
 
 
 def tracks_of_table(
-    table: Table,
+    table: TextTable,
     labels: Sequence[str],
     coordinate_columns: Sequence[Sequence[int]],
     chosen: Sequence[int],
@@ -77,7 +77,7 @@ def tracks_of_table(
 
     Parameters
     ----------
-    table : Table
+    table : TextTable
     labels : sequence of str
     coordinate_columns : sequence of (int, int, int)
         Indices of the columns of x, y and z, by marker.

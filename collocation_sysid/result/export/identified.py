@@ -397,7 +397,7 @@ def _warnings(result: Result) -> tuple[str, ...]:
             f"{listed(result.fields)} differs from place to place: the mean is exported"
         )
     for name, each in result.parameters.items():
-        if each.is_at_bound and not each.fixed:
+        if each.at_bound and not each.fixed:
             warnings.append(
                 f"{name} = {each.value:.4g} ended at a bound: the data would have it elsewhere"
             )

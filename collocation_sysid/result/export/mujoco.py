@@ -261,9 +261,10 @@ def _mujoco() -> ModuleType:
         raise InputError(
             'mujoco is not installed: pip install "collocation-sysid[mujoco]"'
         ) from error
-    if int(mujoco.__version__.partition(".")[0]) < SINCE:
+    version: str = getattr(mujoco, "__version__")  # noqa: B009 (not in its stubs)
+    if int(version.partition(".")[0]) < SINCE:
         raise InputError(
-            f"found MuJoCo {mujoco.__version__}, which takes a flex for stiffer than is written; "
+            f"found MuJoCo {version}, which takes a flex for stiffer than is written; "
             f'expected {SINCE} or newer: pip install --upgrade "collocation-sysid[mujoco]"'
         )
     return mujoco

@@ -391,7 +391,8 @@ def grasp_sentence(grasp_check: GraspCheck) -> str:
     axes = (
         "" if grasp_check.axes == "xyz" else f", held along {' and '.join(grasp_check.axes)} only"
     )
-    return f"{grasp_check.nodes} nodes, {grasp_check.share:.0%} of all, in a box of {size} mm at ({low}) mm{axes}"
+    nodes = f"{grasp_check.nodes} nodes, {grasp_check.share:.0%} of all"
+    return f"{nodes}, in a box of {size} mm at ({low}) mm{axes}"
 
 
 def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
