@@ -54,6 +54,7 @@ from studies import markdown
 
 from collocation_sysid import cli
 from collocation_sysid.cli import problems, runs, streams  # noqa: F401
+from collocation_sysid.fem.kernels import jit
 from collocation_sysid.fem.structured import box_mesh
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.formats import topics  # noqa: F401
@@ -831,6 +832,8 @@ def _kernels(rng: Rng, folder: Path, limit_s: float) -> tuple[str, Ended]:
 
     def with_cache() -> None:
         os.environ["COLLOCATION_SYSID_CACHE"] = str(cache)
+        # A fork inherits the kernels in memory, for which it would neither write nor read a file.
+        jit.compile_function.cache_clear()
         _without_privileges()
 
     first = run(words, folder, limit_s, with_cache)
